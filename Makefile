@@ -1,0 +1,48 @@
+# `make demo` and `make test` do all their own set-up: Python >= 3.11, a C++ compiler and make suffice.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+CORE_SOURCES := $(shell find src/core CMakeLists.txt)
+
+# Real images for tests and benchmarks; tests that need them skip where there are none.
+ifndef ENGRAM_DATA
+ifneq ($(wildcard ../shared/data),)
+export ENGRAM_DATA := $(abspath ../shared/data)
+endif
+endif
+
+.PHONY: setup demo test test-long check format clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt $(CORE_SOURCES)
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Engram needs Python 3.11 or newer; set PYTHON=...")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
+	$(BIN)/python -m pip install --quiet -c constraints.txt scikit-build-core nanobind cmake ninja
+	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[plots]'
+	touch $(STAMP)
+
+demo: setup
+	$(BIN)/engram demo --out demo
+
+test: setup
+	$(BIN)/python -m pytest -n 2 -m 'not long'
+
+test-long: setup
+	$(BIN)/python -m pytest -n 2 -m long
+
+check: setup
+	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: setup
+	$(BIN)/ruff format src tests benchmarks
+	$(BIN)/ruff check --fix src tests benchmarks
+
+clean:
+	rm -rf $(VENV) build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,0 +1,15 @@
+// engram._core: arrays in, arrays out. Each subject binds its own kernels in a file of its own:
+// declare its bind_… function here and call it below.
+#include <nanobind/nanobind.h>
+
+#include "dispatch.hpp"
+
+namespace nb = nanobind;
+
+void bind_hamming(nb::module_ &module);
+
+NB_MODULE(_core, module) {
+  module.doc() = "The measured hot kernels of Engram. Every function releases the GIL.";
+  module.attr("isa") = engram::name_of(engram::active_isa());
+  bind_hamming(module);
+}

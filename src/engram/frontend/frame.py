@@ -1,0 +1,94 @@
+"""What the front-end takes and makes: `StereoPair` → `Frame`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.geometry import StereoCamera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoPair:
+    """One rectified, synchronised stereo pair.
+
+    Attributes:
+        stamp_ns: capture time, ns.
+        left, right: (height, width) uint8 grey images, C-contiguous.
+        camera: the camera that both images belong to.
+    """
+
+    stamp_ns: int
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    camera: StereoCamera
+
+
+class DescriptorKind(StrEnum):
+    """Binary descriptors of 256 bits. Two kinds are never matched with each other."""
+
+    BRIEF = "brief"
+    TEBLID = "teblid"
+
+
+class FrameStatus(StrEnum):
+    """Whether a frame is of use on its own (SPEC §5: useless frames are never saved)."""
+
+    OK = "ok"
+    DARK = "dark"
+    COVERED = "covered"
+    TOO_FEW_LANDMARKS = "too_few_landmarks"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks:
+    """The landmarks of one frame: a struct of arrays, one row per landmark.
+
+    Pixels and disparities are multiples of the quantum in which they are stored, so that a frame
+    read back from a log or a map matches exactly as the frame that was written.
+
+    Attributes:
+        pixels: (N, 2) float32, left u, v, px.
+        disparity_px: (N,) float32, > 0.
+        disparity_sigma_px: (N,) float32, standard deviation of the disparity.
+        points_in_cam: (N, 3) float32, metres, in the left camera.
+        descriptors: (N, 32) uint8, 256 bits.
+        octaves: (N,) uint8, pyramid level of detection, 0 is full resolution.
+    """
+
+    pixels: NDArray[np.float32]
+    disparity_px: NDArray[np.float32]
+    disparity_sigma_px: NDArray[np.float32]
+    points_in_cam: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    octaves: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What the front-end makes of one stereo pair, in the camera's own coordinates.
+
+    Attributes:
+        stamp_ns: capture time, ns.
+        camera: the camera of the pair.
+        landmarks: its 3D landmarks (possibly none).
+        descriptor: the kind of the landmarks' descriptors.
+        frontend: hash of the front-end's version and configuration.
+        status: `FrameStatus.OK`, or why the frame is of no use on its own.
+        thumbnail: (h, w) uint8 grey, at most 160 px wide, for people to look at; None where it
+            was not loaded.
+    """
+
+    stamp_ns: int
+    camera: StereoCamera
+    landmarks: Landmarks
+    descriptor: DescriptorKind
+    frontend: str
+    status: FrameStatus
+    thumbnail: NDArray[np.uint8] | None = None

@@ -1,0 +1,214 @@
+"""Rigid transforms between named frames: ``target_from_source``.
+
+``points_in_target = target_from_source @ points_in_source``; equal names touch when transforms
+are chained, and the inverse swaps the names. Tangent vectors are ``[translation, rotation]``
+(metres, radians) and perturb on the left: ``exp(tangent) @ target_from_source``, so that a 6×6
+covariance lives in the target frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from engram.errors import InputError
+
+Array = NDArray[np.float64]
+
+# Below this angle the closed forms lose digits to cancellation; the series, cut after the fourth
+# power, are exact to 1e-15 there.
+_SMALL_ANGLE_RAD = 1e-2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SE3:
+    """A rigid transform ``target_from_source``.
+
+    Attributes:
+        rotation: (3, 3) float64, orthonormal with determinant 1.
+        translation: (3,) float64, metres; the source's origin in the target frame.
+    """
+
+    rotation: Array
+    translation: Array
+
+    @staticmethod
+    def identity() -> SE3:
+        """The transform that changes nothing."""
+        return SE3(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: ArrayLike) -> SE3:
+        """From a (4, 4) or (3, 4) matrix; the rotation is projected onto SO(3).
+
+        Raises:
+            InputError: the shape is wrong, a value is not finite, or the upper left 3×3 block is
+                further than 1e-3 from a rotation.
+        """
+        values = np.asarray(matrix, dtype=np.float64)
+        if values.shape not in {(4, 4), (3, 4)}:
+            raise InputError(f"a transform has shape (4, 4) or (3, 4), not {values.shape}")
+        if not np.isfinite(values).all():
+            raise InputError("a transform must be finite")
+        left, _, right = np.linalg.svd(values[:3, :3])
+        rotation = left @ right
+        if np.linalg.det(rotation) < 0 or np.abs(rotation - values[:3, :3]).max() > 1e-3:
+            raise InputError("the upper left 3×3 block of a transform must be a rotation")
+        return SE3(rotation, values[:3, 3].copy())
+
+    @staticmethod
+    def from_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> SE3:
+        """From a quaternion (4,) in the order w, x, y, z (normalised here) and a (3,) position."""
+        quaternion = np.asarray(wxyz, dtype=np.float64)
+        norm = np.linalg.norm(quaternion)
+        if quaternion.shape != (4,) or not np.isfinite(norm) or norm < 1e-9:
+            raise InputError("a quaternion is four finite numbers w, x, y, z, not all zero")
+        w, x, y, z = quaternion / norm
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        return SE3(rotation, np.array(translation, dtype=np.float64))
+
+    @staticmethod
+    def exp(tangent: ArrayLike) -> SE3:
+        """The transform of a (6,) tangent vector [translation m, rotation rad]."""
+        vector = np.asarray(tangent, dtype=np.float64)
+        rotation_vector = vector[3:]
+        a, b, c = _rodrigues_coefficients(float(np.linalg.norm(rotation_vector)))
+        k = skew(rotation_vector)
+        kk = k @ k
+        rotation = np.eye(3) + a * k + b * kk
+        return SE3(rotation, (np.eye(3) + b * k + c * kk) @ vector[:3])
+
+    def log(self) -> Array:
+        """The (6,) tangent vector [translation m, rotation rad] whose `exp` this is."""
+        rotation_vector = _rotation_log(self.rotation)
+        angle = float(np.linalg.norm(rotation_vector))
+        a, b, _ = _rodrigues_coefficients(angle)
+        k = skew(rotation_vector)
+        # Inverse of the left Jacobian of SO(3).
+        if angle < _SMALL_ANGLE_RAD:
+            d = 1 / 12 + angle**2 / 720 + angle**4 / 30240
+        else:
+            d = (1 - a / (2 * b)) / angle**2
+        inverse_jacobian = np.eye(3) - 0.5 * k + d * (k @ k)
+        return np.concatenate([inverse_jacobian @ self.translation, rotation_vector])
+
+    @overload
+    def __matmul__(self, other: SE3) -> SE3: ...
+    @overload
+    def __matmul__(self, other: Array) -> Array: ...
+    def __matmul__(self, other: SE3 | Array) -> SE3 | Array:
+        """Chain with a transform, or map points (..., 3) from the source to the target frame."""
+        if isinstance(other, SE3):
+            return SE3(
+                self.rotation @ other.rotation,
+                self.rotation @ other.translation + self.translation,
+            )
+        return other @ self.rotation.T + self.translation
+
+    def inverse(self) -> SE3:
+        """``source_from_target``."""
+        transposed = self.rotation.T
+        return SE3(transposed, -(transposed @ self.translation))
+
+    def matrix(self) -> Array:
+        """The (4, 4) matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def adjoint(self) -> Array:
+        """The (6, 6) matrix that carries tangent vectors from the source to the target frame."""
+        adjoint = np.zeros((6, 6))
+        adjoint[:3, :3] = self.rotation
+        adjoint[:3, 3:] = skew(self.translation) @ self.rotation
+        adjoint[3:, 3:] = self.rotation
+        return adjoint
+
+    def quaternion_wxyz(self) -> Array:
+        """The (4,) unit quaternion w, x, y, z with w >= 0."""
+        vector = _rotation_log(self.rotation)
+        angle = float(np.linalg.norm(vector))
+        half_sinc = 0.5 * np.sinc(angle / (2 * np.pi))
+        quaternion = np.concatenate([[np.cos(angle / 2)], half_sinc * vector])
+        return np.asarray(quaternion / np.linalg.norm(quaternion))
+
+    @property
+    def distance_m(self) -> float:
+        """Length of the translation, metres."""
+        return float(np.sqrt(self.translation @ self.translation))
+
+    @property
+    def angle_rad(self) -> float:
+        """Angle of the rotation, radians, in [0, π]."""
+        return float(np.linalg.norm(_rotation_log(self.rotation)))
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading of the source's optical axis in the target's x-z plane, radians, right positive.
+
+        Camera axes are x right, y down, z forward (SPEC §1), so this is the turn about y.
+        """
+        return float(np.arctan2(self.rotation[0, 2], self.rotation[2, 2]))
+
+
+def skew(vector: Array) -> Array:
+    """The (3, 3) matrix with ``skew(a) @ b == cross(a, b)``."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def propagate_covariance(a_from_b: SE3, covariance_ab: Array, covariance_bc: Array) -> Array:
+    """Covariance (6, 6) of ``a_from_b @ b_from_c`` from those of its two factors.
+
+    First order, the two errors independent, left perturbation.
+    """
+    adjoint = a_from_b.adjoint()
+    return covariance_ab + adjoint @ covariance_bc @ adjoint.T
+
+
+def _rodrigues_coefficients(angle: float) -> tuple[float, float, float]:
+    """Coefficients of 1, k, k² in exp and in the left Jacobian."""
+    square = angle * angle
+    if angle < _SMALL_ANGLE_RAD:
+        return (
+            1 - square / 6 * (1 - square / 20),
+            0.5 - square / 24 * (1 - square / 30),
+            1 / 6 - square / 120 * (1 - square / 42),
+        )
+    sine, cosine = np.sin(angle), np.cos(angle)
+    return sine / angle, (1 - cosine) / square, (angle - sine) / (square * angle)
+
+
+def _rotation_log(rotation: Array) -> Array:
+    """The rotation vector (3,) of a rotation matrix, angle in [0, π]."""
+    axis_sine = 0.5 * np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    sine = float(np.linalg.norm(axis_sine))
+    cosine = 0.5 * (float(np.trace(rotation)) - 1)
+    angle = float(np.arctan2(sine, cosine))
+    if sine < 1e-9 and cosine > 0:
+        return axis_sine
+    if np.pi - angle > 1e-3:
+        return axis_sine * (angle / sine)
+    # Near π the antisymmetric part vanishes: take the axis from R + Rᵀ instead.
+    symmetric = (rotation + rotation.T) / 2 - cosine * np.eye(3)
+    column = symmetric[:, int(np.argmax(np.diag(symmetric)))]
+    axis = column / np.linalg.norm(column)
+    if axis @ axis_sine < 0:
+        axis = -axis
+    return np.asarray(angle * axis)

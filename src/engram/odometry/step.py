@@ -1,0 +1,39 @@
+"""What visual odometry says about one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.geometry import SE3
+
+
+class OdometryStatus(StrEnum):
+    """Whether a motion was estimated, and if not, why."""
+
+    FIRST = "first"
+    OK = "ok"
+    UNUSABLE_FRAME = "unusable_frame"
+    TOO_FEW_MATCHES = "too_few_matches"
+    NO_CONSENSUS = "no_consensus"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometryStep:
+    """Motion since the previous frame of the sequence; a failure carries no made-up motion.
+
+    Attributes:
+        status: `OK`, `FIRST` for the first frame of a drive, or the reason of the failure.
+        prev_from_curr: pose of this frame in the previous one; None unless `OK`.
+        covariance: (6, 6) float64 of `prev_from_curr`, left perturbation,
+            [translation, rotation]; None unless `OK`.
+        inliers: landmarks that agree with the motion, 0 unless `OK`.
+    """
+
+    status: OdometryStatus
+    prev_from_curr: SE3 | None = None
+    covariance: NDArray[np.float64] | None = None
+    inliers: int = 0

@@ -1,0 +1,1 @@
+"""Readers of drives: images in known layouts, and frame logs."""

@@ -1,0 +1,80 @@
+"""The two protocols behind which every source of data stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+from engram.experience.model import Clock
+from engram.frontend import Frame, StereoPair
+from engram.geometry import StereoCamera
+from engram.odometry import OdometryStep
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceInfo:
+    """What is known of a drive before its first image is decoded.
+
+    Attributes:
+        name: short name for people, from the path.
+        format: key in `SEQUENCES`, such as "kitti".
+        clock: what the stamps mean.
+        robot: name of the robot, where the source names one.
+        longitude_deg, zone: where the drive was, if known (SPEC §2.8).
+    """
+
+    name: str
+    format: str
+    clock: Clock
+    robot: str | None = None
+    longitude_deg: float | None = None
+    zone: str | None = None
+
+
+class StereoSequence(Protocol):
+    """A drive as rectified stereo pairs, in the order of time."""
+
+    @property
+    def info(self) -> SequenceInfo: ...
+
+    @property
+    def camera(self) -> StereoCamera: ...
+
+    @property
+    def skipped(self) -> int:
+        """Pairs left out so far under `skip_bad`."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        """Decodes one pair at a time.
+
+        Raises:
+            SequenceError: an image is missing, unreadable or of the wrong size, and `skip_bad`
+                was not asked for.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedFrame:
+    """One entry of a frame log: a frame and the odometry that led to it."""
+
+    frame: Frame
+    odometry: OdometryStep
+
+
+class FrameSequence(Protocol):
+    """A drive as frames with odometry: a frame log, or a stereo sequence run through both."""
+
+    @property
+    def info(self) -> SequenceInfo: ...
+
+    @property
+    def camera(self) -> StereoCamera: ...
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[LoggedFrame]: ...
