@@ -36,10 +36,14 @@ class StereoSequence(Protocol):
     """A drive as rectified stereo pairs, in the order of time."""
 
     @property
-    def info(self) -> SequenceInfo: ...
+    def info(self) -> SequenceInfo:
+        """What is known of the drive as a whole."""
+        ...
 
     @property
-    def camera(self) -> StereoCamera: ...
+    def camera(self) -> StereoCamera:
+        """The one camera of the drive."""
+        ...
 
     @property
     def skipped(self) -> int:
@@ -70,10 +74,14 @@ class FrameSequence(Protocol):
     """A drive as frames with odometry: a frame log, or a stereo sequence run through both."""
 
     @property
-    def info(self) -> SequenceInfo: ...
+    def info(self) -> SequenceInfo:
+        """What is known of the drive as a whole."""
+        ...
 
     @property
-    def camera(self) -> StereoCamera: ...
+    def camera(self) -> StereoCamera:
+        """The one camera of the drive."""
+        ...
 
     def __len__(self) -> int: ...
 
