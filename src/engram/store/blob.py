@@ -39,7 +39,7 @@ _ROW_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "octaves": ("U8", ()),
     "sigma": ("U8", ()),
 }
-_DTYPES = {"U16": np.dtype("<u2"), "U8": np.dtype("u1")}
+_DTYPES: dict[str, np.dtype[Any]] = {"U16": np.dtype("<u2"), "U8": np.dtype("u1")}
 
 # Good enough to recognise a place at 160 px, a third of the bytes of PNG.
 _JPEG_QUALITY = 80
