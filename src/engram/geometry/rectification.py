@@ -1,0 +1,293 @@
+"""Raw stereo calibration → rectified `StereoCamera` and the tables that rectify its images.
+
+Only tables are made here; a reader applies them (`cv2.remap`), so geometry knows no images.
+Source: Bouguet's rectification as in OpenCV's ``stereoRectify``: each camera turns by half of the
+rotation between them, then both together until their rows lie along the baseline.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from enum import StrEnum
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from engram.errors import CalibrationError
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+
+# Names the method in the hash of a rectification: a change to what `rectify` computes is another
+# camera, since landmarks made with the old tables would no longer fit the new intrinsics.
+_METHOD = "bouguet-1"
+
+# Larger images are refused: the four tables of a pair take 12 bytes a pixel.
+_MAX_SIDE_PX = 16_384
+
+
+class DistortionModel(StrEnum):
+    """How a lens bends rays.
+
+    `RADIAL_TANGENTIAL` is Brown's polynomial with coefficients k1, k2, p1, p2 [, k3 [, k4, k5,
+    k6]] in OpenCV's order; `EQUIDISTANT` the fisheye of Kannala and Brandt with k1, k2, k3, k4.
+    """
+
+    NONE = "none"
+    RADIAL_TANGENTIAL = "radial-tangential"
+    EQUIDISTANT = "equidistant"
+
+
+_COEFFICIENT_COUNTS = {
+    DistortionModel.NONE: {0},
+    DistortionModel.RADIAL_TANGENTIAL: {4, 5, 8},
+    DistortionModel.EQUIDISTANT: {4},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RawCamera:
+    """One camera as it delivers its images: distorted, not rectified.
+
+    Attributes:
+        fx, fy, cx, cy: intrinsics, px; pixel centres at integers.
+        width, height: image size, px.
+        distortion: model of the lens.
+        coefficients: as many as the model has, see `DistortionModel`.
+
+    Raises:
+        CalibrationError: a value is not finite, not positive, or their number does not fit.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    distortion: DistortionModel = DistortionModel.NONE
+    coefficients: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("fx", "fy"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise CalibrationError(f"raw camera: {name} is {value}, must be finite and > 0")
+        for name, size in (("cx", self.width), ("cy", self.height)):
+            if not 0 < size <= _MAX_SIDE_PX:
+                raise CalibrationError(
+                    f"raw camera: image size is {self.width}×{self.height}, "
+                    f"each side must be 1 to {_MAX_SIDE_PX} px"
+                )
+            value = getattr(self, name)
+            if not (np.isfinite(value) and -size <= value <= 2 * size):
+                raise CalibrationError(f"raw camera: {name} is {value}, image size is {size} px")
+        allowed = _COEFFICIENT_COUNTS[self.distortion]
+        if len(self.coefficients) not in allowed:
+            raise CalibrationError(
+                f"raw camera: distortion {self.distortion.value!r} has "
+                f"{' or '.join(map(str, sorted(allowed)))} coefficients, "
+                f"not {len(self.coefficients)}"
+            )
+        if not np.isfinite(self.coefficients).all():
+            raise CalibrationError("raw camera: a distortion coefficient is not finite")
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The (3, 3) camera matrix, px."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawStereoCalibration:
+    """Two raw cameras and how they stand to each other.
+
+    Attributes:
+        left, right: the two cameras, of equal image size.
+        right_from_left: pose of the left raw camera in the right one, metres.
+        left_from_rig: mounting of the left raw camera on the robot, if known.
+    """
+
+    left: RawCamera
+    right: RawCamera
+    right_from_left: SE3
+    left_from_rig: SE3 | None = None
+
+    def content_hash(self) -> str:
+        """32 hexadecimal digits, equal for equal calibrations; mounting does not count."""
+        content = [_METHOD]
+        for camera in (self.left, self.right):
+            content += [float(value).hex() for value in camera.matrix.ravel()]
+            content += [f"{camera.width}x{camera.height}", camera.distortion.value]
+            content += [float(value).hex() for value in camera.coefficients]
+        content += [float(value).hex() for value in self.right_from_left.matrix()[:3].ravel()]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RemapTable:
+    """Where each pixel of a rectified image comes from, in OpenCV's fixed-point form.
+
+    Attributes:
+        pixels: (height, width, 2) int16, whole source u, v.
+        fractions: (height, width) uint16, index into the interpolation table.
+    """
+
+    pixels: NDArray[np.int16]
+    fractions: NDArray[np.uint16]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rectification:
+    """A rectified camera and what leads to it from the raw one.
+
+    Attributes:
+        camera: the rectified pair; its `rectification` is the hash of the raw calibration.
+        rectified_from_raw: rotation of the left camera (its centre stays).
+        left, right: the tables for the two images.
+    """
+
+    camera: StereoCamera
+    rectified_from_raw: SE3
+    left: RemapTable
+    right: RemapTable
+
+
+def rectify(calibration: RawStereoCalibration) -> Rectification:
+    """Rectify a raw stereo calibration; the image size stays, and no border is left unseen.
+
+    Raises:
+        CalibrationError: the two sizes differ, the right camera does not stand to the right of
+            the left one, or the calibration leaves no image to rectify.
+    """
+    left, right = calibration.left, calibration.right
+    _check_pair(calibration)
+    try:
+        rotations, projections = _stereo_rectify(calibration)
+        tables = [
+            _table(camera, rotation, projection)
+            for camera, rotation, projection in zip(
+                (left, right), rotations, projections, strict=True
+            )
+        ]
+    except cv2.error as error:
+        raise CalibrationError(f"the stereo calibration cannot be rectified: {error}") from error
+    rectified_from_raw = SE3(rotations[0], np.zeros(3))
+    camera = _rectified_camera(calibration, projections, rectified_from_raw)
+    return Rectification(camera, rectified_from_raw, tables[0], tables[1])
+
+
+def _check_pair(calibration: RawStereoCalibration) -> None:
+    left, right = calibration.left, calibration.right
+    if (left.width, left.height) != (right.width, right.height):
+        raise CalibrationError(
+            f"left images are {left.width}×{left.height}, right ones {right.width}×{right.height}: "
+            "a stereo pair needs equal sizes"
+        )
+    fisheye = [camera.distortion is DistortionModel.EQUIDISTANT for camera in (left, right)]
+    if fisheye[0] != fisheye[1]:
+        raise CalibrationError(
+            f"left lens is {left.distortion.value!r}, right lens {right.distortion.value!r}: "
+            "a fisheye pairs only with a fisheye"
+        )
+    right_in_left = calibration.right_from_left.inverse().translation
+    if not (right_in_left[0] > 0 and right_in_left[0] > abs(right_in_left[1])):
+        offset = ", ".join(f"{value:.4f}" for value in right_in_left)
+        raise CalibrationError(
+            f"the right camera stands at ({offset}) m of the left one: x must be positive and the "
+            "largest part; swap the two cameras or correct the extrinsics"
+        )
+
+
+def _stereo_rectify(
+    calibration: RawStereoCalibration,
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+    """Rotations (3, 3) and projections (3, 4) of the left and the right rectified camera."""
+    left, right = calibration.left, calibration.right
+    size = (left.width, left.height)
+    rotation = calibration.right_from_left.rotation
+    translation = calibration.right_from_left.translation.reshape(3, 1)
+    if left.distortion is DistortionModel.EQUIDISTANT:
+        r0, r1, p0, p1, _ = cv2.fisheye.stereoRectify(
+            left.matrix,
+            np.array(left.coefficients),
+            right.matrix,
+            np.array(right.coefficients),
+            size,
+            rotation,
+            translation,
+            flags=cv2.CALIB_ZERO_DISPARITY,
+            balance=0.0,
+        )
+        return _float64(r0, r1), _float64(p0, p1)
+    r0, r1, p0, p1, *_ = cv2.stereoRectify(
+        left.matrix,
+        _coefficients(left),
+        right.matrix,
+        _coefficients(right),
+        size,
+        rotation,
+        translation,
+        flags=cv2.CALIB_ZERO_DISPARITY,
+        alpha=0.0,
+    )
+    return _float64(r0, r1), _float64(p0, p1)
+
+
+def _float64(*arrays: ArrayLike) -> list[NDArray[np.float64]]:
+    """OpenCV's results under the type they have."""
+    return [np.asarray(array, dtype=np.float64) for array in arrays]
+
+
+def _coefficients(camera: RawCamera) -> NDArray[np.float64]:
+    return np.array(camera.coefficients or (0.0,) * 4, dtype=np.float64)
+
+
+def _table(
+    camera: RawCamera, rotation: NDArray[np.float64], projection: NDArray[np.float64]
+) -> RemapTable:
+    make = (
+        cv2.fisheye.initUndistortRectifyMap
+        if camera.distortion is DistortionModel.EQUIDISTANT
+        else cv2.initUndistortRectifyMap
+    )
+    pixels, fractions = make(
+        camera.matrix,
+        _coefficients(camera),
+        rotation,
+        projection[:, :3],
+        (camera.width, camera.height),
+        cv2.CV_16SC2,
+    )
+    return RemapTable(np.asarray(pixels, np.int16), np.asarray(fractions, np.uint16))
+
+
+def _rectified_camera(
+    calibration: RawStereoCalibration,
+    projections: list[NDArray[np.float64]],
+    rectified_from_raw: SE3,
+) -> StereoCamera:
+    left, right = projections
+    # Far below what matters, far above what differs between processors: a camera's identity hangs
+    # on every digit, and the same drive must give the same camera everywhere.
+    fx, fy, cx, cy = (round(float(left[at]), 6) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    baseline_m = round(float(-right[0, 3] / left[0, 0]), 9)
+    mounting = calibration.left_from_rig
+    return StereoCamera(
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        baseline_m=baseline_m,
+        width=calibration.left.width,
+        height=calibration.left.height,
+        cam_from_rig=None if mounting is None else _rounded(rectified_from_raw @ mounting),
+        rectification=calibration.content_hash(),
+    )
+
+
+def _rounded(transform: SE3) -> SE3:
+    # Adding 0.0 makes -0.0 positive: the two differ in a hash.
+    return SE3(transform.rotation.round(9) + 0.0, transform.translation.round(9) + 0.0)

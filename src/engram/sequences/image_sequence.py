@@ -1,0 +1,198 @@
+"""Drives that are stored as images: one reader of pairs for all layouts."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError, SequenceError
+from engram.experience.model import Clock
+from engram.frontend import StereoPair
+from engram.geometry import StereoCamera
+from engram.geometry.rectification import Rectification, RemapTable
+from engram.sequences.images import Channel, read_image
+from engram.sequences.listing import BadPlace, Listing, PairFiles, usable_pairs
+from engram.sequences.options import OpenOptions
+from engram.sequences.sequence import SequenceInfo
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageDrive:
+    """What a layout amounts to, before a caller's choices.
+
+    Attributes:
+        path: where the drive lies.
+        info: what its files say of it.
+        camera: the rectified camera.
+        places: its pairs and faults, all of them, in the order of time.
+        rectification: how its raw images become rectified; None if they are delivered so.
+    """
+
+    path: Path
+    info: SequenceInfo
+    camera: StereoCamera
+    places: Listing
+    rectification: Rectification | None = None
+
+
+class ImageSequence:
+    """A `StereoSequence` over image files. Pairs are decoded when they are asked for."""
+
+    def __init__(
+        self,
+        drive: ImageDrive,
+        pairs: Sequence[PairFiles],
+        faults: Sequence[str] = (),
+        *,
+        channel: Channel = Channel.GREY,
+        skip_bad: bool = False,
+    ) -> None:
+        self._drive = drive
+        self._pairs = tuple(pairs)
+        self._listing_faults = tuple(faults)
+        self._reading_faults: list[str] = []
+        self._channel = channel
+        self._skip_bad = skip_bad
+
+    @property
+    def info(self) -> SequenceInfo:
+        """What is known of the drive as a whole."""
+        return self._drive.info
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The one camera of the drive, rectified."""
+        return self._drive.camera
+
+    @property
+    def rectification(self) -> Rectification | None:
+        """How raw images become rectified; None for a drive that is delivered rectified."""
+        return self._drive.rectification
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) int64 stamps of the pairs, also of those that may turn out unreadable."""
+        return np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
+
+    @property
+    def skipped(self) -> int:
+        """Pairs left out so far under `skip_bad`, in the latest pass through the drive."""
+        return len(self.skipped_reasons)
+
+    @property
+    def skipped_reasons(self) -> list[str]:
+        """Why each of the `skipped` pairs was left out."""
+        return [*self._listing_faults, *self._reading_faults]
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        """Decodes one pair at a time.
+
+        Raises:
+            SequenceError: an image is missing, unreadable or of the wrong size, and `skip_bad`
+                was not asked for.
+        """
+        self._reading_faults.clear()
+        for index in range(len(self._pairs)):
+            try:
+                pair = self.read(index)
+            except SequenceError as error:
+                if not self._skip_bad:
+                    raise SequenceError(f"{error}; --skip-bad goes on without it") from error
+                self._reading_faults.append(str(error))
+                continue
+            yield pair
+
+    def read(self, index: int) -> StereoPair:
+        """Decode pair `index` of `len(self)`, whatever `skip_bad` says.
+
+        Raises:
+            SequenceError: as for iterating.
+        """
+        files = self._pairs[index]
+        rectification = self._drive.rectification
+        left = self._load(files.left, rectification.left if rectification else None)
+        right = self._load(files.right, rectification.right if rectification else None)
+        return StereoPair(files.stamp_ns, left, right, self.camera)
+
+    def _load(self, path: Path, table: RemapTable | None) -> NDArray[np.uint8]:
+        # Rectification keeps the size, so the camera's is that of the files too.
+        image = read_image(path, self.camera.width, self.camera.height, self._channel)
+        if table is None:
+            return image
+        return np.asarray(
+            cv2.remap(image, table.pixels, table.fractions, cv2.INTER_LINEAR), dtype=np.uint8
+        )
+
+
+def open_drive(drive: ImageDrive, options: OpenOptions) -> ImageSequence:
+    """Apply a caller's choices to a drive.
+
+    Raises:
+        SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.
+        ConfigError: a start time is given for a drive whose clock is UTC already.
+    """
+    info = with_options(drive.info, options)
+    places = drive.places
+    if options.start_ns is not None:
+        places = _shifted(places, options.start_ns)
+    pairs, faults = usable_pairs(places, options.skip_bad, drive.path, options.frames.of)
+    return ImageSequence(
+        replace(drive, info=info, places=places),
+        pairs,
+        faults,
+        channel=options.channel,
+        skip_bad=options.skip_bad,
+    )
+
+
+def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
+    """What is known of a drive, completed by what the caller says.
+
+    Raises:
+        ConfigError: a start time is given for a drive whose clock is UTC already.
+    """
+    clock = info.clock
+    if options.start_ns is not None:
+        if clock is Clock.UTC:
+            raise ConfigError(
+                f"{info.name}: its stamps are UTC already; a start time is for drives whose clock "
+                "is relative or unknown"
+            )
+        clock = Clock.UTC
+    return replace(
+        info,
+        clock=clock,
+        robot=info.robot if options.robot is None else options.robot,
+        longitude_deg=(
+            info.longitude_deg if options.longitude_deg is None else options.longitude_deg
+        ),
+        zone=info.zone if options.zone is None else options.zone,
+    )
+
+
+def first_pair_hash(pair: StereoPair) -> str:
+    """32 hexadecimal digits of a pair's pixels, part of a session's identity (SPEC §2.7)."""
+    digest = hashlib.sha256(f"{pair.left.shape}{pair.right.shape}".encode())
+    digest.update(np.ascontiguousarray(pair.left).data)
+    digest.update(np.ascontiguousarray(pair.right).data)
+    return digest.hexdigest()[:32]
+
+
+def _shifted(places: Listing, start_ns: int) -> Listing:
+    """The same places with the first good stamp of the whole drive moved to `start_ns`."""
+    first_ns = next((place.stamp_ns for place in places if isinstance(place, PairFiles)), 0)
+    return [
+        place
+        if isinstance(place, BadPlace)
+        else replace(place, stamp_ns=place.stamp_ns - first_ns + start_ns)
+        for place in places
+    ]

@@ -1,0 +1,230 @@
+"""One image file → one grey image, without trusting the file.
+
+Sizes are read from the header before anything is decoded, so that a few bytes that claim to be a
+gigapixel cost nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import StrEnum
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError, SequenceError
+
+# What OpenCV's wheels decode. Files of other kinds beside the images (notes, thumbnails' caches)
+# are no concern of a reader.
+IMAGE_SUFFIXES = frozenset(
+    [
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".jpe",
+        ".jp2",
+        ".bmp",
+        ".dib",
+        ".pgm",
+        ".ppm",
+        ".pnm",
+        ".pbm",
+        ".tif",
+        ".tiff",
+        ".webp",
+        ".avif",
+        ".ras",
+        ".sr",
+    ]
+)
+
+# An uncompressed 16-bit colour image of 64 megapixels fits; nothing a stereo camera delivers is
+# larger.
+_MAX_FILE_BYTES = 400_000_000
+_MAX_PIXELS = 64_000_000
+
+
+class Channel(StrEnum):
+    """What is taken of a colour image: its luma, or one channel alone."""
+
+    GREY = "grey"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
+
+_BGR_INDEX = {Channel.BLUE: 0, Channel.GREEN: 1, Channel.RED: 2}
+
+
+def parse_channel(text: str) -> Channel:
+    """Look a channel up by name.
+
+    Raises:
+        ConfigError: there is no such channel.
+    """
+    try:
+        return Channel(text)
+    except ValueError:
+        raise ConfigError(f"channel {text!r} is unknown; known: {', '.join(Channel)}") from None
+
+
+def read_image(
+    path: Path, width: int, height: int, channel: Channel = Channel.GREY
+) -> NDArray[np.uint8]:
+    """Decode an image as (height, width) uint8 grey, C-contiguous.
+
+    16-bit images are scaled from their full range (65,535 → 255); transparency is dropped.
+
+    Raises:
+        SequenceError: the file is missing, cut short, no image, of an unknown kind, or its size is
+            not `width` × `height`.
+        ConfigError: one colour channel is asked for and the image is grey.
+    """
+    content = _read_bytes(path)
+    _check_size(path, header_size(content), width, height)
+    if content.startswith(b"\xff\xd8") and not _jpeg_is_whole(content):
+        # libjpeg would fill the missing rows with grey and only warn.
+        raise SequenceError(f"{path}: the JPEG is cut short ({len(content)} bytes)")
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise SequenceError(f"{path}: cannot be decoded: {error.err or error}") from error
+    if image is None:
+        raise SequenceError(
+            f"{path}: no readable image ({len(content)} bytes): damaged, cut short, or something "
+            "else"
+        )
+    _check_size(path, (image.shape[1], image.shape[0]), width, height)
+    return _one_channel(path, _eight_bit(path, image), channel)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, px, decoding it only where its header is not understood.
+
+    Raises:
+        SequenceError: the file is missing or no image.
+    """
+    content = _read_bytes(path)
+    size = header_size(content)
+    if size is None:
+        try:
+            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error as error:
+            raise SequenceError(f"{path}: cannot be decoded: {error.err or error}") from error
+        if image is None:
+            raise SequenceError(f"{path}: no readable image ({len(content)} bytes)")
+        size = (image.shape[1], image.shape[0])
+    return size
+
+
+def header_size(content: bytes) -> tuple[int, int] | None:
+    """Width and height that a PNG, JPEG, BMP or PNM header claims, px; None for other kinds."""
+    try:
+        if content.startswith(b"\x89PNG\r\n\x1a\n"):
+            return struct.unpack(">II", content[16:24])
+        if content.startswith(b"\xff\xd8"):
+            return _jpeg_size(content)
+        if content.startswith(b"BM"):
+            width, height = struct.unpack("<ii", content[18:26])
+            return width, abs(height)
+        if content[:1] == b"P" and content[1:2] in b"123456":
+            return _pnm_size(content)
+    except (struct.error, ValueError):
+        return None
+    return None
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        size = path.stat().st_size
+        if size > _MAX_FILE_BYTES:
+            raise SequenceError(
+                f"{path}: {size} bytes is no camera image (at most {_MAX_FILE_BYTES})"
+            )
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise SequenceError(f"{path}: the image is missing") from None
+    except OSError as error:
+        raise SequenceError(f"{path}: cannot be read: {error.strerror}") from error
+    if not content:
+        raise SequenceError(f"{path}: the image is empty (0 bytes)")
+    return content
+
+
+def _check_size(path: Path, size: tuple[int, int] | None, width: int, height: int) -> None:
+    if size is None or size == (width, height):
+        return
+    if size[0] * size[1] > _MAX_PIXELS:
+        raise SequenceError(
+            f"{path}: claims {size[0]}×{size[1]} px, more than {_MAX_PIXELS:,}: not decoded"
+        )
+    raise SequenceError(
+        f"{path}: the image is {size[0]}×{size[1]} px, the calibration says {width}×{height}"
+    )
+
+
+def _jpeg_segments(content: bytes) -> tuple[tuple[int, int] | None, int]:
+    """Size in the frame header (None if there is none) and the start of the first scan (-1)."""
+    position, size = 2, None
+    while position + 4 <= len(content) and content[position] == 0xFF:
+        marker = content[position + 1]
+        if marker == 0xFF:  # fill byte
+            position += 1
+            continue
+        (length,) = struct.unpack(">H", content[position + 2 : position + 4])
+        if 0xC0 <= marker <= 0xCF and marker not in {0xC4, 0xC8, 0xCC}:
+            height, width = struct.unpack(">HH", content[position + 5 : position + 9])
+            size = (width, height)
+        position += 2 + length
+        if marker == 0xDA:
+            return size, position
+    return size, -1
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int] | None:
+    return _jpeg_segments(content)[0]
+
+
+def _jpeg_is_whole(content: bytes) -> bool:
+    """Whether an end marker follows the first scan; within scan data FF D9 cannot occur."""
+    try:
+        _, scan = _jpeg_segments(content)
+    except struct.error:
+        return False
+    return scan > 0 and content.find(b"\xff\xd9", scan) >= 0
+
+
+def _pnm_size(content: bytes) -> tuple[int, int] | None:
+    lines = (line.split(b"#", 1)[0] for line in content[2:1024].split(b"\n"))
+    numbers = b" ".join(lines).split()
+    if len(numbers) < 2 or max(map(len, numbers[:2])) > 9:
+        return None
+    return int(numbers[0]), int(numbers[1])
+
+
+def _eight_bit(path: Path, image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    if image.dtype == np.uint8:
+        return image.view(np.uint8)
+    if image.dtype == np.uint16:
+        # 257 maps 65,535 to 255 exactly; fixed for all images, so that brightness stays comparable.
+        return np.asarray((image.astype(np.uint32) + 128) // 257, dtype=np.uint8)
+    raise SequenceError(f"{path}: pixels are {image.dtype}, need 8 or 16 bit unsigned")
+
+
+def _one_channel(path: Path, image: NDArray[np.uint8], channel: Channel) -> NDArray[np.uint8]:
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels not in {1, 3, 4}:
+        raise SequenceError(f"{path}: {channels} channels, need 1, 3 or 4")
+    if channels == 1:
+        if channel is not Channel.GREY:
+            raise ConfigError(
+                f"{path}: channel {channel.value!r} was asked for, but the image is grey; "
+                "leave the channel at 'grey' or choose the colour rig"
+            )
+        return np.ascontiguousarray(image.reshape(image.shape[:2]))
+    if channel is Channel.GREY:
+        code = cv2.COLOR_BGR2GRAY if channels == 3 else cv2.COLOR_BGRA2GRAY
+        return np.asarray(cv2.cvtColor(image, code), dtype=np.uint8)
+    return np.ascontiguousarray(image[:, :, _BGR_INDEX[channel]])

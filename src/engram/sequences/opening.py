@@ -1,0 +1,159 @@
+"""From a path to a drive: the table of known layouts and the one function that opens any."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from types import MappingProxyType
+
+from engram.errors import ConfigError, SequenceError
+from engram.sequences.euroc import find_euroc, is_euroc
+from engram.sequences.folder import find_folder, is_folder
+from engram.sequences.frame_range import FrameRange
+from engram.sequences.image_sequence import ImageDrive, ImageSequence, open_drive
+from engram.sequences.images import Channel, parse_channel
+from engram.sequences.kitti import (
+    find_kitti_odometry,
+    find_kitti_raw,
+    is_kitti_odometry,
+    is_kitti_raw,
+)
+from engram.sequences.options import OpenOptions, Rig, parse_rig, parse_start
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceFormat:
+    """One known layout.
+
+    Attributes:
+        looks_like: what a path must hold, for people.
+        recognises: whether a path is of this layout; looks at names only.
+        open: opens it.
+        rigs: the rigs it can have.
+    """
+
+    looks_like: str
+    recognises: Callable[[Path], bool]
+    open: Callable[[Path, OpenOptions], ImageSequence]
+    rigs: tuple[Rig, ...] = (Rig.GREY,)
+
+
+def _images(
+    find: Callable[[Path, OpenOptions], ImageDrive],
+) -> Callable[[Path, OpenOptions], ImageSequence]:
+    return lambda path, options: open_drive(find(path, options), options)
+
+
+SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
+    {
+        "kitti": SequenceFormat(
+            "KITTI odometry, sequences/NN with image_0/, image_1/, calib.txt, times.txt",
+            is_kitti_odometry,
+            _images(find_kitti_odometry),
+            (Rig.GREY, Rig.COLOUR),
+        ),
+        "kitti-raw": SequenceFormat(
+            "KITTI raw, DATE_drive_NNNN_sync with image_00/data/, image_00/timestamps.txt, …",
+            is_kitti_raw,
+            _images(find_kitti_raw),
+            (Rig.GREY, Rig.COLOUR),
+        ),
+        "euroc": SequenceFormat(
+            "EuRoC / ASL, mav0/cam0/{data/,data.csv,sensor.yaml} and mav0/cam1 likewise",
+            is_euroc,
+            _images(find_euroc),
+        ),
+        "folder": SequenceFormat(
+            "plain folder, left/, right/, calibration.toml and perhaps times.txt",
+            is_folder,
+            _images(find_folder),
+        ),
+    }
+)
+
+
+def open_sequence(
+    path: str | Path,
+    *,
+    format: str | None = None,  # noqa: A002, the word of the command line
+    rig: Rig | str = Rig.GREY,
+    channel: Channel | str = Channel.GREY,
+    frames: FrameRange | str | None = None,
+    skip_bad: bool = False,
+    pair_tolerance_ns: int = 5_000_000,
+    robot: str | None = None,
+    start: str | datetime | int | None = None,
+    longitude_deg: float | None = None,
+    zone: str | None = None,
+) -> ImageSequence:
+    """Open a drive of any known layout. No image is decoded yet, but all are looked for.
+
+    Args:
+        path: folder or file of the drive.
+        format: key of `SEQUENCES`; None recognises the layout from what is there.
+        rig: "grey" or "colour", where a robot carries both (KITTI).
+        channel: "grey", or one channel of colour images: "red", "green", "blue".
+        frames: which frames are used, as `FrameRange` or text START:STOP:STEP.
+        skip_bad: leave bad pairs out and count them (`skipped`), instead of failing.
+        pair_tolerance_ns: largest difference of stamps within a pair, ns, where a layout pairs by
+            stamp.
+        robot: name of the robot, instead of what the source says.
+        start: absolute time of the drive's first frame (ISO 8601, UTC unless it has an offset, or
+            ns since 1970), for a drive whose clock is relative or unknown.
+        longitude_deg: longitude of the drive, degrees east.
+        zone: IANA time zone of the drive.
+
+    Raises:
+        SequenceError: there is no such path, it is of no known layout, or its images or stamps
+            cannot be used; the message names file and fact.
+        CalibrationError: its calibration is missing, malformed, or does not fit.
+        ConfigError: an argument is out of range or does not fit the layout.
+    """
+    path = Path(path)
+    options = OpenOptions(
+        rig=parse_rig(rig),
+        channel=parse_channel(channel),
+        frames=FrameRange.parse(frames) if isinstance(frames, str) else frames or FrameRange(),
+        skip_bad=skip_bad,
+        pair_tolerance_ns=pair_tolerance_ns,
+        robot=robot,
+        start_ns=parse_start(start),
+        longitude_deg=longitude_deg,
+        zone=zone,
+    )
+    name = recognise(path) if format is None else _known(format)
+    layout = SEQUENCES[name]
+    if options.rig not in layout.rigs:
+        raise ConfigError(
+            f"{path}: layout {name!r} has no rig {options.rig.value!r}, only "
+            f"{', '.join(known.value for known in layout.rigs)}"
+        )
+    return layout.open(path, options)
+
+
+def recognise(path: Path) -> str:
+    """The key in `SEQUENCES` of the layout found at a path.
+
+    Raises:
+        SequenceError: there is nothing, or nothing known, or more than one layout.
+    """
+    if not path.exists():
+        raise SequenceError(f"{path}: there is no such file or folder")
+    found = [name for name, layout in SEQUENCES.items() if layout.recognises(path)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise SequenceError(f"{path}: could be {' or '.join(found)}: name the layout with --format")
+    raise SequenceError(f"{path}: no drive of a known layout; known are\n{_known_layouts()}")
+
+
+def _known(name: str) -> str:
+    if name not in SEQUENCES:
+        raise ConfigError(f"format {name!r} is unknown; known are\n{_known_layouts()}")
+    return name
+
+
+def _known_layouts() -> str:
+    return "\n".join(f"  {name}: {layout.looks_like}" for name, layout in SEQUENCES.items())

@@ -1,0 +1,109 @@
+"""The readers on real drives, against facts stated beside the data."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from engram.experience.model import Clock
+from engram.sequences import first_pair_hash, open_sequence
+
+pytestmark = pytest.mark.data
+
+RAW_DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
+
+
+def test_kitti_odometry_06(data_dir: Path) -> None:
+    drive = open_sequence(data_dir / "kitti_odometry/sequences/06")
+    pairs = list(drive)
+    assert len(drive) == len(pairs) == 51
+    assert all(pair.left.shape == pair.right.shape == (370, 1226) for pair in pairs)
+    assert drive.info.clock is Clock.RELATIVE
+    assert drive.camera.fx == 707.0912
+    assert drive.camera.baseline_m == pytest.approx(379.8145 / 707.0912, abs=1e-9)
+    assert pairs[1].stamp_ns == 104_498_900
+    assert drive.skipped == 0
+
+
+def test_kitti_raw_has_two_rigs_that_stand_apart_as_stated(data_dir: Path) -> None:
+    grey = open_sequence(data_dir / RAW_DRIVE)
+    colour = open_sequence(data_dir / RAW_DRIVE, rig="colour")
+    assert len(grey) == len(colour) == 54
+    assert grey.camera.baseline_m == pytest.approx(0.5372, abs=1e-4)
+    assert colour.camera.baseline_m == pytest.approx(0.5327, abs=1e-4)
+    assert grey.camera.cam_from_rig is not None
+    assert colour.camera.cam_from_rig is not None
+    cam0_from_cam2 = grey.camera.cam_from_rig @ colour.camera.cam_from_rig.inverse()
+    np.testing.assert_allclose(
+        cam0_from_cam2.translation, [-0.0598, 0.0004, -0.0027], atol=1e-4
+    )  # the data's description gives four digits
+    assert grey.info.clock is Clock.UTC
+    assert grey.stamps_ns[0] == 1_317_042_145_967_790_592  # 2011-09-26 13:02:25.967790592
+    assert np.abs(grey.stamps_ns - colour.stamps_ns).max() < 9_000_000
+
+
+def test_one_colour_channel_looks_unlike_grey(data_dir: Path) -> None:
+    images = {
+        channel: open_sequence(data_dir / RAW_DRIVE, rig="colour", channel=channel).read(0).left
+        for channel in ("grey", "red", "green", "blue")
+    }
+    grey = images["grey"].astype(float)
+    mix = 0.299 * images["red"] + 0.587 * images["green"] + 0.114 * images["blue"]
+    np.testing.assert_allclose(grey, mix, atol=0.51)  # rounded to whole grey levels
+    assert np.abs(images["blue"] - grey).mean() > 2
+
+
+def test_euroc_rectifies_to_the_reference(data_dir: Path) -> None:
+    folder = data_dir / "euroc/V1_01_easy_sparse"
+    drive = open_sequence(folder)
+    reference = json.loads((folder / "rectified_calibration_for_reference.json").read_text())
+    assert drive.rectification is not None
+    np.testing.assert_allclose(
+        drive.rectification.rectified_from_raw.rotation, reference["R0"], atol=1e-7
+    )
+    for name in ("fx", "fy", "cx", "cy", "baseline_m"):
+        assert getattr(drive.camera, name) == pytest.approx(reference[name], abs=1e-6)
+    assert (drive.camera.width, drive.camera.height) == (752, 480)
+    assert len(drive) == 63
+    with (folder / "revisit_pairs.csv").open() as file:
+        named = {int(row["earlier_ns"]) for row in csv.DictReader(file)}
+    assert named <= set(drive.stamps_ns.tolist())
+
+
+def test_rectified_rows_agree(data_dir: Path) -> None:
+    drive = open_sequence(data_dir / "euroc/V1_01_easy_sparse", frames="::6")
+    orb = cv2.ORB_create(1000)
+    matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+    row_offsets = []
+    for pair in drive:
+        left_points, left_codes = orb.detectAndCompute(pair.left, None)
+        right_points, right_codes = orb.detectAndCompute(pair.right, None)
+        for match in matcher.match(left_codes, right_codes):
+            left, right = left_points[match.queryIdx].pt, right_points[match.trainIdx].pt
+            if match.distance < 30 and -1 < left[0] - right[0] < 80:
+                row_offsets.append(left[1] - right[1])
+    assert len(row_offsets) > 500
+    # ORB's corners scatter by about a pixel on its coarser levels; the median does not.
+    assert abs(np.median(row_offsets)) < 0.5
+
+
+def test_at_rest_the_pictures_stay(data_dir: Path) -> None:
+    pairs = list(open_sequence(data_dir / "euroc/V1_01_easy_at_rest"))
+    assert len(pairs) == 10
+    first = pairs[0].left.astype(np.float32)
+    for pair in pairs:
+        (right_px, down_px), _ = cv2.phaseCorrelate(first, pair.left.astype(np.float32))
+        # The exposure drifts, so grey levels differ; 2 px is a quarter of a degree.
+        assert np.hypot(right_px, down_px) < 2.0
+
+
+@pytest.mark.parametrize("frames", [None, "10:30:3"])
+def test_the_same_drive_has_the_same_first_pair(data_dir: Path, frames: str | None) -> None:
+    path = data_dir / "kitti_odometry/sequences/06"
+    once, again = (next(iter(open_sequence(path, frames=frames))) for _ in range(2))
+    assert first_pair_hash(once) == first_pair_hash(again)
+    other = open_sequence(path).read(7)
+    assert first_pair_hash(other) != first_pair_hash(once)
