@@ -1,0 +1,200 @@
+#include "kernels/matching.hpp"
+
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+
+#include "bindings/arrays.hpp"
+#include "kernels/pose.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+using namespace engram;
+
+namespace {
+
+constexpr size_t kMostLandmarks = 32767; // rows are counted in 16 bits
+
+// Holds on to a frame's arrays; checked once, so that the kernels need not.
+struct Features {
+  Input<float, 2> pixels;
+  Input<float, 1> disparity_px, disparity_sigma_px;
+  Input<float, 2> points_in_cam;
+  Descriptors descriptors;
+  Input<uint8_t, 1> octaves;
+  std::array<double, 5> camera; // fx, fy, cx, cy, baseline_m
+
+  Features(Input<float, 2> pixels, Input<float, 1> disparity_px,
+           Input<float, 1> disparity_sigma_px, Input<float, 2> points_in_cam,
+           Descriptors descriptors, Input<uint8_t, 1> octaves, std::array<double, 5> camera)
+      : pixels(pixels), disparity_px(disparity_px), disparity_sigma_px(disparity_sigma_px),
+        points_in_cam(points_in_cam), descriptors(descriptors), octaves(octaves), camera(camera) {
+    const size_t count = pixels.shape(0);
+    if (pixels.shape(1) != 2 || points_in_cam.shape(1) != 3)
+      throw nb::value_error("pixels must have shape (N, 2) and points_in_cam (N, 3)");
+    for (const size_t other : {disparity_px.shape(0), disparity_sigma_px.shape(0),
+                               points_in_cam.shape(0), descriptors.shape(0), octaves.shape(0)})
+      if (other != count)
+        throw nb::value_error("the arrays of a frame's landmarks must have one row each");
+    if (count > kMostLandmarks)
+      throw nb::value_error("a frame may have at most 32767 landmarks");
+  }
+
+  FrameView view() const {
+    return {static_cast<int64_t>(pixels.shape(0)),
+            pixels.data(),
+            disparity_px.data(),
+            disparity_sigma_px.data(),
+            points_in_cam.data(),
+            words(descriptors),
+            octaves.data(),
+            {camera[0], camera[1], camera[2], camera[3], camera[4]}};
+  }
+};
+
+using Matrix = Input<double, 2>;
+
+void check_shape(const Matrix &matrix, size_t rows, size_t columns, const char *message) {
+  if (matrix.shape(0) != rows || matrix.shape(1) != columns)
+    throw nb::value_error(message);
+}
+
+RigidTransform rigid(const Matrix &matrix) {
+  check_shape(matrix, 4, 4, "a transform must have shape (4, 4)");
+  const double *m = matrix.data();
+  return {{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]}, {m[3], m[7], m[11]}};
+}
+
+std::vector<double> matrix_of(const RigidTransform &pose) {
+  const auto &r = pose.rotation;
+  const auto &t = pose.translation;
+  return {r[0], r[1], r[2], t[0], r[3], r[4], r[5], t[1], r[6], r[7], r[8], t[2], 0, 0, 0, 1};
+}
+
+auto rows_to_numpy(const std::vector<RowPair> &pairs) {
+  std::vector<int32_t> reference, live;
+  for (const RowPair &pair : pairs) {
+    reference.push_back(pair.reference);
+    live.push_back(pair.live);
+  }
+  const size_t count = pairs.size();
+  return nb::make_tuple(to_numpy(std::move(reference), {count}),
+                        to_numpy(std::move(live), {count}));
+}
+
+// (reference_from_live (4, 4), covariance (6, 6), reference rows, live rows), or None.
+nb::object to_python(const PoseEstimate &estimate) {
+  if (!estimate.found)
+    return nb::none();
+  const auto rows = rows_to_numpy(estimate.inliers);
+  std::vector<double> covariance(estimate.covariance.begin(), estimate.covariance.end());
+  return nb::make_tuple(to_numpy(matrix_of(estimate.reference_from_live), {4, 4}),
+                        to_numpy(std::move(covariance), {6, 6}), rows[0], rows[1]);
+}
+
+std::optional<Prediction> prediction_of(const std::optional<Matrix> &predicted,
+                                        const std::optional<Matrix> &covariance) {
+  if (!predicted)
+    return std::nullopt;
+  if (!covariance)
+    throw nb::value_error("a predicted transform needs its covariance");
+  check_shape(*covariance, 6, 6, "a covariance must have shape (6, 6)");
+  Prediction prediction{rigid(*predicted), {}};
+  std::copy(covariance->data(), covariance->data() + 36, prediction.covariance.begin());
+  return prediction;
+}
+
+nb::object match_rows(const Features &reference, const Features &live,
+                      const MatchSettings &settings, std::optional<Matrix> predicted,
+                      std::optional<Matrix> covariance) {
+  const auto prediction = prediction_of(predicted, covariance);
+  const FrameView a = reference.view(), b = live.view();
+  std::vector<RowPair> pairs;
+  {
+    nb::gil_scoped_release unlocked;
+    if (prediction)
+      ENGRAM_CALL(match_near, a, b, *prediction, settings, pairs);
+    else
+      ENGRAM_CALL(match_all, a, b, settings, pairs);
+  }
+  return rows_to_numpy(pairs);
+}
+
+nb::object estimate_pose(const Features &reference, const Features &live,
+                         const Input<int32_t, 1> &reference_rows,
+                         const Input<int32_t, 1> &live_rows, const MatchSettings &settings,
+                         uint64_t seed) {
+  if (reference_rows.shape(0) != live_rows.shape(0))
+    throw nb::value_error("as many reference rows as live rows are needed");
+  const FrameView a = reference.view(), b = live.view();
+  std::vector<RowPair> pairs;
+  for (size_t i = 0; i < live_rows.shape(0); ++i) {
+    const RowPair pair{reference_rows.data()[i], live_rows.data()[i], 0};
+    if (pair.reference < 0 || pair.reference >= a.count || pair.live < 0 || pair.live >= b.count)
+      throw nb::index_error("a row lies outside its frame's landmarks");
+    pairs.push_back(pair);
+  }
+  PoseEstimate estimate;
+  {
+    nb::gil_scoped_release unlocked;
+    estimate = ENGRAM_CALL(estimate_pose, a, b, pairs, settings, seed, nullptr);
+  }
+  return to_python(estimate);
+}
+
+nb::object attempt(const Features &reference, const Features &live, const MatchSettings &settings,
+                   uint64_t seed, std::optional<Matrix> predicted,
+                   std::optional<Matrix> covariance) {
+  const auto prediction = prediction_of(predicted, covariance);
+  const FrameView a = reference.view(), b = live.view();
+  PoseEstimate estimate;
+  {
+    nb::gil_scoped_release unlocked;
+    estimate =
+        ENGRAM_CALL(attempt, a, b, settings, seed, prediction ? &*prediction : nullptr);
+  }
+  return to_python(estimate);
+}
+
+} // namespace
+
+void bind_matching(nb::module_ &module) {
+  nb::class_<MatchSettings>(module, "MatchSettings",
+                            "Settings of matching; see `engram.frontend.MatcherConfig`.")
+      .def(nb::init<>())
+      .def_rw("max_distance", &MatchSettings::max_distance)
+      .def_rw("max_guided_distance", &MatchSettings::max_guided_distance)
+      .def_rw("ratio", &MatchSettings::ratio)
+      .def_rw("guided_ratio", &MatchSettings::guided_ratio)
+      .def_rw("same_corner_px", &MatchSettings::same_corner_px)
+      .def_rw("octave_scale", &MatchSettings::octave_scale)
+      .def_rw("patch_ratio", &MatchSettings::patch_ratio)
+      .def_rw("pixel_sigma_px", &MatchSettings::pixel_sigma_px)
+      .def_rw("gate_sigmas", &MatchSettings::gate_sigmas)
+      .def_rw("max_radius_px", &MatchSettings::max_radius_px)
+      .def_rw("chi2", &MatchSettings::chi2)
+      .def_rw("min_consensus", &MatchSettings::min_consensus)
+      .def_rw("max_samples", &MatchSettings::max_samples)
+      .def_rw("max_hypotheses", &MatchSettings::max_hypotheses)
+      .def_rw("confidence", &MatchSettings::confidence)
+      .def_rw("second_pass", &MatchSettings::second_pass);
+  nb::class_<Features>(module, "Features", "The landmarks of a frame, checked for shape.")
+      .def(nb::init<Input<float, 2>, Input<float, 1>, Input<float, 1>, Input<float, 2>,
+                    Descriptors, Input<uint8_t, 1>, std::array<double, 5>>(),
+           "pixels"_a, "disparity_px"_a, "disparity_sigma_px"_a, "points_in_cam"_a,
+           "descriptors"_a, "octaves"_a, "camera"_a);
+  module.def("match_rows", &match_rows, "reference"_a, "live"_a, "settings"_a,
+             "predicted"_a = nb::none(), "covariance"_a = nb::none(),
+             "Rows of the landmarks that look alike: (reference rows, live rows), (K,) int32. "
+             "Near their predicted places where reference_from_live (4, 4) and its covariance "
+             "(6, 6) are given.");
+  module.def("estimate_pose", &estimate_pose, "reference"_a, "live"_a, "reference_rows"_a,
+             "live_rows"_a, "settings"_a, "seed"_a,
+             "(reference_from_live (4, 4), covariance (6, 6), reference rows, live rows of the "
+             "inliers), or None where too few rows agree on a pose.");
+  module.def("attempt", &attempt, "reference"_a, "live"_a, "settings"_a, "seed"_a,
+             "predicted"_a = nb::none(), "covariance"_a = nb::none(),
+             "`match_rows` and `estimate_pose` in one, with a second pass guided by what the first "
+             "one found. Same result as `estimate_pose`.");
+}

@@ -1,0 +1,17 @@
+// Which landmarks of two frames look alike: over the whole frames, or near a predicted place.
+#pragma once
+
+#include "dispatch.hpp"
+#include "kernels/types.hpp"
+
+ENGRAM_DECLARE_KERNELS(
+    // Pairs that are each other's nearest descriptor, distinctly so, among landmarks whose patches
+    // could be of one size in the world (SPEC §2.6).
+    void match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
+                   std::vector<RowPair> &pairs);
+
+    // The same among live landmarks near where the prediction projects the reference's. How near
+    // follows from the covariance of the prediction and the landmark's own.
+    void match_near(const FrameView &reference, const FrameView &live,
+                    const Prediction &prediction, const MatchSettings &settings,
+                    std::vector<RowPair> &pairs);)

@@ -1,0 +1,72 @@
+// What crosses the border between the bindings and the kernels: plain data, one type for every
+// instruction set.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <vector>
+
+namespace engram {
+
+// target_from_source, rotation row-major.
+struct RigidTransform {
+  std::array<double, 9> rotation{1, 0, 0, 0, 1, 0, 0, 0, 1};
+  std::array<double, 3> translation{0, 0, 0};
+};
+
+struct Camera {
+  double fx, fy, cx, cy, baseline_m;
+};
+
+// The landmarks of a frame, as `engram.frontend.Landmarks` has them.
+struct FrameView {
+  int64_t count;
+  const float *pixels;             // (count, 2)
+  const float *disparity_px;       // (count,)
+  const float *disparity_sigma_px; // (count,)
+  const float *points_in_cam;      // (count, 3)
+  const uint64_t *descriptors;     // (count, 4)
+  const uint8_t *octaves;          // (count,)
+  Camera camera;
+};
+
+// See `engram.frontend.MatcherConfig`, which holds the defaults and their reasons.
+struct MatchSettings {
+  int32_t max_distance = 0;
+  int32_t max_guided_distance = 0;
+  double ratio = 0;
+  double guided_ratio = 0;
+  double same_corner_px = 0;
+  double octave_scale = 0;
+  double patch_ratio = 0;
+  double pixel_sigma_px = 0;
+  double gate_sigmas = 0;
+  double max_radius_px = 0;
+  double chi2 = 0;
+  int32_t min_consensus = 0;
+  int32_t max_samples = 0;
+  int32_t max_hypotheses = 0;
+  double confidence = 0;
+  bool second_pass = true;
+};
+
+struct RowPair {
+  int32_t reference;
+  int32_t live;
+  int32_t distance;
+};
+
+struct PoseEstimate {
+  bool found = false;
+  RigidTransform reference_from_live;
+  std::array<double, 36> covariance{}; // [translation, rotation], left perturbation
+  std::vector<RowPair> inliers;
+};
+
+// A predicted reference_from_live and its covariance, row-major 6×6.
+struct Prediction {
+  RigidTransform reference_from_live;
+  std::array<double, 36> covariance;
+};
+
+} // namespace engram

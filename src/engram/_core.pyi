@@ -1,0 +1,73 @@
+"""The C++ core: arrays in, arrays out. Every function releases the GIL. Sorted by subject."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+isa: str
+
+# --- hamming
+
+def hamming_matrix(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.uint16]: ...
+
+# --- matching
+
+class MatchSettings:
+    max_distance: int
+    max_guided_distance: int
+    ratio: float
+    guided_ratio: float
+    same_corner_px: float
+    octave_scale: float
+    patch_ratio: float
+    pixel_sigma_px: float
+    gate_sigmas: float
+    max_radius_px: float
+    chi2: float
+    min_consensus: int
+    max_samples: int
+    max_hypotheses: int
+    confidence: float
+    second_pass: bool
+    def __init__(self) -> None: ...
+
+class Features:
+    def __init__(
+        self,
+        pixels: NDArray[np.float32],
+        disparity_px: NDArray[np.float32],
+        disparity_sigma_px: NDArray[np.float32],
+        points_in_cam: NDArray[np.float32],
+        descriptors: NDArray[np.uint8],
+        octaves: NDArray[np.uint8],
+        camera: Sequence[float],
+    ) -> None: ...
+
+PoseAndInliers = tuple[
+    NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]
+]
+
+def match_rows(
+    reference: Features,
+    live: Features,
+    settings: MatchSettings,
+    predicted: NDArray[np.float64] | None = None,
+    covariance: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]: ...
+def estimate_pose(
+    reference: Features,
+    live: Features,
+    reference_rows: NDArray[np.int32],
+    live_rows: NDArray[np.int32],
+    settings: MatchSettings,
+    seed: int,
+) -> PoseAndInliers | None: ...
+def attempt(
+    reference: Features,
+    live: Features,
+    settings: MatchSettings,
+    seed: int,
+    predicted: NDArray[np.float64] | None = None,
+    covariance: NDArray[np.float64] | None = None,
+) -> PoseAndInliers | None: ...

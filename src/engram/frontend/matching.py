@@ -1,0 +1,193 @@
+"""Frame ↔ frame: matched landmarks and the relative pose, also between different cameras.
+
+`match_frames` is a pure function: the same frames, configuration, seed and prediction give the same
+`Match`, to the bit, on every machine. Not finding a pose is a result, not an error.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.config import config_hash
+from engram.errors import ConfigError, IncompatibleError, InputError
+from engram.frontend.frame import Frame
+from engram.geometry import SE3
+
+# Goes into `matcher_hash`: raise it whenever the kernels give other results for equal settings.
+_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class MatcherConfig:
+    """Settings of `match_frames`.
+
+    Attributes:
+        max_distance: bits in which descriptors may differ, searching the whole frame. Two random
+            descriptors differ in 128 ± 8 bits; the least of 500 differs in about 100.
+        max_guided_distance: the same near a predicted place, where few candidates compete.
+        ratio: the best distance must be less than this times the next best (Lowe 2004).
+        guided_ratio: the same near a predicted place.
+        same_corner_px: a candidate this close to the best one is the same corner in another
+            octave, not a rival.
+        octave_scale: size ratio of successive octaves of the front-end.
+        patch_ratio: largest ratio of the sizes in the world of two patches that are compared
+            (SPEC §2.6). BRIEF bears a change of scale of about 1.5; the rest is for slanted
+            surfaces. Doubt about depth widens it.
+        pixel_sigma_px: error of a corner's place in its octave, one axis.
+        gate_sigmas: how many standard deviations gates and search windows span.
+        max_radius_px: bound of a search window, whatever the prediction's covariance.
+        chi2: an inlier's squared normalised reprojection error is below this: 99 % of χ² with the
+            three degrees of freedom of left u, left v and disparity.
+        min_consensus: fewest landmarks that make a pose at all. What is accepted as a
+            localisation is decided by the localiser, with a higher threshold.
+        max_samples: bound on the triples drawn from the matches.
+        max_hypotheses: bound on the triples that are scored.
+        confidence: stop drawing once a better pose is less likely than one minus this.
+        second_pass: search once more, guided by the pose found.
+    """
+
+    max_distance: int = 80
+    max_guided_distance: int = 90
+    ratio: float = 0.85
+    guided_ratio: float = 0.9
+    same_corner_px: float = 3.0
+    octave_scale: float = 2.0
+    patch_ratio: float = 2.0
+    pixel_sigma_px: float = 0.5
+    gate_sigmas: float = 3.0
+    max_radius_px: float = 128.0
+    chi2: float = 11.34
+    min_consensus: int = 6
+    max_samples: int = 3000
+    max_hypotheses: int = 400
+    confidence: float = 0.99
+    second_pass: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("ratio", "guided_ratio", "confidence"):
+            if not 0 < getattr(self, name) < 1:
+                raise ConfigError(
+                    f"matcher: {name} is {getattr(self, name)}, must be within (0, 1)"
+                )
+        for name in ("octave_scale", "patch_ratio"):
+            if not 1 <= getattr(self, name) <= 100:
+                raise ConfigError(f"matcher: {name} is {getattr(self, name)}, must be ≥ 1")
+        for name in ("pixel_sigma_px", "gate_sigmas", "max_radius_px", "chi2"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"matcher: {name} is {getattr(self, name)}, must be > 0")
+        if self.min_consensus < 4:
+            raise ConfigError(
+                f"matcher: min_consensus is {self.min_consensus}, must be ≥ 4: "
+                "three landmarks agree on some pose whatever they are"
+            )
+        for name in ("max_distance", "max_guided_distance"):
+            if not 0 <= getattr(self, name) <= 256:
+                raise ConfigError(f"matcher: {name} is {getattr(self, name)}, must be 0 … 256")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """What two frames have to do with each other.
+
+    Attributes:
+        reference_from_live: pose of the live camera in the reference camera; None where too few
+            landmarks agree on one.
+        covariance: (6, 6) float64 of it, left perturbation, [translation, rotation].
+        inliers: number of landmarks that agree, 0 without a pose.
+        reference_rows, live_rows: (inliers,) int32, rows of the landmarks that agree.
+    """
+
+    reference_from_live: SE3 | None
+    covariance: NDArray[np.float64] | None
+    inliers: int
+    reference_rows: NDArray[np.int32]
+    live_rows: NDArray[np.int32]
+
+
+def match_frames(
+    reference: Frame,
+    live: Frame,
+    config: MatcherConfig,
+    seed: int,
+    predicted: SE3 | None = None,
+    predicted_covariance: NDArray[np.float64] | None = None,
+) -> Match:
+    """Match the landmarks of two frames and estimate the pose between them.
+
+    Args:
+        reference: the frame in which the live camera is sought; its camera may be another one.
+        live: the frame whose camera is sought.
+        config: the settings.
+        seed: of the random draws, 0 … 2⁶⁴ − 1; see `pair_seed`.
+        predicted: reference_from_live as far as known: only landmarks near their predicted places
+            are compared.
+        predicted_covariance: (6, 6) of `predicted`, left perturbation, [translation, rotation];
+            needed with it.
+
+    Raises:
+        IncompatibleError: the frames have different kinds of descriptors.
+        InputError: a prediction without covariance, or the reverse.
+
+    Source: SPEC §2.4–2.6.
+    """
+    if reference.descriptor != live.descriptor:
+        raise IncompatibleError(
+            f"cannot match {live.descriptor} descriptors with {reference.descriptor}: "
+            "use the front-end that the map was made with"
+        )
+    if (predicted is None) != (predicted_covariance is None):
+        raise InputError("a prediction and its covariance are given together or not at all")
+    found = _core.attempt(
+        features(reference),
+        features(live),
+        _settings(config),
+        seed,
+        None if predicted is None else predicted.matrix(),
+        None if predicted_covariance is None else np.ascontiguousarray(predicted_covariance),
+    )
+    if found is None:
+        nothing = np.empty(0, dtype=np.int32)
+        return Match(None, None, 0, nothing, nothing)
+    matrix, covariance, reference_rows, live_rows = found
+    pose = SE3(matrix[:3, :3], matrix[:3, 3])
+    return Match(pose, covariance, len(live_rows), reference_rows, live_rows)
+
+
+def matcher_hash(config: MatcherConfig) -> str:
+    """Twelve hexadecimal digits that change with any setting and with the method's version."""
+    return hashlib.sha256(f"{_VERSION} {config_hash(config)}".encode()).hexdigest()[:12]
+
+
+def pair_seed(a: UUID, b: UUID) -> int:
+    """The seed for matching two frames, from their UUIDs (SPEC §3.2); (b, a) gives another."""
+    digest = hashlib.blake2b(a.bytes + b.bytes, digest_size=8).digest()
+    return int.from_bytes(digest, "little")
+
+
+def features(frame: Frame) -> _core.Features:
+    """The landmarks of a frame as the kernels take them; nothing is copied."""
+    landmarks, camera = frame.landmarks, frame.camera
+    return _core.Features(
+        landmarks.pixels,
+        landmarks.disparity_px,
+        landmarks.disparity_sigma_px,
+        landmarks.points_in_cam,
+        landmarks.descriptors,
+        landmarks.octaves,
+        (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m),
+    )
+
+
+@lru_cache(maxsize=16)
+def _settings(config: MatcherConfig) -> _core.MatchSettings:
+    settings = _core.MatchSettings()
+    for name in MatcherConfig.__dataclass_fields__:
+        setattr(settings, name, getattr(config, name))
+    return settings
