@@ -7,6 +7,53 @@ from numpy.typing import NDArray
 
 isa: str
 
+# --- extraction: positions are (N, 2) int16 x, y, at least 17 px inside the image
+
+def detect_corners(
+    image: NDArray[np.uint8], threshold: int
+) -> tuple[NDArray[np.int16], NDArray[np.uint8]]: ...
+def order_corners(
+    positions: NDArray[np.int16], scores: NDArray[np.uint8], width: int, height: int, cell_px: int
+) -> NDArray[np.int32]: ...
+def smooth(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
+def halve(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
+def describe(smoothed: NDArray[np.uint8], positions: NDArray[np.int16]) -> NDArray[np.uint8]: ...
+def measure_disparities(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    positions: NDArray[np.int16],
+    max_disparity_px: int,
+    min_disparity_px: float,
+    uniqueness: float,
+    max_residual: float,
+    max_sigma_px: float,
+    sigma_floor_px: float,
+    sigma_scale: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+def extract(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    landmarks: int,
+    octaves: int,
+    fast_threshold: int,
+    cell_px: int,
+    with_descriptors: bool,
+    max_disparity_px: int,
+    min_disparity_px: float,
+    uniqueness: float,
+    max_residual: float,
+    max_sigma_px: float,
+    sigma_floor_px: float,
+    sigma_scale: float,
+) -> tuple[
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.uint8],
+    NDArray[np.uint8],
+    int,
+]: ...
+
 # --- hamming
 
 def hamming_matrix(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.uint16]: ...

@@ -6,12 +6,14 @@
 
 namespace nb = nanobind;
 
+void bind_extraction(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
 void bind_matching(nb::module_ &module);
 
 NB_MODULE(_core, module) {
   module.doc() = "The measured hot kernels of Engram. Every function releases the GIL.";
   module.attr("isa") = engram::name_of(engram::active_isa());
+  bind_extraction(module);
   bind_hamming(module);
   bind_matching(module);
 }
