@@ -7,51 +7,52 @@ from numpy.typing import NDArray
 
 isa: str
 
-# --- extraction: positions are (N, 2) int16 x, y, at least 17 px inside the image
+# --- graph search
 
-def detect_corners(
-    image: NDArray[np.uint8], threshold: int
-) -> tuple[NDArray[np.int16], NDArray[np.uint8]]: ...
-def order_corners(
-    positions: NDArray[np.int16], scores: NDArray[np.uint8], width: int, height: int, cell_px: int
-) -> NDArray[np.int32]: ...
-def smooth(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
-def halve(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
-def describe(smoothed: NDArray[np.uint8], positions: NDArray[np.int16]) -> NDArray[np.uint8]: ...
-def measure_disparities(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    positions: NDArray[np.int16],
-    max_disparity_px: int,
-    min_disparity_px: float,
-    uniqueness: float,
-    max_residual: float,
-    max_sigma_px: float,
-    sigma_floor_px: float,
-    sigma_scale: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
-def extract(
-    left: NDArray[np.uint8],
-    right: NDArray[np.uint8],
-    landmarks: int,
-    octaves: int,
-    fast_threshold: int,
-    cell_px: int,
-    with_descriptors: bool,
-    max_disparity_px: int,
-    min_disparity_px: float,
-    uniqueness: float,
-    max_residual: float,
-    max_sigma_px: float,
-    sigma_floor_px: float,
-    sigma_scale: float,
+def graph_candidates(
+    first_half: NDArray[np.int32],
+    next_half: NDArray[np.int32],
+    target: NDArray[np.int32],
+    a_from_b: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    reference: int,
+    reference_from_live: NDArray[np.float64],
+    live_error: NDArray[np.float64],
+    radius_m: float,
+    margin_m: float,
+    view_gate_rad: float,
+    slack_sigmas: float,
+    sessions: NDArray[np.int32],
+    driven_m: NDArray[np.float64],
+    own_session: int,
+    own_driven_m: float,
+    own_exclusion_m: float,
 ) -> tuple[
-    NDArray[np.float32],
-    NDArray[np.float32],
-    NDArray[np.float32],
-    NDArray[np.uint8],
-    NDArray[np.uint8],
-    int,
+    NDArray[np.int32],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]: ...
+def graph_chains(
+    first_half: NDArray[np.int32],
+    next_half: NDArray[np.int32],
+    target: NDArray[np.int32],
+    a_from_b: NDArray[np.float64],
+    errors: NDArray[np.float64],
+    root: int,
+    goal: int = -1,
+    usable: NDArray[np.uint8] | None = None,
+) -> tuple[
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.float64],
+    NDArray[np.float64],
 ]: ...
 
 # --- hamming
@@ -118,3 +119,24 @@ def attempt(
     predicted: NDArray[np.float64] | None = None,
     covariance: NDArray[np.float64] | None = None,
 ) -> PoseAndInliers | None: ...
+
+# --- path memory
+
+def co_occurrence(
+    bits: NDArray[np.uint64],
+    path_count: int,
+    a: NDArray[np.int32],
+    b: NDArray[np.int32],
+    excluded: int = -1,
+) -> NDArray[np.int32]: ...
+def path_scores(
+    bits: NDArray[np.uint64],
+    path_count: int,
+    candidates: NDArray[np.int32],
+    observed: NDArray[np.int32],
+    outcomes: NDArray[np.bool_],
+    reference: int,
+    alpha: float,
+    gamma: float,
+    excluded: int = -1,
+) -> NDArray[np.float64]: ...

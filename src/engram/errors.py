@@ -7,7 +7,7 @@
     │   ├── SequenceError        images, stamps or layout of a drive
     │   ├── CalibrationError     a calibration that is missing, malformed or does not fit
     │   └── ConfigError          a setting: unknown key, wrong type, out of range
-    ├── MapError                 a stored file: a map or a frame log
+    ├── MapError                 the map file
     │   ├── NotAMapError         the file is something else
     │   ├── FormatVersionError   written by a newer Engram: upgrade
     │   ├── MapLockedError       another process writes to it: wait
@@ -42,7 +42,7 @@ class ConfigError(InputError):
 
 
 class MapError(EngramError):
-    """A map or a frame log cannot be used as asked."""
+    """The map file cannot be used as asked."""
 
 
 class NotAMapError(MapError):
@@ -50,11 +50,11 @@ class NotAMapError(MapError):
 
 
 class FormatVersionError(MapError):
-    """The file was written in a newer format than this version reads."""
+    """The map was written in a newer format than this version reads."""
 
 
 class MapLockedError(MapError):
-    """Another process is writing to the file."""
+    """Another process is writing to the map."""
 
 
 class MapCorruptError(MapError):

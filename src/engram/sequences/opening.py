@@ -12,7 +12,6 @@ from engram.errors import ConfigError, SequenceError
 from engram.sequences.euroc import find_euroc, is_euroc
 from engram.sequences.folder import find_folder, is_folder
 from engram.sequences.frame_range import FrameRange
-from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
 from engram.sequences.image_sequence import ImageDrive, ImageSequence, open_drive
 from engram.sequences.images import Channel, parse_channel
 from engram.sequences.kitti import (
@@ -37,7 +36,7 @@ class SequenceFormat:
 
     looks_like: str
     recognises: Callable[[Path], bool]
-    open: Callable[[Path, OpenOptions], ImageSequence | FrameLog]
+    open: Callable[[Path, OpenOptions], ImageSequence]
     rigs: tuple[Rig, ...] = (Rig.GREY,)
 
 
@@ -71,11 +70,6 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             is_folder,
             _images(find_folder),
         ),
-        "framelog": SequenceFormat(
-            "frame log, a file NAME.framelog that `engram extract` made",
-            is_framelog,
-            open_framelog,
-        ),
     }
 )
 
@@ -93,11 +87,8 @@ def open_sequence(
     start: str | datetime | int | None = None,
     longitude_deg: float | None = None,
     zone: str | None = None,
-) -> ImageSequence | FrameLog:
+) -> ImageSequence:
     """Open a drive of any known layout. No image is decoded yet, but all are looked for.
-
-    Image layouts give an `ImageSequence` (a `StereoSequence`), frame logs a `FrameLog` (a
-    `FrameSequence`).
 
     Args:
         path: folder or file of the drive.
@@ -119,7 +110,6 @@ def open_sequence(
             cannot be used; the message names file and fact.
         CalibrationError: its calibration is missing, malformed, or does not fit.
         ConfigError: an argument is out of range or does not fit the layout.
-        MapError: a frame log that is damaged, locked, or of a newer format.
     """
     path = Path(path)
     options = OpenOptions(

@@ -1,0 +1,128 @@
+#include "kernels/graph_search.hpp"
+
+#include "bindings/arrays.hpp"
+
+#include <nanobind/stl/optional.h>
+
+#include <optional>
+#include <stdexcept>
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using engram::Input;
+
+engram::GraphView view_of(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
+                          const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
+                          const Input<double, 2> &errors) {
+  const size_t edges = a_from_b.shape(0);
+  if (next_half.shape(0) != 2 * edges || target.shape(0) != 2 * edges ||
+      errors.shape(0) != edges || a_from_b.shape(1) != 12 || errors.shape(1) != 8)
+    throw std::invalid_argument("graph arrays: expected next_half and target (2E,), a_from_b "
+                                "(E, 12), errors (E, 8)");
+  return {static_cast<int64_t>(first_half.shape(0)),
+          static_cast<int64_t>(edges),
+          first_half.data(),
+          next_half.data(),
+          target.data(),
+          a_from_b.data(),
+          errors.data()};
+}
+
+void check_node(const engram::GraphView &graph, int64_t node, const char *name) {
+  if (node < 0 || node >= graph.node_count)
+    throw std::invalid_argument(std::string(name) + " " + std::to_string(node) +
+                                ": the graph has " + std::to_string(graph.node_count) + " nodes");
+}
+
+auto graph_candidates(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
+                      const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
+                      const Input<double, 2> &errors, int64_t reference,
+                      const Input<double, 1> &reference_from_live,
+                      const Input<double, 1> &live_error, double radius_m, double margin_m,
+                      double view_gate_rad, double slack_sigmas, const Input<int32_t, 1> &sessions,
+                      const Input<double, 1> &driven_m, int32_t own_session, double own_driven_m,
+                      double own_exclusion_m) {
+  const engram::GraphView graph = view_of(first_half, next_half, target, a_from_b, errors);
+  check_node(graph, reference, "reference");
+  if (reference_from_live.shape(0) != 12 || live_error.shape(0) != 5 ||
+      sessions.shape(0) != first_half.shape(0) || driven_m.shape(0) != first_half.shape(0))
+    throw std::invalid_argument("graph_candidates: expected reference_from_live (12,), live_error "
+                                "(5,), sessions and driven_m (N,)");
+  const engram::CandidateQuery query{static_cast<int32_t>(reference),
+                                     reference_from_live.data(),
+                                     live_error.data(),
+                                     radius_m,
+                                     margin_m,
+                                     view_gate_rad,
+                                     slack_sigmas,
+                                     sessions.data(),
+                                     driven_m.data(),
+                                     own_session,
+                                     own_driven_m,
+                                     own_exclusion_m};
+  engram::Candidates found;
+  {
+    nb::gil_scoped_release unlocked;
+    ENGRAM_CALL(find_candidates, graph, query, found);
+  }
+  const size_t count = found.nodes.size();
+  return nb::make_tuple(engram::to_numpy(std::move(found.nodes), {count}),
+                        engram::to_numpy(std::move(found.node_from_live), {count, 4, 4}),
+                        engram::to_numpy(std::move(found.distance_m), {count}),
+                        engram::to_numpy(std::move(found.along_m), {count}),
+                        engram::to_numpy(std::move(found.across_m), {count}),
+                        engram::to_numpy(std::move(found.yaw_rad), {count}),
+                        engram::to_numpy(std::move(found.sigma_m), {count}),
+                        engram::to_numpy(std::move(found.sigma_yaw_rad), {count}),
+                        engram::to_numpy(std::move(found.pivot_in_node), {count, 3}));
+}
+
+auto graph_chains(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
+                  const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
+                  const Input<double, 2> &errors, int64_t root, int64_t goal,
+                  std::optional<Input<uint8_t, 1>> usable) {
+  const engram::GraphView graph = view_of(first_half, next_half, target, a_from_b, errors);
+  check_node(graph, root, "root");
+  if (usable && usable->shape(0) != a_from_b.shape(0))
+    throw std::invalid_argument("graph_chains: expected usable (E,)");
+  const engram::SearchLimits limits{nullptr, 0, usable ? usable->data() : nullptr,
+                                    static_cast<int32_t>(goal)};
+  std::vector<int32_t> nodes, parents, halves;
+  std::vector<double> poses, errors_out;
+  {
+    nb::gil_scoped_release unlocked;
+    std::vector<engram::Reached> reached;
+    ENGRAM_CALL(search_chains, graph, static_cast<int32_t>(root), limits, reached);
+    for (const engram::Reached &row : reached) {
+      nodes.push_back(row.node);
+      parents.push_back(row.parent);
+      halves.push_back(row.half);
+      poses.insert(poses.end(), row.root_from_node, row.root_from_node + 12);
+      const engram::ChainError &e = row.error;
+      errors_out.insert(errors_out.end(), {e.tau, e.s0, e.s1[0], e.s1[1], e.s1[2], e.s2});
+    }
+  }
+  const size_t count = nodes.size();
+  return nb::make_tuple(engram::to_numpy(std::move(nodes), {count}),
+                        engram::to_numpy(std::move(parents), {count}),
+                        engram::to_numpy(std::move(halves), {count}),
+                        engram::to_numpy(std::move(poses), {count, 12}),
+                        engram::to_numpy(std::move(errors_out), {count, 6}));
+}
+
+} // namespace
+
+void bind_graph_search(nb::module_ &module) {
+  module.def("graph_candidates", &graph_candidates, "first_half"_a, "next_half"_a, "target"_a,
+             "a_from_b"_a, "errors"_a, "reference"_a, "reference_from_live"_a, "live_error"_a,
+             "radius_m"_a, "margin_m"_a, "view_gate_rad"_a, "slack_sigmas"_a, "sessions"_a,
+             "driven_m"_a, "own_session"_a, "own_driven_m"_a, "own_exclusion_m"_a,
+             "Columns of a Neighbourhood: the nodes near the live camera.");
+  module.def("graph_chains", &graph_chains, "first_half"_a, "next_half"_a, "target"_a,
+             "a_from_b"_a, "errors"_a, "root"_a, "goal"_a = -1, "usable"_a = nb::none(),
+             "Least uncertain chains from a root: nodes (N,), parent rows (N,), half edges (N,), "
+             "root_from_node (N, 12), errors (N, 6: tau, s0, s1, s2).");
+}

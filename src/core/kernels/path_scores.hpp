@@ -1,0 +1,35 @@
+// The ranking of [L15 §V] over path memory: co-occurrence counts by popcount, the likelihood as a
+// product in double.
+#pragma once
+
+#include <cstdint>
+
+#include "dispatch.hpp"
+
+namespace engram {
+
+// Which paths each node is on: row n of `bits` holds `stride` words, of which `words` are in use.
+struct PathBits {
+  const uint64_t *bits;
+  int64_t rows, stride, words;
+  int64_t excluded; // number of a path that does not count, or -1
+};
+
+struct PathEvidence {
+  const int32_t *observed; // W
+  const uint8_t *outcomes; // (W) z: 1 where the attempt succeeded
+  int64_t observed_count;
+  int64_t reference; // node k, or -1
+  double alpha, gamma;
+};
+
+} // namespace engram
+
+ENGRAM_DECLARE_KERNELS(
+    // counts[i * b_count + j] = number of paths that hold both a[i] and b[j].
+    void co_occurrence(const PathBits &paths, const int32_t *a, int64_t a_count, const int32_t *b,
+                       int64_t b_count, int32_t *counts);
+
+    // scores[i] = log of the unnormalised posterior of candidate i [L15 (1)-(5)].
+    void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count,
+                     const PathEvidence &evidence, double *scores);)

@@ -1,0 +1,182 @@
+"""The match basin: how far apart two views may be and still match (SPEC §3.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+from engram.errors import InputError
+from engram.experience.model import Attempt
+
+Array = NDArray[np.float64]
+
+BIN_M = 0.5
+BIN_COUNT = 48  # up to 24 m
+BASIN_LEVEL = 0.6
+DEFAULT_RADIUS_M = 8.0
+
+# The prior weighs as much as this many attempts in each bin: a bin with a few dozen real
+# attempts speaks for itself.
+_PRIOR_ATTEMPTS = 10.0
+# Success at no offset, of compatible appearance: 94 % within 1 m in the feasibility study.
+_SUCCESS_AT_ZERO = 0.97
+# Steepness of the prior, as a share of the basin: the study's 0.94, 0.7, 0.4, 0.15, 0 at 0.5, 1.5,
+# 2.5, 3.5 and 5 m for a basin of 2 m.
+_SOFTNESS = 0.28
+# Attempts count for one direction if they are closer than this in the other (half a metre aside
+# was seen to cost nothing), and if their prediction was better than this.
+_ASIDE_M = 1.0
+_GREATEST_SIGMA_M = 1.0
+# An experience is compatible if it was matched within the last 5 m: ten iterations of 0.5 m.
+_COMPATIBLE_ITERATIONS = 10
+
+
+def prior_basin_m(focal_px: float) -> float:
+    """Shipped prior of the basin: 2 m for f = 256 px, 8 m for f = 707 px (SPEC §3.1), a power law.
+
+    Raises:
+        InputError: the focal length is not finite and positive.
+    """
+    if not (np.isfinite(focal_px) and focal_px > 0):
+        raise InputError(f"focal length is {focal_px} px, must be finite and > 0")
+    return float(2.0 * (focal_px / 256.0) ** (np.log(4.0) / np.log(707.0 / 256.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BasinCounts:
+    """Remembered attempts by distance: what a map stores for one camera. Adds up.
+
+    Attributes:
+        attempts: (2, BIN_COUNT) int64; row 0 along the viewing direction, row 1 across; bin k
+            holds offsets from ``k`` to ``k + 1`` times `BIN_M`, the last one all beyond.
+        successes: (2, BIN_COUNT) int64, those accepted.
+    """
+
+    attempts: NDArray[np.int64]
+    successes: NDArray[np.int64]
+
+    @staticmethod
+    def empty() -> BasinCounts:
+        """No attempts yet."""
+        zeros = np.zeros((2, BIN_COUNT), dtype=np.int64)
+        return BasinCounts(zeros, zeros)
+
+    def __add__(self, other: BasinCounts) -> BasinCounts:
+        return BasinCounts(self.attempts + other.attempts, self.successes + other.successes)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchBasin:
+    """g(d): the success rate of an attempt against distance, appearance being compatible.
+
+    Attributes:
+        focal_px: focal length of the camera that the map is searched with.
+        counts: the attempts learnt from.
+        rates: (2, BIN_COUNT) float64, success rate in the middle of each bin, along and across,
+            falling with distance (isotonic regression over counts and prior).
+    """
+
+    focal_px: float
+    counts: BasinCounts
+    rates: Array
+
+    @staticmethod
+    def of(focal_px: float, counts: BasinCounts | None = None) -> MatchBasin:
+        """The basin from the shipped prior and the attempts so far.
+
+        Raises:
+            InputError: the focal length is not finite and positive.
+        """
+        counts = BasinCounts.empty() if counts is None else counts
+        prior = _prior_rates(prior_basin_m(focal_px))
+        attempts = counts.attempts + _PRIOR_ATTEMPTS
+        raw = (counts.successes + _PRIOR_ATTEMPTS * prior) / attempts
+        rates = np.stack(
+            [
+                isotonic_regression(raw[row], weights=attempts[row], increasing=False).x
+                for row in (0, 1)
+            ]
+        )
+        return MatchBasin(focal_px, counts, rates)
+
+    def learnt(self, counts: BasinCounts) -> MatchBasin:
+        """The basin with more attempts counted in."""
+        return MatchBasin.of(self.focal_px, self.counts + counts)
+
+    def success_rate(self, along_m: Array, across_m: Array) -> Array:
+        """The rate g at offsets along and across the viewing direction, metres, of any one shape.
+
+        The two directions are taken as independent: ``g_along · g_across / g(0)``.
+        """
+        along, across = (
+            np.interp(np.abs(offset), _BIN_CENTRES_M, rates)
+            for offset, rates in zip((along_m, across_m), self.rates, strict=True)
+        )
+        at_zero = max(float(self.rates[:, 0].max()), 1e-9)
+        return np.asarray(np.minimum(along * across / at_zero, 1.0))
+
+    @property
+    def basin_m(self) -> float:
+        """The farthest distance along the viewing direction with g >= 0.6, metres."""
+        rates = self.rates[0]
+        below = np.flatnonzero(rates < BASIN_LEVEL)
+        if len(below) == 0:
+            return BIN_M * BIN_COUNT
+        first = int(below[0])
+        if first == 0:
+            return float(_BIN_CENTRES_M[0] * rates[0] / BASIN_LEVEL)
+        share = (rates[first - 1] - BASIN_LEVEL) / (rates[first - 1] - rates[first])
+        return float(_BIN_CENTRES_M[first - 1] + share * BIN_M)
+
+    def search_radius_m(self, sigma_m: float, least_m: float = DEFAULT_RADIUS_M) -> float:
+        """Radius of the neighbourhood search for a position with this standard deviation."""
+        return max(least_m, self.basin_m + 2 * sigma_m)
+
+
+def count_attempts(attempts: Sequence[Attempt], experiences: NDArray[np.int32]) -> BasinCounts:
+    """Counts of one session's attempts on experiences that were matched within the last 5 m.
+
+    An attempt on an experience that had no match in the ten iterations before says more about
+    appearance than about distance, and is left out; so is one whose prediction was vague. A match
+    does not vouch for itself: only earlier iterations count.
+
+    Args:
+        attempts: of one session, in the order of their iterations.
+        experiences: (A,) int32, for each attempt the experience of its node, numbered anyhow.
+    """
+    counts = np.zeros((2, 2, BIN_COUNT), dtype=np.int64)
+    last_match: dict[int, int] = {}
+    fresh: list[tuple[int, int]] = []
+    for attempt, experience in zip(attempts, experiences.tolist(), strict=True):
+        while fresh and fresh[0][1] < attempt.iteration:
+            matched, iteration = fresh.pop(0)
+            last_match[matched] = iteration
+        since = attempt.iteration - last_match.get(experience, -_COMPATIBLE_ITERATIONS - 1)
+        if since <= _COMPATIBLE_ITERATIONS and attempt.sigma_m <= _GREATEST_SIGMA_M:
+            _count(counts, attempt)
+        if attempt.accepted:
+            fresh.append((experience, attempt.iteration))
+    return BasinCounts(counts[0], counts[1])
+
+
+def _count(counts: NDArray[np.int64], attempt: Attempt) -> None:
+    offsets = (abs(attempt.along_m), abs(attempt.across_m))
+    for direction in (0, 1):
+        if offsets[1 - direction] <= _ASIDE_M:
+            place = min(int(offsets[direction] / BIN_M), BIN_COUNT - 1)
+            counts[0, direction, place] += 1
+            counts[1, direction, place] += attempt.accepted
+
+
+def _prior_rates(basin_m: float) -> Array:
+    """(BIN_COUNT,) a logistic curve through `BASIN_LEVEL` at the basin."""
+    softness = _SOFTNESS * basin_m
+    centre = basin_m - softness * np.log(_SUCCESS_AT_ZERO / BASIN_LEVEL - 1)
+    return np.asarray(_SUCCESS_AT_ZERO / (1 + np.exp((_BIN_CENTRES_M - centre) / softness)))
+
+
+_BIN_CENTRES_M = (np.arange(BIN_COUNT) + 0.5) * BIN_M

@@ -1,0 +1,65 @@
+"""What a ranking policy gets to see, and what it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.experience.basin import MatchBasin
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import PathId
+from engram.experience.neighbourhood import Neighbourhood
+from engram.experience.path_memory import PathMemory
+from engram.ranking.recent import Observations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RankingContext:
+    """One live frame's situation.
+
+    Attributes:
+        neighbourhood: the candidates Y.
+        graph: the graph that they are in.
+        path_memory: all paths of the map.
+        basin: the live camera's match basin.
+        observations: W and z, the recent attempts.
+        reference: dense index of the node k in which the robot is localised, or was last; None
+            if it never was.
+        own_path: the live session's path, which counts neither in Z nor in N; None if it has none.
+        stamp_ns: the live frame's stamp, ns.
+        seed: of policies that draw at random.
+    """
+
+    neighbourhood: Neighbourhood
+    graph: ExperienceGraph
+    path_memory: PathMemory
+    basin: MatchBasin
+    observations: Observations
+    reference: int | None
+    own_path: PathId | None
+    stamp_ns: int
+    seed: int = 0
+
+
+class RankingPolicy(Protocol):
+    """Orders the candidates of one live frame by how likely they are to match it."""
+
+    @property
+    def name(self) -> str:
+        """Its name in `POLICIES`."""
+        ...
+
+    def rank(self, context: RankingContext) -> NDArray[np.int64]:
+        """(Y,) int64: the rows of the neighbourhood, most promising first; each row once."""
+        ...
+
+
+def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
+    """Rows by the keys, (Y,) each, smallest first; ties by distance, then by UUID (SPEC §4)."""
+    neighbourhood = context.neighbourhood
+    words = context.graph.uuid_words[neighbourhood.nodes]
+    ties = (words[:, 1], words[:, 0], neighbourhood.distance_m)
+    return np.lexsort((*ties, *reversed(keys)))

@@ -1,0 +1,123 @@
+"""The recent attempts W and their outcomes z, over the last T iterations (SPEC §3.6, §4)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError
+
+
+class IterationUnit(StrEnum):
+    """What one iteration of the localiser is."""
+
+    DISTANCE = "distance"
+    FRAME = "frame"
+
+
+@dataclass(frozen=True, slots=True)
+class RecentConfig:
+    """Settings of `RecentAttempts`.
+
+    Attributes:
+        T: iterations remembered; the paper finds 5…200 nearly flat and 0 clearly worse.
+        T_unit: `distance` makes one iteration of all frames within `iteration_m` of its first, so
+            that the memory does not depend on the frame rate (SPEC §3.6); `frame` makes one of
+            each frame, as the paper does.
+        iteration_m: length of an iteration, metres.
+
+    Raises:
+        ConfigError: T is negative or the length is not positive.
+    """
+
+    T: int = 10
+    T_unit: IterationUnit = IterationUnit.DISTANCE
+    iteration_m: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.T < 0:
+            raise ConfigError(f"T is {self.T}, must be 0 or more")
+        if not self.iteration_m > 0:
+            raise ConfigError(f"iteration_m is {self.iteration_m}, must be > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """W and z of [L15 §V].
+
+    Attributes:
+        nodes: (W,) int32, dense indices of the nodes attempted, each once, least recent first.
+        succeeded: (W,) bool, the latest outcome of each.
+    """
+
+    nodes: NDArray[np.int32]
+    succeeded: NDArray[np.bool_]
+
+    @staticmethod
+    def none() -> Observations:
+        """Nothing attempted yet."""
+        return Observations(np.zeros(0, np.int32), np.zeros(0, np.bool_))
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+
+class RecentAttempts:
+    """The window over the last T iterations that the localiser feeds.
+
+    Before the attempts of a frame: `begin_frame`; W is `observations`. After them: `add`. The
+    frames of the running iteration see T iterations before it and what it attempted so far.
+    """
+
+    def __init__(self, config: RecentConfig | None = None) -> None:
+        self._config = RecentConfig() if config is None else config
+        self._iterations: deque[dict[int, bool]] = deque(maxlen=self._config.T)
+        self._current: dict[int, bool] = {}
+        self._began_m: float | None = None
+        self._number = -1
+
+    @property
+    def iteration(self) -> int:
+        """Number of the running iteration, from 0; -1 before the first frame."""
+        return self._number
+
+    def begin_frame(self, driven_m: float) -> int:
+        """Tell how far the session has driven, metres; returns the frame's iteration."""
+        by_distance = self._config.T_unit is IterationUnit.DISTANCE
+        if (
+            by_distance
+            and self._began_m is not None
+            and driven_m - self._began_m < self._config.iteration_m
+        ):
+            return self._number
+        if self._number >= 0:
+            self._iterations.append(self._current)
+        self._current, self._began_m = {}, driven_m
+        self._number += 1
+        return self._number
+
+    def add(self, nodes: Iterable[int], succeeded: Iterable[bool]) -> None:
+        """Remember attempts of the frame: dense indices and whether each was accepted."""
+        for node, outcome in zip(nodes, succeeded, strict=True):
+            self._current.pop(node, None)
+            self._current[int(node)] = bool(outcome)
+
+    @property
+    def observations(self) -> Observations:
+        """W and z now."""
+        if self._config.T == 0:
+            return Observations.none()
+        latest: dict[int, bool] = {}
+        for attempts in (*self._iterations, self._current):
+            for node, outcome in attempts.items():
+                latest.pop(node, None)
+                latest[node] = outcome
+        return Observations(
+            np.fromiter(latest.keys(), np.int32, len(latest)),
+            np.fromiter(latest.values(), np.bool_, len(latest)),
+        )

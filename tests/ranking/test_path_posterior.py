@@ -1,0 +1,120 @@
+"""[L15 §V]: the worked example of SPEC §4, and the kernel against exact fractions."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.reference.path_posterior import posterior, prior_of, theta_row
+from tests.worlds import flat_graph, memory_of, path_uuid
+
+from engram.experience.path_memory import PathMemory
+
+
+def posterior_of(memory: PathMemory, candidates, observed, outcomes, reference, **options):
+    scores = memory.scores(
+        np.array(candidates, np.int32),
+        np.array(observed, np.int32),
+        np.array(outcomes, np.bool_),
+        reference,
+        **options,
+    )
+    weights = np.exp(scores - scores.max())
+    return weights / weights.sum(), scores
+
+
+# [L15 Fig. 5] as SPEC §4 works it out; n1…n9 are the indices 1…9.
+EXAMPLE_PATHS = [[1, 2, 3, 4, 9], [6, 7, 8, 4, 5]]
+EXAMPLE_OBSERVED = [1, 2, 3, 4, 8]
+EXAMPLE_OUTCOMES = [True, True, True, True, False]
+
+
+def test_worked_example_of_the_paper() -> None:
+    memory = memory_of(flat_graph(10), EXAMPLE_PATHS)
+    probabilities, scores = posterior_of(memory, [5, 9], EXAMPLE_OBSERVED, EXAMPLE_OUTCOMES, 4)
+    np.testing.assert_allclose(probabilities, [0.215367, 0.784633], atol=1e-6)
+    # Without the prior's common factor of 2 (one shared path, gamma 1) the scores are likelihoods.
+    np.testing.assert_allclose(np.exp(scores) / 2, [5.94990e-4, 2.167692e-3], rtol=1e-5)
+
+
+def test_counts_of_the_worked_example() -> None:
+    memory = memory_of(flat_graph(10), EXAMPLE_PATHS)
+    counts = memory.co_occurrence(np.array([5, 9], np.int32), np.array(EXAMPLE_OBSERVED, np.int32))
+    np.testing.assert_array_equal(counts, [[0, 0, 0, 1, 1], [1, 1, 1, 1, 0]])
+
+
+def test_the_oracle_gives_the_worked_example() -> None:
+    paths = [set(path) for path in EXAMPLE_PATHS]
+    assert theta_row(paths, 5, EXAMPLE_OBSERVED) == pytest.approx(
+        [1 / 7, 1 / 7, 1 / 7, 2 / 7, 2 / 7]
+    )
+    expected = posterior(paths, [5, 9], EXAMPLE_OBSERVED, EXAMPLE_OUTCOMES, 4)
+    assert [float(p) for p in expected] == pytest.approx([0.215367, 0.784633], abs=1e-6)
+
+
+@st.composite
+def situations(draw):
+    nodes = draw(st.integers(3, 30))
+    some = st.lists(st.integers(0, nodes - 1), max_size=nodes, unique=True)
+    paths = draw(st.lists(some, max_size=140))
+    candidates = draw(some.filter(bool))
+    observed = draw(some)
+    outcomes = [draw(st.booleans()) for _ in observed]
+    reference = draw(st.none() | st.integers(0, nodes - 1))
+    return nodes, paths, candidates, observed, outcomes, reference
+
+
+@given(situations())
+@settings(max_examples=150, deadline=None)
+def test_posterior_equals_the_equations_in_exact_fractions(situation) -> None:
+    nodes, paths, candidates, observed, outcomes, reference = situation
+    sets = [set(path) for path in paths]
+    expected = posterior(sets, candidates, observed, outcomes, reference)
+    assert sum(expected) == 1
+    assert sum(prior_of(sets, candidates, reference)) == 1
+    if observed:
+        assert all(sum(theta_row(sets, c, observed)) == 1 for c in candidates)
+    memory = memory_of(flat_graph(nodes), paths)
+    probabilities, _ = posterior_of(memory, candidates, observed, outcomes, reference)
+    # Thirty factors of double precision.
+    np.testing.assert_allclose(probabilities, [float(p) for p in expected], rtol=1e-11)
+
+
+def test_a_thousand_observations_neither_underflow_nor_overflow() -> None:
+    rng = np.random.default_rng(5)
+    paths = [np.flatnonzero(rng.random(1100) < 0.3).tolist() for _ in range(70)]
+    candidates, observed = list(range(1000, 1040)), list(range(1000))
+    outcomes = (rng.random(1000) < 0.5).tolist()
+    memory = memory_of(flat_graph(1100), paths)
+    _, scores = posterior_of(memory, candidates, observed, outcomes, 1050)
+    counts = memory.co_occurrence(
+        np.array(candidates, np.int32), np.array(observed, np.int32)
+    ).astype(float)
+    theta = (counts + 1) / (counts + 1).sum(axis=1, keepdims=True)
+    shared = memory.co_occurrence(np.array(candidates, np.int32), np.array([1050], np.int32))
+    expected = np.log(np.where(outcomes, theta, 1 - theta)).sum(axis=1) + np.log(shared[:, 0] + 1)
+    np.testing.assert_allclose(scores, expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("observed", [[], [3]])
+def test_none_or_one_observation_leaves_the_prior_alone(observed) -> None:
+    memory = memory_of(flat_graph(10), EXAMPLE_PATHS)
+    outcomes = [True] * len(observed)
+    probabilities, _ = posterior_of(memory, [5, 9, 6], observed, outcomes, 7)
+    np.testing.assert_allclose(probabilities, [0.4, 0.2, 0.4], rtol=1e-12)
+
+
+def test_empty_path_memory_leaves_all_exactly_equal() -> None:
+    memory = memory_of(flat_graph(10), [])
+    _, scores = posterior_of(memory, [5, 9, 6], [1, 2, 3], [True, False, True], 4)
+    assert len(set(scores.tolist())) == 1
+
+
+def test_excluded_path_counts_neither_in_likelihood_nor_in_prior() -> None:
+    graph = flat_graph(10)
+    live = [1, 2, 5, 4]
+    with_live = memory_of(graph, [*EXAMPLE_PATHS, live])
+    without = memory_of(graph, EXAMPLE_PATHS)
+    situation = ([5, 9], EXAMPLE_OBSERVED, EXAMPLE_OUTCOMES, 4)
+    excluded, _ = posterior_of(with_live, *situation, excluded=path_uuid(2))
+    np.testing.assert_array_equal(excluded, posterior_of(without, *situation)[0])
+    assert not np.allclose(posterior_of(with_live, *situation)[0], excluded)

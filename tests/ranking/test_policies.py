@@ -1,0 +1,152 @@
+"""The contract of every ranking policy, and what is particular to each."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tests.worlds import make_context, neighbourhood_of, path_uuid
+
+from engram.errors import ConfigError
+from engram.ranking import POLICIES, RankingContext, policy_named
+
+
+@st.composite
+def contexts(draw) -> RankingContext:
+    nodes = draw(st.integers(1, 25))
+    some = st.lists(st.integers(0, nodes - 1), max_size=nodes, unique=True)
+    candidates = draw(some)
+    observed = draw(some)
+    return make_context(
+        paths=draw(st.lists(some, max_size=8)),
+        candidates=candidates,
+        # Few values, so that ties in distance are common.
+        along_m=[draw(st.sampled_from([-3.0, -0.5, 0.0, 0.5, 1.0, 6.0])) for _ in candidates],
+        observed=observed,
+        outcomes=[draw(st.booleans()) for _ in observed],
+        reference=draw(st.none() | st.integers(0, nodes - 1)),
+        own_path=draw(st.none() | st.just(path_uuid(0))),
+        stamp_ns=draw(st.integers(0, 2**62)),
+    )
+
+
+@pytest.mark.parametrize("name", sorted(POLICIES))
+class TestContract:
+    def test_name_is_the_one_in_the_table(self, name: str) -> None:
+        assert policy_named(name).name == name
+
+    @given(context=contexts())
+    @settings(max_examples=60, deadline=None)
+    def test_ranking_is_a_permutation_of_the_rows(self, name: str, context) -> None:
+        order = policy_named(name).rank(context)
+        assert order.dtype == np.int64
+        assert sorted(order.tolist()) == list(range(len(context.neighbourhood)))
+
+    @given(context=contexts(), seed=st.integers(0, 2**32))
+    @settings(max_examples=60, deadline=None)
+    def test_order_of_nodes_does_not_depend_on_the_order_of_rows(
+        self, name: str, context, seed: int
+    ) -> None:
+        shuffle = np.random.default_rng(seed).permutation(len(context.neighbourhood))
+        near = context.neighbourhood
+        shuffled = dataclasses.replace(
+            context,
+            neighbourhood=neighbourhood_of(near.nodes[shuffle], near.along_m[shuffle]),
+        )
+        nodes = near.nodes[policy_named(name).rank(context)]
+        again = shuffled.neighbourhood.nodes[policy_named(name).rank(shuffled)]
+        np.testing.assert_array_equal(nodes, again)
+
+    @given(context=contexts())
+    @settings(max_examples=30, deadline=None)
+    def test_one_policy_serves_again_and_gives_the_same(self, name: str, context) -> None:
+        policy = policy_named(name)
+        first = policy.rank(context)
+        policy.rank(make_context(candidates=[0, 1, 2], paths=[[0, 1]], reference=1))
+        np.testing.assert_array_equal(first, policy.rank(context))
+
+    def test_no_candidates_give_an_empty_order(self, name: str) -> None:
+        assert policy_named(name).rank(make_context()).shape == (0,)
+
+    def test_the_live_path_does_not_count(self, name: str) -> None:
+        situation = {
+            "candidates": [0, 1, 2, 3],
+            "observed": [4, 5, 6],
+            "outcomes": [True, True, False],
+            "reference": 4,
+        }
+        past = [[4, 1, 5], [6, 2]]
+        without = make_context(paths=past, **situation)
+        with_live = make_context(
+            paths=[*past, [4, 3, 5], [4, 3, 5]][:3], own_path=path_uuid(2), **situation
+        )
+        policy = policy_named(name)
+        np.testing.assert_array_equal(policy.rank(without), policy.rank(with_live))
+
+
+@pytest.mark.parametrize("name", ["distance", "path", "path-literal"])
+def test_equal_candidates_stand_by_distance_then_by_uuid(name: str) -> None:
+    context = make_context(candidates=[0, 1, 2, 3, 4], along_m=[1.0, 0.5, -0.5, 0.5, -1.0])
+    ids = [context.graph.node(i).id for i in range(5)]
+    expected = sorted(range(5), key=lambda i: (context.neighbourhood.distance_m[i], ids[i]))
+    assert policy_named(name).rank(context).tolist() == expected
+
+
+@pytest.mark.parametrize("name", ["path", "path-literal"])
+def test_path_policies_put_the_companion_of_recent_successes_first(name: str) -> None:
+    context = make_context(
+        paths=[[1, 2, 3, 4, 9], [6, 7, 8, 4, 5]],
+        candidates=[5, 9],
+        along_m=[0.1, 1.0],
+        observed=[1, 2, 3, 4, 8],
+        outcomes=[True, True, True, True, False],
+        reference=4,
+    )
+    assert policy_named(name).rank(context).tolist() == [1, 0]
+
+
+def test_candidates_with_the_same_counts_in_another_order_tie() -> None:
+    # Node 0 shares path A with two of W, node 1 path B with two others: equal posteriors, though
+    # the factors are multiplied in different orders.
+    rng = np.random.default_rng(3)
+    observed = list(range(2, 60))
+    members = rng.permutation(observed)
+    paths = [[0, *members[:29].tolist()], [1, *members[29:].tolist()]]
+    context = make_context(
+        paths=paths,
+        candidates=[0, 1],
+        along_m=[0.7, 0.6],
+        observed=observed,
+        outcomes=[True] * len(observed),
+    )
+    assert policy_named("path-literal").rank(context).tolist() == [1, 0]
+
+
+def test_path_ranks_beyond_the_basin_by_distance_where_the_literal_formula_does_not() -> None:
+    situation = {
+        "paths": [[0, 1, 2, 3]],
+        "candidates": [3, 4, 5],
+        "along_m": [6.0, 1.0, 4.0],
+        "observed": [0, 1, 2],
+        "outcomes": [True, True, True],
+        "reference": 2,
+    }
+    context = make_context(**situation)
+    assert policy_named("path-literal").rank(context)[0] == 0
+    assert policy_named("path").rank(context).tolist() == [1, 2, 0]
+    # A longer lens sees farther: the basin then holds the companion 6 m away.
+    assert policy_named("path").rank(make_context(**situation, focal_px=707.0))[0] == 0
+
+
+def test_random_depends_on_seed_and_stamp() -> None:
+    orders = {
+        tuple(policy_named("random").rank(make_context(candidates=range(12), **varied)).tolist())
+        for varied in ({}, {"seed": 1}, {"stamp_ns": 1}, {"seed": 1, "stamp_ns": 1})
+    }
+    assert len(orders) == 4
+
+
+def test_unknown_policy_is_refused_with_the_known_ones_named() -> None:
+    with pytest.raises(ConfigError, match=r"'nearest'.*distance, path, path-literal, random"):
+        policy_named("nearest")

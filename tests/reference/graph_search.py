@@ -1,0 +1,58 @@
+"""Least uncertain chains in plain Python: the oracle of the search kernel."""
+
+import heapq
+
+import numpy as np
+
+from engram.experience.chain_error import PivotedError
+from engram.experience.graph import ExperienceGraph
+from engram.geometry import SE3
+
+LEVER_M = 10.0
+
+
+def chains(graph: ExperienceGraph, root: int, anchor=None, reach_m: float = np.inf):
+    """node -> (root_from_node, [(tau, v, pivot in root)], cost), as Dijkstra settles them."""
+    edges = [[] for _ in range(len(graph))]
+    for edge in graph.edges:
+        error = PivotedError.from_covariance(edge.covariance)
+        a, b = graph.index(edge.a), graph.index(edge.b)
+        edges[a].append((b, edge.a_from_b, error, error.pivot_in_a))
+        b_from_a = edge.a_from_b.inverse()
+        edges[b].append((a, b_from_a, error, b_from_a @ error.pivot_in_a))
+    settled = {}
+    heap = [(0.0, root, SE3.identity(), [])]
+    while heap:
+        cost, node, root_from_node, errors = heapq.heappop(heap)
+        if node in settled:
+            continue
+        settled[node] = (root_from_node, errors, cost)
+        if anchor is not None and np.linalg.norm(root_from_node.translation - anchor) > reach_m:
+            continue
+        for target, node_from_target, error, pivot_in_node in edges[node]:
+            if target in settled:
+                continue
+            pivot = root_from_node @ pivot_in_node
+            lever = LEVER_M**2 + (0 if anchor is None else np.sum((pivot - anchor) ** 2))
+            step = error.translation_var + error.rotation_var * lever
+            term = (error.translation_var, error.rotation_var, pivot)
+            entry = (cost + step, target, root_from_node @ node_from_target, [*errors, term])
+            heapq.heappush(heap, entry)
+    return settled
+
+
+def neighbourhood(graph, reference, reference_from_live, covariance, radius_m, gate_rad, margin_m):
+    """node -> (node_from_live, sigma_m, sigma_yaw_rad) of the candidates, no slack."""
+    live = reference_from_live.translation
+    reach_m = max(radius_m, float(np.linalg.norm(live))) + margin_m
+    own = PivotedError.from_covariance(covariance)
+    own_term = (own.translation_var, own.rotation_var, own.pivot_in_a)
+    found = {}
+    for node, (pose, errors, _) in chains(graph, reference, live, reach_m).items():
+        node_from_live = pose.inverse() @ reference_from_live
+        if node_from_live.distance_m > radius_m or abs(node_from_live.yaw_rad) > gate_rad:
+            continue
+        terms = [*errors, own_term]
+        variance = sum(tau + v * np.sum((live - pivot) ** 2) for tau, v, pivot in terms)
+        found[node] = (node_from_live, np.sqrt(variance), np.sqrt(sum(v for _, v, _ in terms)))
+    return found

@@ -1,0 +1,118 @@
+"""Small experience graphs, path memories and ranking contexts for tests."""
+
+from uuid import UUID
+
+import numpy as np
+
+from engram.experience.basin import MatchBasin
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import (
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    PathId,
+    SessionId,
+    node_id,
+)
+from engram.experience.neighbourhood import Neighbourhood
+from engram.experience.path_memory import ALL_KINDS, PathMemory
+from engram.geometry import SE3, CameraId
+from engram.ranking import Observations, RankingContext
+
+CAMERA = CameraId("0" * 32)
+
+
+def session_uuid(number: int) -> SessionId:
+    return SessionId(UUID(int=(0x5E << 120) | number))
+
+
+def path_uuid(number: int) -> PathId:
+    return PathId(UUID(int=(0xBA << 120) | number))
+
+
+def make_node(session: int, index: int, driven_m: float | None = None) -> Node:
+    """Node `index` of a session, 1 m driven per index unless told."""
+    drive = session_uuid(session)
+    stamp_ns = index * 1_000_000_000
+    metres = float(index) if driven_m is None else driven_m
+    return Node(node_id(drive, stamp_ns), drive, stamp_ns, CAMERA, metres)
+
+
+def covariance_of(sigma_m: float, sigma_rad: float) -> np.ndarray:
+    return np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+
+
+def make_edge(a: NodeId, b: NodeId, a_from_b: SE3, kind=EdgeKind.ODOMETRY, sigma=(0.02, 0.001)):
+    return Edge(a, b, kind, a_from_b, covariance_of(*sigma))
+
+
+def forward(metres: float, across_m: float = 0.0, yaw_rad: float = 0.0) -> SE3:
+    """A pose ahead, to the right, and turned to the right."""
+    turn = SE3.exp([0, 0, 0, 0, yaw_rad, 0])
+    return SE3(turn.rotation, np.array([across_m, 0.0, metres]))
+
+
+def flat_graph(count: int) -> ExperienceGraph:
+    """Nodes without edges."""
+    graph = ExperienceGraph()
+    for index in range(count):
+        graph.add_node(make_node(0, index))
+    return graph
+
+
+def memory_of(graph: ExperienceGraph, paths, kinds=ALL_KINDS) -> PathMemory:
+    """Path m holds the nodes (dense indices) of paths[m]."""
+    memory = PathMemory(graph, kinds)
+    for number, nodes in enumerate(paths):
+        for sequence, index in enumerate(nodes):
+            entry = PathEntry(
+                path_uuid(number), sequence, graph.node(index).id, PathEntryKind.MATCHED, sequence
+            )
+            memory.add(entry)
+    return memory
+
+
+def neighbourhood_of(nodes, along_m) -> Neighbourhood:
+    """Candidates straight ahead or behind, predicted without error."""
+    nodes = np.asarray(nodes, np.int32)
+    along = np.asarray(along_m, np.float64)
+    poses = np.tile(np.eye(4), (len(nodes), 1, 1))
+    poses[:, 2, 3] = along
+    zeros = np.zeros(len(nodes))
+    pivots = np.zeros((len(nodes), 3))
+    return Neighbourhood(nodes, poses, np.abs(along), along, zeros, zeros, zeros, zeros, pivots)
+
+
+def make_context(
+    *,
+    graph=None,
+    paths=(),
+    candidates=(),
+    along_m=None,
+    observed=(),
+    outcomes=(),
+    reference=None,
+    own_path=None,
+    focal_px=256.0,
+    stamp_ns=0,
+    seed=0,
+) -> RankingContext:
+    """A context over dense indices; candidates stand 0.1 m apart unless told."""
+    along = 0.1 * np.arange(len(candidates)) if along_m is None else along_m
+    if graph is None:
+        used = [*candidates, *observed, *(n for path in paths for n in path), reference or 0]
+        graph = flat_graph(max(used, default=0) + 1)
+    return RankingContext(
+        neighbourhood=neighbourhood_of(candidates, along),
+        graph=graph,
+        path_memory=memory_of(graph, paths),
+        basin=MatchBasin.of(focal_px),
+        observations=Observations(np.array(observed, np.int32), np.array(outcomes, np.bool_)),
+        reference=reference,
+        own_path=own_path,
+        stamp_ns=stamp_ns,
+        seed=seed,
+    )
