@@ -7,6 +7,53 @@ from numpy.typing import NDArray
 
 isa: str
 
+# --- extraction: positions are (N, 2) int16 x, y, at least 17 px inside the image
+
+def detect_corners(
+    image: NDArray[np.uint8], threshold: int
+) -> tuple[NDArray[np.int16], NDArray[np.uint8]]: ...
+def order_corners(
+    positions: NDArray[np.int16], scores: NDArray[np.uint8], width: int, height: int, cell_px: int
+) -> NDArray[np.int32]: ...
+def smooth(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
+def halve(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
+def describe(smoothed: NDArray[np.uint8], positions: NDArray[np.int16]) -> NDArray[np.uint8]: ...
+def measure_disparities(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    positions: NDArray[np.int16],
+    max_disparity_px: int,
+    min_disparity_px: float,
+    uniqueness: float,
+    max_residual: float,
+    max_sigma_px: float,
+    sigma_floor_px: float,
+    sigma_scale: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+def extract(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    landmarks: int,
+    octaves: int,
+    fast_threshold: int,
+    cell_px: int,
+    with_descriptors: bool,
+    max_disparity_px: int,
+    min_disparity_px: float,
+    uniqueness: float,
+    max_residual: float,
+    max_sigma_px: float,
+    sigma_floor_px: float,
+    sigma_scale: float,
+) -> tuple[
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.float32],
+    NDArray[np.uint8],
+    NDArray[np.uint8],
+    int,
+]: ...
+
 # --- graph search
 
 def graph_candidates(
@@ -140,18 +187,3 @@ def path_scores(
     gamma: float,
     excluded: int = -1,
 ) -> NDArray[np.float64]: ...
-
-# --- window_ba
-
-def adjust_window(
-    camera: Sequence[float],
-    world_from_cam: NDArray[np.float64],
-    frame: NDArray[np.int32],
-    track: NDArray[np.int32],
-    stereo: NDArray[np.float32],
-    pixel_sigma_px: NDArray[np.float32],
-    disparity_sigma_px: NDArray[np.float32],
-    fixed: int,
-    iterations: int,
-    chi2: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float] | None: ...

@@ -7,7 +7,7 @@
     │   ├── SequenceError        images, stamps or layout of a drive
     │   ├── CalibrationError     a calibration that is missing, malformed or does not fit
     │   └── ConfigError          a setting: unknown key, wrong type, out of range
-    ├── MapError                 the map file
+    ├── MapError                 a stored file: a map or a frame log
     │   ├── NotAMapError         the file is something else
     │   ├── FormatVersionError   written by a newer Engram: upgrade
     │   ├── MapLockedError       another process writes to it: wait
@@ -42,7 +42,7 @@ class ConfigError(InputError):
 
 
 class MapError(EngramError):
-    """The map file cannot be used as asked."""
+    """A map or a frame log cannot be used as asked."""
 
 
 class NotAMapError(MapError):
@@ -50,11 +50,11 @@ class NotAMapError(MapError):
 
 
 class FormatVersionError(MapError):
-    """The map was written in a newer format than this version reads."""
+    """The file was written in a newer format than this version reads."""
 
 
 class MapLockedError(MapError):
-    """Another process is writing to the map."""
+    """Another process is writing to the file."""
 
 
 class MapCorruptError(MapError):

@@ -6,18 +6,18 @@
 
 namespace nb = nanobind;
 
+void bind_extraction(nb::module_ &module);
 void bind_graph_search(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
 void bind_matching(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
-void bind_window_ba(nb::module_ &module);
 
 NB_MODULE(_core, module) {
   module.doc() = "The measured hot kernels of Engram. Every function releases the GIL.";
   module.attr("isa") = engram::name_of(engram::active_isa());
+  bind_extraction(module);
   bind_graph_search(module);
   bind_hamming(module);
   bind_matching(module);
   bind_path_scores(module);
-  bind_window_ba(module);
 }

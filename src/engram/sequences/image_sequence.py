@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -177,14 +176,6 @@ def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
         ),
         zone=info.zone if options.zone is None else options.zone,
     )
-
-
-def first_pair_hash(pair: StereoPair) -> str:
-    """32 hexadecimal digits of a pair's pixels, part of a session's identity (SPEC §2.7)."""
-    digest = hashlib.sha256(f"{pair.left.shape}{pair.right.shape}".encode())
-    digest.update(np.ascontiguousarray(pair.left).data)
-    digest.update(np.ascontiguousarray(pair.right).data)
-    return digest.hexdigest()[:32]
 
 
 def _shifted(places: Listing, start_ns: int) -> Listing:

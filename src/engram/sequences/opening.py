@@ -12,6 +12,7 @@ from engram.errors import ConfigError, SequenceError
 from engram.sequences.euroc import find_euroc, is_euroc
 from engram.sequences.folder import find_folder, is_folder
 from engram.sequences.frame_range import FrameRange
+from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
 from engram.sequences.image_sequence import ImageDrive, ImageSequence, open_drive
 from engram.sequences.images import Channel, parse_channel
 from engram.sequences.kitti import (
@@ -36,7 +37,7 @@ class SequenceFormat:
 
     looks_like: str
     recognises: Callable[[Path], bool]
-    open: Callable[[Path, OpenOptions], ImageSequence]
+    open: Callable[[Path, OpenOptions], ImageSequence | FrameLog]
     rigs: tuple[Rig, ...] = (Rig.GREY,)
 
 
@@ -70,6 +71,11 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             is_folder,
             _images(find_folder),
         ),
+        "framelog": SequenceFormat(
+            "frame log, a file NAME.framelog that `engram extract` made",
+            is_framelog,
+            open_framelog,
+        ),
     }
 )
 
@@ -87,8 +93,11 @@ def open_sequence(
     start: str | datetime | int | None = None,
     longitude_deg: float | None = None,
     zone: str | None = None,
-) -> ImageSequence:
+) -> ImageSequence | FrameLog:
     """Open a drive of any known layout. No image is decoded yet, but all are looked for.
+
+    Image layouts give an `ImageSequence` (a `StereoSequence`), frame logs a `FrameLog` (a
+    `FrameSequence`).
 
     Args:
         path: folder or file of the drive.
@@ -110,6 +119,7 @@ def open_sequence(
             cannot be used; the message names file and fact.
         CalibrationError: its calibration is missing, malformed, or does not fit.
         ConfigError: an argument is out of range or does not fit the layout.
+        MapError: a frame log that is damaged, locked, or of a newer format.
     """
     path = Path(path)
     options = OpenOptions(

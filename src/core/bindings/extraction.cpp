@@ -1,0 +1,226 @@
+#include "kernels/extraction.hpp"
+
+#include <stdexcept>
+#include <string>
+
+#include "bindings/arrays.hpp"
+#include "kernels/brief.hpp"
+#include "kernels/corners.hpp"
+#include "kernels/pyramid.hpp"
+
+namespace nb = nanobind;
+using namespace nb::literals;
+
+namespace {
+
+using engram::Corner;
+using engram::Image;
+using GreyImage = engram::Input<uint8_t, 2>;
+using Positions = nb::ndarray<const int16_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+
+constexpr int64_t longest_side_px = 32767; // positions are int16
+constexpr int most_disparity_px = 500;     // the search's cost table
+
+void require(bool holds, const std::string &what) {
+  if (!holds)
+    throw std::invalid_argument(what);
+}
+
+Image view(const GreyImage &array) {
+  const auto height = static_cast<int64_t>(array.shape(0));
+  const auto width = static_cast<int64_t>(array.shape(1));
+  require(width <= longest_side_px && height <= longest_side_px,
+          "an image side is longer than 32767 px");
+  return {array.data(), width, height};
+}
+
+void require_same_size(const Image &left, const Image &right) {
+  require(left.width == right.width && left.height == right.height,
+          "left and right image differ in size");
+}
+
+void require_threshold(int threshold) {
+  require(threshold >= 1 && threshold <= 254, "the FAST threshold must lie in 1 to 254");
+}
+
+std::vector<Corner> corners_inside(const Positions &positions, const Image &image) {
+  std::vector<Corner> corners(positions.shape(0));
+  for (size_t i = 0; i < corners.size(); ++i) {
+    const int16_t x = positions(i, 0), y = positions(i, 1);
+    require(x >= engram::corner_border && y >= engram::corner_border &&
+                x < image.width - engram::corner_border && y < image.height - engram::corner_border,
+            "a corner lies less than 17 px inside the image");
+    corners[i] = {x, y, 0};
+  }
+  return corners;
+}
+
+engram::StereoSettings stereo_settings(int max_disparity_px, float min_disparity_px,
+                                       float uniqueness, float max_residual, float max_sigma_px,
+                                       float sigma_floor_px, float sigma_scale) {
+  require(max_disparity_px >= 1 && max_disparity_px <= most_disparity_px,
+          "max_disparity_px must lie in 1 to 500");
+  require(min_disparity_px > 0, "min_disparity_px must be above 0");
+  return {max_disparity_px, min_disparity_px, uniqueness, max_residual,
+          max_sigma_px,     sigma_floor_px,   sigma_scale};
+}
+
+auto detect_corners(const GreyImage &array, int threshold) {
+  const Image image = view(array);
+  require_threshold(threshold);
+  std::vector<Corner> corners(engram::most_corners(image.width, image.height));
+  std::vector<int16_t> positions;
+  std::vector<uint8_t> scores;
+  {
+    nb::gil_scoped_release unlocked;
+    corners.resize(ENGRAM_CALL(detect_corners, image, threshold, corners.data()));
+    for (const Corner &corner : corners) {
+      positions.insert(positions.end(), {corner.x, corner.y});
+      scores.push_back(corner.score);
+    }
+  }
+  const size_t count = corners.size();
+  return nb::make_tuple(engram::to_numpy(std::move(positions), {count, 2}),
+                        engram::to_numpy(std::move(scores), {count}));
+}
+
+auto order_corners(const Positions &positions, const engram::Input<uint8_t, 1> &scores, int width,
+                   int height, int cell_px) {
+  require(positions.shape(0) == scores.shape(0), "positions and scores differ in number");
+  require(cell_px >= 4, "cell_px must be at least 4");
+  const Image image{nullptr, width, height};
+  std::vector<Corner> corners = corners_inside(positions, image);
+  for (size_t i = 0; i < corners.size(); ++i)
+    corners[i].score = scores(i);
+  std::vector<int32_t> order(corners.size());
+  {
+    nb::gil_scoped_release unlocked;
+    ENGRAM_CALL(order_corners, corners.data(), static_cast<int64_t>(corners.size()), image, cell_px,
+                order.data());
+  }
+  const size_t count = order.size();
+  return engram::to_numpy(std::move(order), {count});
+}
+
+auto smooth(const GreyImage &array) {
+  const Image image = view(array);
+  std::vector<uint8_t> smoothed(array.size());
+  {
+    nb::gil_scoped_release unlocked;
+    ENGRAM_CALL(smooth, image, smoothed.data());
+  }
+  return engram::to_numpy(std::move(smoothed), {array.shape(0), array.shape(1)});
+}
+
+std::vector<uint8_t> half_of(const Image &image) {
+  std::vector<uint8_t> half((image.width / 2) * (image.height / 2));
+  ENGRAM_CALL(halve, image, half.data());
+  return half;
+}
+
+auto halve(const GreyImage &array) {
+  const Image image = view(array);
+  std::vector<uint8_t> half;
+  {
+    nb::gil_scoped_release unlocked;
+    half = half_of(image);
+  }
+  return engram::to_numpy(std::move(half), {array.shape(0) / 2, array.shape(1) / 2});
+}
+
+auto describe(const GreyImage &smoothed, const Positions &positions) {
+  const Image image = view(smoothed);
+  const std::vector<Corner> corners = corners_inside(positions, image);
+  const size_t count = corners.size();
+  std::vector<uint8_t> descriptors(32 * count);
+  {
+    nb::gil_scoped_release unlocked;
+    ENGRAM_CALL(describe, image, corners.data(), static_cast<int64_t>(count),
+                reinterpret_cast<uint64_t *>(descriptors.data()));
+  }
+  return engram::to_numpy(std::move(descriptors), {count, 32});
+}
+
+auto measure_disparities(const GreyImage &left_array, const GreyImage &right_array,
+                         const Positions &positions, int max_disparity_px, float min_disparity_px,
+                         float uniqueness, float max_residual, float max_sigma_px,
+                         float sigma_floor_px, float sigma_scale) {
+  const Image left = view(left_array), right = view(right_array);
+  require_same_size(left, right);
+  const auto settings = stereo_settings(max_disparity_px, min_disparity_px, uniqueness,
+                                        max_residual, max_sigma_px, sigma_floor_px, sigma_scale);
+  const std::vector<Corner> corners = corners_inside(positions, left);
+  const size_t count = corners.size();
+  std::vector<float> disparities(count), sigmas(count);
+  {
+    nb::gil_scoped_release unlocked;
+    const std::vector<uint8_t> left_half = half_of(left), right_half = half_of(right);
+    const engram::StereoImages images{left,
+                                      right,
+                                      {left_half.data(), left.width / 2, left.height / 2},
+                                      {right_half.data(), left.width / 2, left.height / 2}};
+    for (size_t i = 0; i < count; ++i)
+      if (!ENGRAM_CALL(measure_disparity, images, corners[i].x, corners[i].y, settings,
+                       &disparities[i], &sigmas[i]))
+        disparities[i] = sigmas[i] = 0;
+  }
+  return nb::make_tuple(engram::to_numpy(std::move(disparities), {count}),
+                        engram::to_numpy(std::move(sigmas), {count}));
+}
+
+auto extract(const GreyImage &left_array, const GreyImage &right_array, int landmarks, int octaves,
+             int fast_threshold, int cell_px, bool with_descriptors, int max_disparity_px,
+             float min_disparity_px, float uniqueness, float max_residual, float max_sigma_px,
+             float sigma_floor_px, float sigma_scale) {
+  const Image left = view(left_array), right = view(right_array);
+  require_same_size(left, right);
+  require(landmarks >= 1 && landmarks <= 1'000'000, "landmarks must lie in 1 to 1000000");
+  require(octaves >= 1 && octaves <= engram::most_octaves, "octaves must lie in 1 to 4");
+  require(cell_px >= 4, "cell_px must be at least 4");
+  require_threshold(fast_threshold);
+  const engram::ExtractionSettings settings{
+      landmarks, octaves, fast_threshold, cell_px,
+      stereo_settings(max_disparity_px, min_disparity_px, uniqueness, max_residual, max_sigma_px,
+                      sigma_floor_px, sigma_scale)};
+  const auto room = static_cast<size_t>(landmarks);
+  std::vector<float> pixels(2 * room), disparities(room), sigmas(room);
+  std::vector<uint8_t> descriptors(with_descriptors ? 32 * room : 0), levels(room);
+  engram::ExtractionCounts counts;
+  {
+    nb::gil_scoped_release unlocked;
+    counts = ENGRAM_CALL(
+        extract, left, right, settings,
+        {pixels.data(), disparities.data(), sigmas.data(),
+         with_descriptors ? reinterpret_cast<uint64_t *>(descriptors.data()) : nullptr,
+         levels.data()});
+  }
+  const auto count = static_cast<size_t>(counts.landmarks);
+  return nb::make_tuple(engram::to_numpy(std::move(pixels), {count, 2}),
+                        engram::to_numpy(std::move(disparities), {count}),
+                        engram::to_numpy(std::move(sigmas), {count}),
+                        engram::to_numpy(std::move(descriptors), {with_descriptors ? count : 0, 32}),
+                        engram::to_numpy(std::move(levels), {count}), counts.corners);
+}
+
+} // namespace
+
+void bind_extraction(nb::module_ &module) {
+  module.def("detect_corners", &detect_corners, "image"_a, "threshold"_a,
+             "FAST-9 corners: positions (N, 2) int16 x, y in raster order, scores (N,) uint8.");
+  module.def("order_corners", &order_corners, "positions"_a, "scores"_a, "width"_a, "height"_a,
+             "cell_px"_a, "Indices (N,) int32: best corner of each cell first, then the second.");
+  module.def("smooth", &smooth, "image"_a, "Binomial 5×5 blur; the outer two pixels are zero.");
+  module.def("halve", &halve, "image"_a, "Mean of 2×2 pixels, rounded half up.");
+  module.def("describe", &describe, "smoothed"_a, "positions"_a,
+             "BRIEF-256 (N, 32) uint8 at corners (N, 2) int16 of a smoothed image.");
+  module.def("measure_disparities", &measure_disparities, "left"_a, "right"_a, "positions"_a,
+             "max_disparity_px"_a, "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a,
+             "sigma_floor_px"_a, "sigma_scale"_a,
+             "Disparities and σ (N,) float32 px at corners (N, 2) int16; 0 where there is none.");
+  module.def("extract", &extract, "left"_a, "right"_a, "landmarks"_a, "octaves"_a,
+             "fast_threshold"_a, "cell_px"_a, "with_descriptors"_a, "max_disparity_px"_a,
+             "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a, "sigma_floor_px"_a,
+             "sigma_scale"_a,
+             "Stereo pair → pixels (N, 2), disparities, σ (N,) float32, descriptors (N, 32), "
+             "octaves (N,) uint8, number of corners.");
+}

@@ -1,0 +1,38 @@
+// The front-end's hot path in one call: stereo pair → landmarks.
+#pragma once
+
+#include "dispatch.hpp"
+#include "kernels/disparity.hpp"
+#include "kernels/image.hpp"
+
+namespace engram {
+
+constexpr int32_t most_octaves = 4;
+
+struct ExtractionSettings {
+  int32_t landmarks; // at most so many, all octaves together
+  int32_t octaves;   // 1 to most_octaves, each half the size of the one before
+  int32_t fast_threshold, cell_px;
+  StereoSettings stereo;
+};
+
+// Where the landmarks go: room for ExtractionSettings::landmarks each.
+struct ExtractedLandmarks {
+  float *pixels; // u, v of the full-size left image
+  float *disparity_px, *sigma_px;
+  uint64_t *descriptors; // four words each; may be null: not computed
+  uint8_t *octaves;
+};
+
+struct ExtractionCounts {
+  int64_t landmarks, corners;
+};
+
+} // namespace engram
+
+ENGRAM_DECLARE_KERNELS(
+    // Octave by octave: corners, in the order of order_corners(), are given a disparity until the
+    // octave's share of landmarks is reached; what an octave leaves over goes to the next. Shares
+    // fall with the octave's scale, 1 : 1/2 : 1/4 …. Landmarks come out by octave, in raster order.
+    ExtractionCounts extract(const Image &left, const Image &right,
+                             const ExtractionSettings &settings, const ExtractedLandmarks &out);)

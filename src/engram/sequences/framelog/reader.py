@@ -1,0 +1,260 @@
+"""Reading a frame log like any drive: in order, from the middle, or every n-th frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, select
+
+from engram.errors import MapCorruptError, SequenceError
+from engram.geometry import StereoCamera, propagate_covariance
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.sequences.framelog import file
+from engram.sequences.framelog.file import frames_table, log_table
+from engram.sequences.framelog.header import FrameLogHeader
+from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
+from engram.sequences.image_sequence import with_options
+from engram.sequences.options import OpenOptions
+from engram.sequences.sequence import LoggedFrame, SequenceInfo
+from engram.store.blob import content_digest
+
+SUFFIX = ".framelog"
+
+
+def is_framelog(path: Path) -> bool:
+    """A file that is named `….framelog`.
+
+    Its bytes are not looked at: opening and closing a file that this process also writes through
+    SQLite would drop SQLite's locks.
+    """
+    return path.suffix == SUFFIX and path.is_file()
+
+
+def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
+    """A frame log as a drive; see `FrameLog` for what is raised."""
+    return FrameLog(path, options)
+
+
+class FrameLog:
+    """A `FrameSequence` over a frame log. Frames are decoded when they are asked for.
+
+    With a range of frames, the odometry of each is composed over those that are left out; if one
+    of those steps failed, the composed step is that failure. With `skip_bad`, frames whose bytes
+    are damaged are left out the same way, and counted.
+
+    Raises:
+        SequenceError: no frame log, or no frame of it is chosen.
+        FormatVersionError: written by a newer Engram.
+        MapCorruptError: damaged or cut short.
+        ConfigError: a start time is given for a log whose clock is UTC already.
+    """
+
+    def __init__(self, path: str | Path, options: OpenOptions | None = None) -> None:
+        self._path = Path(path)
+        options = options or OpenOptions()
+        if not self._path.is_file():
+            raise SequenceError(f"{self._path}: there is no such frame log")
+        self._engine = file.reading_engine(self._path)
+        try:
+            with file.plain_errors(self._path), self._engine.connect() as connection:
+                file.check_kind(connection, self._path)
+                self._header, self._complete = read_header(connection)
+                stamps_ns = _read_stamps(connection)
+        except MapCorruptError as error:
+            raise self._named(error) from error
+        self._info = with_options(self._header.info, options)
+        self._numbers = options.frames.indices(len(stamps_ns))
+        if not self._numbers:
+            raise SequenceError(
+                f"{self._path}: no frame is chosen of the {len(stamps_ns)} in the log "
+                f"(frames {options.frames})"
+            )
+        shift_ns = 0 if options.start_ns is None else options.start_ns - int(stamps_ns[0])
+        self._shift_ns = shift_ns
+        self._stamps_ns = stamps_ns[list(self._numbers)] + shift_ns
+        self._skip_bad = options.skip_bad
+        self._skipped_reasons: list[str] = []
+
+    @property
+    def info(self) -> SequenceInfo:
+        """What is known of the drive as a whole; `format` is "framelog"."""
+        return replace(self._info, format="framelog")
+
+    @property
+    def header(self) -> FrameLogHeader:
+        """What the log says of itself, as it was recorded."""
+        return self._header
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The one camera of the drive."""
+        return self._header.camera
+
+    @property
+    def complete(self) -> bool:
+        """Whether the drive was recorded to its end; False after an interruption."""
+        return self._complete
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) int64 stamps of the chosen frames."""
+        return self._stamps_ns
+
+    @property
+    def first_pair_hash(self) -> str:
+        """`first_pair_hash` of the images of the first chosen frame (SPEC §2.7)."""
+        with file.plain_errors(self._path), self._engine.connect() as connection:
+            return next(self._steps(connection, self._numbers[0], self._numbers[0])).pair_hash
+
+    @property
+    def skipped(self) -> int:
+        """Frames left out as damaged under `skip_bad`, in the latest pass through the log."""
+        return len(self._skipped_reasons)
+
+    @property
+    def skipped_reasons(self) -> list[str]:
+        """Why each of the `skipped` frames was left out."""
+        return list(self._skipped_reasons)
+
+    def close(self) -> None:
+        """Give the file back; the log opens it again if it is asked for more."""
+        self._engine.dispose()
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __iter__(self) -> Iterator[LoggedFrame]:
+        """The chosen frames in the order of time.
+
+        Raises:
+            MapCorruptError: a frame's bytes do not match their hash, and `skip_bad` was not asked
+                for.
+        """
+        self._skipped_reasons.clear()
+        previous: int | None = None
+        for number in self._numbers:
+            try:
+                logged = self._read(number, previous)
+            except MapCorruptError as error:
+                if not self._skip_bad:
+                    raise MapCorruptError(f"{error}; --skip-bad goes on without it") from error
+                self._skipped_reasons.append(str(error))
+                continue
+            previous = number
+            yield logged
+
+    def read(self, index: int) -> LoggedFrame:
+        """Frame `index` of `len(self)`, with the motion since the chosen frame before it.
+
+        Raises:
+            MapCorruptError: its bytes do not match their hash.
+        """
+        index = range(len(self._numbers))[index]
+        previous = self._numbers[index - 1] if index > 0 else None
+        return self._read(self._numbers[index], previous)
+
+    def _read(self, number: int, previous: int | None) -> LoggedFrame:
+        """A frame with the motion since frame `previous`, FIRST where there is none."""
+        try:
+            with file.plain_errors(self._path), self._engine.connect() as connection:
+                row, step = self._frame_row(connection, number)
+                frame = decode_frame(step, row.landmarks, row.thumbnail, self._header)
+                odometry = (
+                    OdometryStep(OdometryStatus.FIRST)
+                    if previous is None
+                    else self._motion(connection, previous, step)
+                )
+        except MapCorruptError as error:
+            raise self._named(error) from error
+        return LoggedFrame(replace(frame, stamp_ns=frame.stamp_ns + self._shift_ns), odometry)
+
+    def _frame_row(self, connection: Connection, number: int) -> tuple[Any, StepRow]:
+        columns = (*STEP_COLUMNS, frames_table.c.landmarks, frames_table.c.thumbnail)
+        row = connection.execute(
+            select(*columns).where(frames_table.c.number == number).order_by(frames_table.c.number)
+        ).one_or_none()
+        if row is None:
+            raise MapCorruptError(f"frame {number} is gone")
+        return row, decode_step(row)
+
+    def _motion(self, connection: Connection, previous: int, last: StepRow) -> OdometryStep:
+        """Motion of a frame since frame `previous`, composed over those between them."""
+        composed: OdometryStep | None = None
+        if last.number - previous > 1:
+            try:
+                for step in self._steps(connection, previous + 1, last.number - 1):
+                    composed = compose(composed, step.odometry)
+            except MapCorruptError:
+                if not self._skip_bad:
+                    raise
+                # The motion over a damaged row is not known.
+                return OdometryStep(OdometryStatus.NO_CONSENSUS)
+        return compose(composed, last.odometry)
+
+    def _steps(self, connection: Connection, first: int, last: int) -> Iterator[StepRow]:
+        """The rows `first` to `last`, both included, without their blobs."""
+        query = (
+            select(*STEP_COLUMNS)
+            .where(frames_table.c.number.between(first, last))
+            .order_by(frames_table.c.number)
+        )
+        for row in connection.execute(query):
+            yield decode_step(row)
+
+    def _named(self, error: MapCorruptError) -> MapCorruptError:
+        text = str(error)
+        return (
+            error if text.startswith(str(self._path)) else MapCorruptError(f"{self._path}: {text}")
+        )
+
+
+def compose(first: OdometryStep | None, second: OdometryStep) -> OdometryStep:
+    """Two successive steps as one; a failure of either is the failure of both.
+
+    The covariance is first order with independent errors, the inliers are those of the weaker.
+    """
+    if first is None or first.status is not OdometryStatus.OK:
+        return first or second
+    if second.status is not OdometryStatus.OK:
+        return second
+    assert first.prev_from_curr is not None
+    assert first.covariance is not None
+    assert second.prev_from_curr is not None
+    assert second.covariance is not None
+    return OdometryStep(
+        OdometryStatus.OK,
+        first.prev_from_curr @ second.prev_from_curr,
+        propagate_covariance(first.prev_from_curr, first.covariance, second.covariance),
+        min(first.inliers, second.inliers),
+    )
+
+
+def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
+    """Header and completeness of a log.
+
+    Raises:
+        MapCorruptError: it is missing or does not match its hash.
+    """
+    rows = connection.execute(select(log_table).order_by(log_table.c.key)).all()
+    if len(rows) != 1 or content_digest(rows[0].header.encode()) != rows[0].digest:
+        raise MapCorruptError("the frame log's header is missing or does not match its hash")
+    return FrameLogHeader.from_json(rows[0].header), bool(rows[0].complete)
+
+
+def _read_stamps(connection: Connection) -> NDArray[np.int64]:
+    rows = connection.execute(
+        select(frames_table.c.number, frames_table.c.stamp_ns).order_by(frames_table.c.number)
+    ).all()
+    if not rows:
+        raise SequenceError("the frame log holds no frame")
+    table = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    if (table[:, 0] != np.arange(len(table))).any():
+        raise MapCorruptError("frames are missing in the frame log: their numbers have gaps")
+    if (np.diff(table[:, 1]) <= 0).any():
+        raise MapCorruptError("the frame log's stamps do not rise")
+    return table[:, 1].copy()

@@ -1,0 +1,249 @@
+"""The extraction kernels against their plain NumPy twins."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.core.textures import shifted_pair, texture
+from tests.reference import brief, corners, disparity
+
+from engram import _core
+
+STEREO = {
+    "max_disparity_px": 60,
+    "min_disparity_px": 0.5,
+    "uniqueness": 0.85,
+    "max_residual": 0.5,
+    "max_sigma_px": 1.0,
+    "sigma_floor_px": 0.05,
+    "sigma_scale": 1.0,
+}
+EXTRACT = {"landmarks": 150, "octaves": 2, "fast_threshold": 7, "cell_px": 32, **STEREO}
+
+
+def plateaus(height: int, width: int) -> np.ndarray:
+    """An image of few grey levels, full of equal scores, with saturated pixels."""
+    rng = np.random.default_rng(4)
+    return (
+        (rng.integers(0, 4, (height // 3 + 1, width // 3 + 1)) * 85)
+        .astype(np.uint8)
+        .repeat(3, axis=0)
+        .repeat(3, axis=1)[:height, :width]
+        .copy()
+    )
+
+
+IMAGES = {
+    "texture": texture(70, 150, 1),
+    "faint": texture(64, 97, 2, contrast=0.1),
+    "plateaus": plateaus(66, 131),
+    "noise": np.random.default_rng(3).integers(0, 256, (53, 64), dtype=np.uint8),
+    "narrow": np.random.default_rng(5).integers(0, 256, (90, 36), dtype=np.uint8),
+}
+
+
+@pytest.mark.parametrize("threshold", [1, 7, 40])
+@pytest.mark.parametrize("image", IMAGES.values(), ids=IMAGES)
+def test_corners_and_scores_equal_the_definition(image: np.ndarray, threshold: int) -> None:
+    positions, scores = _core.detect_corners(image, threshold)
+    expected_positions, expected_scores = corners.detect(image, threshold)
+    np.testing.assert_array_equal(positions, expected_positions)
+    np.testing.assert_array_equal(scores, expected_scores)
+
+
+def test_corners_agree_with_opencv() -> None:
+    image = texture(300, 400, 6)
+    positions, scores = _core.detect_corners(image, 10)
+    # OpenCV's response is the largest threshold at which it is a corner; it drops ties.
+    theirs = {
+        (round(k.pt[0]), round(k.pt[1])): k.response + 1
+        for k in cv2.FastFeatureDetector_create(10, True).detect(image, None)
+    }
+    ours = {(int(x), int(y)): int(s) for (x, y), s in zip(positions, scores, strict=True)}
+    inside = {
+        (x, y): score
+        for (x, y), score in theirs.items()
+        if 17 <= x < 400 - 17 and 17 <= y < 300 - 17
+    }
+    assert len(inside) > 500
+    assert inside.items() <= ours.items()
+
+
+@pytest.mark.parametrize("shape", [(34, 200), (200, 34), (1, 1), (3, 500)])
+def test_images_without_an_inside_have_no_corners(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    assert len(_core.detect_corners(noise, 5)[0]) == 0
+
+
+def test_order_takes_the_best_of_each_cell_in_turn() -> None:
+    image = texture(200, 300, 7)
+    positions, scores = _core.detect_corners(image, 5)
+    order = _core.order_corners(positions, scores, 300, 200, 32)
+    np.testing.assert_array_equal(order, corners.spread_order(positions, scores, 32))
+    first = positions[order[:40]] // 32
+    assert len(np.unique(first, axis=0)) == 40
+
+
+@pytest.mark.parametrize("shape", [(40, 97), (5, 5), (66, 200)])
+def test_smoothing_and_halving_equal_the_definition(shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(8).integers(0, 256, shape, dtype=np.uint8)
+    image[:4, :4] = 255
+    np.testing.assert_array_equal(_core.smooth(image), brief.smooth(image))
+    np.testing.assert_array_equal(_core.halve(image), brief.halve(image))
+
+
+def test_descriptors_equal_the_definition() -> None:
+    image = _core.smooth(texture(120, 160, 9))
+    positions, _ = _core.detect_corners(image, 5)
+    assert len(positions) > 50
+    expected = brief.describe(image, positions)
+    np.testing.assert_array_equal(_core.describe(image, positions), expected)
+
+
+def measure_all(left: np.ndarray, right: np.ndarray, positions: np.ndarray, **changed: float):
+    return _core.measure_disparities(left, right, positions, **{**STEREO, **changed})
+
+
+@pytest.mark.parametrize("noise", [0.0, 4.0])
+def test_disparities_equal_the_definition(noise: float) -> None:
+    left, right = shifted_pair(100, 220, 12.25, seed=10, noise=noise)
+    right[:, 100:110] = 40  # an occluder, so that some are refused
+    positions, _ = _core.detect_corners(left, 10)
+    measured, sigma = measure_all(left, right, positions)
+    accepted = 0
+    for (x, y), d, s in zip(positions, measured, sigma, strict=True):
+        expected = disparity.measure(left, right, int(x), int(y), **STEREO)
+        assert (d > 0) == (expected is not None)
+        if expected is not None:
+            accepted += 1
+            # float32 of the same sums in float64
+            np.testing.assert_allclose((d, s), expected, rtol=1e-5)
+    assert 0.4 * len(positions) < accepted < len(positions)
+
+
+@pytest.mark.parametrize("truth_px", [3.0, 17.25, 30.5, 41.75])
+def test_sub_pixel_disparity_is_true_and_its_sigma_honest(truth_px: float) -> None:
+    left, right = shifted_pair(240, 400, truth_px, seed=11, noise=8.0)
+    positions, _ = _core.detect_corners(left, 10)
+    measured, sigma = measure_all(left, right, positions, sigma_floor_px=0.0)
+    error = measured[measured > 0] - truth_px
+    predicted = sigma[measured > 0]
+    assert len(error) > 0.5 * len(positions)
+    assert abs(np.median(error)) < 0.02  # pull towards whole pixels, plus 3σ of the median
+    normalised = error / predicted
+    # Half way between two pixels the linear model leaves some residual: σ is somewhat too large.
+    assert 0.5 < 1.4826 * np.median(np.abs(normalised)) < 1.2
+
+
+def test_a_repeated_pattern_has_no_disparity() -> None:
+    tile = texture(120, 16, 12)
+    image = np.tile(tile, (1, 20))
+    positions, _ = _core.detect_corners(image, 5)
+    assert len(positions) > 50
+    assert not measure_all(image, image, positions)[0].any()
+
+
+def test_what_the_right_image_does_not_show_has_no_disparity() -> None:
+    left, other = texture(120, 300, 13), texture(120, 300, 14)
+    positions, _ = _core.detect_corners(left, 10)
+    measured, _ = measure_all(left, other, positions)
+    # Chance likeness passes uniqueness and mutual check now and then.
+    assert (measured > 0).mean() < 0.02
+
+
+def test_extract_is_its_steps_put_together() -> None:
+    left, right = shifted_pair(150, 260, 9.5, seed=15, noise=2.0)
+    settings = {**EXTRACT, "octaves": 1, "landmarks": 60}
+    pixels, measured, sigma, descriptors, octaves, found = _core.extract(
+        left, right, with_descriptors=True, **settings
+    )
+    positions, scores = _core.detect_corners(left, 7)
+    order = _core.order_corners(positions, scores, 260, 150, 32)
+    d, s = measure_all(left, right, positions)
+    taken = np.sort([i for i in order if d[i] > 0][:60])
+    assert found == len(positions)
+    assert len(taken) == 60
+    np.testing.assert_array_equal(pixels, positions[taken])
+    np.testing.assert_array_equal(measured, d[taken])
+    np.testing.assert_array_equal(sigma, s[taken])
+    expected = _core.describe(_core.smooth(left), positions[taken])
+    np.testing.assert_array_equal(descriptors, expected)
+    assert not octaves.any()
+
+
+def test_octaves_share_the_landmarks() -> None:
+    left, right = shifted_pair(300, 400, 9.5, seed=16)
+    result = _core.extract(left, right, with_descriptors=False, **{**EXTRACT, "octaves": 3})
+    # 1 : 1/2 : 1/4 of 150; here every octave fills its share.
+    assert np.bincount(result[4]).tolist() == [85, 43, 22]
+    assert result[3].shape == (0, 32)
+    assert np.abs(result[1] - 9.5).max() < 0.3
+
+
+def test_any_image_size_is_read_within_bounds() -> None:
+    rng = np.random.default_rng(17)
+    for height, width in [(1, 1), (2, 3), (35, 35), (36, 64), (64, 35), (35, 300), (77, 131)]:
+        image = rng.integers(0, 256, (height, width), dtype=np.uint8)
+        for most in (1, 60, 500):
+            _core.extract(
+                image,
+                image,
+                with_descriptors=True,
+                **{**EXTRACT, "octaves": 4, "fast_threshold": 1, "max_disparity_px": most},
+            )
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"octaves": 5}, "octaves must lie in 1 to 4"),
+        ({"landmarks": 0}, "landmarks must lie"),
+        ({"fast_threshold": 255}, "FAST threshold must lie"),
+        ({"max_disparity_px": 501}, "max_disparity_px must lie"),
+        ({"cell_px": 0}, "cell_px must be"),
+    ],
+)
+def test_settings_out_of_range_are_refused(changed: dict[str, int], said: str) -> None:
+    image = texture(64, 64, 18)
+    with pytest.raises(ValueError, match=said):
+        _core.extract(image, image, with_descriptors=True, **{**EXTRACT, **changed})
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    image = texture(64, 80, 19)
+    with pytest.raises(ValueError, match="differ in size"):
+        _core.extract(image, image[:, :64].copy(), with_descriptors=True, **EXTRACT)
+    with pytest.raises(ValueError, match="less than 17 px inside"):
+        _core.describe(image, np.array([[16, 20]], np.int16))
+
+
+def digest() -> str:
+    """Hash of all that extraction computes on two images."""
+    total = hashlib.sha256()
+    for left, right in (shifted_pair(200, 330, 21.75, seed=20, noise=5.0), (IMAGES["noise"],) * 2):
+        for part in _core.extract(left, right, with_descriptors=True, **EXTRACT)[:5]:
+            total.update(np.ascontiguousarray(part).tobytes())
+        total.update(_core.detect_corners(left, 3)[1].tobytes())
+    return total.hexdigest()
+
+
+@pytest.mark.parametrize("isa", ["generic", "v3"])
+def test_every_instruction_set_computes_the_same_bits(isa: str) -> None:
+    root = Path(__file__).parents[2]
+    run = subprocess.run(
+        [sys.executable, "-c", "from tests.core.test_extraction import digest; print(digest())"],
+        env={**os.environ, "ENGRAM_ISA": isa},
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "this machine has no more than" in run.stderr:
+        pytest.skip(f"this machine has no {isa}")
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == digest()

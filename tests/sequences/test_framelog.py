@@ -1,0 +1,321 @@
+"""Frame logs: what is written is read back, whatever happens in between."""
+
+import multiprocessing
+import os
+import signal
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from engram.errors import (
+    ConfigError,
+    EngramError,
+    FormatVersionError,
+    IncompatibleError,
+    InputError,
+    MapCorruptError,
+    MapLockedError,
+    SequenceError,
+)
+from engram.experience.model import Clock
+from engram.geometry import SE3, propagate_covariance
+from engram.odometry import OdometryStatus
+from engram.sequences import FrameLog, FrameLogWriter, LoggedFrame, open_sequence
+
+from .synthetic import (
+    PAIRS,
+    PERIOD_NS,
+    START_NS,
+    log_header,
+    logged,
+    only_engram_errors,
+    pair_hash,
+    picture,
+    stamp_ns,
+    write_log,
+)
+
+
+def assert_same_frame(found: LoggedFrame, wanted: LoggedFrame) -> None:
+    for name in ("stamp_ns", "camera", "descriptor", "frontend", "status"):
+        assert getattr(found.frame, name) == getattr(wanted.frame, name)
+    for name in type(wanted.frame.landmarks).__slots__:
+        np.testing.assert_array_equal(
+            getattr(found.frame.landmarks, name), getattr(wanted.frame.landmarks, name)
+        )
+    assert found.odometry.status is wanted.odometry.status
+    assert found.odometry.inliers == wanted.odometry.inliers
+    if wanted.odometry.prev_from_curr is not None:
+        np.testing.assert_array_equal(
+            found.odometry.prev_from_curr.matrix(), wanted.odometry.prev_from_curr.matrix()
+        )
+        np.testing.assert_array_equal(found.odometry.covariance, wanted.odometry.covariance)
+
+
+def test_what_is_written_is_read_back_bit_for_bit(tmp_path: Path) -> None:
+    log = open_sequence(write_log(tmp_path / "a.framelog"))
+    assert isinstance(log, FrameLog)
+    frames = list(log)
+    assert len(log) == len(frames) == PAIRS
+    for index, frame in enumerate(frames):
+        assert_same_frame(frame, logged(index))
+        # A thumbnail is for people: JPEG of noise, so only its shape is exact.
+        assert frame.frame.thumbnail.shape == picture(index, 0).shape
+    assert log.complete
+    assert log.header.to_json() == log_header().to_json()
+    assert (log.info.robot, log.info.zone, log.info.format) == (
+        "husky",
+        "Europe/Berlin",
+        "framelog",
+    )
+    assert log.first_pair_hash == pair_hash(0)
+
+
+def test_a_finished_log_is_one_file(tmp_path: Path) -> None:
+    write_log(tmp_path / "a.framelog")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.framelog"]
+
+
+def test_a_log_is_read_from_the_middle(tmp_path: Path) -> None:
+    log = FrameLog(write_log(tmp_path / "a.framelog"))
+    assert_same_frame(log.read(4), logged(4))
+    assert_same_frame(log.read(-1), logged(PAIRS - 1))
+    with pytest.raises(IndexError):
+        log.read(PAIRS)
+
+
+def test_steps_are_composed_over_skipped_frames(tmp_path: Path) -> None:
+    log = open_sequence(write_log(tmp_path / "a.framelog"), frames="1::2")
+    frames = list(log)
+    assert [frame.frame.stamp_ns for frame in frames] == [stamp_ns(1), stamp_ns(3), stamp_ns(5)]
+    assert frames[0].odometry.status is OdometryStatus.FIRST
+    first, second = logged(2).odometry, logged(3).odometry
+    motion = first.prev_from_curr @ second.prev_from_curr
+    np.testing.assert_allclose(
+        frames[1].odometry.prev_from_curr.matrix(), motion.matrix(), atol=1e-14
+    )
+    np.testing.assert_allclose(
+        frames[1].odometry.covariance,
+        propagate_covariance(first.prev_from_curr, first.covariance, second.covariance),
+        atol=1e-18,
+    )
+    assert frames[1].odometry.inliers == 102
+    assert log.first_pair_hash == pair_hash(1)
+
+
+def test_steps_of_three_compose_to_the_whole_way(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    last = list(open_sequence(path, frames="0::5"))[-1].odometry
+    whole = SE3.identity()
+    for index in range(1, 6):
+        whole = whole @ logged(index).odometry.prev_from_curr
+    np.testing.assert_allclose(last.prev_from_curr.matrix(), whole.matrix(), atol=1e-13)
+
+
+@pytest.mark.parametrize("failed", [2, 3, 4])
+def test_a_failed_step_makes_the_composed_step_fail(tmp_path: Path, failed: int) -> None:
+    frames = [
+        logged(index, OdometryStatus.NO_CONSENSUS if index == failed else None)
+        for index in range(PAIRS)
+    ]
+    path = write_log(tmp_path / "a.framelog", frames)
+    composed = [frame.odometry for frame in open_sequence(path, frames="1::3")]
+    assert composed[1].status is OdometryStatus.NO_CONSENSUS
+    assert composed[1].prev_from_curr is None
+    assert composed[1].inliers == 0
+
+
+def test_a_start_time_makes_a_relative_clock_utc(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+    write_log(path)
+    with pytest.raises(ConfigError, match="UTC already"):
+        open_sequence(path, start="2020-01-01T00:00:00Z")
+
+
+def test_recording_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+
+    def record_until_interrupted() -> None:
+        with FrameLogWriter(path, log_header()) as writer:
+            for index in range(3):
+                writer.append(logged(index), pair_hash(index))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record_until_interrupted()
+    interrupted = FrameLog(path)
+    assert len(interrupted) == 3
+    assert not interrupted.complete
+    with FrameLogWriter(path, log_header()) as writer:
+        assert writer.recorded == 3
+        assert writer.last_stamp_ns == stamp_ns(2)
+        for index in range(3, PAIRS):
+            writer.append(logged(index), pair_hash(index))
+    log = FrameLog(path)
+    assert log.complete
+    for index, frame in enumerate(log):
+        assert_same_frame(frame, logged(index))
+
+
+def _record_until_killed(path: Path) -> None:
+    writer = FrameLogWriter(path, log_header(), checkpoint_every=2)
+    for index in range(5):
+        writer.append(logged(index), pair_hash(index))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_killed_recording_keeps_its_checkpoints(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+    process = multiprocessing.get_context("spawn").Process(
+        target=_record_until_killed, args=(path,)
+    )
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    log = FrameLog(path)
+    assert len(list(log)) == 4
+    assert not log.complete
+    with FrameLogWriter(path, log_header()) as writer:
+        assert writer.recorded == 4
+
+
+def test_a_log_is_read_while_it_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+    with FrameLogWriter(path, log_header(), checkpoint_every=2) as writer:
+        for index in range(3):
+            writer.append(logged(index), pair_hash(index))
+        assert len(list(FrameLog(path))) == 2
+
+
+def test_two_writers_the_second_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+    with FrameLogWriter(path, log_header()) as writer:
+        writer.append(logged(0), pair_hash(0))
+        with pytest.raises(MapLockedError, match="another process writes"):
+            FrameLogWriter(path, log_header())
+        writer.append(logged(1), pair_hash(1))
+    assert len(FrameLog(path)) == 2
+
+
+def test_another_drive_is_not_appended(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    with pytest.raises(IncompatibleError, match="another"):
+        FrameLogWriter(path, log_header(frontend="other settings"))
+
+
+def test_frames_must_rise_and_fit(tmp_path: Path) -> None:
+    with FrameLogWriter(tmp_path / "a.framelog", log_header()) as writer:
+        writer.append(logged(1), pair_hash(1))
+        with pytest.raises(InputError, match="not behind"):
+            writer.append(logged(1), pair_hash(1))
+    with (
+        FrameLogWriter(tmp_path / "b.framelog", log_header(frontend="x")) as writer,
+        pytest.raises(InputError, match="another frontend"),
+    ):
+        writer.append(logged(0), pair_hash(0))
+
+
+def test_what_is_no_frame_log_is_refused(tmp_path: Path) -> None:
+    text = tmp_path / "a.framelog"
+    text.write_text("hello, this is no database at all, but it is long enough to be one" * 20)
+    with pytest.raises(SequenceError, match="no frame log"):
+        open_sequence(text)
+    with pytest.raises(SequenceError, match="no frame log"):
+        FrameLogWriter(text, log_header())
+    other = tmp_path / "b.framelog"
+    with sqlite3.connect(other) as database:
+        database.execute("CREATE TABLE frames (number INTEGER)")
+    database.close()
+    with pytest.raises(SequenceError, match="no frame log"):
+        open_sequence(other)
+    empty = tmp_path / "c.framelog"
+    empty.touch()
+    with pytest.raises(SequenceError, match="no frame log"):
+        open_sequence(empty)
+    with pytest.raises(SequenceError, match="there is no such"):
+        open_sequence(tmp_path / "d.framelog", format="framelog")
+
+
+def test_a_newer_format_is_refused(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    with sqlite3.connect(path) as database:
+        database.execute("PRAGMA user_version = 99")
+    database.close()
+    with pytest.raises(FormatVersionError, match=r"format 99.*upgrade"):
+        open_sequence(path)
+
+
+@pytest.mark.parametrize("keep", [0.3, 0.6, 0.95])
+def test_a_log_cut_short_is_told(tmp_path: Path, keep: float) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * keep)])
+    with pytest.raises(EngramError, match=r"a\.framelog"):
+        list(open_sequence(path))
+
+
+DAMAGES = [
+    "UPDATE frames SET landmarks = CAST(substr(landmarks, 1, 200) AS BLOB) WHERE number = 2",
+    "UPDATE frames SET thumbnail = x'ffd8' WHERE number = 2",
+    "UPDATE frames SET stamp_ns = stamp_ns + 1 WHERE number = 2",
+    "UPDATE frames SET landmarks = (SELECT landmarks FROM frames WHERE number = 3) "
+    "WHERE number = 2",
+    "UPDATE frames SET inliers = 7 WHERE number = 2",
+]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_frame_is_named_or_skipped(tmp_path: Path, damage: str) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    with sqlite3.connect(path) as database:
+        database.execute(damage)
+    database.close()
+    with pytest.raises(MapCorruptError, match=r"a\.framelog.*frame 2"):
+        list(open_sequence(path))
+    log = open_sequence(path, skip_bad=True)
+    assert [frame.frame.stamp_ns for frame in log] == [stamp_ns(i) for i in (0, 1, 3, 4, 5)]
+    assert log.skipped == 1
+    assert "frame 2" in log.skipped_reasons[0]
+
+
+def test_a_gap_in_the_numbers_is_told(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    with sqlite3.connect(path) as database:
+        database.execute("DELETE FROM frames WHERE number = 2")
+    database.close()
+    with pytest.raises(MapCorruptError, match="gaps"):
+        open_sequence(path)
+
+
+@settings(max_examples=60, deadline=None)
+@given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
+def test_a_flipped_byte_gives_our_errors_or_the_same_frames(
+    tmp_path_factory: pytest.TempPathFactory, place: float, flip: int
+) -> None:
+    path = write_log(tmp_path_factory.mktemp("flip") / "a.framelog")
+    content = bytearray(path.read_bytes())
+    content[int(place * len(content))] ^= flip
+    path.write_bytes(content)
+    read: list[LoggedFrame] = []
+    error = only_engram_errors(lambda: read.extend(open_sequence(path)))
+    for index, frame in enumerate(read):
+        assert_same_frame(frame, logged(index))
+    assert error is not None or len(read) == PAIRS
+
+
+def test_start_shifts_the_stamps_of_a_log_without_a_clock(tmp_path: Path) -> None:
+    header = log_header(info=replace(log_header().info, clock=Clock.RELATIVE))
+    path = tmp_path / "a.framelog"
+    with FrameLogWriter(path, header) as writer:
+        for index in range(PAIRS):
+            writer.append(logged(index), pair_hash(index))
+    log = open_sequence(path, start=START_NS + 5, frames="2:4")
+    assert log.info.clock is Clock.UTC
+    wanted = [START_NS + 5 + index * PERIOD_NS for index in (2, 3)]
+    assert [frame.frame.stamp_ns for frame in log] == wanted
+    assert log.stamps_ns.tolist() == wanted
