@@ -187,3 +187,18 @@ def path_scores(
     gamma: float,
     excluded: int = -1,
 ) -> NDArray[np.float64]: ...
+
+# --- window_ba
+
+def adjust_window(
+    camera: Sequence[float],
+    world_from_cam: NDArray[np.float64],
+    frame: NDArray[np.int32],
+    track: NDArray[np.int32],
+    stereo: NDArray[np.float32],
+    pixel_sigma_px: NDArray[np.float32],
+    disparity_sigma_px: NDArray[np.float32],
+    fixed: int,
+    iterations: int,
+    chi2: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float] | None: ...

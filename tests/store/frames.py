@@ -8,6 +8,7 @@ from engram.frontend import DescriptorKind, Frame, FrameStatus, Landmarks
 from engram.frontend.quantisation import LandmarkCodes, landmarks_from_codes
 from engram.geometry import StereoCamera
 
+FRONTEND = "f00dfeed0001"
 CAMERA = StereoCamera(
     fx=256.0, fy=256.5, cx=255.5, cy=191.5, baseline_m=0.54, width=512, height=384
 )
@@ -33,7 +34,7 @@ def frame(stamp_ns: int, *, count: int = 40, seed: int = 0, camera: StereoCamera
         camera,
         landmarks(count, seed, camera),
         DescriptorKind.BRIEF,
-        "f00dfeed0001",
+        FRONTEND,
         FrameStatus.OK,
         smooth.astype(np.uint8),
     )

@@ -5,7 +5,7 @@
 
 #include <optional>
 
-#include "bindings/arrays.hpp"
+#include "bindings/transforms.hpp"
 #include "kernels/pose.hpp"
 
 namespace nb = nanobind;
@@ -62,14 +62,7 @@ void check_shape(const Matrix &matrix, size_t rows, size_t columns, const char *
 
 RigidTransform rigid(const Matrix &matrix) {
   check_shape(matrix, 4, 4, "a transform must have shape (4, 4)");
-  const double *m = matrix.data();
-  return {{m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]}, {m[3], m[7], m[11]}};
-}
-
-std::vector<double> matrix_of(const RigidTransform &pose) {
-  const auto &r = pose.rotation;
-  const auto &t = pose.translation;
-  return {r[0], r[1], r[2], t[0], r[3], r[4], r[5], t[1], r[6], r[7], r[8], t[2], 0, 0, 0, 1};
+  return rigid_from(matrix.data());
 }
 
 auto rows_to_numpy(const std::vector<RowPair> &pairs) {
@@ -88,8 +81,10 @@ nb::object to_python(const PoseEstimate &estimate) {
   if (!estimate.found)
     return nb::none();
   const auto rows = rows_to_numpy(estimate.inliers);
+  std::vector<double> matrix;
+  append_matrix(estimate.reference_from_live, matrix);
   std::vector<double> covariance(estimate.covariance.begin(), estimate.covariance.end());
-  return nb::make_tuple(to_numpy(matrix_of(estimate.reference_from_live), {4, 4}),
+  return nb::make_tuple(to_numpy(std::move(matrix), {4, 4}),
                         to_numpy(std::move(covariance), {6, 6}), rows[0], rows[1]);
 }
 

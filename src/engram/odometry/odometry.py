@@ -1,0 +1,180 @@
+"""Visual odometry: frames in the order of time → the motion between them (SPEC §2.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError, IncompatibleError
+from engram.frontend import Frame, FrameStatus, Match, MatcherConfig, match_frames
+from engram.geometry import SE3, propagate_covariance
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.odometry.window import Window, WindowConfig
+
+_S_PER_NS = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    """Settings of `Odometry`.
+
+    Attributes:
+        matcher: how frames are matched.
+        window: the joint optimisation.
+        min_inliers: a motion that fewer landmarks agree on is no motion.
+        acceleration_m_s2, angular_acceleration_rad_s2: standard deviations of what constant
+            velocity leaves out. A car brakes with up to 8 m/s²; a head or a handlebar turns by
+            10 rad/s² and more.
+        max_prediction_s: over a longer interval the whole frame is searched.
+        keyframe_flow_px: a frame becomes a keyframe once its landmarks have moved so far in the
+            image (median). Below that, noise would outweigh motion.
+        keyframe_share: or once fewer than this share of the keyframe's landmarks is seen.
+    """
+
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    min_inliers: int = 15
+    acceleration_m_s2: float = 4.0
+    angular_acceleration_rad_s2: float = 5.0
+    max_prediction_s: float = 0.25
+    keyframe_flow_px: float = 10.0
+    keyframe_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        if self.min_inliers < 6:
+            raise ConfigError(f"odometry: min_inliers is {self.min_inliers}, must be ≥ 6")
+
+
+class Odometry:
+    """Estimates the motion of one camera from frame to frame.
+
+    Frames are matched to the last *keyframe* rather than to the previous frame: while the camera
+    rests or creeps the two differ, and then errors do not add up. The motion between successive
+    frames follows by composition.
+    """
+
+    def __init__(self, config: OdometryConfig | None = None) -> None:
+        self._config = config or OdometryConfig()
+        self._track: _Track | None = None
+
+    def step(self, frame: Frame) -> OdometryStep:
+        """The motion since the last usable frame; see `OdometryStep` for what a failure means.
+
+        Raises:
+            IncompatibleError: the camera or the kind of descriptors is not that of the frame
+                before.
+
+        Source: SPEC §2.4; [G16] §III-A.
+        """
+        if frame.status is not FrameStatus.OK:
+            return OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+        if self._track is None:
+            self._track = _Track(frame, self._config)
+            return OdometryStep(OdometryStatus.FIRST)
+
+        match = self._track.match(frame)
+        if match.inliers < self._config.min_inliers:
+            self._track = _Track(frame, self._config)
+            return OdometryStep(_reason(match))
+
+        keyframe_from_curr, covariance = self._track.place(frame, match)
+        return self._track.advance(frame, match, keyframe_from_curr, covariance)
+
+
+class _Track:
+    """An unbroken run of frames: the window, the last motion, the pose of the previous frame."""
+
+    def __init__(self, first: Frame, config: OdometryConfig) -> None:
+        self._config = config
+        self._window = Window(first, config.window, config.matcher)
+        self._stamp_ns = first.stamp_ns
+        self._keyframe_from_prev = SE3.identity()
+        self._covariance = np.zeros((6, 6))  # of keyframe_from_prev
+        self._velocity: NDArray[np.float64] | None = None  # (6,) tangent per second
+
+    def match(self, frame: Frame) -> Match:
+        """Match to the keyframe, and where that fails to the previous frame."""
+        if frame.camera != self._window.keyframe.camera:
+            raise IncompatibleError(
+                "the camera changed within a drive; begin another odometry for another camera"
+            )
+        match = self._match_to_keyframe(frame)
+        if match.inliers < self._config.min_inliers and self._window.has_newest:
+            self._keep_previous_as_keyframe()
+            match = self._match_to_keyframe(frame)
+        return match
+
+    def place(self, frame: Frame, match: Match) -> tuple[SE3, NDArray[np.float64]]:
+        """Pose of the frame in the keyframe, after joint optimisation, with covariance."""
+        self._window.add(frame, match)
+        return self._window.optimise(match)
+
+    def advance(
+        self,
+        frame: Frame,
+        match: Match,
+        keyframe_from_curr: SE3,
+        covariance: NDArray[np.float64],
+    ) -> OdometryStep:
+        """Make the frame the previous one; returns the motion that led to it."""
+        prev_from_keyframe = self._keyframe_from_prev.inverse()
+        prev_from_curr = prev_from_keyframe @ keyframe_from_curr
+        carry = prev_from_keyframe.adjoint()
+        step = OdometryStep(
+            OdometryStatus.OK,
+            prev_from_curr,
+            carry @ (self._covariance + covariance) @ carry.T,
+            match.inliers,
+        )
+        interval_s = (frame.stamp_ns - self._stamp_ns) * _S_PER_NS
+        self._velocity = prev_from_curr.log() / interval_s if interval_s > 0 else None
+        self._stamp_ns = frame.stamp_ns
+        self._keyframe_from_prev, self._covariance = keyframe_from_curr, covariance
+        if self._has_moved_on(frame, match):
+            self._keep_previous_as_keyframe()
+        return step
+
+    def _match_to_keyframe(self, frame: Frame) -> Match:
+        """Guided by constant velocity, and where that fails unguided."""
+        key, matcher = self._window.keyframe, self._config.matcher
+        seed = frame.stamp_ns % 2**64
+        prediction = self._predict(frame)
+        if prediction is not None:
+            match = match_frames(key, frame, matcher, seed, *prediction)
+            if match.inliers >= self._config.min_inliers:
+                return match
+        return match_frames(key, frame, matcher, seed)
+
+    def _predict(self, frame: Frame) -> tuple[SE3, NDArray[np.float64]] | None:
+        interval_s = (frame.stamp_ns - self._stamp_ns) * _S_PER_NS
+        if self._velocity is None or not 0 < interval_s <= self._config.max_prediction_s:
+            return None
+        prev_from_curr = SE3.exp(self._velocity * interval_s)
+        sigma = np.repeat(
+            [self._config.acceleration_m_s2, self._config.angular_acceleration_rad_s2], 3
+        )
+        noise = np.diag((sigma * interval_s**2) ** 2)
+        return (
+            self._keyframe_from_prev @ prev_from_curr,
+            propagate_covariance(self._keyframe_from_prev, self._covariance, noise),
+        )
+
+    def _keep_previous_as_keyframe(self) -> None:
+        self._window.keep_newest()
+        self._keyframe_from_prev = SE3.identity()
+        self._covariance = np.zeros((6, 6))
+
+    def _has_moved_on(self, frame: Frame, match: Match) -> bool:
+        before = self._window.keyframe.landmarks
+        if match.inliers < self._config.keyframe_share * min(len(before), len(frame.landmarks)):
+            return True
+        flow = frame.landmarks.pixels[match.live_rows] - before.pixels[match.reference_rows]
+        return bool(np.median(np.abs(flow).max(axis=1)) > self._config.keyframe_flow_px)
+
+
+def _reason(match: Match) -> OdometryStatus:
+    if match.reference_from_live is None:
+        return OdometryStatus.NO_CONSENSUS
+    return OdometryStatus.TOO_FEW_MATCHES

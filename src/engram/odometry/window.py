@@ -1,0 +1,188 @@
+"""The last few keyframes with the landmarks they share, optimised together [G16 §III-A]."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.errors import ConfigError
+from engram.frontend import Frame, Match, MatcherConfig
+from engram.geometry import SE3
+
+_UNSEEN = -1
+
+
+@dataclass(frozen=True, slots=True)
+class WindowConfig:
+    """Settings of the joint optimisation.
+
+    Attributes:
+        frames: frames optimised together, the newest included. More than seven gain little.
+        landmarks: at most so many, those with the longest tracks first; bounds the time.
+        iterations: at most so many. The start is good: one or two usually suffice.
+    """
+
+    frames: int = 7
+    landmarks: int = 500
+    iterations: int = 5
+
+    def __post_init__(self) -> None:
+        if self.frames < 2:
+            raise ConfigError(f"window: frames is {self.frames}, must be ≥ 2")
+        for name in ("landmarks", "iterations"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"window: {name} is {getattr(self, name)}, must be ≥ 1")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """A frame with its estimated pose.
+
+    Attributes:
+        frame: the frame.
+        world_from_cam: its pose.
+        tracks: (N,) int32, the track of each landmark, `_UNSEEN` where no other frame shares it.
+        stereo: (N, 3) float32, left u, left v, disparity, px.
+        pixel_sigma_px: (N,) float32.
+    """
+
+    frame: Frame
+    world_from_cam: SE3
+    tracks: NDArray[np.int32]
+    stereo: NDArray[np.float32]
+    pixel_sigma_px: NDArray[np.float32]
+
+
+class Window:
+    """Poses live in a world of the window's own: the camera of the frame it was begun with.
+
+    The oldest pose is held, the others move. The newest frame gives way to the next one unless
+    `keep_newest` was called, so that the window spans motion, not time.
+    """
+
+    def __init__(self, first: Frame, config: WindowConfig, matcher: MatcherConfig) -> None:
+        self._config = config
+        self._matcher = matcher
+        self._keyframes = [self._place(first, SE3.identity())]
+        self._newest: _Placed | None = None
+        self._next_track = 0
+
+    @property
+    def keyframe(self) -> Frame:
+        """The newest keyframe, to which the next frame is matched."""
+        return self._keyframes[-1].frame
+
+    @property
+    def has_newest(self) -> bool:
+        """Whether the newest frame is none of the keyframes."""
+        return self._newest is not None
+
+    def add(self, frame: Frame, match: Match) -> None:
+        """Put a frame that was matched to `keyframe` in the place of the newest one."""
+        assert match.reference_from_live is not None
+        key = self._keyframes[-1]
+        tracks = key.tracks.copy()
+        fresh = match.reference_rows[tracks[match.reference_rows] == _UNSEEN]
+        tracks[fresh] = np.arange(self._next_track, self._next_track + len(fresh), dtype=np.int32)
+        self._next_track += len(fresh)
+        self._keyframes[-1] = replace(key, tracks=tracks)
+        self._newest = self._place(frame, key.world_from_cam @ match.reference_from_live)
+        self._newest.tracks[match.live_rows] = tracks[match.reference_rows]
+
+    def keep_newest(self) -> None:
+        """Make the newest frame a keyframe; the oldest one leaves when the window is full."""
+        assert self._newest is not None
+        self._keyframes = [*self._keyframes, self._newest][-(self._config.frames - 1) :]
+        self._newest = None
+
+    def optimise(self, match: Match) -> tuple[SE3, NDArray[np.float64]]:
+        """Adjust all poses but the oldest, and all landmarks.
+
+        Returns:
+            keyframe_from_newest and its covariance (6, 6); as `match` has them where the landmarks
+            do not determine the window.
+
+        Source: SPEC §2.4.
+        """
+        assert self._newest is not None
+        assert match.reference_from_live is not None
+        assert match.covariance is not None
+        placed = [*self._keyframes, self._newest]
+        adjusted = self._adjust(placed)
+        if adjusted is None:
+            return match.reference_from_live, match.covariance
+        matrices, covariance = adjusted
+        moved = [
+            replace(each, world_from_cam=SE3(matrix[:3, :3], matrix[:3, 3]))
+            for each, matrix in zip(placed, matrices, strict=True)
+        ]
+        self._keyframes, self._newest = moved[:-1], moved[-1]
+        keyframe_from_world = moved[-2].world_from_cam.inverse()
+        carry = keyframe_from_world.adjoint()
+        return (
+            keyframe_from_world @ moved[-1].world_from_cam,
+            carry @ _covariance_of_last_step(covariance) @ carry.T,
+        )
+
+    def _place(self, frame: Frame, world_from_cam: SE3) -> _Placed:
+        marks = frame.landmarks
+        octave_scale = self._matcher.octave_scale ** marks.octaves.astype(np.float32)
+        return _Placed(
+            frame,
+            world_from_cam,
+            tracks=np.full(len(marks), _UNSEEN, dtype=np.int32),
+            stereo=np.column_stack([marks.pixels, marks.disparity_px]),
+            pixel_sigma_px=(self._matcher.pixel_sigma_px * octave_scale).astype(np.float32),
+        )
+
+    def _adjust(
+        self, placed: list[_Placed]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+        track = np.concatenate([each.tracks for each in placed])
+        used = np.flatnonzero(track != _UNSEEN)
+        numbered = _number_longest(track[used], self._config.landmarks)
+        used, numbered = used[numbered != _UNSEEN], numbered[numbered != _UNSEEN]
+        sizes = [len(each.tracks) for each in placed]
+        frame_of = np.repeat(np.arange(len(placed), dtype=np.int32), sizes)
+        camera = placed[-1].frame.camera
+        adjusted = _core.adjust_window(
+            (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m),
+            np.array([each.world_from_cam.matrix() for each in placed]),
+            frame_of[used],
+            numbered,
+            np.concatenate([each.stereo for each in placed])[used],
+            np.concatenate([each.pixel_sigma_px for each in placed])[used],
+            np.concatenate([each.frame.landmarks.disparity_sigma_px for each in placed])[used],
+            fixed=1,
+            iterations=self._config.iterations,
+            chi2=self._matcher.chi2,
+        )
+        return None if adjusted is None else adjusted[:2]
+
+
+def _number_longest(track: NDArray[np.int32], most: int) -> NDArray[np.int32]:
+    """Number the tracks from 0; `_UNSEEN` for those seen once and, beyond `most`, the shortest."""
+    if len(track) == 0:
+        return track
+    track = track - track.min()
+    length = np.bincount(track)
+    kept = np.argsort(-length, kind="stable")[:most]
+    kept = kept[length[kept] >= 2]
+    number = np.full(len(length), _UNSEEN, dtype=np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    return number[track]
+
+
+def _covariance_of_last_step(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance, in the world, of the last pose relative to the one before it.
+
+    The last block belongs to the newest frame; without a block before it the keyframe is held.
+    """
+    newest = covariance[-6:, -6:]
+    if len(covariance) == 6:
+        return newest
+    key, cross = covariance[-12:-6, -12:-6], covariance[-12:-6, -6:]
+    return newest + key - cross - cross.T

@@ -1,0 +1,74 @@
+"""What the store asks of a database: SQLite is one (`sqlite`), PostgreSQL another."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Protocol
+
+from sqlalchemy import Connection, Executable, Table
+
+from engram.store.lock import Holder
+
+
+class Lock(Protocol):
+    """The right to be the only writer."""
+
+    @property
+    def holder(self) -> Holder:
+        """Who has it."""
+        ...
+
+    def release(self) -> None:
+        """Let others write."""
+        ...
+
+
+class Database(Protocol):
+    """Connections, transactions, errors and the few statements that differ between databases.
+
+    All errors that a connection raises inside `reading` and `writing` come out as `MapError`s.
+    """
+
+    @property
+    def name(self) -> str:
+        """Path or address, for messages."""
+        ...
+
+    def reading(self) -> AbstractContextManager[Connection]:
+        """A connection for selects, from any thread."""
+        ...
+
+    def writing(self) -> AbstractContextManager[Connection]:
+        """One durable transaction: all of it, or nothing if the block raises."""
+        ...
+
+    def lock_for_writing(self) -> Lock:
+        """Become the only writer.
+
+        Raises:
+            MapLockedError: somebody else is.
+        """
+        ...
+
+    def writer(self) -> Holder | None:
+        """Who writes now."""
+        ...
+
+    def replace(self, table: Table, key: tuple[str, ...]) -> Executable:
+        """An insert that takes the place of a row with the same values in the columns `key`.
+
+        The row takes on all other values, its primary key too.
+        """
+        ...
+
+    def integrity_problems(self) -> list[str]:
+        """What the database itself finds wrong with its file."""
+        ...
+
+    def size_bytes(self) -> int:
+        """Bytes on disk."""
+        ...
+
+    def close(self) -> None:
+        """Give back all connections."""
+        ...

@@ -1,0 +1,198 @@
+"""Frames of a map's nodes, read when they are asked for."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import bindparam, select
+
+from engram.errors import InputError, MapCorruptError, MapError
+from engram.experience.model import NodeId
+from engram.frontend import DescriptorKind, Frame, FrameStatus
+from engram.geometry import StereoCamera
+from engram.store.blob import blob_hash, decode_landmarks, decode_thumbnail
+from engram.store.database import Database
+from engram.store.reading import load_cameras, load_frontends
+from engram.store.rows import Row, verified
+from engram.store.schema import frames, nodes
+from engram.store.view import View
+
+DEFAULT_CACHE_BYTES = 256 * 2**20
+# Of a landmark in memory: 2 + 1 + 1 + 3 floats, descriptor, octave.
+_BYTES_PER_LANDMARK = 61
+_BYTES_PER_FRAME = 1500
+
+
+class FrameReader:
+    """A `LandmarkSource` over a map: bounded cache, read-ahead on a thread of its own, thread-safe.
+
+    Args:
+        database: where the map is.
+        view: which nodes are seen.
+        cache_bytes: how much the decoded frames may take; the least recently used go first.
+    """
+
+    def __init__(
+        self, database: Database, view: View, cache_bytes: int = DEFAULT_CACHE_BYTES
+    ) -> None:
+        self._database = database
+        self._cache_bytes = cache_bytes
+        self._cache: OrderedDict[NodeId, Frame] = OrderedDict()
+        self._cached_bytes = 0
+        self._held: dict[NodeId, Frame] = {}
+        self._lock = threading.Lock()
+        self._wanted: deque[NodeId] = deque()
+        self._wanted_changed = threading.Condition(self._lock)
+        self._thread: threading.Thread | None = None
+        self._closed = False
+        self.set_view(view)
+
+    def frame(self, node: NodeId) -> Frame:
+        """The frame that was saved as `node`, without its thumbnail.
+
+        Raises:
+            InputError: the map has no such node, or not yet in this revision.
+            MapCorruptError: its bytes do not match their hash.
+        """
+        with self._lock:
+            frame = self._held.get(node) or self._cache.get(node)
+            if frame is not None:
+                if node in self._cache:
+                    self._cache.move_to_end(node)
+                return frame
+        frame = self._read(node)
+        self._remember(node, frame)
+        return frame
+
+    def thumbnail(self, node: NodeId) -> NDArray[np.uint8] | None:
+        """The (h, w) uint8 grey picture of a node; None if none was saved.
+
+        Raises:
+            InputError: the map has no such node.
+            MapCorruptError: its bytes are damaged.
+        """
+        with self._lock:
+            held = self._held.get(node)
+        if held is not None:
+            return held.thumbnail
+        key = self._node_row(node)[0]["key"]
+        with self._database.reading() as connection:
+            rows = connection.execute(select(frames).where(frames.c.node == key))
+            row = next(verified(frames, rows), None)
+        if row is None:
+            raise MapCorruptError(f"node {node}: its frame is missing")
+        return None if row["thumbnail"] is None else decode_thumbnail(row["thumbnail"])
+
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        """Read these ahead; a newer call takes the place of what an older one still had to do."""
+        with self._wanted_changed:
+            self._wanted = deque(
+                node for node in nodes if node not in self._cache and node not in self._held
+            )
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(
+                    target=self._read_ahead, name="engram-read-ahead", daemon=True
+                )
+                self._thread.start()
+            self._wanted_changed.notify()
+
+    def hold(self, node: NodeId, frame: Frame) -> None:
+        """Keep the frame of a node that is not yet in the database."""
+        with self._lock:
+            self._held[node] = frame
+
+    def release(self, stored: list[NodeId]) -> None:
+        """These are in the database now: keep them no longer than any other."""
+        for node in stored:
+            with self._lock:
+                frame = self._held.pop(node, None)
+            if frame is not None:
+                self._remember(node, frame)
+
+    def forget(self) -> None:
+        """Drop all that is held or cached."""
+        with self._lock:
+            self._held.clear()
+            self._cache.clear()
+            self._cached_bytes = 0
+
+    def set_view(self, view: View) -> None:
+        """See the map as of another revision."""
+        with self._database.reading() as connection:
+            self._revisions = frozenset(connection.execute(view.revision_keys()).scalars())
+            self._hidden = frozenset(connection.execute(view.hidden_keys(nodes)).scalars())
+            self._cameras: dict[int, StereoCamera] = load_cameras(connection)
+            self._frontends: dict[int, tuple[DescriptorKind, str]] = load_frontends(connection)
+
+    def close(self) -> None:
+        """End the read-ahead thread."""
+        with self._wanted_changed:
+            self._closed = True
+            self._wanted.clear()
+            self._wanted_changed.notify()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _read(self, node: NodeId) -> Frame:
+        row, blob = self._node_row(node)
+        camera = self._cameras.get(row["camera"])
+        frontend = self._frontends.get(row["frontend"])
+        if camera is None or frontend is None or blob is None:
+            raise MapCorruptError(f"node {node}: its camera, front-end or frame is missing")
+        if blob_hash(blob) != row["landmark_hash"]:
+            raise MapCorruptError(f"node {node}: its landmarks are not those that were saved")
+        try:
+            landmarks = decode_landmarks(blob, camera)
+            status = FrameStatus(row["status"])
+        except (MapCorruptError, ValueError) as error:
+            raise MapCorruptError(f"node {node}: {error}") from error
+        return Frame(row["stamp_ns"], camera, landmarks, frontend[0], frontend[1], status)
+
+    def _node_row(self, node: NodeId) -> tuple[Row, bytes | None]:
+        with self._database.reading() as connection:
+            found = connection.execute(_NODE_WITH_LANDMARKS, {"uuid": node.bytes}).first()
+        if found is None:
+            raise InputError(f"the map has no node {node}")
+        row = next(verified(nodes, [found]))
+        if row["revision"] not in self._revisions or row["key"] in self._hidden:
+            raise InputError(f"node {node} is not part of the map at this revision")
+        return row, found[-1]
+
+    def _remember(self, node: NodeId, frame: Frame) -> None:
+        with self._lock:
+            if node in self._cache:
+                return
+            self._cache[node] = frame
+            self._cached_bytes += _size_bytes(frame)
+            while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+                _, oldest = self._cache.popitem(last=False)
+                self._cached_bytes -= _size_bytes(oldest)
+
+    def _read_ahead(self) -> None:
+        while True:
+            with self._wanted_changed:
+                self._wanted_changed.wait_for(lambda: self._wanted or self._closed)
+                if self._closed:
+                    return
+                node = self._wanted.popleft()
+                if node in self._cache or node in self._held:
+                    continue
+            try:
+                self.frame(node)
+            except (MapError, InputError):
+                continue  # only a hint: who really asks for this node gets the same error
+
+
+_NODE_WITH_LANDMARKS = (
+    select(*nodes.columns, frames.c.landmarks)
+    .select_from(nodes.outerjoin(frames, frames.c.node == nodes.c.key))
+    .where(nodes.c.uuid == bindparam("uuid"))
+    .order_by(nodes.c.key)
+)
+
+
+def _size_bytes(frame: Frame) -> int:
+    return _BYTES_PER_FRAME + _BYTES_PER_LANDMARK * len(frame.landmarks)

@@ -1,0 +1,433 @@
+"""A map on disk: open it, read it, add sessions to it, look at its history."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from sqlalchemy import Connection, func, insert, select
+
+from engram import __version__
+from engram.errors import IncompatibleError, InputError, MapError, RevisionError
+from engram.experience.model import Session, SessionId, path_id
+from engram.frontend import DescriptorKind
+from engram.geometry import StereoCamera
+from engram.store import reading
+from engram.store.collecting import collect_abandoned
+from engram.store.database import Database, Lock
+from engram.store.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
+from engram.store.keys import KeyBook
+from engram.store.records import (
+    InterruptedSession,
+    MapContents,
+    MapInfo,
+    Revision,
+    SessionState,
+    StoredSession,
+)
+from engram.store.rows import (
+    Row,
+    node_from_row,
+    sealed,
+    session_from_row,
+    session_row,
+    to_json,
+    verified,
+)
+from engram.store.schema import nodes, path_entries, paths, revisions, sessions
+from engram.store.session_writer import SessionWriter, change_revision
+from engram.store.sqlite import SqliteDatabase
+from engram.store.view import View, head
+
+
+class MapStore:
+    """A map, read as of one revision. A context manager; safe to use from several threads.
+
+    Readers never wait for the writer, nor it for them: they see the revisions that were committed
+    when they opened the map, whatever is added meanwhile.
+
+    Attributes:
+        frames: the frames of its nodes: a `LandmarkSource`.
+    """
+
+    def __init__(
+        self, database: Database, *, at: int | None, cache_bytes: int = DEFAULT_CACHE_BYTES
+    ) -> None:
+        self._database = database
+        with database.reading() as connection:
+            newest = head(connection)
+        if at is not None and not 0 <= at <= newest:
+            raise RevisionError(f"{database.name} has revisions 1 to {newest}, not {at}")
+        self._view = View(newest if at is None else at)
+        self.frames = FrameReader(database, self._view, cache_bytes)
+
+    @staticmethod
+    def create(location: Path | str) -> WritableMapStore:
+        """Make an empty map and open it for writing.
+
+        Raises:
+            InputError: something is there already, or the folder is not.
+            MapError: it cannot be written.
+        """
+        path = Path(location)
+        SqliteDatabase.create(path)
+        return MapStore.open_for_writing(path)
+
+    @staticmethod
+    def open(
+        location: Path | str, *, at: int | None = None, cache_bytes: int = DEFAULT_CACHE_BYTES
+    ) -> MapStore:
+        """Open a map for reading.
+
+        Args:
+            location: path of the map file.
+            at: number of the revision to see; None for the newest, 0 for the map before the first.
+            cache_bytes: how much memory decoded frames may take.
+
+        Raises:
+            NotAMapError: nothing is there, or something else.
+            FormatVersionError: a newer Engram wrote it.
+            MapCorruptError: it is damaged so that it cannot be read.
+            RevisionError: it has no such revision.
+        """
+        return MapStore(SqliteDatabase(Path(location)), at=at, cache_bytes=cache_bytes)
+
+    @staticmethod
+    def open_for_writing(
+        location: Path | str, *, cache_bytes: int = DEFAULT_CACHE_BYTES
+    ) -> WritableMapStore:
+        """Open a map for adding to it: its only writer until `close`.
+
+        Raises:
+            MapLockedError: another process writes to it; names process and host.
+            MapError: as `open`, or the file is read-only.
+        """
+        return WritableMapStore(SqliteDatabase(Path(location)), cache_bytes=cache_bytes)
+
+    @property
+    def revision(self) -> int:
+        """Number of the newest revision that is seen; 0 for an empty map."""
+        return self._view.at
+
+    def load(self) -> MapContents:
+        """Everything but the landmarks: for a writer, what its open session has checkpointed too.
+
+        Raises:
+            MapCorruptError: a row does not match its checksum or points at nothing.
+        """
+        with self._database.reading() as connection:
+            return reading.load(connection, self._view)
+
+    def log(self) -> list[Revision]:
+        """The committed revisions that are seen, oldest first."""
+        with self._database.reading() as connection:
+            return reading.log(connection, self._view)
+
+    def info(self) -> MapInfo:
+        """The map in numbers."""
+        with self._database.reading() as connection:
+            return reading.info(connection, self._view, self._database.size_bytes())
+
+    def statistics(self) -> dict[str, dict[str, Any]]:
+        """The newest of every statistic of the map, by name."""
+        with self._database.reading() as connection:
+            return reading.load_statistics(connection, self._view)
+
+    def session_state(self, session: SessionId) -> SessionState:
+        """What the map knows of a session: ask before handing one in."""
+        with self._database.reading() as connection:
+            found = _session_and_revision(connection, session)
+        if found is None or found[1]["status"] == "abandoned":
+            return SessionState.ABSENT
+        _, revision = found
+        if revision["status"] == "committed":
+            seen = revision["number"] <= self._view.at
+            return SessionState.COMMITTED if seen else SessionState.ABSENT
+        return SessionState.OPEN if self._is_alive(revision) else SessionState.INTERRUPTED
+
+    def interrupted(self) -> list[InterruptedSession]:
+        """Sessions whose writer is gone before it committed, oldest first."""
+        query = select(revisions).where(revisions.c.status == "open").order_by(revisions.c.key)
+        with self._database.reading() as connection:
+            opened = list(verified(revisions, connection.execute(query)))
+            gone = [row for row in opened if not self._is_alive(row)]
+            return [one for row in gone for one in _interrupted(connection, row)]
+
+    def close(self) -> None:
+        """Give back files and threads. A session that is still open becomes interrupted."""
+        self.frames.close()
+        self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _is_alive(self, revision: Row) -> bool:
+        holder = self._database.writer()
+        return holder is not None and holder.token == revision["writer"]
+
+
+class WritableMapStore(MapStore):
+    """A map and the right to be its only writer, until `close`."""
+
+    def __init__(self, database: Database, *, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
+        self._lock: Lock = database.lock_for_writing()
+        try:
+            super().__init__(database, at=None, cache_bytes=cache_bytes)
+            self._keys = KeyBook(database, self._view)
+        except BaseException:
+            self._lock.release()
+            raise
+        self._open_session: SessionWriter | None = None
+        self._holder = self._lock.holder
+
+    def begin_session(
+        self,
+        session: Session,
+        camera: StereoCamera,
+        *,
+        descriptor: DescriptorKind,
+        frontend: str,
+        author: str,
+        configuration: Mapping[str, Any],
+        message: str = "",
+    ) -> SessionWriter:
+        """Begin to write one drive, in a revision of its own.
+
+        Args:
+            session: the drive; its id tells whether the map has it already (`session_state`).
+            camera: the session's camera.
+            descriptor: kind of the descriptors of all its frames.
+            frontend: hash of the front-end that makes them.
+            author: who, or which robot.
+            configuration: the resolved settings, plain JSON data.
+            message: what `log` shows.
+
+        Raises:
+            RevisionError: the map has this session already, committed or interrupted, or another
+                session is being written.
+            IncompatibleError: the map's frames have another kind of descriptor.
+            InputError: the camera is not the session's, or the configuration is no JSON data.
+        """
+        self._check_none_open()
+        if session.camera != camera.id:
+            raise InputError(f"session {session.id} has camera {session.camera}, not {camera.id}")
+        self._check_new(session)
+        opened = self._revision_row(author, message, to_json(configuration))
+        with self._database.writing() as connection:
+            collect_abandoned(connection)  # whose UUIDs may come again
+            self._check_descriptor(connection, descriptor)
+            connection.execute(insert(revisions), [sealed(revisions, opened)])
+            camera_key = self._keys.ensure_camera(connection, camera)
+            frontend_key = self._keys.ensure_frontend(connection, descriptor, frontend)
+            self._insert_session(connection, session, opened["key"], camera_key, frontend_key)
+        return self._writer(session.id, StoredSession((), None, 0, 0))
+
+    def resume_session(self, session: SessionId) -> SessionWriter:
+        """Go on with an interrupted session; `SessionWriter.stored` says where.
+
+        Raises:
+            RevisionError: the map has no interrupted session of this id.
+            IncompatibleError: meanwhile another kind of descriptor came into the map.
+        """
+        self._check_none_open()
+        row, revision = self._interrupted_rows(session)
+        with self._database.writing() as connection:
+            change_revision(
+                connection,
+                revision["key"],
+                host=self._holder.host,
+                pid=self._holder.pid,
+                writer=self._holder.token,
+            )
+            stored = _stored_session(connection, View(self._view.at, revision["key"]), row)
+        return self._writer(session, stored)
+
+    def seal(self, session: SessionId) -> Revision:
+        """Commit what an interrupted session had checkpointed.
+
+        Raises:
+            RevisionError: the map has no interrupted session of this id.
+            IncompatibleError: meanwhile another kind of descriptor came into the map.
+        """
+        return self.resume_session(session).commit()
+
+    def close(self) -> None:
+        """Give back files, threads and the right to write."""
+        try:
+            super().close()
+        finally:
+            self._lock.release()
+
+    def _revision_row(self, author: str, message: str, configuration: str) -> Row:
+        return {
+            "key": self._keys.next(revisions),
+            "number": None,
+            "status": "open",
+            "parent": None,
+            "author": author,
+            "message": message,
+            "tool_version": __version__,
+            "configuration": configuration,
+            "contents": "{}",
+            "opened_ns": time.time_ns(),
+            "committed_ns": None,
+            "host": self._holder.host,
+            "pid": self._holder.pid,
+            "writer": self._holder.token,
+        }
+
+    def _insert_session(
+        self, connection: Connection, session: Session, revision: int, camera: int, frontend: int
+    ) -> None:
+        """The session and its path."""
+        key = self._keys.next(sessions)
+        row = session_row(session, key, revision, camera, frontend)
+        connection.execute(insert(sessions), [sealed(sessions, row)])
+        path: Row = {
+            "key": self._keys.next(paths),
+            "uuid": path_id(session.id).bytes,
+            "revision": revision,
+            "session": key,
+            "partial": 0,
+        }
+        connection.execute(insert(paths), [sealed(paths, path)])
+
+    def _writer(self, session: SessionId, stored: StoredSession) -> SessionWriter:
+        with self._database.reading() as connection:
+            found = _session_and_revision(connection, session)
+            assert found is not None
+            row, revision = found
+            camera = reading.load_cameras(connection)[row["camera"]]
+            path_query = select(paths.c.key).where(paths.c.uuid == path_id(session).bytes)
+            path_key = connection.execute(path_query.order_by(paths.c.key)).scalar_one()
+            frontend = reading.load_frontends(connection)[row["frontend"]]
+        self._see(View(self._view.at, revision["key"]))
+        self._open_session = SessionWriter(
+            self._database,
+            self._keys,
+            self.frames,
+            session=session_from_row(row, camera.id),
+            revision_key=revision["key"],
+            session_key=row["key"],
+            path_key=path_key,
+            camera_key=row["camera"],
+            frontend=(row["frontend"], *frontend),
+            stored=stored,
+            on_end=self._session_ended,
+        )
+        return self._open_session
+
+    def _session_ended(self) -> None:
+        self._open_session = None
+        with self._database.reading() as connection:
+            newest = head(connection)
+        self._see(View(newest))
+
+    def _see(self, view: View) -> None:
+        self._view = view
+        self._keys.set_view(view)
+        self.frames.set_view(view)
+
+    def _check_none_open(self) -> None:
+        if self._open_session is not None:
+            raise RevisionError(
+                f"session {self._open_session.session.id} is being written; commit or abandon it"
+            )
+
+    def _check_new(self, session: Session) -> None:
+        state = self.session_state(session.id)
+        if state is SessionState.COMMITTED:
+            raise RevisionError(f"{self._database.name} has session {session.id} already")
+        if state is not SessionState.ABSENT:
+            raise RevisionError(
+                f"session {session.id} was interrupted; resume it or seal what is there"
+            )
+
+    def _check_descriptor(self, connection: Connection, descriptor: DescriptorKind) -> None:
+        present = reading.descriptor_of(connection, self._view)
+        if present not in {None, descriptor}:
+            raise IncompatibleError(
+                f"{self._database.name} holds {present} descriptors, this session {descriptor}; "
+                "the two cannot be matched: extract the session again, or make another map"
+            )
+
+    def _interrupted_rows(self, session: SessionId) -> tuple[Row, Row]:
+        with self._database.reading() as connection:
+            found = _session_and_revision(connection, session)
+            if found is None or found[1]["status"] != "open":
+                raise RevisionError(
+                    f"{self._database.name} has no interrupted session {session}; "
+                    f"it is {self.session_state(session)}"
+                )
+            self._check_descriptor(
+                connection, reading.load_frontends(connection)[found[0]["frontend"]][0]
+            )
+        return found
+
+
+def _session_and_revision(connection: Connection, session: SessionId) -> tuple[Row, Row] | None:
+    """Rows of a session and of the revision that brought it, whatever its status."""
+    query = select(sessions).where(sessions.c.uuid == session.bytes).order_by(sessions.c.key)
+    row = next(verified(sessions, connection.execute(query)), None)
+    if row is None:
+        return None
+    query = select(revisions).where(revisions.c.key == row["revision"]).order_by(revisions.c.key)
+    revision = next(verified(revisions, connection.execute(query)), None)
+    if revision is None:
+        raise MapError(f"session {session}: its revision is missing; run engram check")
+    return row, revision
+
+
+def _interrupted(connection: Connection, revision: Row) -> list[InterruptedSession]:
+    """The sessions of one open revision: one, or none for a revision of another kind."""
+    query = select(sessions).where(sessions.c.revision == revision["key"]).order_by(sessions.c.key)
+    cameras = reading.load_cameras(connection)
+    found = []
+    for row in verified(sessions, connection.execute(query)):
+        saved = select(func.count(), func.max(nodes.c.stamp_ns)).where(
+            nodes.c.session == row["key"]
+        )
+        count, last_stamp_ns = connection.execute(saved).one()
+        found.append(
+            InterruptedSession(
+                session=session_from_row(row, cameras[row["camera"]].id),
+                author=revision["author"],
+                host=revision["host"],
+                pid=revision["pid"],
+                opened_ns=revision["opened_ns"],
+                nodes=count,
+                last_stamp_ns=last_stamp_ns,
+            )
+        )
+    return found
+
+
+def _stored_session(connection: Connection, view: View, session: Row) -> StoredSession:
+    cameras = reading.load_cameras(connection)
+    session_id = session_from_row(session, cameras[session["camera"]].id).id
+    query = select(nodes).where(nodes.c.session == session["key"]).order_by(nodes.c.key)
+    saved = tuple(
+        node_from_row(row, session_id, cameras[row["camera"]].id)
+        for row in verified(nodes, connection.execute(query))
+    )
+    steps = (
+        select(func.max(path_entries.c.sequence), func.max(path_entries.c.stamp_ns))
+        .select_from(path_entries.join(paths, paths.c.key == path_entries.c.path))
+        .where(paths.c.session == session["key"])
+    )
+    last_sequence, last_entry_ns = connection.execute(steps).one()
+    made = reading.attempt_tables(connection, view).get(session["key"])
+    stamps = [node.stamp_ns for node in saved]
+    return StoredSession(
+        nodes=saved,
+        last_stamp_ns=max(
+            [*stamps, *([] if last_entry_ns is None else [last_entry_ns])], default=None
+        ),
+        next_sequence=0 if last_sequence is None else last_sequence + 1,
+        next_iteration=0 if made is None else int(made.columns["iteration"].max()) + 1,
+    )

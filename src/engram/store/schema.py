@@ -1,0 +1,238 @@
+"""The tables of a map. Prose: docs/format.md.
+
+Every row carries the key of the revision that brought it (cameras and front-ends, which are named
+by what they are, do not) and a checksum over its other columns. References between rows are not
+declared as foreign keys: collecting abandoned rows would have to search all referring tables;
+`engram check` verifies them instead. Keys are 64-bit integers, given out in order of writing.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import (
+    REAL,
+    BigInteger,
+    Column,
+    Double,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+from sqlalchemy.schema import SchemaItem
+from sqlalchemy.types import TypeEngine
+
+FORMAT_VERSION = 1
+
+# SQLite's INTEGER and REAL are 64 bits wide.
+_INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
+_FLOAT64: TypeEngine[float] = Double().with_variant(REAL(), "sqlite")
+
+metadata = MetaData()
+
+
+def _key() -> Column[int]:
+    return Column("key", _INT64, primary_key=True, autoincrement=False)
+
+
+def _int(name: str, *, nullable: bool = False) -> Column[int]:
+    return Column(name, _INT64, nullable=nullable)
+
+
+def _float(name: str, *, nullable: bool = False) -> Column[float]:
+    return Column(name, _FLOAT64, nullable=nullable)
+
+
+def _text(name: str, *, nullable: bool = False) -> Column[str]:
+    return Column(name, Text(), nullable=nullable)
+
+
+def _bytes(name: str, *, nullable: bool = False) -> Column[bytes]:
+    return Column(name, LargeBinary(), nullable=nullable)
+
+
+def _table(name: str, *items: SchemaItem) -> Table:
+    return Table(name, metadata, *items, _int("checksum"), sqlite_strict=True)
+
+
+map_format = _table("map_format", _key(), _int("version"), _text("tool_version"))
+
+revisions = _table(
+    "revisions",
+    _key(),
+    _int("number", nullable=True),  # given at commit: what users call the revision
+    _text("status"),
+    _int("parent", nullable=True),
+    _text("author"),
+    _text("message"),
+    _text("tool_version"),
+    _text("configuration"),
+    _text("contents"),
+    _int("opened_ns"),
+    _int("committed_ns", nullable=True),
+    _text("host"),
+    _int("pid"),
+    _text("writer"),  # the token with which its writer holds the lock
+    UniqueConstraint("number"),
+)
+
+cameras = _table(
+    "cameras",
+    _key(),
+    _text("id"),
+    _float("fx"),
+    _float("fy"),
+    _float("cx"),
+    _float("cy"),
+    _float("baseline_m"),
+    _int("width"),
+    _int("height"),
+    _bytes("cam_from_rig", nullable=True),
+    _text("rectification"),
+    UniqueConstraint("id"),
+)
+
+frontends = _table(
+    "frontends",
+    _key(),
+    _text("descriptor"),
+    _text("hash"),
+    UniqueConstraint("descriptor", "hash"),
+)
+
+sessions = _table(
+    "sessions",
+    _key(),
+    _bytes("uuid"),
+    _int("revision"),
+    _text("robot"),
+    _int("camera"),
+    _int("frontend"),
+    _int("start_ns"),
+    _text("clock"),
+    _float("longitude_deg", nullable=True),
+    _text("zone", nullable=True),
+    UniqueConstraint("uuid"),
+)
+
+nodes = _table(
+    "nodes",
+    _key(),
+    _bytes("uuid"),
+    _int("revision"),
+    _int("session"),
+    _int("camera"),
+    _int("frontend"),
+    _int("stamp_ns"),
+    _float("driven_m"),
+    _text("status"),
+    _bytes("landmark_hash"),
+    UniqueConstraint("uuid"),
+)
+
+# Apart from the nodes, so that reading the graph does not walk through the blobs.
+frames = _table(
+    "frames",
+    Column("node", _INT64, primary_key=True, autoincrement=False),
+    _int("revision"),
+    _bytes("landmarks"),
+    _bytes("thumbnail", nullable=True),
+)
+
+edges = _table(
+    "edges",
+    _key(),
+    _int("revision"),
+    _int("a"),
+    _int("b"),
+    _text("kind"),
+    _bytes("a_from_b"),
+    _bytes("covariance"),
+    UniqueConstraint("a", "b", "kind", "revision"),
+)
+
+paths = _table(
+    "paths",
+    _key(),
+    _bytes("uuid"),
+    _int("revision"),
+    _int("session"),
+    _int("partial"),
+    UniqueConstraint("uuid"),
+)
+
+path_entries = _table(
+    "path_entries",
+    _key(),
+    _int("revision"),
+    _int("path"),
+    _int("sequence"),
+    _int("node"),
+    _text("kind"),
+    _int("stamp_ns"),
+    UniqueConstraint("path", "sequence"),
+)
+
+omissions = _table(
+    "omissions",
+    _key(),
+    _bytes("uuid"),
+    _int("revision"),
+    _int("node"),
+    _bytes("node_from_omitted"),
+    UniqueConstraint("uuid"),
+)
+
+attempts = _table(
+    "attempts",
+    _key(),
+    _int("revision"),
+    _int("session"),
+    _int("count"),
+    _bytes("body"),
+    Index("attempts_by_session", "session"),
+)
+
+statistics = _table(
+    "statistics",
+    _key(),
+    _int("revision"),
+    _text("name"),
+    _text("body"),
+    UniqueConstraint("name", "revision"),
+)
+
+vocabularies = _table(
+    "vocabularies",
+    _key(),
+    _int("revision"),
+    _bytes("hash"),
+    _bytes("body"),
+)
+
+hidden = _table(
+    "hidden",
+    _key(),
+    _int("revision"),
+    _text("record"),  # name of the table
+    _int("target"),  # key of the row
+    _int("hidden"),  # 1 hides it, 0 shows it again
+)
+
+# In the order in which rows may refer to earlier tables.
+VERSIONED: tuple[Table, ...] = (
+    sessions,
+    nodes,
+    frames,
+    edges,
+    paths,
+    path_entries,
+    omissions,
+    attempts,
+    statistics,
+    vocabularies,
+    hidden,
+)
+KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)

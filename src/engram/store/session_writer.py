@@ -1,0 +1,412 @@
+"""One session on its way into a map: buffered, checkpointed, then committed in one small step."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Table, delete, func, insert, select, update
+
+from engram.errors import IncompatibleError, InputError, RevisionError
+from engram.experience.model import (
+    Attempt,
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    PathEntry,
+    PathId,
+    Session,
+    path_id,
+)
+from engram.frontend import DescriptorKind, Frame
+from engram.store.attempts import COLUMNS, AttemptTable, concatenate, pack, unpack
+from engram.store.blob import blob_hash, encode_landmarks, encode_thumbnail
+from engram.store.database import Database
+from engram.store.frame_reader import FrameReader
+from engram.store.keys import KeyBook
+from engram.store.reading import log
+from engram.store.records import Revision, StoredSession
+from engram.store.rows import Row, edge_row, sealed, to_json, transform_from_bytes, verified
+from engram.store.schema import (
+    VERSIONED,
+    attempts,
+    edges,
+    frames,
+    nodes,
+    path_entries,
+    revisions,
+    statistics,
+)
+from engram.store.view import View, head
+
+# Covariances come from products with their own transposes: what is left of asymmetry is rounding.
+_ASYMMETRY_LIMIT = 1e-6
+
+
+class SessionWriter:
+    """Adds one session to a map. Thread-safe; made by `MapStore.begin_session` or `resume_session`.
+
+    What is added waits in memory until `checkpoint`, which makes it durable in one transaction;
+    readers see it after `commit`. A checkpoint that fails (disk full) leaves the last one intact
+    and keeps what waits, so that it can be tried again.
+
+    Attributes:
+        session: the drive that is written.
+        path: its path.
+        stored: what had been checkpointed when this writer was made; empty for a new session.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        keys: KeyBook,
+        frame_reader: FrameReader,
+        *,
+        session: Session,
+        revision_key: int,
+        session_key: int,
+        path_key: int,
+        camera_key: int,
+        frontend: tuple[int, DescriptorKind, str],
+        stored: StoredSession,
+        on_end: Callable[[], None],
+    ) -> None:
+        self.session = session
+        self.path: PathId = path_id(session.id)
+        self.stored = stored
+        self._database = database
+        self._keys = keys
+        self._frames = frame_reader
+        self._revision_key = revision_key
+        self._session_key = session_key
+        self._path_key = path_key
+        self._camera_key = camera_key
+        self._frontend_key, self._descriptor, self._frontend = frontend
+        self._next_sequence = stored.next_sequence
+        self._on_end = on_end
+        self._ended = False
+        self._lock = threading.RLock()
+        self._clear()
+
+    def add_node(self, node: Node, frame: Frame) -> None:
+        """Save a frame as a node. Its frame can be read at once through the map's `frames`.
+
+        Raises:
+            InputError: node and frame do not belong together or to this session, the node is in
+                the map already, or the landmarks cannot be stored without loss.
+            IncompatibleError: the frame comes from another front-end than the session's.
+        """
+        self._check_node(node, frame)
+        landmarks = encode_landmarks(frame.landmarks, frame.camera)
+        thumbnail = None if frame.thumbnail is None else encode_thumbnail(frame.thumbnail)
+        with self._lock:
+            self._check_open()
+            if self._keys.find_node(node.id) is not None:
+                raise InputError(f"node {node.id} is in the map already; a node is saved once")
+            key = self._keys.next(nodes)
+            row = {
+                "key": key,
+                "uuid": node.id.bytes,
+                "revision": self._revision_key,
+                "session": self._session_key,
+                "camera": self._camera_key,
+                "frontend": self._frontend_key,
+                "stamp_ns": int(node.stamp_ns),
+                "driven_m": float(node.driven_m),
+                "status": str(frame.status),
+                "landmark_hash": blob_hash(landmarks),
+            }
+            frame_row = {
+                "node": key,
+                "revision": self._revision_key,
+                "landmarks": landmarks,
+                "thumbnail": thumbnail,
+            }
+            self._rows[nodes].append(sealed(nodes, row))
+            self._rows[frames].append(sealed(frames, frame_row))
+            self._keys.learn_node(node.id, key)
+            self._frames.hold(node.id, frame)
+            self._saved.append(node.id)
+
+    def add_edge(self, edge: Edge) -> None:
+        """Add an edge; it takes the place of an older one with the same (a, b, kind).
+
+        Raises:
+            InputError: an end is not in the map, both are the same, or a number is not finite.
+        """
+        _check_edge(edge)
+        with self._lock:
+            self._check_open()
+            a, b = self._node_key(edge.a, "edge"), self._node_key(edge.b, "edge")
+            row = edge_row(edge, self._keys.next(edges), self._revision_key, a, b)
+            self._edges.pop((a, b, row["kind"]), None)
+            self._edges[a, b, row["kind"]] = sealed(edges, row)
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        """Add the next step of the session's path.
+
+        Raises:
+            InputError: another session's path, a sequence number that is not above all before, or
+                a node that is not in the map.
+        """
+        with self._lock:
+            self._check_open()
+            if entry.path != self.path:
+                raise InputError(f"path {entry.path} is not {self.path}, the path of this session")
+            if entry.sequence < self._next_sequence:
+                raise InputError(
+                    f"path entry {entry.sequence} comes after {self._next_sequence - 1}; sequence "
+                    "numbers must increase"
+                )
+            row = {
+                "key": self._keys.next(path_entries),
+                "revision": self._revision_key,
+                "path": self._path_key,
+                "sequence": int(entry.sequence),
+                "node": self._node_key(entry.node, "path entry"),
+                "kind": str(entry.kind),
+                "stamp_ns": int(entry.stamp_ns),
+            }
+            self._rows[path_entries].append(sealed(path_entries, row))
+            self._next_sequence = entry.sequence + 1
+
+    def add_attempts(self, made: list[Attempt]) -> None:
+        """Remember match attempts (SPEC §3.5), rounded to 18 bytes each.
+
+        Offsets and headings keep 11 bits, standard deviations are right to 3 %, ranks end at 255.
+
+        Raises:
+            InputError: a node is not in the map.
+        """
+        with self._lock:
+            self._check_open()
+            keys = [
+                (self._node_key(one.reference, "attempt"), self._node_key(one.node, "attempt"))
+                for one in made
+            ]
+            if made:
+                self._attempts.append(_attempt_table(made, keys))
+
+    def put_statistics(self, name: str, values: Mapping[str, Any]) -> None:
+        """Keep a statistic of the map under a name; the newest counts.
+
+        Raises:
+            InputError: the values are no plain JSON data.
+        """
+        body = to_json(values)
+        with self._lock:
+            self._check_open()
+            row = {
+                "key": self._keys.next(statistics),
+                "revision": self._revision_key,
+                "name": name,
+                "body": body,
+            }
+            self._statistics[name] = sealed(statistics, row)
+
+    def checkpoint(self) -> None:
+        """Make all that was added durable, in one transaction. Readers see it after `commit`.
+
+        Raises:
+            StorageFullError: no space; the last checkpoint is intact, and this may be tried again.
+        """
+        with self._lock:
+            self._check_open()
+            if not self._waiting():
+                return
+            with self._database.writing() as connection:
+                self._write(connection)
+            self._frames.release(self._saved)
+            self._clear()
+
+    def commit(self) -> Revision:
+        """Make the session part of the map: a last checkpoint, then the revision's status.
+
+        Raises:
+            StorageFullError: as `checkpoint`; the session stays open.
+        """
+        with self._lock:
+            self.checkpoint()
+            with self._database.writing() as connection:
+                revision = commit_revision(connection, self._keys, self._revision_key)
+            self._end()
+            return revision
+
+    def abandon(self) -> None:
+        """Give the session up. Its rows stay invisible until `check(clean=True)` collects them."""
+        with self._lock:
+            self._check_open()
+            with self._database.writing() as connection:
+                change_revision(connection, self._revision_key, status="abandoned")
+            self._clear()
+            self._keys.forget_nodes()
+            self._frames.forget()
+            self._end()
+
+    def _end(self) -> None:
+        self._ended = True
+        self._on_end()
+
+    def _check_open(self) -> None:
+        if self._ended:
+            raise RevisionError(f"session {self.session.id} is committed or abandoned already")
+
+    def _check_node(self, node: Node, frame: Frame) -> None:
+        if node.session != self.session.id:
+            raise InputError(f"node {node.id} is of session {node.session}, not {self.session.id}")
+        if (node.stamp_ns, node.camera) != (frame.stamp_ns, frame.camera.id):
+            raise InputError(
+                f"node {node.id} (stamp {node.stamp_ns}, camera {node.camera}) does not fit its "
+                f"frame (stamp {frame.stamp_ns}, camera {frame.camera.id})"
+            )
+        if not np.isfinite(node.driven_m):
+            raise InputError(f"node {node.id}: driven_m is {node.driven_m}, must be finite")
+        if frame.camera.id != self.session.camera:
+            raise InputError(
+                f"node {node.id} is of camera {frame.camera.id}, its session of "
+                f"{self.session.camera}; a recalibrated robot begins another session"
+            )
+        if (frame.descriptor, frame.frontend) != (self._descriptor, self._frontend):
+            raise IncompatibleError(
+                f"node {node.id} comes from front-end {frame.frontend} ({frame.descriptor}), its "
+                f"session from {self._frontend} ({self._descriptor}); begin another session"
+            )
+
+    def _node_key(self, node: NodeId, what: str) -> int:
+        key = self._keys.find_node(node)
+        if key is None:
+            raise InputError(f"{what}: node {node} is not in the map; add it first")
+        return key
+
+    def _waiting(self) -> bool:
+        return bool(any(self._rows.values()) or self._edges or self._attempts or self._statistics)
+
+    def _clear(self) -> None:
+        self._rows: dict[Table, list[Row]] = {nodes: [], frames: [], path_entries: []}
+        self._edges: dict[tuple[int, int, str], Row] = {}
+        self._statistics: dict[str, Row] = {}
+        self._attempts: list[AttemptTable] = []
+        self._saved: list[NodeId] = []
+
+    def _write(self, connection: Connection) -> None:
+        for table, rows in self._rows.items():
+            if rows:
+                connection.execute(insert(table), rows)
+        if self._edges:
+            key = ("a", "b", "kind", "revision")
+            connection.execute(self._database.replace(edges, key), list(self._edges.values()))
+        if self._statistics:
+            statement = self._database.replace(statistics, ("name", "revision"))
+            connection.execute(statement, list(self._statistics.values()))
+        if self._attempts:
+            made = concatenate(self._attempts)
+            _write_attempts(connection, self._keys, self._revision_key, self._session_key, made)
+
+
+def commit_revision(connection: Connection, keys: KeyBook, revision_key: int) -> Revision:
+    """Flip an open revision to committed and give it its number."""
+    _repack_attempts(connection, keys, revision_key)
+    parent = head(connection)
+    change_revision(
+        connection,
+        revision_key,
+        status="committed",
+        number=parent + 1,
+        parent=parent or None,
+        committed_ns=time.time_ns(),
+        contents=to_json(revision_contents(connection, revision_key)),
+    )
+    return log(connection, View(parent + 1))[-1]
+
+
+def change_revision(connection: Connection, key: int, **changes: Any) -> None:
+    """Change an open revision's row.
+
+    Raises:
+        RevisionError: it is not open.
+    """
+    found = connection.execute(select(revisions).where(revisions.c.key == key))
+    row = next(verified(revisions, found), None)
+    if row is None or row["status"] != "open":
+        raise RevisionError(f"revision row {key} is not open")
+    row = sealed(revisions, {**row, **changes})
+    connection.execute(update(revisions).where(revisions.c.key == key).values(row))
+
+
+def revision_contents(connection: Connection, revision_key: int) -> dict[str, float]:
+    """How many rows of each table a revision brought, and metres of odometry edges."""
+    contents: dict[str, float] = {}
+    for table in VERSIONED:
+        rows = select(func.count()).select_from(table).where(table.c.revision == revision_key)
+        contents[table.name] = connection.execute(rows).scalar_one()
+    packed = select(func.sum(attempts.c.count)).where(attempts.c.revision == revision_key)
+    contents["attempts"] = int(connection.execute(packed).scalar() or 0)
+    steps = (
+        select(edges.c.a_from_b)
+        .where(edges.c.revision == revision_key, edges.c.kind == str(EdgeKind.ODOMETRY))
+        .order_by(edges.c.key)
+    )
+    contents["mapped_m"] = sum(
+        transform_from_bytes(step, "odometry edge").distance_m
+        for step in connection.execute(steps).scalars()
+    )
+    return contents
+
+
+def _repack_attempts(connection: Connection, keys: KeyBook, revision_key: int) -> None:
+    """Pack the attempts of all checkpoints together: the file does not tell when they were made."""
+    query = select(attempts).where(attempts.c.revision == revision_key).order_by(attempts.c.key)
+    by_session: dict[int, list[AttemptTable]] = {}
+    for row in verified(attempts, connection.execute(query)):
+        by_session.setdefault(row["session"], []).append(unpack(row["body"], row["count"]))
+    if by_session:
+        connection.execute(delete(attempts).where(attempts.c.revision == revision_key))
+    for session_key, tables in by_session.items():
+        _write_attempts(connection, keys, revision_key, session_key, concatenate(tables))
+
+
+def _write_attempts(
+    connection: Connection, keys: KeyBook, revision_key: int, session_key: int, table: AttemptTable
+) -> None:
+    rows = [
+        sealed(
+            attempts,
+            {
+                "key": keys.next(attempts),
+                "revision": revision_key,
+                "session": session_key,
+                "count": count,
+                "body": body,
+            },
+        )
+        for count, body in pack(table)
+    ]
+    connection.execute(insert(attempts), rows)
+
+
+def _attempt_table(made: list[Attempt], keys: list[tuple[int, int]]) -> AttemptTable:
+    policies = tuple(dict.fromkeys(one.policy for one in made))
+    index = {name: at for at, name in enumerate(policies)}
+    ends = dict(zip(("reference", "node"), zip(*keys, strict=True), strict=True))
+    columns = {
+        name: np.array(ends[name] if name in ends else [getattr(one, name) for one in made], kind)
+        for name, kind in COLUMNS
+    }
+    policy = np.array([index[one.policy] for one in made], np.int32)
+    return AttemptTable(columns, policy, policies)
+
+
+def _check_edge(edge: Edge) -> None:
+    what = f"edge {edge.a} → {edge.b} ({edge.kind})"
+    if edge.a == edge.b:
+        raise InputError(f"{what} joins a node with itself")
+    transform = np.concatenate([edge.a_from_b.rotation.ravel(), edge.a_from_b.translation])
+    if not np.isfinite(transform).all() or edge.covariance.shape != (6, 6):
+        raise InputError(f"{what}: a transform is finite, its covariance (6, 6)")
+    asymmetry = np.abs(edge.covariance - edge.covariance.T).max()
+    if not asymmetry <= _ASYMMETRY_LIMIT * max(1.0, np.abs(edge.covariance).max()):
+        raise InputError(f"{what}: its covariance is not finite and symmetric")

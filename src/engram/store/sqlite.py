@@ -1,0 +1,342 @@
+"""A map as one SQLite file: all that is said to SQLite and to no other database stands here.
+
+Write-ahead log, so that readers and the writer never wait for each other. `synchronous=FULL`: a
+checkpoint that has returned survives a power cut, not only a kill; it costs one fsync per
+checkpoint, on the saving thread (measured in docs/performance.md). No memory mapping: a file that
+is cut while it is mapped would kill the process.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sqlalchemy import Connection, Engine, Table, create_engine, event, insert
+from sqlalchemy.dialects.sqlite import Insert
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import QueuePool
+
+from engram import __version__
+from engram.errors import (
+    FormatVersionError,
+    InputError,
+    MapCorruptError,
+    MapError,
+    MapLockedError,
+    NotAMapError,
+    StorageFullError,
+)
+from engram.store.lock import Holder, WriterLock, current_holder
+from engram.store.rows import sealed
+from engram.store.schema import FORMAT_VERSION, map_format, metadata
+
+# "EGRM": tells `file` and other programs that this SQLite file is a map.
+APPLICATION_ID = 0x4547524D
+_HEADER_BYTES = 100
+_MAGIC = b"SQLite format 3\x00"
+# Writers hold the file only for a checkpoint; somebody who waits longer than this is stuck.
+_BUSY_TIMEOUT_S = 30.0
+_CACHE_KIB = 8192
+
+
+class SqliteDatabase:
+    """One map file. Checks on opening that it is a map of a format that this version reads.
+
+    Args:
+        path: the file.
+
+    Raises:
+        NotAMapError: nothing is there, or something else.
+        FormatVersionError: written by a newer Engram.
+        MapCorruptError: a map whose tables are not as they must be.
+        MapError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        _check_header(path)
+        self._reader = _engine(_reading_uri(path), _prepare_reader)
+        self._writer: Engine | None = None
+        with self.reading() as connection:
+            _check_tables(connection, path)
+
+    @staticmethod
+    def create(path: Path) -> None:
+        """Make an empty map. It appears under its name whole or not at all.
+
+        Raises:
+            InputError: something is there already, or the folder is not.
+            MapError: it cannot be written.
+        """
+        if path.exists() or path.is_symlink():
+            raise InputError(f"{path} exists already; open it, or choose another name")
+        if not path.parent.is_dir():
+            raise InputError(f"{path.parent} is no folder; make it first")
+        draft = path.with_name(f".{path.name}.{os.getpid()}.new")
+        try:
+            _remove(draft)
+            _write_empty(draft)
+            os.link(draft, path)  # unlike a rename, never replaces a map that came meanwhile
+            _sync_folder(path.parent)
+        except FileExistsError as error:
+            raise InputError(f"{path} exists already; open it, or choose another name") from error
+        except OSError as error:
+            raise MapError(f"{path} cannot be created: {error.strerror}") from error
+        finally:
+            _remove(draft)
+
+    @property
+    def name(self) -> str:
+        """The path."""
+        return str(self.path)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection for selects."""
+        with _translated(self.name), self._reader.connect() as connection:
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """One transaction, durable when the block is left."""
+        if self._writer is None:
+            self._writer = _engine(_uri(self.path, "mode=rw"), _prepare_writer)
+        with _translated(self.name), self._writer.begin() as connection:
+            yield connection
+
+    def lock_for_writing(self) -> WriterLock:
+        """Become the only writer."""
+        if not os.access(self.path, os.W_OK):
+            raise MapError(f"{self.path} is read-only; copy it where it may be written")
+        return WriterLock(self.path)
+
+    def writer(self) -> Holder | None:
+        """Who writes now."""
+        return current_holder(self.path)
+
+    def replace(self, table: Table, key: tuple[str, ...]) -> Insert:
+        """An upsert."""
+        statement = Insert(table)
+        return statement.on_conflict_do_update(
+            index_elements=list(key),
+            set_={
+                column.name: statement.excluded[column.name]
+                for column in table.columns
+                if column.name not in key
+            },
+        )
+
+    def integrity_problems(self) -> list[str]:
+        """What `PRAGMA integrity_check` says."""
+        try:
+            with self.reading() as connection:
+                found = connection.exec_driver_sql("PRAGMA integrity_check(100)").scalars().all()
+        except MapCorruptError as error:
+            return [str(error)]
+        return [str(fact) for fact in found if fact != "ok"]
+
+    def size_bytes(self) -> int:
+        """The file and its write-ahead log."""
+        log = self.path.with_name(self.path.name + "-wal")
+        return sum(file.stat().st_size for file in (self.path, log) if file.exists())
+
+    def close(self) -> None:
+        """Close all connections; the last one to close empties the write-ahead log."""
+        self._reader.dispose()
+        if self._writer is not None:
+            with _translated(self.name):
+                self._writer.dispose()
+
+
+def _uri(path: Path, options: str) -> str:
+    return f"file:{quote(str(path.absolute()))}?{options}"
+
+
+def _reading_uri(path: Path) -> str:
+    """How to open a file for reading, wherever it lies.
+
+    A write-ahead log wants a second file beside it, which cannot be made on read-only media.
+    Without a log there is nothing to coordinate, and SQLite may be told so.
+    """
+    if os.access(path, os.W_OK) and os.access(path.absolute().parent, os.W_OK):
+        return _uri(path, "mode=rw")
+    log = path.with_name(path.name + "-wal")
+    if log.exists() and log.stat().st_size:
+        return _uri(path, "mode=ro")
+    return _uri(path, "mode=ro&immutable=1")
+
+
+def _engine(uri: str, prepare: Any) -> Engine:
+    def connect() -> sqlite3.Connection:
+        connection = sqlite3.connect(
+            uri,
+            uri=True,
+            timeout=_BUSY_TIMEOUT_S,
+            check_same_thread=False,  # the pool gives a connection to one thread at a time
+            isolation_level=None,  # transactions begin where SQLAlchemy says so
+        )
+        try:
+            prepare(connection)
+        except sqlite3.Error:
+            connection.close()
+            raise
+        return connection
+
+    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, max_overflow=-1)
+    if prepare is _prepare_writer:
+        # Take the write lock at once: a transaction that upgrades later can fail half way.
+        @event.listens_for(engine, "begin")
+        def begin(connection: Connection) -> None:
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+    return engine
+
+
+def _prepare(connection: sqlite3.Connection) -> None:
+    connection.execute("PRAGMA trusted_schema=OFF")
+    connection.execute("PRAGMA cell_size_check=ON")
+    connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")
+
+
+def _prepare_reader(connection: sqlite3.Connection) -> None:
+    _prepare(connection)
+    connection.execute("PRAGMA query_only=ON")
+
+
+def _prepare_writer(connection: sqlite3.Connection) -> None:
+    _prepare(connection)
+    connection.execute("PRAGMA synchronous=FULL")
+
+
+def _check_header(path: Path) -> None:
+    """What can be said from the first 100 bytes, without letting SQLite near the file."""
+    if not path.exists():
+        raise NotAMapError(f"{path}: there is no such file")
+    if path.is_dir():
+        raise NotAMapError(f"{path} is a folder, not a map file")
+    try:
+        with path.open("rb") as file:
+            header = file.read(_HEADER_BYTES)
+    except OSError as error:
+        raise MapError(f"{path} cannot be read: {error.strerror}") from error
+    if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
+        size = "an empty file" if not header else "no map file"
+        raise NotAMapError(f"{path} is {size}; a map begins with {_MAGIC[:15].decode()!r}")
+    if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
+        raise NotAMapError(f"{path} is an SQLite file, but no Engram map")
+    version = int.from_bytes(header[60:64], "big")
+    if version > FORMAT_VERSION:
+        raise FormatVersionError(
+            f"{path} is a map of format {version}, this Engram ({__version__}) reads up to "
+            f"{FORMAT_VERSION}; install a newer one"
+        )
+    if version < 1:
+        raise MapCorruptError(f"{path}: format {version} never existed; restore a copy")
+
+
+def _check_tables(connection: Connection, path: Path) -> None:
+    """Only our tables with our columns: no view, trigger or computed column of a stranger."""
+    found = connection.exec_driver_sql(
+        "SELECT type, name, tbl_name FROM sqlite_schema ORDER BY name"
+    )
+    rows = [tuple(row) for row in found]
+    tables = {name for kind, name, _ in rows if kind == "table"}
+    strange = [f"{kind} {name}" for kind, name, _ in rows if kind not in {"table", "index"}]
+    missing = sorted(metadata.tables.keys() - tables)
+    strange += sorted(f"table {name}" for name in tables - metadata.tables.keys())
+    if missing or strange:
+        raise MapCorruptError(
+            f"{path}: not the tables of format {FORMAT_VERSION}: missing {missing}, "
+            f"strange {strange}"
+        )
+    for table in metadata.sorted_tables:
+        columns = [
+            (row[1], row[6])
+            for row in connection.exec_driver_sql(f"PRAGMA table_xinfo({table.name})")
+        ]
+        if columns != [(column.name, 0) for column in table.columns]:
+            raise MapCorruptError(f"{path}: table {table.name} has the columns {columns}")
+
+
+def _write_empty(path: Path) -> None:
+    engine = _engine(_uri(path, "mode=rwc"), _prepare_writer)
+    try:
+        with _translated(str(path)):
+            with engine.begin() as connection:
+                metadata.create_all(connection)
+                row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
+                connection.execute(insert(map_format), sealed(map_format, row))
+                connection.exec_driver_sql(f"PRAGMA application_id={APPLICATION_ID}")
+                connection.exec_driver_sql(f"PRAGMA user_version={FORMAT_VERSION}")
+            _enter_wal(engine)
+    finally:
+        engine.dispose()
+
+
+def _enter_wal(engine: Engine) -> None:
+    """The file remembers this for ever; it cannot be said inside a transaction."""
+    raw = engine.raw_connection()
+    try:
+        raw.cursor().execute("PRAGMA journal_mode=WAL")
+    finally:
+        raw.close()
+
+
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _remove(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        with suppress(FileNotFoundError):
+            path.with_name(path.name + suffix).unlink()
+
+
+_CORRUPT = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+_FULL = {
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR_WRITE,
+    sqlite3.SQLITE_IOERR_TRUNCATE,
+    sqlite3.SQLITE_IOERR_FSYNC,
+    sqlite3.SQLITE_IOERR_SHMSIZE,
+}
+
+
+@contextmanager
+def _translated(name: str) -> Iterator[None]:
+    """SQLite's errors as ours."""
+    try:
+        yield
+    except (DBAPIError, sqlite3.Error) as error:
+        cause = error.orig if isinstance(error, DBAPIError) else error
+        raise _translate(cause, name) from error
+
+
+def _translate(cause: BaseException | None, name: str) -> MapError:
+    code = getattr(cause, "sqlite_errorcode", 0)
+    if code in _FULL:
+        return StorageFullError(
+            f"{name} cannot grow ({cause}); free some space or raise the limit and try again: "
+            "everything up to the last checkpoint is safe"
+        )
+    if code & 0xFF in _CORRUPT or "decode" in str(cause):
+        return MapCorruptError(f"{name} is damaged ({cause}); run engram check, and restore a copy")
+    if code & 0xFF in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+        return MapLockedError(
+            f"{name} is held by another program for more than {_BUSY_TIMEOUT_S:.0f} s ({cause})"
+        )
+    if code & 0xFF == sqlite3.SQLITE_CANTOPEN:
+        return MapError(
+            f"{name} cannot be opened ({cause}); if it lies on read-only media with a file "
+            f"{Path(name).name}-wal beside it, copy both where they may be written"
+        )
+    return MapError(f"{name}: {cause}")

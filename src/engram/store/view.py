@@ -1,0 +1,76 @@
+"""Which rows can be seen: those of committed revisions up to one, and not hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, Select, Table, and_, func, or_, select
+
+from engram.store.rows import Row, verified
+from engram.store.schema import hidden, revisions
+
+# Rows of the writer's own open revision are newer than all that is committed.
+_NEWEST = 2**62
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A map as of one revision.
+
+    Attributes:
+        at: number of the newest revision that is seen; 0 sees nothing.
+        own: key of the open revision that is being written and sees itself; None for readers.
+    """
+
+    at: int
+    own: int | None = None
+
+    def revision_keys(self) -> Select[tuple[int]]:
+        """Keys of the revisions that are seen."""
+        committed = and_(revisions.c.status == "committed", revisions.c.number <= self.at)
+        seen = committed if self.own is None else or_(committed, revisions.c.key == self.own)
+        return select(revisions.c.key).where(seen)
+
+    def select(self, table: Table) -> Select[tuple[object, ...]]:
+        """All columns of the rows that are seen.
+
+        Ordered by their revision's place in history, then by key: of rows that supersede each
+        other the newest is last.
+        """
+        place = func.coalesce(revisions.c.number, _NEWEST)
+        return (
+            select(*table.columns)
+            .select_from(table.join(revisions, revisions.c.key == table.c.revision))
+            .where(table.c.revision.in_(self.revision_keys()))
+            .where(table.primary_key.columns[0].not_in(self.hidden_keys(table)))
+            .order_by(place, table.primary_key.columns[0])
+        )
+
+    def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
+        """The rows that are seen, verified, in the order of `select`."""
+        return verified(table, connection.execute(self.select(table)))
+
+    def hidden_keys(self, table: Table) -> Select[tuple[int]]:
+        """Keys of the table's rows whose newest `hidden` row hides them."""
+        place = func.coalesce(revisions.c.number, _NEWEST)
+        latest = (
+            select(
+                hidden.c.target,
+                hidden.c.hidden,
+                func.row_number()
+                .over(partition_by=hidden.c.target, order_by=[place.desc(), hidden.c.key.desc()])
+                .label("age"),
+            )
+            .select_from(hidden.join(revisions, revisions.c.key == hidden.c.revision))
+            .where(hidden.c.record == table.name)
+            .where(hidden.c.revision.in_(self.revision_keys()))
+            .subquery()
+        )
+        return select(latest.c.target).where(latest.c.age == 1, latest.c.hidden == 1)
+
+
+def head(connection: Connection) -> int:
+    """Number of the newest committed revision; 0 if there is none."""
+    newest = select(func.max(revisions.c.number)).where(revisions.c.status == "committed")
+    return connection.execute(newest).scalar() or 0
