@@ -26,7 +26,7 @@ def load_toml(text: str, kind: type[T]) -> T:
     """
     try:
         values = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # also numbers of thousands of digits
         raise ConfigError(f"not valid TOML: {error}") from error
     return from_dict(values, kind)
 

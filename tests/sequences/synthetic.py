@@ -53,6 +53,7 @@ class ImageLayout:
     """How a layout lays its files out.
 
     Attributes:
+        format: key in `SEQUENCES`.
         write: writes a drive of `PAIRS` pairs below a folder and gives the path to open.
         image: the path of an image, from the path to open, the pair's index and the side.
         calibration: the calibration file, from the path to open.
@@ -61,6 +62,7 @@ class ImageLayout:
         first_ns: stamp of the first pair.
     """
 
+    format: str
     write: Callable[[Path], Path]
     image: Callable[[Path, int, int], Path]
     calibration: Callable[[Path], Path]
@@ -180,6 +182,7 @@ def _stamped_image(path: Path, index: int, side: int) -> Path:
 
 LAYOUTS: dict[str, ImageLayout] = {
     "kitti": ImageLayout(
+        "kitti",
         _write_kitti,
         _kitti_image,
         lambda path: path / "calib.txt",
@@ -187,12 +190,14 @@ LAYOUTS: dict[str, ImageLayout] = {
         first_ns=0,
     ),
     "kitti-raw": ImageLayout(
+        "kitti-raw",
         _write_kitti_raw,
         _kitti_raw_image,
         lambda path: path.parent / "calib_cam_to_cam.txt",
         lambda path: path / "image_00" / "timestamps.txt",
     ),
     "euroc": ImageLayout(
+        "euroc",
         _write_euroc,
         _euroc_image,
         lambda path: path / "mav0" / "cam1" / "sensor.yaml",
@@ -200,12 +205,14 @@ LAYOUTS: dict[str, ImageLayout] = {
         head=1,
     ),
     "folder": ImageLayout(
+        "folder",
         _write_folder,
         _folder_image,
         lambda path: path / "calibration.toml",
         lambda path: path / "times.txt",
     ),
     "folder, named by stamp": ImageLayout(
+        "folder",
         _write_stamped_folder,
         _stamped_image,
         lambda path: path / "calibration.toml",

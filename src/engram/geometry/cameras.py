@@ -15,6 +15,9 @@ from engram.geometry.se3 import SE3
 
 CameraId = NewType("CameraId", str)
 
+# Landmarks are stored with 16 bits for a pixel.
+_MAX_SIDE_PX = 65535
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StereoCamera:
@@ -48,7 +51,11 @@ class StereoCamera:
     id: CameraId = field(init=False)
 
     def __post_init__(self) -> None:
-        for name in ("fx", "fy", "baseline_m", "width", "height"):
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not 1 <= value <= _MAX_SIDE_PX:
+                raise CalibrationError(f"camera: {name} is {value}, must be 1 to {_MAX_SIDE_PX} px")
+        for name in ("fx", "fy", "baseline_m"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise CalibrationError(f"camera: {name} is {value}, must be finite and > 0")

@@ -11,7 +11,7 @@ from engram.errors import ConfigError
 
 T = TypeVar("T")
 
-_PART = re.compile(r"\d{1,9}")
+_PART = re.compile(r"[0-9]{1,9}")
 
 
 @dataclass(frozen=True, slots=True)
