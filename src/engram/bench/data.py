@@ -46,7 +46,8 @@ def load_bench_data() -> BenchData:
     if root:
         clip = Path(root) / "kitti_odometry" / "sequences" / "06"
         if clip.is_dir():
-            return BenchData("KITTI odometry 06", tuple(open_sequence(clip)))
+            pairs = [entry for entry in open_sequence(clip) if isinstance(entry, StereoPair)]
+            return BenchData("KITTI odometry 06", tuple(pairs))
     return BenchData("synthetic street", synthetic_drive())
 
 
@@ -112,7 +113,10 @@ def _street(rng: np.random.Generator) -> list[_Plane]:
     forward, right, down = np.eye(3)[[2, 0, 1]]
 
     def plane(
-        corner: list[float], along: NDArray[np.float64], up: NDArray[np.float64], size_m: list[float]
+        corner: list[float],
+        along: NDArray[np.float64],
+        up: NDArray[np.float64],
+        size_m: list[float],
     ) -> _Plane:
         grain = 0.02
         shape = (int(size_m[1] / grain), int(size_m[0] / grain))
@@ -154,4 +158,3 @@ def _render(
         image[shown] = view[shown]
         nearest[shown] = depth[shown]
     return image
-

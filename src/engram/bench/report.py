@@ -79,7 +79,10 @@ class BenchReport:
     stages: tuple[StageResult, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values: ``{"machine": {…}, "stages": {NAME: {"ms", "p99_ms", "reference_ms", …}}}``."""
+        """Plain values.
+
+        ``{"machine": {…}, "stages": {NAME: {"ms", "p99_ms", "reference_ms", "ratio", …}}}``
+        """
         stages: dict[str, Any] = {}
         for stage in self.stages:
             reference = stage.reference

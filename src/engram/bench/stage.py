@@ -35,7 +35,9 @@ class Prepared:
 class Stage(Protocol):
     """Prepares one stage; gets the plain pipeline where it is at hand."""
 
-    def __call__(self, data: BenchData, plain: PlainPipeline | None) -> Prepared: ...
+    def __call__(self, data: BenchData, plain: PlainPipeline | None) -> Prepared:
+        """Loads, extracts and builds whatever the timed runs need."""
+        ...
 
 
 def time_stage(name: str, prepared: Prepared, runs: int, note: str) -> StageResult:

@@ -22,7 +22,8 @@ class WindowConfig:
     Attributes:
         frames: frames optimised together, the newest included. More than seven gain little.
         landmarks: at most so many, those with the longest tracks first; bounds the time.
-        iterations: at most so many. The start is good: one or two usually suffice.
+        iterations: at most so many. The start is good: one or two usually suffice. 0 leaves the
+            window as matching put it.
     """
 
     frames: int = 7
@@ -32,9 +33,9 @@ class WindowConfig:
     def __post_init__(self) -> None:
         if self.frames < 2:
             raise ConfigError(f"window: frames is {self.frames}, must be ≥ 2")
-        for name in ("landmarks", "iterations"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"window: {name} is {getattr(self, name)}, must be ≥ 1")
+        for name, least in (("landmarks", 1), ("iterations", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"window: {name} is {getattr(self, name)}, must be ≥ {least}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +112,7 @@ class Window:
         assert match.reference_from_live is not None
         assert match.covariance is not None
         placed = [*self._keyframes, self._newest]
-        adjusted = self._adjust(placed)
+        adjusted = self._adjust(placed) if self._config.iterations else None
         if adjusted is None:
             return match.reference_from_live, match.covariance
         matrices, covariance = adjusted

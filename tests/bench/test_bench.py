@@ -1,0 +1,136 @@
+"""The benchmark runs, reports in the agreed shape, and both sides solve the same problem."""
+
+import json
+
+import numpy as np
+import pytest
+
+from engram.bench import STAGES, BenchReport, run_bench, runner
+from engram.bench.data import BenchData, load_bench_data, scale_and_crop, synthetic_drive
+from engram.bench.plain import load_plain_pipeline
+from engram.bench.report import Machine, Side, StageResult
+from engram.bench.stages import prepare_attempt, prepare_frontend_odometry
+from engram.errors import ConfigError
+from engram.frontend import Frontend
+from engram.odometry import Odometry
+
+STEP_M = 0.8
+
+
+@pytest.fixture(scope="module")
+def drive() -> BenchData:
+    return BenchData("synthetic street", synthetic_drive(frames=6, step_m=STEP_M))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    module, why_not = load_plain_pipeline()
+    if module is None:
+        pytest.skip(why_not)
+    return module
+
+
+def test_odometry_on_the_synthetic_drive_is_true(drive: BenchData) -> None:
+    frontend, odometry = Frontend(), Odometry()
+    steps = [odometry.step(frontend.extract(pair)) for pair in drive.small]
+    for step in steps[1:]:
+        assert step.prev_from_curr is not None
+        # 1 % of the step: a few hundred landmarks at 0.5 px between 2 and 70 m.
+        np.testing.assert_allclose(
+            step.prev_from_curr.translation, [0, 0, STEP_M], atol=0.02 * STEP_M
+        )
+        assert step.prev_from_curr.angle_rad < 1e-3
+
+
+def test_the_plain_pipeline_is_an_honest_yardstick(drive: BenchData, plain) -> None:
+    camera = drive.full[0].camera
+    names = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
+    plain_camera = plain.Camera(*(getattr(camera, name) for name in names))
+    frontend, odometry = plain.FrontEnd(plain_camera, 1000), plain.Odometry(plain_camera)
+    poses = [odometry.step(frontend.extract(pair.left, pair.right)) for pair in drive.full]
+    assert poses[0] is None
+    for pose in poses[1:]:
+        expected = np.eye(4)
+        expected[2, 3] = -STEP_M  # live_from_reference: what lies ahead comes nearer
+        np.testing.assert_allclose(pose.live_from_reference, expected, atol=0.02 * STEP_M)
+        assert len(pose.inliers) > 100
+
+
+@pytest.mark.parametrize("prepare", [prepare_frontend_odometry, prepare_attempt])
+def test_both_sides_get_as_many_features(prepare, drive: BenchData, plain) -> None:
+    prepared = prepare(drive, plain, size="512")
+    for i in range(4):
+        ours, reference = prepared.ours(i), prepared.reference(i)
+    assert ours["inliers"] > 50
+    assert reference["inliers"] > 30
+    if "features" in reference:
+        assert reference["features"] == pytest.approx(ours["landmarks"], rel=0.1)
+
+
+def test_window_solutions_agree(drive: BenchData, plain) -> None:
+    prepared = STAGES["window_ba_512"](drive, plain)
+    assert prepared.ours(0) == prepared.reference(0)
+
+
+def test_ranking_needs_no_reference(drive: BenchData, plain) -> None:
+    prepared = STAGES["rank_150_paths"](drive, plain)
+    assert prepared.reference is None
+    assert prepared.ours(0) == {"paths": 150, "candidates": 200, "observed": 1000}
+
+
+def test_report_has_the_agreed_shape(drive: BenchData) -> None:
+    seen = []
+    report = run_bench(
+        ["attempt_512"], repeats=3, progress=lambda *call: seen.append(call), data=drive
+    )
+    plain_values = json.loads(json.dumps(report.to_dict()))
+    assert list(plain_values["stages"]) == ["attempt_512"]
+    stage = plain_values["stages"]["attempt_512"]
+    assert {"ms", "p99_ms", "reference_ms", "ratio"} <= stage.keys()
+    assert 0 < stage["ms"] <= stage["p99_ms"]
+    if stage["reference_ms"] is not None:
+        assert stage["ratio"] == pytest.approx(stage["reference_ms"] / stage["ms"])
+    assert plain_values["machine"]["data"] == "synthetic street"
+    assert seen == [("attempt_512", 0, 1)]
+
+
+def test_without_the_plain_pipeline_the_report_says_why(drive: BenchData, monkeypatch) -> None:
+    monkeypatch.setattr(runner, "load_plain_pipeline", lambda: (None, "no reference: not here"))
+    stage = run_bench(["attempt_512"], repeats=2, data=drive).to_dict()["stages"]["attempt_512"]
+    assert stage["reference_ms"] is None
+    assert stage["ratio"] is None
+    assert stage["note"] == "no reference: not here"
+
+
+def test_ratio_is_reference_over_ours() -> None:
+    machine = Machine("cpu", "v4", 1, "3", "2", "5", None, "data")
+    stage = StageResult("a", 5, Side(2.0, 3.0, {"inliers": 70.0}), Side(8.0, 9.0))
+    report = BenchReport(machine, (stage,))
+    assert report.to_dict()["stages"]["a"]["ratio"] == 4.0
+    assert report.table().row_count == 1
+
+
+def test_unknown_stages_are_refused(drive: BenchData) -> None:
+    with pytest.raises(ConfigError, match="unknown stage frontend; there are: frontend_odometry"):
+        run_bench(["frontend"], data=drive)
+
+
+def test_the_small_pairs_see_the_same_points(drive: BenchData) -> None:
+    pair = drive.full[0]
+    small = scale_and_crop(pair)
+    assert small.left.shape == (384, 512)
+    full = Frontend().extract(pair).landmarks.points_in_cam
+    cropped = Frontend().extract(small).landmarks.points_in_cam
+    # The walls stand at x = ±7 m and the ground at y = 1.6 m for both.
+    for points in (full, cropped):
+        near = points[points[:, 2] < 20]
+        on_wall = np.abs(np.abs(near[:, 0]) - 7) < 0.3
+        on_ground = np.abs(near[:, 1] - 1.6) < 0.1
+        assert (on_wall | on_ground).mean() > 0.95
+
+
+def test_without_real_images_the_drive_is_synthetic(monkeypatch) -> None:
+    monkeypatch.delenv("ENGRAM_DATA", raising=False)
+    data = load_bench_data()
+    assert data.name == "synthetic street"
+    assert len(data.full) == 24
