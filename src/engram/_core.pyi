@@ -69,6 +69,7 @@ def graph_candidates(
     margin_m: float,
     view_gate_rad: float,
     slack_sigmas: float,
+    slack_m: float,
     sessions: NDArray[np.int32],
     driven_m: NDArray[np.float64],
     own_session: int,

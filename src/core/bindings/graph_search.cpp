@@ -42,7 +42,8 @@ auto graph_candidates(const Input<int32_t, 1> &first_half, const Input<int32_t, 
                       const Input<double, 2> &errors, int64_t reference,
                       const Input<double, 1> &reference_from_live,
                       const Input<double, 1> &live_error, double radius_m, double margin_m,
-                      double view_gate_rad, double slack_sigmas, const Input<int32_t, 1> &sessions,
+                      double view_gate_rad, double slack_sigmas, double slack_m,
+                      const Input<int32_t, 1> &sessions,
                       const Input<double, 1> &driven_m, int32_t own_session, double own_driven_m,
                       double own_exclusion_m) {
   const engram::GraphView graph = view_of(first_half, next_half, target, a_from_b, errors);
@@ -58,6 +59,7 @@ auto graph_candidates(const Input<int32_t, 1> &first_half, const Input<int32_t, 
                                      margin_m,
                                      view_gate_rad,
                                      slack_sigmas,
+                                     slack_m,
                                      sessions.data(),
                                      driven_m.data(),
                                      own_session,
@@ -88,7 +90,7 @@ auto graph_chains(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &
   check_node(graph, root, "root");
   if (usable && usable->shape(0) != a_from_b.shape(0))
     throw std::invalid_argument("graph_chains: expected usable (E,)");
-  const engram::SearchLimits limits{nullptr, 0, usable ? usable->data() : nullptr,
+  const engram::SearchLimits limits{nullptr, 0, 0, 0, usable ? usable->data() : nullptr,
                                     static_cast<int32_t>(goal)};
   std::vector<int32_t> nodes, parents, halves;
   std::vector<double> poses, errors_out;
@@ -118,7 +120,7 @@ auto graph_chains(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &
 void bind_graph_search(nb::module_ &module) {
   module.def("graph_candidates", &graph_candidates, "first_half"_a, "next_half"_a, "target"_a,
              "a_from_b"_a, "errors"_a, "reference"_a, "reference_from_live"_a, "live_error"_a,
-             "radius_m"_a, "margin_m"_a, "view_gate_rad"_a, "slack_sigmas"_a, "sessions"_a,
+             "radius_m"_a, "margin_m"_a, "view_gate_rad"_a, "slack_sigmas"_a, "slack_m"_a, "sessions"_a,
              "driven_m"_a, "own_session"_a, "own_driven_m"_a, "own_exclusion_m"_a,
              "Columns of a Neighbourhood: the nodes near the live camera.");
   module.def("graph_chains", &graph_chains, "first_half"_a, "next_half"_a, "target"_a,

@@ -153,8 +153,13 @@ private:
     if (limits_.anchor == nullptr)
       return true;
     const Reached &here = seen_[static_cast<size_t>(row)];
-    return squared_distance(here.root_from_node + 9, limits_.anchor) <=
-           limits_.reach_m * limits_.reach_m;
+    const double square = squared_distance(here.root_from_node + 9, limits_.anchor);
+    if (square <= limits_.reach_m * limits_.reach_m)
+      return true;
+    const double sigma = std::sqrt(variance_at(here.error, limits_.anchor));
+    const double reach =
+        limits_.reach_m + std::min(limits_.slack_sigmas * sigma, limits_.slack_m);
+    return square <= reach * reach;
   }
 
   void expand(int32_t row) {
@@ -234,7 +239,7 @@ void add_candidate(const CandidateQuery &query, const Reached &row, Candidates &
   const double sigma = std::sqrt(variance_at(error, live)), sigma_yaw = std::sqrt(error.s0);
   const double distance = std::sqrt(dot(offset, offset));
   const double yaw = std::atan2(node_from_live[2], node_from_live[8]);
-  if (distance > query.radius_m + std::min(query.slack_sigmas * sigma, query.margin_m) ||
+  if (distance > query.radius_m + std::min(query.slack_sigmas * sigma, query.slack_m) ||
       std::abs(yaw) > query.view_gate_rad + query.slack_sigmas * sigma_yaw)
     return;
   double pivot_in_reference[3];
@@ -285,7 +290,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
   // The reference may lie behind, after a while on odometry alone: reach at least as far as it.
   const double *live = query.reference_from_live + 9;
   const double reach = std::max(query.radius_m, std::sqrt(dot(live, live))) + query.margin_m;
-  const SearchLimits limits{live, reach, nullptr, -1};
+  const SearchLimits limits{live, reach, query.slack_sigmas, query.slack_m, nullptr, -1};
   static thread_local std::vector<Reached> seen;
   std::vector<int32_t> order;
   {

@@ -40,7 +40,9 @@ struct Reached {
 
 struct SearchLimits {
   const double *anchor;  // (3) in the root's frame: errors are weighed as seen there; or null
-  double reach_m;        // nodes further than this from the anchor are not gone through
+  double reach_m;        // nodes further than this from the anchor are not gone through,
+  double slack_sigmas;   // plus so many standard deviations of where they are,
+  double slack_m;        // but no more than this
   const uint8_t *usable; // (edges) 0 for edges to leave out; or null
   int32_t goal;          // stop once this node is reached; -1 for none
 };
@@ -56,7 +58,7 @@ struct CandidateQuery {
   int32_t reference;
   const double *reference_from_live; // (12)
   const double *live_error;          // (5) tau, v, pivot in the reference's frame
-  double radius_m, margin_m, view_gate_rad, slack_sigmas;
+  double radius_m, margin_m, view_gate_rad, slack_sigmas, slack_m;
   const int32_t *sessions; // (nodes)
   const double *driven_m;  // (nodes)
   int32_t own_session;     // -1 for none

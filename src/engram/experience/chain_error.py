@@ -78,6 +78,10 @@ class PivotedError:
         covariance[3:, 3:] = self.rotation_var * np.eye(3)
         return covariance
 
+    def seen_from(self, other_from_a: SE3) -> PivotedError:
+        """The same error in another frame."""
+        return PivotedError(self.translation_var, self.rotation_var, other_from_a @ self.pivot_in_a)
+
     def variance_at(self, point_in_a: Array) -> float:
         """Variance along the worst axis, m², of where a point (3,) carried by the transform is."""
         lever = point_in_a - self.pivot_in_a

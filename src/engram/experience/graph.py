@@ -23,6 +23,8 @@ from engram.geometry import SE3
 DEFAULT_MARGIN_M = 12.0
 # A node that is predicted just outside may truly lie inside. Two sigmas keep 95 % of them.
 DEFAULT_SLACK_SIGMAS = 2.0
+# Beyond this the map does not know where the node is, and looking for it there costs too much.
+DEFAULT_SLACK_M = 30.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -273,6 +275,7 @@ class ExperienceGraph:
         own_exclusion_m: float = 30.0,
         margin_m: float = DEFAULT_MARGIN_M,
         slack_sigmas: float = DEFAULT_SLACK_SIGMAS,
+        slack_m: float = DEFAULT_SLACK_M,
     ) -> Neighbourhood:
         """The candidates Y near the live camera (SPEC §3.1).
 
@@ -285,8 +288,8 @@ class ExperienceGraph:
 
         A node is a candidate if its predicted distance is at most `radius_m`, and its heading
         within the gate (yaw alone, SPEC §2.6), each plus `slack_sigmas` standard deviations of
-        the prediction (the distance by no more than `margin_m`): so nodes that are truly within are
-        in, also where the map is loose.
+        the prediction (the distance by no more than `slack_m`): so nodes that are truly within are
+        in, also where the map is loose. The search's reach is extended alike.
 
         Args:
             reference: dense index of the node that the position refers to.
@@ -300,6 +303,7 @@ class ExperienceGraph:
             own_exclusion_m: see above.
             margin_m: see above.
             slack_sigmas: see above.
+            slack_m: see above.
         """
         live = PivotedError.from_covariance(np.asarray(covariance, dtype=np.float64))
         number = None if own_session is None else self._session_index.get(own_session)
@@ -312,6 +316,7 @@ class ExperienceGraph:
             margin_m,
             view_gate_rad,
             slack_sigmas,
+            slack_m,
             self._node_sessions.rows,
             self._driven_m.rows,
             -1 if number is None else number,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,10 @@ class Neighbourhood:
 
     def __len__(self) -> int:
         return len(self.nodes)
+
+    def rows(self, rows: NDArray[np.intp]) -> Neighbourhood:
+        """Some of the candidates, in the order of `rows`."""
+        return Neighbourhood(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def covariance(self, row: int) -> NDArray[np.float64]:
         """(6, 6) covariance of `node_from_live[row]`, left perturbation, [translation, rotation].
