@@ -1,0 +1,382 @@
+#include "kernels/raster.hpp"
+
+#include <math.h>
+
+namespace engram::ENGRAM_ISA {
+namespace {
+
+constexpr double kNear = 0.1; // metres
+
+// Everything is linear in the sample's column x and row y: f = dx·x + dy·y + at.
+struct Linear {
+  double dx, dy, at;
+};
+
+struct Target {
+  int32_t width, row_begin, row_end;
+  int32_t *ids;
+  float *values;
+};
+
+// A polygon ready to fill: its edges, the value that the greatest of wins, and where a cutout's
+// texture coordinates are.
+struct Polygon {
+  Linear edges[4];
+  Linear value;
+  double x_min, x_max, y_min, y_max;
+  Linear u, v;          // of texture coordinates, times value when perspective
+  double u_at, v_at;    // added after the division by value
+  bool perspective;
+  const uint8_t *mask;  // RGBA level, null for solid surfaces
+  int32_t mask_width, mask_height;
+};
+
+inline double dot(const float *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+// The edge from p to q as a plane through the origin: positive on the side of the polygon.
+inline Linear edge_between(const double *p, const double *q, double side, const Linear &x,
+                           const Linear &y) {
+  const double a = side * (p[1] * q[2] - p[2] * q[1]), b = side * (p[2] * q[0] - p[0] * q[2]),
+               c = side * (p[0] * q[1] - p[1] * q[0]);
+  return {a * x.dx, b * y.dy, a * x.at + b * y.at + c};
+}
+
+inline Linear plane(const double *normal, double scale, const Linear &x, const Linear &y) {
+  return {scale * normal[0] * x.dx, scale * normal[1] * y.dy,
+          scale * (normal[0] * x.at + normal[1] * y.at + normal[2])};
+}
+
+inline void fill_solid(int32_t *ids, float *values, int32_t from, int32_t to, float at, float step,
+                       int32_t id) {
+  for (int32_t x = from; x <= to; ++x) {
+    const float value = at + step * static_cast<float>(x);
+    const bool wins = value > values[x];
+    values[x] = wins ? value : values[x];
+    ids[x] = wins ? id : ids[x];
+  }
+}
+
+inline void fill_depth(float *values, int32_t from, int32_t to, float at, float step) {
+  for (int32_t x = from; x <= to; ++x) {
+    const float value = at + step * static_cast<float>(x);
+    values[x] = value > values[x] ? value : values[x];
+  }
+}
+
+inline bool covered(const Polygon &polygon, int32_t x, double u_row, double v_row, float value) {
+  const double scale = polygon.perspective ? 1.0 / static_cast<double>(value) : 1.0;
+  double u = (u_row + polygon.u.dx * x) * scale + polygon.u_at;
+  double v = (v_row + polygon.v.dx * x) * scale + polygon.v_at;
+  u -= floor(u);
+  v -= floor(v);
+  const int32_t column = static_cast<int32_t>(u * polygon.mask_width);
+  const int32_t row = static_cast<int32_t>(v * polygon.mask_height);
+  const int32_t column_in = column < polygon.mask_width ? column : 0;
+  const int32_t row_in = row < polygon.mask_height ? row : 0;
+  return polygon.mask[4 * (row_in * polygon.mask_width + column_in) + 3] >= 128;
+}
+
+inline void fill_cutout(const Polygon &polygon, int32_t *ids, float *values, int32_t from, int32_t to,
+                        float at, float step, int32_t y, int32_t id) {
+  const double u_row = polygon.u.dy * y + polygon.u.at, v_row = polygon.v.dy * y + polygon.v.at;
+  for (int32_t x = from; x <= to; ++x) {
+    const float value = at + step * static_cast<float>(x);
+    if (value <= values[x] || !covered(polygon, x, u_row, v_row, value))
+      continue;
+    values[x] = value;
+    if (ids != nullptr)
+      ids[x] = id;
+  }
+}
+
+// The interval of columns of row y that lies inside all edges.
+inline bool interval(const Polygon &polygon, int32_t y, double &low, double &high) {
+  low = polygon.x_min;
+  high = polygon.x_max;
+  for (const Linear &edge : polygon.edges) {
+    const double at = edge.dy * y + edge.at;
+    if (edge.dx > 1e-12) {
+      const double x = -at / edge.dx;
+      low = x > low ? x : low;
+    } else if (edge.dx < -1e-12) {
+      const double x = -at / edge.dx;
+      high = x < high ? x : high;
+    } else if (at < 0) {
+      return false;
+    }
+  }
+  return low <= high;
+}
+
+void fill(const Polygon &polygon, const Target &target, int32_t id) {
+  const int32_t first = static_cast<int32_t>(ceil(polygon.y_min > target.row_begin ? polygon.y_min : target.row_begin));
+  const double last_row = target.row_end - 1;
+  const int32_t last = static_cast<int32_t>(floor(polygon.y_max < last_row ? polygon.y_max : last_row));
+  for (int32_t y = first; y <= last; ++y) {
+    double low, high;
+    if (!interval(polygon, y, low, high))
+      continue;
+    const int32_t from = static_cast<int32_t>(ceil(low)), to = static_cast<int32_t>(floor(high));
+    const float at = static_cast<float>(polygon.value.dy * y + polygon.value.at);
+    const float step = static_cast<float>(polygon.value.dx);
+    const int64_t row = static_cast<int64_t>(y) * target.width;
+    int32_t *ids = target.ids == nullptr ? nullptr : target.ids + row;
+    if (polygon.mask != nullptr)
+      fill_cutout(polygon, ids, target.values + row, from, to, at, step, y, id);
+    else if (ids != nullptr)
+      fill_solid(ids, target.values + row, from, to, at, step, id);
+    else
+      fill_depth(target.values + row, from, to, at, step);
+  }
+}
+
+void grow(Polygon &polygon, double x, double y) {
+  polygon.x_min = x < polygon.x_min ? x : polygon.x_min;
+  polygon.x_max = x > polygon.x_max ? x : polygon.x_max;
+  polygon.y_min = y < polygon.y_min ? y : polygon.y_min;
+  polygon.y_max = y > polygon.y_max ? y : polygon.y_max;
+}
+
+void clamp_box(Polygon &polygon, int32_t width) {
+  polygon.x_min = polygon.x_min > 0 ? polygon.x_min : 0;
+  polygon.x_max = polygon.x_max < width - 1 ? polygon.x_max : width - 1;
+}
+
+void take_mask(Polygon &polygon, const Texture &texture, double texels_per_sample) {
+  int32_t level = 0;
+  while (texels_per_sample > 1.5 && level + 3 < texture.level_count) {
+    texels_per_sample *= 0.5;
+    ++level;
+  }
+  polygon.mask = texture.levels[level];
+  polygon.mask_width = texture.widths[level];
+  polygon.mask_height = texture.heights[level];
+}
+
+// Columns and rows of samples as linear functions: x_cam / z_cam = x.dx · column + x.at.
+struct Grid {
+  Linear x, y;
+};
+
+Grid grid_of(const View &view) {
+  const double step = 1.0 / view.samples, first = 0.5 * step - 0.5;
+  return {{step / view.fx, 0, (first - view.cx) / view.fx},
+          {0, step / view.fy, (first - view.cy) / view.fy}};
+}
+
+// The box of samples that the polygon can touch; false when it lies wholly behind the near plane.
+bool bound(Polygon &polygon, const double points[4][3], const Grid &grid) {
+  polygon.x_min = polygon.y_min = 1e9;
+  polygon.x_max = polygon.y_max = -1e9;
+  for (int i = 0; i < 4; ++i) {
+    const double *p = points[i], *q = points[(i + 1) & 3];
+    if (p[2] >= kNear)
+      grow(polygon, (p[0] / p[2] - grid.x.at) / grid.x.dx, (p[1] / p[2] - grid.y.at) / grid.y.dy);
+    if ((p[2] < kNear) == (q[2] < kNear))
+      continue;
+    const double s = (kNear - p[2]) / (q[2] - p[2]);
+    grow(polygon, ((p[0] + s * (q[0] - p[0])) / kNear - grid.x.at) / grid.x.dx,
+         ((p[1] + s * (q[1] - p[1])) / kNear - grid.y.at) / grid.y.dy);
+  }
+  return polygon.x_min <= polygon.x_max;
+}
+
+// Rows of cam_from_world times a world vector.
+inline void turn(const double *rotation, const double *vector, double *turned) {
+  for (int i = 0; i < 3; ++i)
+    turned[i] = rotation[i] * vector[0] + rotation[3 + i] * vector[1] + rotation[6 + i] * vector[2];
+}
+
+void mask_in_view(Polygon &polygon, const Surface &surface, const Texture &texture, const View &view,
+                  const Grid &grid, double depth) {
+  const double along_u[3] = {surface.along_u[0], surface.along_u[1], surface.along_u[2]};
+  const double along_v[3] = {surface.along_v[0], surface.along_v[1], surface.along_v[2]};
+  double u_cam[3], v_cam[3];
+  turn(view.rotation, along_u, u_cam);
+  turn(view.rotation, along_v, v_cam);
+  polygon.u = plane(u_cam, 1.0, grid.x, grid.y);
+  polygon.v = plane(v_cam, 1.0, grid.x, grid.y);
+  polygon.u_at = dot(surface.along_u, view.centre) + surface.u_at_origin;
+  polygon.v_at = dot(surface.along_v, view.centre) + surface.v_at_origin;
+  polygon.perspective = true;
+  const double per_m = texture.widths[0] * sqrt(along_u[0] * along_u[0] + along_u[1] * along_u[1] +
+                                                along_u[2] * along_u[2]);
+  take_mask(polygon, texture, per_m * depth * grid.x.dx);
+}
+
+bool set_up_in_view(Polygon &polygon, const float *vertices, const Surface &surface,
+                    const Texture *textures, const View &view, const Grid &grid, int32_t columns,
+                    double row_low, double row_high) {
+  double points[4][3];
+  for (int i = 0; i < 4; ++i) {
+    const double from_centre[3] = {vertices[3 * i] - view.centre[0],
+                                   vertices[3 * i + 1] - view.centre[1],
+                                   vertices[3 * i + 2] - view.centre[2]};
+    turn(view.rotation, from_centre, points[i]);
+  }
+  const double world_normal[3] = {surface.normal[0], surface.normal[1], surface.normal[2]};
+  double normal[3];
+  turn(view.rotation, world_normal, normal);
+  const double distance =
+      normal[0] * points[0][0] + normal[1] * points[0][1] + normal[2] * points[0][2];
+  const bool from_behind = distance > 0;
+  if ((from_behind && !(surface.flags & kTwoSided)) || fabs(distance) < 1e-6)
+    return false;
+  if (!bound(polygon, points, grid))
+    return false;
+  if (polygon.x_max < 0 || polygon.x_min > columns - 1 || polygon.y_max < row_low ||
+      polygon.y_min > row_high || ceil(polygon.y_min) > polygon.y_max)
+    return false;
+  clamp_box(polygon, columns);
+  for (int i = 0; i < 4; ++i)
+    polygon.edges[i] =
+        edge_between(points[i], points[(i + 1) & 3], from_behind ? 1.0 : -1.0, grid.x, grid.y);
+  polygon.value = plane(normal, 1.0 / distance, grid.x, grid.y);
+  polygon.mask = nullptr;
+  if (surface.flags & kCutout)
+    mask_in_view(polygon, surface, textures[surface.texture], view, grid,
+                 0.5 * (points[0][2] + points[2][2]));
+  return true;
+}
+
+// Whether a sphere can be seen: against the near plane and the four sides of the picture.
+bool in_view(const Chunk &chunk, const View &view) {
+  const double from_centre[3] = {chunk.centre[0] - view.centre[0], chunk.centre[1] - view.centre[1],
+                                 chunk.centre[2] - view.centre[2]};
+  double c[3];
+  turn(view.rotation, from_centre, c);
+  const double r = chunk.radius;
+  if (c[2] < kNear - r)
+    return false;
+  const double left = (-0.5 - view.cx) / view.fx, right = (view.width - 0.5 - view.cx) / view.fx;
+  const double top = (-0.5 - view.cy) / view.fy, bottom = (view.height - 0.5 - view.cy) / view.fy;
+  return c[0] - left * c[2] > -r * sqrt(1 + left * left) &&
+         right * c[2] - c[0] > -r * sqrt(1 + right * right) &&
+         c[1] - top * c[2] > -r * sqrt(1 + top * top) &&
+         bottom * c[2] - c[1] > -r * sqrt(1 + bottom * bottom);
+}
+
+bool set_up_in_window(Polygon &polygon, const float *vertices, const Surface &surface,
+                      const Texture *textures, const Window &window) {
+  const double *axes = window.axes;
+  double points[4][3];
+  polygon.x_min = polygon.y_min = 1e9;
+  polygon.x_max = polygon.y_max = -1e9;
+  for (int i = 0; i < 4; ++i) {
+    for (int k = 0; k < 2; ++k)
+      points[i][k] = dot(vertices + 3 * i, axes + 4 * k) + axes[4 * k + 3];
+    points[i][2] = 1.0;
+    grow(polygon, points[i][0], points[i][1]);
+  }
+  if (polygon.x_max < 0 || polygon.y_max < 0 || polygon.x_min > window.width - 1 ||
+      polygon.y_min > window.height - 1)
+    return false;
+  // The normal in the window's coordinates: rows of axes are orthogonal, of lengths k, k, 1.
+  const double k2 = axes[0] * axes[0] + axes[1] * axes[1] + axes[2] * axes[2];
+  const double across = dot(surface.normal, axes) / k2, down = dot(surface.normal, axes + 4) / k2,
+               up = dot(surface.normal, axes + 8);
+  if (fabs(up) < 1e-4)
+    return false; // seen edge on
+  const double height = dot(vertices, axes + 8) + axes[11];
+  polygon.value = {-across / up, -down / up,
+                   height + (across * points[0][0] + down * points[0][1]) / up};
+  const Linear column = {1, 0, 0}, row = {0, 1, 0};
+  for (int i = 0; i < 4; ++i)
+    polygon.edges[i] =
+        edge_between(points[i], points[(i + 1) & 3], up > 0 ? 1.0 : -1.0, column, row);
+  clamp_box(polygon, window.width);
+  polygon.mask = nullptr;
+  if (!(surface.flags & kCutout))
+    return true;
+  polygon.perspective = false;
+  polygon.u_at = polygon.v_at = 0;
+  const double height_u = dot(surface.along_u, axes + 8), height_v = dot(surface.along_v, axes + 8);
+  polygon.u = {dot(surface.along_u, axes) / k2 + height_u * polygon.value.dx,
+               dot(surface.along_u, axes + 4) / k2 + height_u * polygon.value.dy, 0};
+  polygon.v = {dot(surface.along_v, axes) / k2 + height_v * polygon.value.dx,
+               dot(surface.along_v, axes + 4) / k2 + height_v * polygon.value.dy, 0};
+  const double corner[3] = {vertices[0], vertices[1], vertices[2]};
+  polygon.u.at = dot(surface.along_u, corner) + surface.u_at_origin - polygon.u.dx * points[0][0] -
+                 polygon.u.dy * points[0][1];
+  polygon.v.at = dot(surface.along_v, corner) + surface.v_at_origin - polygon.v.dx * points[0][0] -
+                 polygon.v.dy * points[0][1];
+  take_mask(polygon, textures[surface.texture], fabs(polygon.u.dx) * textures[surface.texture].widths[0]);
+  return true;
+}
+
+} // namespace
+
+void raster_view(const Mesh *meshes, const Texture *textures, const int32_t *order,
+                 int32_t order_count, const View &view, int32_t row_begin, int32_t row_end,
+                 int32_t *ids, float *inverse_depths) {
+  const int32_t columns = view.width * view.samples;
+  const Target target = {columns, row_begin, row_end, ids, inverse_depths};
+  for (int64_t i = static_cast<int64_t>(row_begin) * columns;
+       i < static_cast<int64_t>(row_end) * columns; ++i)
+    inverse_depths[i] = 0;
+  if (ids != nullptr)
+    for (int64_t i = static_cast<int64_t>(row_begin) * columns;
+         i < static_cast<int64_t>(row_end) * columns; ++i)
+      ids[i] = -1;
+  const Grid grid = grid_of(view);
+  for (int32_t k = 0; k < order_count; ++k) {
+    const int32_t slot = order[2 * k];
+    const Mesh &mesh = meshes[slot];
+    const Chunk &chunk = mesh.chunks[order[2 * k + 1]];
+    if (!in_view(chunk, view))
+      continue;
+    for (int32_t i = chunk.first; i < chunk.last; ++i) {
+      Polygon polygon;
+      if (set_up_in_view(polygon, mesh.vertices + 12 * static_cast<int64_t>(i), mesh.surfaces[i],
+                         textures, view, grid, columns, row_begin, row_end - 1))
+        fill(polygon, target, (slot << kIndexBits) | i);
+    }
+  }
+}
+
+void raster_window(const Mesh *meshes, const Texture *textures, const int32_t *order,
+                   int32_t order_count, const Window &window, uint32_t skip_flags,
+                   float *heights) {
+  const Target target = {window.width, 0, window.height, nullptr, heights};
+  for (int64_t i = 0; i < static_cast<int64_t>(window.width) * window.height; ++i)
+    heights[i] = -1e9f;
+  for (int32_t k = 0; k < order_count; ++k) {
+    const Mesh &mesh = meshes[order[2 * k]];
+    const Chunk &chunk = mesh.chunks[order[2 * k + 1]];
+    for (int32_t i = chunk.first; i < chunk.last; ++i) {
+      Polygon polygon;
+      if (!(mesh.surfaces[i].flags & skip_flags) &&
+          set_up_in_window(polygon, mesh.vertices + 12 * static_cast<int64_t>(i), mesh.surfaces[i],
+                           textures, window))
+        fill(polygon, target, 0);
+    }
+  }
+}
+
+void openness_of(const float *heights, int32_t width, int32_t height, float cell_m, float *share) {
+  constexpr int kDirections = 8, kRings = 6;
+  const float across[kDirections] = {1, 0.7071f, 0, -0.7071f, -1, -0.7071f, 0, 0.7071f};
+  const float radius_m[kRings] = {0.4f, 0.9f, 1.8f, 3.6f, 7.0f, 13.0f};
+  for (int32_t y = 0; y < height; ++y)
+    for (int32_t x = 0; x < width; ++x) {
+      const float own = heights[static_cast<int64_t>(y) * width + x];
+      float open = 0;
+      for (int k = 0; k < kDirections; ++k) {
+        // Under something: only what light comes in from the side.
+        float steepest = own > 0.4f ? own / 1.2f : 0;
+        for (int ring = 0; ring < kRings; ++ring) {
+          const int32_t i = x + static_cast<int32_t>(radius_m[ring] * across[k] / cell_m);
+          const int32_t j = y + static_cast<int32_t>(radius_m[ring] * across[(k + 6) & 7] / cell_m);
+          if (i < 0 || j < 0 || i >= width || j >= height)
+            break;
+          const float slope =
+              (heights[static_cast<int64_t>(j) * width + i] - 0.15f) / radius_m[ring];
+          steepest = slope > steepest ? slope : steepest;
+        }
+        open += 1.0f / (1.0f + steepest * steepest); // the sky above that horizon, cosine-weighted
+      }
+      share[static_cast<int64_t>(y) * width + x] = open / kDirections;
+    }
+}
+
+} // namespace engram::ENGRAM_ISA

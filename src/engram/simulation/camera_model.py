@@ -1,0 +1,173 @@
+"""What a camera makes of light: exposure, noise, blur, glare, and what sticks to its lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.simulation.drive import Pose
+from engram.simulation.robots import Robot
+
+Luminance = NDArray[np.float32]
+Grey = NDArray[np.uint8]
+
+_TARGET = 0.46  # exposed luminance that the metered highlights are brought to
+_MOST_GAIN = 26.0
+_SHUTTER_BY_DAY_S = 0.002
+_LONGEST_SHUTTER_S = 0.012
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What is wrong with the front lens in a session.
+
+    Attributes:
+        dirt: 0…1, specks and smears that stay.
+        covered_from_m, covered_to_m: stretch on which something lies over both lenses.
+    """
+
+    dirt: float = 0.0
+    covered_from_m: float = np.inf
+    covered_to_m: float = np.inf
+
+
+CLEAN = Lens()
+
+
+class CameraModel:
+    """Turns luminance into grey levels; keeps the exposure from frame to frame.
+
+    Args:
+        robot: whose camera.
+        seed: of noise, drops and dirt.
+        lens: what is wrong with it.
+    """
+
+    def __init__(self, robot: Robot, seed: int, lens: Lens) -> None:
+        self._robot = robot
+        self._seed = seed
+        self._lens = lens
+        self._gain: float | None = None
+        self._dirt = [self._specks(eye) for eye in range(2)] if lens.dirt > 0 else []
+
+    def expose(
+        self, luminance: Luminance, inverse_depths: Luminance, pose: Pose, rain: float, frame: int
+    ) -> tuple[Grey, Grey]:
+        """The pair's grey images.
+
+        Args:
+            luminance: (2, height, width), linear.
+            inverse_depths: (2, height, width), 1/m.
+            pose: motion while the shutter is open.
+            rain: 0…1, drops on the lens and streaks in the air.
+            frame: number of the frame, seeds its noise.
+        """
+        if self._lens.covered_from_m <= pose.driven_m < self._lens.covered_to_m:
+            luminance = luminance * np.float32(0.002)
+        gain = self._meter(luminance)
+        shutter_s = float(np.clip(_SHUTTER_BY_DAY_S * gain, 0.0005, _LONGEST_SHUTTER_S))
+        pair = []
+        for eye in range(2):
+            light = self._blur(luminance[eye], inverse_depths[eye], pose.twist * shutter_s)
+            light = _veil(light, gain)
+            if self._dirt:
+                light = _smudge(light, self._dirt[eye])
+            if rain > 0.05:
+                light = self._wet(light, rain, frame, eye)
+            noise_seed = (self._seed * 1_000_003 + 2 * frame + eye) & 0xFFFFFFFFFFFF
+            robot = self._robot
+            pair.append(
+                _core.develop(
+                    np.ascontiguousarray(light, dtype=np.float32), gain,
+                    robot.shot_noise * max(1.0, gain) ** 0.75,
+                    robot.read_noise * max(1.0, gain) ** 0.5, robot.vignette, noise_seed,
+                )
+            )  # fmt: skip
+        return pair[0], pair[1]
+
+    def _meter(self, luminance: Luminance) -> float:
+        """The gain, which follows the scene with a lag of about three frames."""
+        rows = luminance.shape[1]
+        metered = luminance[0, rows // 6 :: 4, ::4]
+        bright = float(np.quantile(metered, 0.85))
+        wanted = min(_TARGET / max(bright, 1e-6), _MOST_GAIN)
+        self._gain = wanted if self._gain is None else self._gain * (wanted / self._gain) ** 0.3
+        return self._gain
+
+    def _blur(
+        self, light: Luminance, inverse_depths: Luminance, twist: NDArray[np.float64]
+    ) -> Luminance:
+        camera = self._robot.camera
+        # The nearest things, about 3 m away, move by this much at most.
+        moved_px = camera.fx * (np.abs(twist[:3]).max() / 3 + np.abs(twist[3:]).max())
+        if moved_px < 0.4:
+            return light
+        blurred: Luminance = _core.smear(
+            np.ascontiguousarray(light), np.ascontiguousarray(inverse_depths),
+            camera.fx, camera.fy, camera.cx, camera.cy, twist.astype(np.float32),
+        )  # fmt: skip
+        return blurred
+
+    def _specks(self, eye: int) -> Luminance:
+        """How much of each pixel (height, width) the dirt on one lens takes, 0…1."""
+        camera = self._robot.camera
+        rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD127, eye])
+        mask = np.zeros((camera.height, camera.width), dtype=np.float32)
+        for _ in range(int(25 * self._lens.dirt) + 1):
+            centre = (int(rng.uniform(0, camera.width)), int(rng.uniform(0, camera.height)))
+            axes = (int(rng.uniform(3, 16)), int(rng.uniform(3, 12)))
+            cv2.ellipse(
+                mask,
+                centre,
+                axes,
+                float(rng.uniform(0, 180)),
+                0,
+                360,
+                float(rng.uniform(0.3, 0.9)),
+                -1,
+            )
+        return np.asarray(cv2.GaussianBlur(mask, (0, 0), 4.0), dtype=np.float32)
+
+    def _wet(self, light: Luminance, rain: float, frame: int, eye: int) -> Luminance:
+        height, width = light.shape
+        rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0x3A14, frame, eye])
+        air = float(np.quantile(light[::8, ::8], 0.8))
+        streaks = np.zeros((height, width), dtype=np.float32)
+        for _ in range(int(150 * rain)):
+            x, y, long = rng.uniform(0, width), rng.uniform(-20, height), rng.uniform(8, 28)
+            end = (int(x + 0.08 * long), int(y + long))
+            cv2.line(streaks, (int(x), int(y)), end, float(air * rng.uniform(0.05, 0.22)), 1)
+        light = light + cv2.GaussianBlur(streaks, (0, 0), 0.6)
+        # Drops sit on the glass for some frames before they run off.
+        sitting = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD209, eye, frame // 9])
+        drops = np.zeros((height, width), dtype=np.float32)
+        for _ in range(int(9 * rain)):
+            centre = (int(sitting.uniform(0, width)), int(sitting.uniform(0, height)))
+            cv2.circle(drops, centre, int(sitting.uniform(5, 13)), 1.0, -1)
+        soft = cv2.GaussianBlur(drops, (0, 0), 1.6)
+        through = cv2.blur(cv2.flip(light, 0) * 0.3 + light * 0.7, (19, 19))
+        return np.asarray(light * (1 - soft) + through * soft, dtype=np.float32)
+
+
+def _veil(light: Luminance, gain: float) -> Luminance:
+    """Light that strays in the lens: a halo round what is far brighter than white."""
+    if float(light.max()) * gain < 1.6:
+        return light
+    small = cv2.resize(light, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    excess = np.clip(small - 1.0 / gain, 0, 30.0 / gain)
+    halo = 0.10 * cv2.GaussianBlur(excess, (0, 0), 2.5) + 0.06 * cv2.GaussianBlur(
+        excess, (0, 0), 14
+    )
+    grown = cv2.resize(halo, (light.shape[1], light.shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(light + grown, dtype=np.float32)
+
+
+def _smudge(light: Luminance, mask: Luminance) -> Luminance:
+    blurred = cv2.GaussianBlur(light, (0, 0), 5.0)
+    mean = float(light[::8, ::8].mean())
+    smeared = 0.75 * blurred + 0.12 * mean
+    return np.asarray(light * (1 - mask) + mask * smeared, dtype=np.float32)
