@@ -78,7 +78,7 @@ def attempt(iteration: int, reference: NodeId, target: NodeId, **changes: object
     return Attempt(iteration, reference, target, **values)
 
 
-@dataclass
+@dataclass(repr=False)
 class Drive:
     """What a session wrote, in order: the oracle for what is read back."""
 
@@ -88,6 +88,9 @@ class Drive:
     edges: list[Edge] = field(default_factory=list)
     entries: list[PathEntry] = field(default_factory=list)
     attempts: list[Attempt] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"Drive({self.session.robot}, {len(self.nodes)} nodes)"
 
     def write_node(self, writer: SessionWriter, index: int) -> None:
         """One more node with its edge, path entry and attempts."""

@@ -29,11 +29,6 @@ from .maps import (
 
 
 @pytest.fixture
-def location(tmp_path):
-    return tmp_path / "town.engram"
-
-
-@pytest.fixture
 def store(location):
     with MapStore.create(location) as store:
         yield store
@@ -294,3 +289,91 @@ class TestHistory:
             assert_holds(again, late, early)
         with MapStore.open(location, at=1) as old:
             assert_holds(old, late)
+
+
+class TestContentHash:
+    def test_equal_maps_have_equal_hashes_however_they_were_checkpointed(self, store, tmp_path):
+        writer = begin(store, session())
+        drive = write_drive(writer)
+        writer.add_edge(edge(drive.nodes[0].id, drive.nodes[4].id, EdgeKind.PROXIMITY, seed=1))
+        writer.commit()
+        with MapStore.create(tmp_path / "other.engram") as other:
+            gone = begin(other, session("gone"))
+            write_drive(gone)
+            gone.checkpoint()
+            gone.abandon()
+            writer = begin(other, session())
+            again = Drive(session())
+            for index in range(5):
+                again.write_node(writer, index)
+                writer.checkpoint()
+                if index == 4:
+                    ends = (again.nodes[0].id, again.nodes[4].id)
+                    writer.add_edge(edge(*ends, EdgeKind.PROXIMITY, seed=5))
+                    writer.checkpoint()
+                    writer.add_edge(edge(*ends, EdgeKind.PROXIMITY, seed=1))
+            writer.commit()
+            assert other.content_hash() == store.content_hash()
+
+    def test_any_other_content_has_another_hash(self, store, location, tmp_path):
+        writer = begin(store, session())
+        write_drive(writer)
+        writer.commit()
+        hashes = {store.content_hash()}
+        for number, changes in enumerate(
+            ({}, {"count": 4}, {"author": "else"}, {"statistic": 1}, {"more": 1}, {"name": "x"})
+        ):
+            with MapStore.create(tmp_path / f"{number}.engram") as other:
+                drive = session(changes.get("name", "robot-1"))
+                writer = begin(other, drive, author=changes.get("author", "tests"))
+                written = write_drive(writer, changes.get("count", 5))
+                if "statistic" in changes:
+                    writer.put_statistics("basin", {"g": []})
+                if "more" in changes:
+                    first = written.nodes[0].id
+                    writer.add_attempts([attempt(9, first, first)])
+                writer.commit()
+                hashes.add(other.content_hash())
+        assert len(hashes) == 6
+
+    def test_the_hash_of_an_old_revision_stays(self, store, location):
+        writer = begin(store, session())
+        write_drive(writer)
+        writer.commit()
+        before = store.content_hash()
+        writer = begin(store, session("robot-2"))
+        write_drive(writer)
+        writer.checkpoint()
+        assert store.content_hash() == before
+        writer.commit()
+        assert store.content_hash() != before
+        with MapStore.open(location, at=1) as old:
+            assert old.content_hash() == before
+
+
+class TestCheck:
+    def test_a_sound_map_has_no_problems(self, store, location):
+        writer = begin(store, session())
+        write_drive(writer)
+        writer.commit()
+        writer = begin(store, session("robot-2"))
+        write_drive(writer)
+        writer.checkpoint()
+        report = MapStore.check(location)
+        assert report.problems == ()
+        assert report.interrupted == ()
+        # Two sessions with five nodes each: landmarks, thumbnails, a body of attempts.
+        assert report.blobs == 2 * (5 + 5 + 1)
+        store.close()
+        assert MapStore.check(location).interrupted == (session("robot-2").id,)
+
+    def test_rows_of_abandoned_sessions_are_counted_and_cleaned(self, store, location):
+        writer = begin(store, session())
+        write_drive(writer)
+        writer.checkpoint()
+        writer.abandon()
+        assert MapStore.check(location).abandoned_rows == 1 + 5 + 5 + 4 + 1 + 5 + 1
+        assert store.clean() == 22
+        report = MapStore.check(location)
+        assert report.abandoned_rows == 0
+        assert report.sound

@@ -2,19 +2,9 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, delete, func, select
+from sqlalchemy import Connection, delete, select
 
 from engram.store.schema import VERSIONED, revisions
-
-
-def count_abandoned(connection: Connection) -> int:
-    """How many rows of abandoned revisions are still in the file."""
-    return sum(
-        connection.execute(
-            select(func.count()).select_from(table).where(table.c.revision.in_(_ABANDONED))
-        ).scalar_one()
-        for table in VERSIONED
-    )
 
 
 def collect_abandoned(connection: Connection) -> int:

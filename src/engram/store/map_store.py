@@ -10,19 +10,24 @@ from typing import Any, Self
 from sqlalchemy import Connection, func, insert, select
 
 from engram import __version__
-from engram.errors import IncompatibleError, InputError, MapError, RevisionError
+from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
 from engram.experience.model import Session, SessionId, path_id
 from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.store import reading
+from engram.store.checking import check
 from engram.store.collecting import collect_abandoned
+from engram.store.content import content_hash
 from engram.store.database import Database, Lock
 from engram.store.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.store.keys import KeyBook
+from engram.store.postgresql import PostgresDatabase
 from engram.store.records import (
+    CheckReport,
     InterruptedSession,
     MapContents,
     MapInfo,
+    Problem,
     Revision,
     SessionState,
     StoredSession,
@@ -40,6 +45,18 @@ from engram.store.schema import nodes, path_entries, paths, revisions, sessions
 from engram.store.session_writer import SessionWriter, change_revision
 from engram.store.sqlite import SqliteDatabase
 from engram.store.view import View, head
+
+
+def is_address(location: Path | str) -> bool:
+    """Whether a map lies in PostgreSQL, not in a file."""
+    return isinstance(location, str) and location.startswith("postgresql")
+
+
+def open_database(location: Path | str) -> Database:
+    """The database of an existing map."""
+    if is_address(location):
+        return PostgresDatabase(str(location))
+    return SqliteDatabase(Path(location))
 
 
 class MapStore:
@@ -71,9 +88,11 @@ class MapStore:
             InputError: something is there already, or the folder is not.
             MapError: it cannot be written.
         """
-        path = Path(location)
-        SqliteDatabase.create(path)
-        return MapStore.open_for_writing(path)
+        if is_address(location):
+            PostgresDatabase.create(str(location))
+        else:
+            SqliteDatabase.create(Path(location))
+        return MapStore.open_for_writing(location)
 
     @staticmethod
     def open(
@@ -82,7 +101,7 @@ class MapStore:
         """Open a map for reading.
 
         Args:
-            location: path of the map file.
+            location: path of the map file, or address of a map in PostgreSQL.
             at: number of the revision to see; None for the newest, 0 for the map before the first.
             cache_bytes: how much memory decoded frames may take.
 
@@ -92,7 +111,7 @@ class MapStore:
             MapCorruptError: it is damaged so that it cannot be read.
             RevisionError: it has no such revision.
         """
-        return MapStore(SqliteDatabase(Path(location)), at=at, cache_bytes=cache_bytes)
+        return MapStore(open_database(location), at=at, cache_bytes=cache_bytes)
 
     @staticmethod
     def open_for_writing(
@@ -104,7 +123,7 @@ class MapStore:
             MapLockedError: another process writes to it; names process and host.
             MapError: as `open`, or the file is read-only.
         """
-        return WritableMapStore(SqliteDatabase(Path(location)), cache_bytes=cache_bytes)
+        return WritableMapStore(open_database(location), cache_bytes=cache_bytes)
 
     @property
     def revision(self) -> int:
@@ -154,6 +173,28 @@ class MapStore:
             opened = list(verified(revisions, connection.execute(query)))
             gone = [row for row in opened if not self._is_alive(row)]
             return [one for row in gone for one in _interrupted(connection, row)]
+
+    def content_hash(self) -> str:
+        """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
+        with self._database.reading() as connection:
+            return content_hash(connection, self._view.at)
+
+    @staticmethod
+    def check(location: Path | str) -> CheckReport:
+        """Verify a map file to the last byte, also one that is too damaged to open.
+
+        Raises:
+            NotAMapError: nothing is there, or something else.
+            FormatVersionError: a newer Engram wrote it.
+        """
+        try:
+            database = open_database(location)
+        except MapCorruptError as error:
+            return CheckReport((Problem("file", "", str(error)),), 0, 0, (), 0)
+        try:
+            return check(database)
+        finally:
+            database.close()
 
     def close(self) -> None:
         """Give back files and threads. A session that is still open becomes interrupted."""
@@ -255,6 +296,12 @@ class WritableMapStore(MapStore):
             IncompatibleError: meanwhile another kind of descriptor came into the map.
         """
         return self.resume_session(session).commit()
+
+    def clean(self) -> int:
+        """Remove the rows of abandoned revisions; returns how many there were."""
+        self._check_none_open()
+        with self._database.writing() as connection:
+            return collect_abandoned(connection)
 
     def close(self) -> None:
         """Give back files, threads and the right to write."""
@@ -379,7 +426,7 @@ def _session_and_revision(connection: Connection, session: SessionId) -> tuple[R
     query = select(revisions).where(revisions.c.key == row["revision"]).order_by(revisions.c.key)
     revision = next(verified(revisions, connection.execute(query)), None)
     if revision is None:
-        raise MapError(f"session {session}: its revision is missing; run engram check")
+        raise MapCorruptError(f"session {session}: its revision is missing; run engram check")
     return row, revision
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -176,7 +175,7 @@ def _node(
     row: Row, known_cameras: dict[int, StereoCamera], session_ids: dict[int, SessionId]
 ) -> Node:
     if row["session"] not in session_ids:
-        name = UUID(bytes=row["uuid"])
+        name = uuid_from_bytes(row["uuid"], "node")
         raise MapCorruptError(f"node {name}: its session, row {row['session']}, is missing")
     return node_from_row(row, session_ids[row["session"]], _camera_id(known_cameras, row, "node"))
 

@@ -233,8 +233,8 @@ class CheckReport:
         problems: empty for a sound map.
         rows, blobs: how many were verified.
         interrupted: sessions that wait to be resumed or sealed; no problem.
-        abandoned_rows: rows of abandoned revisions that are still in the file; no problem.
-        collected_rows: how many of them `clean` removed.
+        abandoned_rows: rows of abandoned revisions that are still in the file, until
+            `WritableMapStore.clean`; no problem.
     """
 
     problems: tuple[Problem, ...]
@@ -242,7 +242,6 @@ class CheckReport:
     blobs: int
     interrupted: tuple[SessionId, ...]
     abandoned_rows: int
-    collected_rows: int
 
     @property
     def sound(self) -> bool:

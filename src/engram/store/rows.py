@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from typing import Any
 from uuid import UUID
 
@@ -44,8 +45,8 @@ def checksum(values: Sequence[Any]) -> int:
 
 def sealed(table: Table, values: Row) -> Row:
     """The row with its checksum."""
-    columns = [column.name for column in table.columns if column.name != "checksum"]
-    values["checksum"] = checksum([values[name] for name in columns])
+    names, _ = _shape(table)
+    values["checksum"] = checksum([values[name] for name in names[:-1]])
     return values
 
 
@@ -59,16 +60,28 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
     Raises:
         MapCorruptError: when met; names the table and the row.
     """
-    names = [column.name for column in table.columns]
+    names, kinds = _shape(table)
     count = len(names)
     for row in rows:
         values = list(row[:count])
-        if checksum(values[:-1]) != values[-1]:
+        if checksum(values[:-1]) != values[-1] or not all(
+            type(value) in kind for value, kind in zip(values, kinds, strict=True)
+        ):
             raise MapCorruptError(
                 f"table {table.name}: {describe(table, values)} does not match its checksum; "
                 "run engram check, and restore a copy"
             )
         yield dict(zip(names, values, strict=True))
+
+
+@cache
+def _shape(table: Table) -> tuple[list[str], list[frozenset[type]]]:
+    """Names of a table's columns and the types that their values may have."""
+    kinds = [
+        frozenset({column.type.python_type, *([type(None)] if column.nullable else [])})
+        for column in table.columns
+    ]
+    return [column.name for column in table.columns], kinds
 
 
 def describe(table: Table, values: Sequence[Any]) -> str:

@@ -319,6 +319,8 @@ def _translated(name: str) -> Iterator[None]:
     except (DBAPIError, sqlite3.Error) as error:
         cause = error.orig if isinstance(error, DBAPIError) else error
         raise _translate(cause, name) from error
+    except UnicodeDecodeError as error:  # sqlite3 reads names of columns without a net
+        raise MapCorruptError(f"{name} is damaged ({error}); restore a copy") from error
 
 
 def _translate(cause: BaseException | None, name: str) -> MapError:
