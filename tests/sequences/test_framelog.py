@@ -21,6 +21,7 @@ from engram.errors import (
     MapCorruptError,
     MapLockedError,
     SequenceError,
+    StorageFullError,
 )
 from engram.experience.model import Clock
 from engram.geometry import SE3, propagate_covariance
@@ -202,10 +203,55 @@ def test_two_writers_the_second_is_told(tmp_path: Path) -> None:
     assert len(FrameLog(path)) == 2
 
 
-def test_another_drive_is_not_appended(tmp_path: Path) -> None:
+@pytest.mark.parametrize("change", [{"frontend": "other settings"}, {"frames": "0::2"}])
+def test_another_drive_is_not_appended(tmp_path: Path, change: dict) -> None:
     path = write_log(tmp_path / "a.framelog")
     with pytest.raises(IncompatibleError, match="another"):
-        FrameLogWriter(path, log_header(frontend="other settings"))
+        FrameLogWriter(path, log_header(**change))
+
+
+def test_frames_of_an_earlier_run_are_known(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+    with FrameLogWriter(path, log_header()) as writer:
+        for index in (0, 2):
+            assert not writer.holds(stamp_ns(index), pair_hash(index))
+            writer.append(logged(index), pair_hash(index))
+    with FrameLogWriter(path, log_header()) as writer:
+        assert writer.holds(stamp_ns(0), pair_hash(0))
+        assert not writer.holds(stamp_ns(3), pair_hash(3))
+        with pytest.raises(IncompatibleError, match="no frame"):
+            writer.holds(stamp_ns(1), pair_hash(1))
+        with pytest.raises(IncompatibleError, match="other images"):
+            writer.holds(stamp_ns(2), pair_hash(0))
+
+
+def test_a_full_disk_loses_nothing_that_was_committed(tmp_path: Path) -> None:
+    path = tmp_path / "a.framelog"
+    writer = FrameLogWriter(path, log_header(), checkpoint_every=2)
+    for index in range(2):
+        writer.append(logged(index), pair_hash(index))
+    pages = writer._connection.exec_driver_sql("PRAGMA page_count").scalar()
+    writer._connection.exec_driver_sql(f"PRAGMA max_page_count = {pages}")
+
+    def record_the_rest() -> None:
+        for index in range(2, PAIRS):
+            writer.append(logged(index), pair_hash(index))
+
+    with pytest.raises(StorageFullError, match="up to the last checkpoint are safe"):
+        record_the_rest()
+    with pytest.raises(InputError, match="closed"):
+        writer.append(logged(5), pair_hash(5))
+    writer.close()
+    log = FrameLog(path)
+    assert len(list(log)) in {2, 4}  # as many checkpoints as the free pages allowed
+    assert not log.complete
+    with FrameLogWriter(path, log_header()) as again:
+        assert again.recorded == len(log)
+
+
+def test_a_log_has_no_colours(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'blue'"):
+        open_sequence(write_log(tmp_path / "a.framelog"), channel="blue")
 
 
 def test_frames_must_rise_and_fit(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ frames_table = Table(
     "frames",
     metadata,
     Column("number", _INT64, primary_key=True, autoincrement=False),
-    Column("stamp_ns", _INT64, nullable=False),
+    Column("stamp_ns", _INT64, nullable=False, unique=True),
     Column("status", Text(), nullable=False),
     Column("pair_hash", Text(), nullable=False),
     Column("odometry_status", Text(), nullable=False),
