@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from engram.errors import (
@@ -296,6 +296,31 @@ def test_a_newer_format_is_refused(tmp_path: Path) -> None:
         open_sequence(path)
 
 
+@pytest.mark.parametrize(
+    "hostile",
+    [
+        "CREATE VIEW more AS WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n FROM r) "
+        "SELECT * FROM r",
+        "CREATE TRIGGER t AFTER UPDATE ON log BEGIN DELETE FROM frames; END",
+        "DROP TABLE frames",
+        "DROP TABLE frames; CREATE TABLE frames (number, stamp_ns, status, pair_hash, "
+        "odometry_status, inliers, prev_from_curr, covariance, digest, landmarks, thumbnail); "
+        "INSERT INTO frames VALUES (0, 'noon', 1, 2, 3, 4, 5, 6, 7, 8, 9)",
+        "DROP TABLE frames; CREATE TABLE frames (number, stamp_ns, status, pair_hash, "
+        "odometry_status, inliers, prev_from_curr, covariance, digest, landmarks, thumbnail); "
+        "INSERT INTO frames VALUES (0, 1, 1, 2, 3, 4, 5, 6, 7, 8, 9)",
+        "DELETE FROM log",
+    ],
+)
+def test_a_made_up_file_is_refused(tmp_path: Path, hostile: str) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    with sqlite3.connect(path) as database:
+        database.executescript(hostile)
+    database.close()
+    with pytest.raises(MapCorruptError, match=r"a\.framelog"):
+        list(open_sequence(path))
+
+
 @pytest.mark.parametrize("keep", [0.3, 0.6, 0.95])
 def test_a_log_cut_short_is_told(tmp_path: Path, keep: float) -> None:
     path = write_log(tmp_path / "a.framelog")
@@ -340,6 +365,7 @@ def test_a_gap_in_the_numbers_is_told(tmp_path: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
+@example(place=0.0859375, flip=128)  # reached the schema, where the driver's own message broke
 def test_a_flipped_byte_gives_our_errors_or_the_same_frames(
     tmp_path_factory: pytest.TempPathFactory, place: float, flip: int
 ) -> None:

@@ -251,7 +251,11 @@ def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
         MapCorruptError: it is missing or does not match its hash.
     """
     rows = connection.execute(select(log_table).order_by(log_table.c.key)).all()
-    if len(rows) != 1 or content_digest(rows[0].header.encode()) != rows[0].digest:
+    if (
+        len(rows) != 1
+        or not isinstance(rows[0].header, str)
+        or content_digest(rows[0].header.encode()) != rows[0].digest
+    ):
         raise MapCorruptError("the frame log's header is missing or does not match its hash")
     return FrameLogHeader.from_json(rows[0].header), bool(rows[0].complete)
 
@@ -262,6 +266,8 @@ def _read_stamps(connection: Connection) -> NDArray[np.int64]:
     ).all()
     if not rows:
         raise SequenceError("the frame log holds no frame")
+    if not all(isinstance(value, int) for row in rows for value in row):
+        raise MapCorruptError("the frame log has stamps that are no numbers")
     table = np.array(rows, dtype=np.int64).reshape(-1, 2)
     if (table[:, 0] != np.arange(len(table))).any():
         raise MapCorruptError("frames are missing in the frame log: their numbers have gaps")
