@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-CORE_SOURCES := $(shell find src/core CMakeLists.txt)
+CORE_SOURCES := $(shell find src/core CMakeLists.txt -type f)
+PACKAGES := $(shell find src/engram -name __init__.py)
 
 # Real images for tests and benchmarks; tests that need them skip where there are none.
 ifndef ENGRAM_DATA
@@ -16,7 +17,7 @@ endif
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt $(CORE_SOURCES)
+$(STAMP): pyproject.toml constraints.txt $(CORE_SOURCES) $(PACKAGES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Engram needs Python 3.11 or newer; set PYTHON=...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'

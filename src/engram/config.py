@@ -42,9 +42,20 @@ def from_dict(values: dict[str, Any], kind: type[T]) -> T:
 
 def to_dict(config: Any) -> dict[str, Any]:
     """Plain values of a dataclass: the resolved configuration that is kept with every result."""
-    plain = msgspec.to_builtins(config)
-    assert isinstance(plain, dict)
+    plain: dict[str, Any] = msgspec.to_builtins(_spread(config))
     return plain
+
+
+def _spread(value: Any) -> Any:
+    """Dataclasses as dicts, at any depth.
+
+    msgspec would do it, but leaves out fields that it itself had filled in from their defaults.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {one.name: _spread(getattr(value, one.name)) for one in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {key: _spread(one) for key, one in value.items()}
+    return value
 
 
 def config_hash(config: Any) -> str:

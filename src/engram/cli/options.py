@@ -1,0 +1,69 @@
+"""Options that several verbs share, and the sequence they describe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+
+MapPath: TypeAlias = Annotated[Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.")]
+DrivePath: TypeAlias = Annotated[
+    Path, typer.Argument(metavar="PATH", help="A drive: a folder of stereo images or a frame log.")
+]
+Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+At: TypeAlias = Annotated[
+    int | None, typer.Option("--at", metavar="REV", help="Read the map as of this revision.")
+]
+Format: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--format", help="kitti, kitti-raw, euroc, folder or framelog [default: seen]."),
+]
+Rig: TypeAlias = Annotated[str, typer.Option("--rig", help="Of several rigs: grey or colour.")]
+Channel: TypeAlias = Annotated[
+    str, typer.Option("--channel", help="Of colour images: grey, red, green or blue.")
+]
+Frames: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--frames", metavar="START:STOP:STEP", help="Only these frames, as in 0:100:2."),
+]
+SkipBad: TypeAlias = Annotated[
+    bool, typer.Option("--skip-bad", help="Go on past images that cannot be used, and count them.")
+]
+Robot: TypeAlias = Annotated[
+    str | None, typer.Option("--robot", help="Name of the robot [default: from the drive].")
+]
+Start: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--start", metavar="TIME", help="When the drive began, ISO 8601 in UTC."),
+]
+Longitude: TypeAlias = Annotated[
+    float | None, typer.Option("--longitude", help="Where the drive was, degrees east.")
+]
+Zone: TypeAlias = Annotated[
+    str | None, typer.Option("--zone", help="Time zone of the drive, as in Europe/London.")
+]
+Settings: TypeAlias = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings in TOML.")
+]
+Lanes: TypeAlias = Annotated[
+    int, typer.Option("--lanes", min=1, help="Match attempts at the same time (Np).")
+]
+Rounds: TypeAlias = Annotated[
+    int, typer.Option("--rounds", min=1, help="Rounds of attempts for one frame (Nr).")
+]
+Deadline: TypeAlias = Annotated[
+    float | None,
+    typer.Option("--deadline", metavar="MS", help="No attempt starts later after its frame."),
+]
+Policy: TypeAlias = Annotated[
+    str, typer.Option("--policy", help="Ranking: distance, path, path-literal or random.")
+]
+ThereAndBack: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        "--there-and-back",
+        metavar="FRAMES",
+        help="Drive the sequence there and back until so many frames have passed.",
+    ),
+]

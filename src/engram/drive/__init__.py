@@ -1,0 +1,44 @@
+"""Whole drives: open, replay, extract, map, localise, summarise."""
+
+from engram.drive.extracting import ExtractReport, extract_log
+from engram.drive.inspecting import check_map, describe_map, map_log, seal_map
+from engram.drive.live import LiveFrame, live_frames
+from engram.drive.localising import LocaliseOptions, LocaliseRun
+from engram.drive.mapping import MapOptions, MapReport, map_drive
+from engram.drive.opened_map import LiveRobot, OpenMap, open_map
+from engram.drive.pictures import PictureWriter
+from engram.drive.results import FrameResult, summarise
+from engram.drive.session import DriveSequence, open_drive, session_of_drive
+from engram.drive.settings import Settings, load_settings
+from engram.drive.there_and_back import ThereAndBack
+from engram.drive.trajectory import chain_trajectory, write_trajectory
+
+__all__ = [
+    "DriveSequence",
+    "ExtractReport",
+    "FrameResult",
+    "LiveFrame",
+    "LiveRobot",
+    "LocaliseOptions",
+    "LocaliseRun",
+    "MapOptions",
+    "MapReport",
+    "OpenMap",
+    "PictureWriter",
+    "Settings",
+    "ThereAndBack",
+    "chain_trajectory",
+    "check_map",
+    "describe_map",
+    "extract_log",
+    "live_frames",
+    "load_settings",
+    "map_drive",
+    "map_log",
+    "open_drive",
+    "open_map",
+    "seal_map",
+    "session_of_drive",
+    "summarise",
+    "write_trajectory",
+]

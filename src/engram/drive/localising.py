@@ -1,0 +1,95 @@
+"""Localising a whole drive in a map that stays as it is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+from engram.drive.live import LiveFrame, live_frames
+from engram.drive.opened_map import open_map
+from engram.drive.results import FrameResult
+from engram.drive.session import DriveSequence
+from engram.drive.settings import Settings
+from engram.localiser import Budget, Localiser
+
+
+@dataclass(frozen=True, slots=True)
+class LocaliseOptions:
+    """How a drive is localised.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each frame.
+        deadline_ms: no attempt starts later than this after its frame arrived; None for no limit.
+        relocaliser: key of `RELOCALISERS`; None for none.
+        at: number of the map's revision; None for the newest.
+        rate_hz: replay in real time; None for as fast as it goes.
+        preload: decode all images before the first frame.
+    """
+
+    policy: str = "path"
+    lanes: int = 2
+    rounds: int = 2
+    deadline_ms: float | None = None
+    relocaliser: str | None = "exhaustive"
+    at: int | None = None
+    rate_hz: float | None = None
+    preload: bool = False
+
+
+class LocaliseRun:
+    """A drive being localised: iterate for each live frame and its result. A context manager.
+
+    Attributes:
+        opened: the map.
+        localiser: the localiser of this drive.
+    """
+
+    def __init__(
+        self, map_path: Path, sequence: DriveSequence, settings: Settings, options: LocaliseOptions
+    ) -> None:
+        self.opened = open_map(map_path, options.at)
+        self._sequence = sequence
+        self._settings = settings.for_descriptor(self.opened.descriptor)
+        self._options = options
+        self.localiser: Localiser = self.opened.localiser(
+            sequence.camera,
+            self._settings,
+            policy=options.policy,
+            budget=Budget(options.lanes, options.rounds),
+            relocaliser=options.relocaliser,
+        )
+
+    def __enter__(self) -> LocaliseRun:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.localiser.close()
+        self.opened.close()
+
+    def __iter__(self) -> Iterator[tuple[LiveFrame, FrameResult]]:
+        options = self._options
+        frames = live_frames(self._sequence, self._settings, options.rate_hz, options.preload)
+        for live in frames:
+            deadline = (
+                None if options.deadline_ms is None else live.arrived + options.deadline_ms / 1e3
+            )
+            found = self.localiser.localise(live.frame, live.odometry, deadline)
+            late = self._is_late(time.perf_counter() - live.arrived)
+            stage_ms = {**live.stage_ms, **found.stage_ms}
+            yield live, FrameResult(found, live.odometry.prev_from_curr, stage_ms, late)
+
+    def _is_late(self, seconds: float) -> bool:
+        """In real time, an answer is late after the deadline or, without one, the next frame."""
+        if self._options.rate_hz is None:
+            return False
+        allowed_ms = self._options.deadline_ms or 1e3 / self._options.rate_hz
+        return seconds * 1e3 > allowed_ms

@@ -1,0 +1,249 @@
+"""Mapping a whole drive: open or resume its session, feed the mapper, commit."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from engram import __version__
+from engram.config import to_dict
+from engram.drive.live import LiveFrame, ignore, live_frames
+from engram.drive.opened_map import OpenMap
+from engram.drive.results import FrameResult, summarise
+from engram.drive.session import DriveSequence, session_of_drive
+from engram.drive.settings import Settings
+from engram.experience.model import Session
+from engram.frontend import Frontend
+from engram.geometry import StereoCamera
+from engram.localiser import Budget
+from engram.mapper import Mapper, Saver
+from engram.sequences import FrameLog
+from engram.store import MapStore, SessionState, SessionWriter, WritableMapStore
+
+
+@dataclass(frozen=True, slots=True)
+class MapOptions:
+    """How a drive is mapped.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each frame.
+        deadline_ms: deadline of each frame; None maps with counts alone, so that the same input
+            gives the same map.
+        relocaliser: key of `RELOCALISERS`.
+        author: who maps; None for the robot.
+        rate_hz: replay in real time; None for as fast as it goes.
+    """
+
+    policy: str = "path"
+    lanes: int = 2
+    rounds: int = 2
+    deadline_ms: float | None = None
+    relocaliser: str | None = "exhaustive"
+    author: str | None = None
+    rate_hz: float | None = None
+
+
+@dataclass(slots=True)
+class MapReport:
+    """What mapping a drive came to.
+
+    Attributes:
+        session: the drive.
+        revision: number of the revision that holds it; None if it was interrupted.
+        known: whether the map held this very drive already; then nothing was done.
+        resumed: whether it went on where an earlier run had stopped.
+        interrupted: whether it was stopped; what was done is saved, and can be resumed.
+        saved: nodes added.
+        skipped: pairs left out under `skip_bad`.
+        results: one per live frame.
+    """
+
+    session: Session
+    revision: int | None = None
+    known: bool = False
+    resumed: bool = False
+    interrupted: bool = False
+    saved: int = 0
+    skipped: int = 0
+    results: list[FrameResult] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``map --json`` prints."""
+        return {
+            "session": str(self.session.id),
+            "robot": self.session.robot,
+            "revision": self.revision,
+            "known": self.known,
+            "resumed": self.resumed,
+            "interrupted": self.interrupted,
+            "nodes_saved": self.saved,
+            "skipped_pairs": self.skipped,
+            **summarise(self.results),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        if self.known:
+            return f"session {self.session.id} is in the map already: nothing to do"
+        summary = summarise(self.results)
+        how = "resumed, " if self.resumed else ""
+        line = (
+            f"{how}{summary['frames']} frames over {summary['driven_m']:.1f} m: "
+            f"{summary['share_localised']:.1%} localised, {self.saved} nodes saved"
+        )
+        if self.skipped:
+            line += f", {self.skipped} pairs skipped"
+        if self.interrupted:
+            return f"{line}\ninterrupted: what was done is saved; give the same command to resume"
+        return f"{line}, revision {self.revision}"
+
+
+def map_drive(
+    map_path: Path,
+    sequence: DriveSequence,
+    settings: Settings,
+    options: MapOptions,
+    advance: Callable[[str], None] = ignore,
+) -> MapReport:
+    """Adds a drive to a map, which is made if there is none.
+
+    A drive that the map holds already changes nothing; one that was interrupted is resumed.
+    Ctrl-C ends it with what was done saved.
+
+    Args:
+        map_path: NAME.engram.
+        sequence: the drive.
+        settings: the resolved configuration, kept with the revision.
+        options: how it is mapped.
+        advance: called once per frame with a word on how it went.
+
+    Raises:
+        MapError: the map cannot be read or written; what was checkpointed is intact.
+        SequenceError: the drive's images cannot be used; what came before is saved.
+    """
+    session = session_of_drive(sequence)
+    report = MapReport(session)
+    with _open_or_create(map_path) as store:
+        state = store.session_state(session.id)
+        if state is SessionState.COMMITTED:
+            report.known = True
+            return report
+        settings = settings.for_descriptor(store.info().descriptor)
+        if state is SessionState.ABSENT:
+            writer = _begin(store, session, sequence, settings, options)
+        else:
+            writer = store.resume_session(session.id)
+            report.resumed = True
+        opened = OpenMap(store)
+        frames = live_frames(sequence, settings, options.rate_hz)
+        _map_frames(opened, writer, sequence.camera, frames, settings, options, report, advance)
+    report.skipped = sequence.skipped
+    return report
+
+
+def _open_or_create(path: Path) -> WritableMapStore:
+    return MapStore.open_for_writing(path) if path.exists() else MapStore.create(path)
+
+
+def _begin(
+    store: WritableMapStore,
+    session: Session,
+    sequence: DriveSequence,
+    settings: Settings,
+    options: MapOptions,
+) -> SessionWriter:
+    """A new session; frame logs tell which front-end made them."""
+    if isinstance(sequence, FrameLog):
+        descriptor, frontend = sequence.header.descriptor, sequence.header.frontend
+    else:
+        descriptor, frontend = settings.frontend.descriptor, Frontend(settings.frontend).hash
+    return store.begin_session(
+        session,
+        sequence.camera,
+        descriptor=descriptor,
+        frontend=frontend,
+        author=options.author or session.robot,
+        configuration=_configuration(settings, options),
+        message=f"map {sequence.info.name}",
+    )
+
+
+def _configuration(settings: Settings, options: MapOptions) -> dict[str, Any]:
+    """The resolved configuration, which every revision keeps (STYLE: reproducible)."""
+    return {
+        "settings": to_dict(settings),
+        "options": to_dict(options),
+        "machine": platform.machine(),
+        "engram": __version__,
+    }
+
+
+def _map_frames(
+    opened: OpenMap,
+    writer: SessionWriter,
+    camera: StereoCamera,
+    frames: Iterable[LiveFrame],
+    settings: Settings,
+    options: MapOptions,
+    report: MapReport,
+    advance: Callable[[str], None],
+) -> None:
+    """Feeds the mapper; commits at the end, or leaves the session to be resumed."""
+    saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every)
+    localiser = opened.localiser(
+        camera,
+        settings,
+        policy=options.policy,
+        budget=Budget(options.lanes, options.rounds),
+        relocaliser=options.relocaliser,
+        session=writer.session.id,
+    )
+    with localiser:
+        mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper)
+        try:
+            for live in _from_where_it_stopped(frames, writer, mapper, advance):
+                deadline = options.deadline_ms and live.arrived + options.deadline_ms / 1e3
+                step = mapper.process(live.frame, live.odometry, deadline)
+                report.saved += step.saved is not None
+                report.results.append(
+                    FrameResult(
+                        step.localisation,
+                        live.odometry.prev_from_curr,
+                        {**live.stage_ms, **step.localisation.stage_ms},
+                    )
+                )
+                word = "saved" if step.saved else step.localisation.status.value
+                advance(word)
+        except KeyboardInterrupt:
+            report.interrupted = True
+        finally:
+            saver.finish()
+    if not report.interrupted:
+        report.revision = writer.commit().number
+
+
+def _from_where_it_stopped(
+    frames: Iterable[LiveFrame],
+    writer: SessionWriter,
+    mapper: Mapper,
+    advance: Callable[[str], None],
+) -> Iterable[LiveFrame]:
+    """All frames of a new session; of a resumed one those from its last saved node on.
+
+    The robot is in the node that it saved by construction, so the drive goes on from that very
+    frame; frames before it went into odometry only.
+    """
+    last = writer.stored.nodes[-1] if writer.stored.nodes else None
+    reached = last is None
+    for live in frames:
+        if reached:
+            yield live
+            continue
+        advance("resuming")
+        if last is not None and live.frame.stamp_ns == last.stamp_ns:
+            mapper.resume(last, writer.stored.next_sequence)
+            reached = True

@@ -1,0 +1,213 @@
+"""A map in use: its graph and path memory in memory, its landmarks on disk."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from types import TracebackType
+
+from engram.drive.settings import Settings
+from engram.errors import ConfigError
+from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import SessionId
+from engram.experience.path_memory import PathMemory
+from engram.frontend import DescriptorKind, Frontend, StereoPair
+from engram.geometry import StereoCamera
+from engram.localiser import RELOCALISERS, Budget, Localisation, Localiser
+from engram.odometry import Odometry
+from engram.ranking import POLICIES
+from engram.store import MapStore
+
+
+class OpenMap:
+    """A map that is open for reading, or for a mapper to add to.
+
+    Attributes:
+        store: the file.
+        graph: its experience graph.
+        path_memory: its paths.
+        attempts: counts of remembered attempts, from which match basins are learnt.
+    """
+
+    def __init__(self, store: MapStore) -> None:
+        self.store = store
+        self.graph = ExperienceGraph()
+        self.path_memory = PathMemory(self.graph)
+        contents = store.load()
+        for node in contents.nodes:
+            self.graph.add_node(node)
+        for edge in contents.edges:
+            self.graph.add_edge(edge)
+        for entry in contents.path_entries:
+            self.path_memory.add(entry)
+        self.attempts = BasinCounts.empty()
+        for session in contents.sessions:
+            made = contents.attempts_of(session.id)
+            tried = [self.graph.index(attempt.node) for attempt in made]
+            self.attempts += count_attempts(made, self.graph.experiences[tried])
+
+    def __enter__(self) -> OpenMap:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self.store.close()
+
+    @property
+    def descriptor(self) -> DescriptorKind | None:
+        """Kind of all descriptors of the map; None while it is empty."""
+        return self.store.info().descriptor
+
+    def localiser(
+        self,
+        camera: StereoCamera,
+        settings: Settings,
+        *,
+        policy: str = "path",
+        budget: Budget | None = None,
+        relocaliser: str | None = "exhaustive",
+        session: SessionId | None = None,
+    ) -> Localiser:
+        """A localiser for one session in this map.
+
+        Args:
+            camera: the live camera, which need not be one of the map's.
+            settings: the resolved configuration.
+            policy: key of `POLICIES`.
+            budget: by default 2 lanes × 2 rounds.
+            relocaliser: key of `RELOCALISERS`; None for none.
+            session: the session that is being mapped; None for one that saves nothing.
+
+        Raises:
+            ConfigError: there is no such policy or relocaliser.
+        """
+        if policy not in POLICIES:
+            raise ConfigError(f"policy {policy!r} is unknown; known: {', '.join(POLICIES)}")
+        if relocaliser is not None and relocaliser not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}, none"
+            )
+        return Localiser(
+            self.graph,
+            self.path_memory,
+            self.store.frames,
+            policy=POLICIES[policy](),
+            budget=budget or Budget(),
+            relocaliser=None if relocaliser is None else RELOCALISERS[relocaliser](self.graph),
+            basin=MatchBasin.of(camera.fx, self.attempts),
+            session=session,
+            config=settings.localiser,
+        )
+
+    def robot(
+        self,
+        camera: StereoCamera,
+        settings: Settings | None = None,
+        *,
+        policy: str = "path",
+        lanes: int = 2,
+        rounds: int = 2,
+        relocaliser: str | None = "exhaustive",
+    ) -> LiveRobot:
+        """A robot that hands in image pairs one by one; see `LiveRobot.localise`.
+
+        Args:
+            camera: its rectified stereo camera.
+            settings: the configuration; None for the defaults.
+            policy: key of `POLICIES`.
+            lanes: attempts at the same time (Np).
+            rounds: rounds of attempts for one frame (Nr).
+            relocaliser: how it is found when lost; None for not at all.
+        """
+        return LiveRobot(
+            self,
+            camera,
+            settings or Settings(),
+            policy=policy,
+            budget=Budget(lanes, rounds),
+            relocaliser=relocaliser,
+        )
+
+
+class LiveRobot:
+    """One robot on one drive: image pairs in, `Localisation`s out. Not thread-safe."""
+
+    def __init__(
+        self,
+        opened: OpenMap,
+        camera: StereoCamera,
+        settings: Settings,
+        *,
+        policy: str,
+        budget: Budget,
+        relocaliser: str | None,
+    ) -> None:
+        self.camera = camera
+        self._frontend = Frontend(settings.for_descriptor(opened.descriptor).frontend)
+        self._odometry = Odometry(settings.odometry)
+        self._localiser = opened.localiser(
+            camera,
+            settings,
+            policy=policy,
+            budget=budget,
+            relocaliser=relocaliser,
+            session=None,
+        )
+
+    def __enter__(self) -> LiveRobot:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the threads of the lanes."""
+        self._localiser.close()
+
+    def localise(self, pair: StereoPair, deadline_ms: float | None = None) -> Localisation:
+        """Localises one pair of images; call it for every pair, in the order of time.
+
+        Args:
+            pair: (h, w) uint8 grey, rectified, synchronised; `stamp_ns` later than the last.
+            deadline_ms: no match attempt starts later than this after the call.
+
+        Returns:
+            Where the robot is, as far as it is known. `node_from_live` (metres, x right, y down,
+            z forward) is set only where the frame was matched.
+
+        Raises:
+            MapError: the map's landmarks cannot be read.
+        """
+        arrived = time.perf_counter()
+        frame = self._frontend.extract(pair)
+        odometry = self._odometry.step(frame)
+        deadline = None if deadline_ms is None else arrived + deadline_ms / 1e3
+        return self._localiser.localise(frame, odometry, deadline)
+
+
+def open_map(path: str | Path, at: int | None = None) -> OpenMap:
+    """Opens a map for localising in it.
+
+    Args:
+        path: NAME.engram.
+        at: number of a revision, to see the map as it was then; None for the newest.
+
+    Raises:
+        MapError: the file is no map, of a newer format, or damaged.
+        RevisionError: there is no such revision.
+    """
+    return OpenMap(MapStore.open(path, at=at))

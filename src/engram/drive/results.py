@@ -1,0 +1,100 @@
+"""What a localised drive comes to: one result per frame, and a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from engram.geometry import SE3
+from engram.localiser import Localisation, LocalisationStatus
+from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameResult:
+    """One live frame of a drive.
+
+    Attributes:
+        localisation: the localiser's answer.
+        prev_from_curr: odometry since the frame before; None for the first frame and failures.
+        stage_ms: time of each stage, front-end to remembering.
+        late: in a replay in real time, whether the answer came after the deadline; else False.
+    """
+
+    localisation: Localisation
+    prev_from_curr: SE3 | None
+    stage_ms: dict[str, float]
+    late: bool = False
+
+    @property
+    def ms(self) -> float:
+        """Time of all stages together."""
+        return sum(self.stage_ms.values())
+
+    @property
+    def step_m(self) -> float:
+        """Distance driven since the frame before, as far as it was measured."""
+        return 0.0 if self.prev_from_curr is None else self.prev_from_curr.distance_m
+
+    @property
+    def localised(self) -> bool:
+        """Whether the frame was matched with the map."""
+        return self.localisation.status is LocalisationStatus.LOCALISED
+
+    def to_dict(self) -> dict[str, Any]:
+        """The record that ``localise --json`` prints for this frame."""
+        found = self.localisation
+        return {
+            "stamp_ns": found.stamp_ns,
+            "status": found.status.value,
+            "node": None if found.node is None else str(found.node),
+            "node_stamp_ns": found.node_stamp_ns,
+            "node_from_live": None
+            if found.node_from_live is None
+            else found.node_from_live.matrix().ravel().tolist(),
+            "inliers": found.inliers,
+            "attempts": found.attempts,
+            "candidates": found.candidates,
+            "open_loop_m": found.open_loop_m,
+            "ms": self.ms,
+        }
+
+
+def summarise(results: Sequence[FrameResult]) -> dict[str, Any]:
+    """The summary that ``localise --json`` prints; every figure is defined in SPEC §8."""
+    drive = Drive(
+        np.array([result.step_m for result in results], dtype=np.float64),
+        np.array([result.localised for result in results], dtype=bool),
+    )
+    count = max(len(results), 1)
+    statuses = [result.localisation.status for result in results]
+    return {
+        "frames": len(results),
+        "share_localised": sum(result.localised for result in results) / count,
+        "statuses": {status.value: statuses.count(status) for status in LocalisationStatus},
+        "attempts_per_frame": sum(r.localisation.attempts for r in results) / count,
+        "driven_m": route_m([drive]),
+        "p_no_match_10m": failure_route([drive], 10.0),
+        "route_not_localised": route_not_localised([drive]),
+        "longest_gap_m": longest_gap_m([drive]),
+        "late_frames": sum(result.late for result in results),
+        "stages_ms": stage_statistics([result.stage_ms for result in results]),
+    }
+
+
+def stage_statistics(stage_ms: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Median and 99th percentile of each stage and of their sum, ms."""
+    stages = dict.fromkeys(stage for frame in stage_ms for stage in frame)
+    series = {stage: [frame.get(stage, 0.0) for frame in stage_ms] for stage in stages}
+    if series:
+        series["total"] = [sum(frame.values()) for frame in stage_ms]
+    return {
+        stage: {
+            "median": float(np.median(values)),
+            "p99": float(np.percentile(values, 99)),
+        }
+        for stage, values in series.items()
+    }

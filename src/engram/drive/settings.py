@@ -1,0 +1,47 @@
+"""All settings of a run in one place: what a TOML file given with --config may contain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from engram.config import load_toml
+from engram.errors import ConfigError
+from engram.frontend import DescriptorKind, FrontendConfig
+from engram.localiser import LocaliserConfig
+from engram.mapper import MapperConfig
+from engram.odometry import OdometryConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The resolved configuration, kept with every result and in every map revision."""
+
+    frontend: FrontendConfig = field(default_factory=FrontendConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    localiser: LocaliserConfig = field(default_factory=LocaliserConfig)
+    mapper: MapperConfig = field(default_factory=MapperConfig)
+
+    def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
+        """These settings with a map's kind of descriptor; None leaves them as they are."""
+        if descriptor is None or descriptor is self.frontend.descriptor:
+            return self
+        return replace(self, frontend=replace(self.frontend, descriptor=descriptor))
+
+
+def load_settings(path: Path | None) -> Settings:
+    """Settings from a TOML file, or the defaults.
+
+    Raises:
+        ConfigError: the file cannot be read, or a setting in it is unknown or out of range.
+    """
+    if path is None:
+        return Settings()
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as settings: {error}") from error
+    try:
+        return load_toml(text, Settings)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error

@@ -1,0 +1,23 @@
+"""Live frame + neighbourhood + policy + budget → localisation; lost and found again."""
+
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
+from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
+from engram.localiser.localiser import Localiser, LocaliserConfig
+from engram.localiser.relocalisation import RELOCALISERS, Exhaustive, Relocaliser
+from engram.localiser.walk import Walk
+
+__all__ = [
+    "RELOCALISERS",
+    "AcceptanceConfig",
+    "Budget",
+    "Exhaustive",
+    "Localisation",
+    "LocalisationStatus",
+    "Localiser",
+    "LocaliserConfig",
+    "Position",
+    "Prediction",
+    "Relocaliser",
+    "Walk",
+    "accept",
+]

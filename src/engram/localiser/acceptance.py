@@ -1,0 +1,70 @@
+"""Whether a match is believed: the cheap second half of an attempt (SPEC §3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from engram.frontend.matching import Match
+from engram.geometry import SE3
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceConfig:
+    """When a match counts as a localisation.
+
+    Attributes:
+        min_inliers: fewest inliers. Source: SPEC §3, 20.
+        min_inliers_lost: fewest inliers where no prediction speaks for the match: a wrong place
+            must not pass, and wrong places stay below 15 (docs/performance.md).
+        reach_m: how far from a node a robot without a prediction may be found. A straight road is
+            recognised from 30 m away, but a robot found there is outside the neighbourhood of the
+            node, and would be lost again. Source: SPEC §3, search radius 8 m.
+        slack_m, slack_rad: disagreement with the prediction that is forgiven on top of three
+            standard deviations. Source: SPEC §3, 1 m and 10°.
+    """
+
+    min_inliers: int = 20
+    min_inliers_lost: int = 25
+    reach_m: float = 8.0
+    slack_m: float = 1.0
+    slack_rad: float = float(np.deg2rad(10.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where the live camera is expected, seen from one candidate node.
+
+    Attributes:
+        node_from_live: expected pose.
+        sigma_m, sigma_yaw_rad: its standard deviations.
+    """
+
+    node_from_live: SE3
+    sigma_m: float
+    sigma_yaw_rad: float
+
+
+def accept(match: Match, prediction: Prediction | None, config: AcceptanceConfig) -> bool:
+    """Whether the match is a localisation: enough inliers, and where it was expected.
+
+    Args:
+        match: the match of the live frame with one node.
+        prediction: what was expected; None while the robot has no idea where it is.
+        config: the thresholds.
+    """
+    if match.reference_from_live is None:
+        return False
+    if prediction is None:
+        near = match.reference_from_live.distance_m <= config.reach_m
+        return near and match.inliers >= config.min_inliers_lost
+    if match.inliers < config.min_inliers:
+        return False
+    predicted, found = prediction.node_from_live, match.reference_from_live
+    offset_m = float(np.linalg.norm(found.translation - predicted.translation))
+    turn_rad = (predicted.inverse() @ found).angle_rad
+    return (
+        offset_m <= config.slack_m + 3 * prediction.sigma_m
+        and turn_rad <= config.slack_rad + 3 * prediction.sigma_yaw_rad
+    )

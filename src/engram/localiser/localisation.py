@@ -1,0 +1,123 @@
+"""What the localiser is asked (`Budget`) and what it answers (`Localisation`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError
+from engram.experience.model import NodeId
+from engram.geometry import SE3, propagate_covariance
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """How much matching one live frame may cost (SPEC §1: Np × Nr).
+
+    Attributes:
+        lanes: Np, attempts that run at the same time, each on a thread of its own.
+        rounds: Nr, how often that many are started for one frame.
+        deadline_ms: no attempt starts later than this after the frame was handed in; None for
+            no limit. The last attempt may overrun it, never more than one per lane.
+    """
+
+    lanes: int = 2
+    rounds: int = 2
+    deadline_ms: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("lanes", "rounds"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"budget: {name} is {getattr(self, name)}, must be at least 1")
+        if self.deadline_ms is not None and not self.deadline_ms > 0:
+            raise ConfigError(f"budget: deadline_ms is {self.deadline_ms}, must be > 0")
+
+    @property
+    def attempts(self) -> int:
+        """The most attempts for one frame."""
+        return self.lanes * self.rounds
+
+
+class LocalisationStatus(StrEnum):
+    """Where the robot stands after one frame (SPEC §3)."""
+
+    LOCALISED = "localised"
+    DEAD_RECKONING = "dead_reckoning"
+    LOST = "lost"
+    NO_ODOMETRY = "no_odometry"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Position:
+    """Where the live camera is, seen from a node (SPEC §1: ``(k, T_k_q)``).
+
+    Attributes:
+        node: the reference node.
+        node_from_live: pose of the live camera in that node's camera.
+        covariance: (6, 6) float64 of `node_from_live`, left perturbation,
+            [translation, rotation].
+    """
+
+    node: NodeId
+    node_from_live: SE3
+    covariance: NDArray[np.float64]
+
+    @staticmethod
+    def at(node: NodeId) -> Position:
+        """The position of the very frame that was saved as a node."""
+        return Position(node, SE3.identity(), np.zeros((6, 6)))
+
+    def carried_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> Position:
+        """The position after one more step of odometry; `covariance` (6, 6) is that step's."""
+        return Position(
+            self.node,
+            self.node_from_live @ prev_from_curr,
+            propagate_covariance(self.node_from_live, self.covariance, covariance),
+        )
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position along its least certain axis, metres."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[:3, :3])[-1], 0.0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localisation:
+    """The answer for one live frame. Not localising is an answer too.
+
+    Attributes:
+        stamp_ns: stamp of the live frame.
+        status: whether the frame was matched, and if not, what is known.
+        node: the matched node; None unless `LOCALISED`.
+        node_stamp_ns: stamp of that node.
+        node_from_live: measured pose of the live camera in it; None unless `LOCALISED`.
+        covariance: (6, 6) of `node_from_live`, left perturbation, [translation, rotation].
+        inliers: landmarks that agree with the pose, 0 unless `LOCALISED`.
+        attempts: match attempts made for this frame.
+        candidates: nodes that could have been tried.
+        open_loop_m: distance driven on odometry alone since the last match.
+        position: the best estimate, measured or carried on by odometry; None while `LOST` with
+            no estimate.
+        stage_ms: time of each stage of this call.
+    """
+
+    stamp_ns: int
+    status: LocalisationStatus
+    attempts: int
+    candidates: int
+    open_loop_m: float
+    node: NodeId | None = None
+    node_stamp_ns: int | None = None
+    node_from_live: SE3 | None = None
+    covariance: NDArray[np.float64] | None = None
+    inliers: int = 0
+    position: Position | None = None
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def ms(self) -> float:
+        """Time of all stages together."""
+        return sum(self.stage_ms.values())

@@ -1,0 +1,415 @@
+"""The localiser: live frame + map + policy + budget → `Localisation` (SPEC §3, [L15] §III)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from time import perf_counter
+from types import TracebackType
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.experience.basin import MatchBasin
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import (
+    Attempt,
+    LandmarkSource,
+    Node,
+    NodeId,
+    PathEntryKind,
+    SessionId,
+    node_id,
+    path_id,
+)
+from engram.experience.neighbourhood import Neighbourhood
+from engram.experience.path_memory import PathMemory
+from engram.frontend import Frame, FrameStatus
+from engram.frontend.matching import MatcherConfig
+from engram.geometry import SE3
+from engram.localiser.acceptance import AcceptanceConfig, Prediction
+from engram.localiser.attempts import Attempter, Candidate, Outcome, best_success
+from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
+from engram.localiser.relocalisation import Relocaliser
+from engram.localiser.walk import Walk
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.ranking import RankingContext, RankingPolicy, RecentAttempts
+
+_PREFETCH = 16
+
+
+@dataclass(frozen=True, slots=True)
+class LocaliserConfig:
+    """Settings of the localiser.
+
+    Attributes:
+        search_radius_m: least radius of the neighbourhood. Source: SPEC §3, 8 m.
+        view_gate_rad: largest difference of heading to a candidate. Source: SPEC §3, 60°.
+        own_exclusion_m: own nodes saved within the last so many metres are no candidates.
+            Source: SPEC §3.1, 30 m.
+        lost_after_m: open loop distance past which the robot is lost. Source: SPEC §3.4, 10 m.
+        guide_below_m, guide_below_rad: an attempt is guided by the prediction where its standard
+            deviations lie below both; 0 turns guidance off.
+        matcher, acceptance: settings of the two halves of an attempt.
+    """
+
+    search_radius_m: float = 8.0
+    view_gate_rad: float = float(np.deg2rad(60.0))
+    own_exclusion_m: float = 30.0
+    lost_after_m: float = 10.0
+    guide_below_m: float = 0.3
+    guide_below_rad: float = float(np.deg2rad(3.0))
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
+
+
+class Localiser:
+    """Localises the frames of one session, one after another.
+
+    Not thread-safe: one session, one localiser. The graph and the path memory may grow between
+    two calls.
+
+    Args:
+        graph: the experience graph.
+        paths: the path memory.
+        frames: where the landmarks of nodes come from.
+        policy: orders the candidates.
+        budget: how much may be attempted per frame.
+        relocaliser: finds a lost robot; None leaves it dead-reckoning with a growing radius.
+        basin: the match basin of this session's camera.
+        session: the live session, whose own recent nodes are no candidates; None for a robot
+            that saves nothing.
+        config: settings.
+    """
+
+    def __init__(
+        self,
+        graph: ExperienceGraph,
+        paths: PathMemory,
+        frames: LandmarkSource,
+        *,
+        policy: RankingPolicy,
+        budget: Budget,
+        relocaliser: Relocaliser | None,
+        basin: MatchBasin,
+        session: SessionId | None = None,
+        config: LocaliserConfig | None = None,
+    ) -> None:
+        self.config = config or LocaliserConfig()
+        self.session = session
+        self._graph = graph
+        self._paths = paths
+        self._frames = frames
+        self._policy = policy
+        self._budget = budget
+        self._relocaliser = relocaliser
+        self._basin = basin
+        self._attempter = Attempter(frames, budget, self.config.matcher, self.config.acceptance)
+        self._live_session = session or SessionId(uuid4())
+        self._recent = RecentAttempts()
+        self.walk = Walk(path_id(self._live_session))
+        self.position: Position | None = None
+        self._open_loop_m = 0.0
+        self._driven_m = 0.0
+        self._last_step_m = 0.0
+        self._adrift = False
+        self._attempts: list[Attempt] = []
+        self._outcomes: list[Outcome] = []
+
+    def __enter__(self) -> Localiser:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the threads of the lanes."""
+        self._attempter.close()
+
+    @property
+    def driven_m(self) -> float:
+        """Odometry distance from the session's start, metres."""
+        return self._driven_m
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """What became of the attempts for the last frame, in ranked order."""
+        return self._outcomes
+
+    def take_attempts(self) -> list[Attempt]:
+        """The attempts remembered since the last call."""
+        taken, self._attempts = self._attempts, []
+        return taken
+
+    def start_at(self, position: Position) -> None:
+        """Tells a robot where it is, as an operator or another localiser would."""
+        self.position = position
+        self._open_loop_m = 0.0
+        self._adrift = False
+
+    def resume_in(self, node: Node, next_sequence: int) -> None:
+        """Goes on in the last node that this session had saved before it was interrupted."""
+        self.position = Position.at(node.id)
+        self._driven_m = node.driven_m
+        self.walk = Walk(self.walk.path, next_sequence)
+
+    def settle_in(self, node: NodeId, stamp_ns: int) -> None:
+        """The live frame was saved as `node`: the robot is in it by construction (SPEC §4)."""
+        self.position = Position.at(node)
+        self._adrift = False
+        self.walk.visit(node, PathEntryKind.SAVED, stamp_ns)
+
+    def localise(
+        self, live: Frame, odometry: OdometryStep, deadline: float | None = None
+    ) -> Localisation:
+        """One iteration of SPEC §3: carry on, gather candidates, rank, attempt, settle.
+
+        Args:
+            live: the live frame.
+            odometry: its motion since the frame before.
+            deadline: `time.perf_counter` value after which no attempt starts; by default that of
+                the budget, counted from this call.
+
+        Raises:
+            IncompatibleError: the map was made with another kind of descriptor.
+            MapCorruptError: a node's landmarks do not match their hash.
+        """
+        clock = _StageClock()
+        if deadline is None and self._budget.deadline_ms is not None:
+            deadline = clock.started + self._budget.deadline_ms / 1e3
+        self._carry_on(odometry)
+        self._recent.begin_frame(self._driven_m)
+        outcomes: list[Outcome] = []
+        neighbourhood: Neighbourhood | None = None
+        if live.status is FrameStatus.OK:
+            neighbourhood = self._neighbourhood()
+            clock.lap("neighbourhood")
+            order = self._rank(live, neighbourhood)
+            clock.lap("rank")
+            candidates = self._candidates(live, neighbourhood, order)
+            outcomes = self._attempter.run(
+                live, node_id(self._live_session, live.stamp_ns), candidates, deadline
+            )
+            clock.lap("attempts")
+            self._remember(neighbourhood, outcomes)
+        self._outcomes = outcomes
+        success = best_success(outcomes)
+        if success is not None:
+            self._settle(success, live.stamp_ns)
+        clock.lap("remember")
+        return self._result(live, odometry, success, neighbourhood, clock.stage_ms)
+
+    def _carry_on(self, odometry: OdometryStep) -> None:
+        """Propagates the position by odometry (SPEC §3).
+
+        A frame that odometry could not use changes nothing: the next usable one brings the motion
+        since the last. Where odometry lost track the motion is unknown: the estimate stays, and
+        its uncertainty grows by as much as the robot may have moved, judged by its last step.
+        """
+        if odometry.status in {OdometryStatus.FIRST, OdometryStatus.UNUSABLE_FRAME}:
+            return
+        if odometry.prev_from_curr is None or odometry.covariance is None:
+            self._open_loop_m += self._last_step_m
+            self._adrift = True
+            if self.position is not None:
+                unknown_m, unknown_rad = 2 * self._last_step_m + 0.1, np.deg2rad(5.0)
+                growth = np.diag([unknown_m**2] * 3 + [unknown_rad**2] * 3)
+                self.position = self.position.carried_on(SE3.identity(), growth)
+            return
+        self._last_step_m = odometry.prev_from_curr.distance_m
+        self._driven_m += self._last_step_m
+        self._open_loop_m += self._last_step_m
+        if self.position is not None:
+            self.position = self.position.carried_on(odometry.prev_from_curr, odometry.covariance)
+
+    @property
+    def certain(self) -> bool:
+        """Whether the position is known: every motion since the last match was measured."""
+        return self.position is not None and not self._adrift
+
+    @property
+    def _lost(self) -> bool:
+        return not self.certain or self._open_loop_m > self.config.lost_after_m
+
+    def _neighbourhood(self) -> Neighbourhood | None:
+        position = self.position
+        if position is None:
+            return None
+        radius_m = self._basin.search_radius_m(position.sigma_m, self.config.search_radius_m)
+        return self._graph.neighbourhood(
+            self._graph.index(position.node),
+            position.node_from_live,
+            position.covariance,
+            radius_m=radius_m,
+            view_gate_rad=self.config.view_gate_rad,
+            own_session=self.session,
+            own_driven_m=self._driven_m,
+            own_exclusion_m=self.config.own_exclusion_m,
+        )
+
+    def _rank(self, live: Frame, neighbourhood: Neighbourhood | None) -> NDArray[np.int64]:
+        if neighbourhood is None or self.position is None or len(neighbourhood) == 0:
+            return np.zeros(0, dtype=np.int64)
+        context = RankingContext(
+            neighbourhood=neighbourhood,
+            graph=self._graph,
+            path_memory=self._paths,
+            basin=self._basin,
+            observations=self._recent.observations,
+            reference=self._graph.index(self.position.node),
+            own_path=self.walk.path,
+            stamp_ns=live.stamp_ns,
+            seed=live.stamp_ns,
+        )
+        return self._policy.rank(context)
+
+    def _candidates(
+        self, live: Frame, neighbourhood: Neighbourhood | None, order: NDArray[np.int64]
+    ) -> list[Candidate]:
+        """What to attempt, best first.
+
+        A lost robot alternates nodes of its neighbourhood and proposed ones; one that knows of no
+        node near it spends its budget on proposed ones before it counts as lost.
+        """
+        budget = self._budget.attempts
+        ranked = []
+        if neighbourhood is not None:
+            self._frames.prefetch(
+                [self._graph.node(int(i)).id for i in neighbourhood.nodes[order[:_PREFETCH]]]
+            )
+            ranked = [self._predicted(neighbourhood, int(row)) for row in order[:budget]]
+        if (ranked and not self._lost) or self._relocaliser is None:
+            return ranked
+        known = {candidate.index for candidate in ranked}
+        proposed = [
+            Candidate(index, self._graph.node(index).id, None, guided=False, row=None)
+            for index in self._proposals(live, budget)
+            if index not in known
+        ]
+        return _alternate(proposed, ranked)[:budget]
+
+    def _proposals(self, live: Frame, count: int) -> list[int]:
+        """The relocaliser's nodes, without this session's own recent ones (SPEC §3.1)."""
+        assert self._relocaliser is not None
+        return [
+            index
+            for index in self._relocaliser.propose(live, count)
+            if not self._is_recent_own(index)
+        ]
+
+    def _is_recent_own(self, index: int) -> bool:
+        node = self._graph.node(index)
+        return (
+            node.session == self.session
+            and node.driven_m > self._driven_m - self.config.own_exclusion_m
+        )
+
+    def _predicted(self, neighbourhood: Neighbourhood, row: int) -> Candidate:
+        index = int(neighbourhood.nodes[row])
+        matrix = neighbourhood.node_from_live[row]
+        prediction = Prediction(
+            SE3(matrix[:3, :3], matrix[:3, 3]),
+            float(neighbourhood.sigma_m[row]),
+            float(neighbourhood.sigma_yaw_rad[row]),
+        )
+        guided = (
+            prediction.sigma_m < self.config.guide_below_m
+            and prediction.sigma_yaw_rad < self.config.guide_below_rad
+        )
+        return Candidate(index, self._graph.node(index).id, prediction, guided, row)
+
+    def _remember(self, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]) -> None:
+        """Keeps the outcome of every attempt that had a prediction (SPEC §3.5)."""
+        self._recent.add(
+            [outcome.candidate.index for outcome in outcomes],
+            [outcome.accepted for outcome in outcomes],
+        )
+        for outcome in outcomes:
+            row = outcome.candidate.row
+            if neighbourhood is None or row is None or self.position is None:
+                continue
+            attempt = Attempt(
+                iteration=self._recent.iteration,
+                reference=self.position.node,
+                node=outcome.candidate.node,
+                along_m=float(neighbourhood.along_m[row]),
+                across_m=float(neighbourhood.across_m[row]),
+                yaw_rad=float(neighbourhood.yaw_rad[row]),
+                sigma_m=float(neighbourhood.sigma_m[row]),
+                sigma_yaw_rad=float(neighbourhood.sigma_yaw_rad[row]),
+                accepted=outcome.accepted,
+                inliers=outcome.match.inliers,
+                rank=outcome.rank,
+                policy=self._policy.name,
+            )
+            self._attempts.append(attempt)
+
+    def _settle(self, success: Outcome, stamp_ns: int) -> None:
+        """The position becomes (n, ``T_n_q``), the open loop 0 (SPEC §3.3)."""
+        node_from_live, covariance = success.match.reference_from_live, success.match.covariance
+        assert node_from_live is not None
+        assert covariance is not None
+        self.position = Position(success.candidate.node, node_from_live, covariance)
+        self._open_loop_m = 0.0
+        self._adrift = False
+        self.walk.visit(success.candidate.node, PathEntryKind.MATCHED, stamp_ns)
+
+    def _result(
+        self,
+        live: Frame,
+        odometry: OdometryStep,
+        success: Outcome | None,
+        neighbourhood: Neighbourhood | None,
+        stage_ms: dict[str, float],
+    ) -> Localisation:
+        unmatched = Localisation(
+            stamp_ns=live.stamp_ns,
+            status=self._status_without_match(odometry),
+            attempts=len(self._outcomes),
+            candidates=0 if neighbourhood is None else len(neighbourhood),
+            open_loop_m=self._open_loop_m,
+            position=self.position,
+            stage_ms=stage_ms,
+        )
+        if success is None:
+            return unmatched
+        node = self._graph.node(success.candidate.index)
+        return replace(
+            unmatched,
+            status=LocalisationStatus.LOCALISED,
+            node=node.id,
+            node_stamp_ns=node.stamp_ns,
+            node_from_live=success.match.reference_from_live,
+            covariance=success.match.covariance,
+            inliers=success.match.inliers,
+        )
+
+    def _status_without_match(self, odometry: OdometryStep) -> LocalisationStatus:
+        if odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:
+            return LocalisationStatus.NO_ODOMETRY
+        return LocalisationStatus.LOST if self._lost else LocalisationStatus.DEAD_RECKONING
+
+
+class _StageClock:
+    """Splits the time of one call into stages."""
+
+    def __init__(self) -> None:
+        self.started = self._last = perf_counter()
+        self.stage_ms: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        now = perf_counter()
+        self.stage_ms[stage] = (now - self._last) * 1e3
+        self._last = now
+
+
+def _alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:
+    """first[0], second[0], first[1], … and what is left of the longer one."""
+    shorter = min(len(first), len(second))
+    paired = [item for pair in zip(first, second, strict=False) for item in pair]
+    return paired + first[shorter:] + second[shorter:]

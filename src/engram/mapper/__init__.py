@@ -1,0 +1,6 @@
+"""The EBN loop: localise, else save an experience. Saving runs on a thread of its own."""
+
+from engram.mapper.mapper import Mapper, MapperConfig, MappingStep
+from engram.mapper.saver import Records, RecordWriter, Saver
+
+__all__ = ["Mapper", "MapperConfig", "MappingStep", "RecordWriter", "Records", "Saver"]

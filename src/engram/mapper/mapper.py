@@ -1,0 +1,211 @@
+"""The mapper: localise, else save an experience (SPEC §5, [L15] §III, [1])."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import Edge, EdgeKind, Node, NodeId, Session, node_id
+from engram.experience.proximity import lay_proximity_edges, tighten_chain
+from engram.frontend import Frame, FrameStatus
+from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
+from engram.mapper.saver import Records, Saver
+from engram.odometry import OdometryStatus, OdometryStep
+
+
+@dataclass(frozen=True, slots=True)
+class MapperConfig:
+    """Settings of the mapper.
+
+    Attributes:
+        save_every_m, save_every_rad: motion since the last saved node after which a frame that
+            did not localise is saved. Source: SPEC §5, 1 m and 15°.
+        tie_within_m: a new experience is also tied to the session's last saved node within this
+            distance; the search radius.
+        checkpoint_every: live frames between two checkpoints of the map.
+    """
+
+    save_every_m: float = 1.0
+    save_every_rad: float = float(np.deg2rad(15.0))
+    tie_within_m: float = 8.0
+    checkpoint_every: int = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappingStep:
+    """What became of one live frame.
+
+    Attributes:
+        localisation: how it was localised.
+        saved: the node that it was saved as, if it was.
+    """
+
+    localisation: Localisation
+    saved: NodeId | None
+
+
+class Mapper:
+    """Maps one session: while localisation succeeds nothing is saved, else an experience grows.
+
+    Args:
+        graph: the experience graph; grows.
+        localiser: the session's localiser, which works on the same graph.
+        saver: writes what is added.
+        session: the drive.
+        config: settings.
+    """
+
+    def __init__(
+        self,
+        graph: ExperienceGraph,
+        localiser: Localiser,
+        saver: Saver,
+        session: Session,
+        config: MapperConfig | None = None,
+    ) -> None:
+        self.config = config or MapperConfig()
+        self._graph = graph
+        self._localiser = localiser
+        self._saver = saver
+        self._session = session
+        # The last saved node and the motion since, while that is known.
+        self._since_saved: Position | None = None
+        # The experience being saved, first node first; empty while localisation succeeds.
+        self._experience: list[NodeId] = []
+
+    def process(
+        self, live: Frame, odometry: OdometryStep, deadline: float | None = None
+    ) -> MappingStep:
+        """Localises one frame, saves it if that failed, and ties experiences to their neighbours.
+
+        Raises:
+            MapError: an earlier frame could not be written.
+        """
+        localisation = self._localiser.localise(live, odometry, deadline)
+        if self._since_saved is not None:
+            self._since_saved = _carried_on(self._since_saved, odometry)
+        edges: list[Edge] = []
+        saved: Node | None = None
+        if localisation.status is LocalisationStatus.LOCALISED:
+            edges = self._end_experience(localisation) + self._match_edges()
+        elif self._worth_saving(live):
+            saved, edges = self._save(live, localisation.position)
+        records = Records(
+            node=saved,
+            frame=live if saved else None,
+            edges=edges,
+            path_entries=self._localiser.walk.take_new(),
+            attempts=self._localiser.take_attempts(),
+        )
+        if records:
+            self._saver.put(records)
+        return MappingStep(localisation, saved.id if saved else None)
+
+    def resume(self, last: Node, next_sequence: int) -> None:
+        """Goes on behind the last saved node of an interrupted session.
+
+        To be called when its frame is the live one, before the next is processed.
+        """
+        self._experience = [last.id]
+        self._since_saved = Position.at(last.id)
+        self._localiser.resume_in(last, next_sequence)
+
+    def _worth_saving(self, live: Frame) -> bool:
+        """A usable frame, far enough from the last saved one (SPEC §5)."""
+        if live.status is not FrameStatus.OK:
+            return False
+        if self._since_saved is None:
+            return True
+        moved = self._since_saved.node_from_live
+        return (
+            moved.distance_m >= self.config.save_every_m
+            or moved.angle_rad >= self.config.save_every_rad
+        )
+
+    def _save(self, live: Frame, position: Position | None) -> tuple[Node, list[Edge]]:
+        """Saves the frame as a node, chained to the experience or tied to where it began."""
+        node = Node(
+            node_id(self._session.id, live.stamp_ns),
+            self._session.id,
+            live.stamp_ns,
+            live.camera.id,
+            self._localiser.driven_m,
+        )
+        self._graph.add_node(node)
+        edges = []
+        if self._experience and self._since_saved is not None:
+            edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
+        elif not self._experience and position is not None and self._localiser.certain:
+            edges.append(_edge(position, node.id, EdgeKind.TIE))
+            edges += self._edge_to_last_saved(position, node.id)
+        self._add_to_graph(edges)
+        edges += lay_proximity_edges(self._graph, self._graph.index(node.id))
+        self._experience.append(node.id)
+        self._since_saved = Position.at(node.id)
+        self._localiser.settle_in(node.id, live.stamp_ns)
+        return node, edges
+
+    def _add_to_graph(self, edges: list[Edge]) -> None:
+        for edge in edges:
+            self._graph.add_edge(edge)
+
+    def _edge_to_last_saved(self, position: Position, node: NodeId) -> list[Edge]:
+        """Ties a new experience to this session's last one too, where that is still near.
+
+        Between them the robot was localised for a moment only, perhaps in a node far away: without
+        this edge the two would be neighbours that do not know of each other.
+        """
+        last = self._since_saved
+        if last is None or last.node == position.node:
+            return []
+        if last.node_from_live.distance_m > self.config.tie_within_m:
+            return []
+        return [_edge(last, node, EdgeKind.TIE)]
+
+    def _end_experience(self, localisation: Localisation) -> list[Edge]:
+        """Localised again: the last node of the experience is tied to the matched one."""
+        experience, self._experience = self._experience, []
+        if not experience or self._since_saved is None:
+            return []
+        assert localisation.position is not None
+        tie = edge_through_live(self._since_saved, localisation.position, EdgeKind.TIE)
+        self._add_to_graph([tie])
+        chain = [self._graph.index(node) for node in experience]
+        return [tie, *tighten_chain(self._graph, chain)]
+
+    def _match_edges(self) -> list[Edge]:
+        """Nodes matched by the same live frame: their relation was measured."""
+        seen_from = [
+            Position(outcome.candidate.node, pose, covariance)
+            for outcome in self._localiser.outcomes
+            if outcome.accepted
+            and (pose := outcome.match.reference_from_live) is not None
+            and (covariance := outcome.match.covariance) is not None
+        ]
+        edges = [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
+        self._add_to_graph(edges)
+        return edges
+
+
+def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
+    """The edge between two nodes from which the same live camera is seen."""
+    a_from_b = a.node_from_live @ b.node_from_live.inverse()
+    adjoint = a_from_b.adjoint()
+    covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
+    return Edge(a.node, b.node, kind, a_from_b, covariance)
+
+
+def _edge(position: Position, node: NodeId, kind: EdgeKind) -> Edge:
+    """The edge to the node that the live frame was saved as."""
+    return Edge(position.node, node, kind, position.node_from_live, position.covariance)
+
+
+def _carried_on(position: Position, odometry: OdometryStep) -> Position | None:
+    """After one more step; None once the motion is unknown."""
+    if odometry.status in {OdometryStatus.FIRST, OdometryStatus.UNUSABLE_FRAME}:
+        return position  # the next usable frame brings the motion since the last
+    if odometry.prev_from_curr is None or odometry.covariance is None:
+        return None
+    return position.carried_on(odometry.prev_from_curr, odometry.covariance)

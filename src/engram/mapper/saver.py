@@ -1,0 +1,146 @@
+"""Saving on a thread of its own, so that it never holds up the next frame ([L15] Fig. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from queue import Queue
+from threading import Thread
+from typing import Protocol
+
+from engram.experience.model import Attempt, Edge, Node, NodeId, PathEntry
+from engram.frontend import Frame
+
+# Frames that may wait to be written, about 40 MB of them: past that a slow disk slows the drive.
+_QUEUE_LENGTH = 1000
+
+
+class FrameHolder(Protocol):
+    """Where frames can be read while they are on their way to the disk."""
+
+    def hold(self, node: NodeId, frame: Frame) -> None:
+        """Keeps a frame readable until its node has been written."""
+        ...
+
+
+class RecordWriter(Protocol):
+    """Where a session's records go; `engram.store.SessionWriter` is one."""
+
+    def add_node(self, node: Node, frame: Frame) -> None:
+        """Adds a node with the frame that it was."""
+        ...
+
+    def add_edge(self, edge: Edge) -> None:
+        """Adds an edge, or supersedes one."""
+        ...
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        """Adds a step of the session's path."""
+        ...
+
+    def add_attempts(self, made: list[Attempt]) -> None:
+        """Adds remembered attempts."""
+        ...
+
+    def checkpoint(self) -> None:
+        """Makes everything added so far durable."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """What one live frame adds to the map."""
+
+    node: Node | None = None
+    frame: Frame | None = None
+    edges: Sequence[Edge] = ()
+    path_entries: Sequence[PathEntry] = ()
+    attempts: list[Attempt] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.node or self.edges or self.path_entries or self.attempts)
+
+
+@dataclass(slots=True)
+class _Stop:
+    """The last thing in the queue."""
+
+
+@dataclass(slots=True)
+class Saver:
+    """Writes records in the order in which they come, and checkpoints every so many frames.
+
+    An error of the writer is raised by the next call of `put` or by `finish`; records behind it
+    are dropped, since a map with holes in a session would be worse than a shorter session.
+
+    Attributes:
+        writer: where the records go.
+        frames: keeps frames readable until they are written.
+        checkpoint_every: live frames between two checkpoints; what a crash may lose.
+    """
+
+    writer: RecordWriter
+    frames: FrameHolder
+    checkpoint_every: int = 20
+    _queue: Queue[Records | _Stop] = field(default_factory=lambda: Queue(_QUEUE_LENGTH))
+    _error: BaseException | None = None
+    _thread: Thread | None = None
+
+    def __post_init__(self) -> None:
+        self._thread = Thread(target=self._run, name="engram-saver", daemon=True)
+        self._thread.start()
+
+    def put(self, records: Records) -> None:
+        """Hands over what one frame adds; returns at once.
+
+        Raises:
+            MapError: an earlier write failed.
+        """
+        self._raise_error()
+        if records.node is not None and records.frame is not None:
+            self.frames.hold(records.node.id, records.frame)
+        self._queue.put(records)
+
+    def finish(self) -> None:
+        """Writes what is left, checkpoints and ends the thread.
+
+        Raises:
+            MapError: a write failed.
+        """
+        if self._thread is not None:
+            self._queue.put(_Stop())
+            self._thread.join()
+            self._thread = None
+        self._raise_error()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        since_checkpoint = 0
+        while True:
+            records = self._queue.get()
+            stopping = isinstance(records, _Stop)
+            if self._error is None:
+                try:
+                    if isinstance(records, Records):
+                        self._write(records)
+                        since_checkpoint += 1
+                    if stopping or since_checkpoint >= self.checkpoint_every:
+                        self.writer.checkpoint()
+                        since_checkpoint = 0
+                except BaseException as error:  # carried to the thread that drives
+                    self._error = error
+            if stopping:
+                return
+
+    def _write(self, records: Records) -> None:
+        if records.node is not None and records.frame is not None:
+            self.writer.add_node(records.node, records.frame)
+        for edge in records.edges:
+            self.writer.add_edge(edge)
+        for entry in records.path_entries:
+            self.writer.add_path_entry(entry)
+        if records.attempts:
+            self.writer.add_attempts(records.attempts)

@@ -1,0 +1,109 @@
+"""How often a robot goes without a match: the failure curve and its three estimators (SPEC §8).
+
+Everything here is a pure function of two arrays per session, one row per live frame: the
+odometry distance of the step that ends in the frame, and whether that frame was matched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """What the measures need to know of one localised session.
+
+    Attributes:
+        step_m: (F,) float64, distance driven from the previous frame to this one, >= 0.
+        matched: (F,) bool, whether this frame was localised.
+    """
+
+    step_m: NDArray[np.float64]
+    matched: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        if self.step_m.shape != self.matched.shape or self.step_m.ndim != 1:
+            raise InputError(
+                f"a drive needs two arrays of one length, not shapes {self.step_m.shape} and "
+                f"{self.matched.shape}"
+            )
+        if not (np.isfinite(self.step_m).all() and (self.step_m >= 0).all()):
+            raise InputError("a drive's steps must be finite and >= 0 metres")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaps:
+    """The distances between successive matches; start and end of a session close a gap.
+
+    Attributes:
+        length_m: (G,) float64.
+        failed: (G,) bool, whether at least one frame within the gap was not matched.
+    """
+
+    length_m: NDArray[np.float64]
+    failed: NDArray[np.bool_]
+
+
+def gaps(drives: Sequence[Drive]) -> Gaps:
+    """All gaps of some sessions. Source: SPEC §8."""
+    lengths: list[float] = []
+    failed: list[bool] = []
+    for drive in drives:
+        positions = np.cumsum(drive.step_m)
+        ends = np.flatnonzero(drive.matched)
+        marks = np.concatenate([[0.0], positions[ends], positions[-1:]])
+        lengths.extend(np.diff(marks))
+        # Between two matches `i < j` lie `j - i - 1` frames without one.
+        rows = np.concatenate([[-1], ends, [len(positions)]])
+        failed.extend(np.diff(rows) > 1)
+    return Gaps(np.array(lengths, dtype=np.float64), np.array(failed, dtype=bool))
+
+
+def failure_route(drives: Sequence[Drive], at_m: float) -> float:
+    """P(X >= x) from a uniformly random point of the route: (1/L) Σ max(0, g − x).
+
+    Source: SPEC §8, estimator *route*. 0 for a route of no length.
+    """
+    length_m = route_m(drives)
+    if length_m == 0.0:
+        return 0.0
+    return float(np.maximum(gaps(drives).length_m - at_m, 0.0).sum() / length_m)
+
+
+def failure_gap(drives: Sequence[Drive], at_m: float) -> float:
+    """P(X >= x) over the gaps: #{g >= x} / #{g}. Source: SPEC §8, estimator *gap*."""
+    lengths = gaps(drives).length_m
+    return float(np.mean(lengths >= at_m)) if len(lengths) else 0.0
+
+
+def failure_lost(drives: Sequence[Drive], at_m: float) -> float:
+    """P(X >= x) over the gaps with at least one failed frame.
+
+    Source: SPEC §8, estimator *lost*; [G16] §VI-B.
+    """
+    found = gaps(drives)
+    lengths = found.length_m[found.failed]
+    return float(np.mean(lengths >= at_m)) if len(lengths) else 0.0
+
+
+def route_m(drives: Sequence[Drive]) -> float:
+    """Length of the route, metres."""
+    return float(sum(drive.step_m.sum() for drive in drives))
+
+
+def route_not_localised(drives: Sequence[Drive]) -> float:
+    """Share of the route whose steps end without an accepted match. Source: SPEC §8."""
+    length_m = route_m(drives)
+    missed_m = sum(float(drive.step_m[~drive.matched].sum()) for drive in drives)
+    return missed_m / length_m if length_m else 0.0
+
+
+def longest_gap_m(drives: Sequence[Drive]) -> float:
+    """The longest distance without a match, metres."""
+    return float(gaps(drives).length_m.max(initial=0.0))

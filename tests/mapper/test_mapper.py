@@ -1,0 +1,182 @@
+"""The EBN loop on simulated drives, from the frames to the map on disk."""
+
+import dataclasses
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.drive import OpenMap
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import EdgeKind, PathEntryKind
+from engram.frontend import FrameStatus
+from engram.geometry import SE3
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.store import MapStore
+from mapping_rig import errors_m, localise_simulated, map_simulated
+from synthetic_world import World, drive
+
+WORLD = World(60.0)
+ROAD = np.arange(0.0, 55.0, 0.7)
+LATER_NS = 10**15
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "town.engram"
+
+
+def graph_of(path: Path) -> ExperienceGraph:
+    with MapStore.open(path) as store:
+        return OpenMap(store).graph
+
+
+def looks(first: int, last: int) -> np.ndarray:
+    """Another appearance of the world from one frame to another."""
+    appearance = np.zeros(len(ROAD), dtype=int)
+    appearance[first:last] = 1
+    return appearance
+
+
+def test_a_first_session_saves_everything_in_one_chain(path: Path) -> None:
+    mapped = map_simulated(path, drive(WORLD, ROAD))
+    assert set(mapped.statuses) <= {"dead_reckoning", "lost"}
+    graph = graph_of(path)
+    # A frame every 0.7 m, a node once 1 m has been driven: every second frame.
+    assert len(graph) == len(mapped.saved) == (len(ROAD) + 1) // 2
+    assert [edge.kind for edge in graph.edges] == [EdgeKind.ODOMETRY] * (len(graph) - 1)
+    assert len(set(graph.experiences.tolist())) == 1
+
+
+def test_while_localisation_succeeds_nothing_is_saved(path: Path) -> None:
+    first = map_simulated(path, drive(WORLD, ROAD))
+    again = map_simulated(path, drive(WORLD, ROAD + 0.3, seed=1, start_ns=LATER_NS), "r2")
+    assert again.statuses.count("localised") == len(ROAD)
+    assert not again.saved
+    found = [step.localisation for step in again.steps]
+    errors = errors_m(found, again.drive, first.saved)
+    # Pixel noise of 0.3 px on points 4 to 40 m away.
+    assert np.median(errors) < 0.03
+    assert errors.max() < 0.3
+
+
+def test_another_appearance_becomes_an_experience_beside_the_known_one(path: Path) -> None:
+    map_simulated(path, drive(WORLD, ROAD))
+    seen = drive(WORLD, ROAD, looks(20, 50), seed=1, start_ns=LATER_NS)
+    mapped = map_simulated(path, seen, "r2")
+    statuses = np.array(mapped.statuses)
+    assert (statuses[:20] == "localised").all()
+    assert (statuses[20:50] != "localised").all()
+    # Past 10 m the robot is lost; where the known appearance returns it is found again.
+    assert (statuses[55:] == "localised").all()
+    assert len(mapped.saved) == pytest.approx(30 * 0.7 / 1.4, abs=2)
+
+    graph = graph_of(path)
+    new = {graph.index(node) for node in mapped.saved}
+    ties = [edge for edge in graph.edges if edge.kind is EdgeKind.TIE]
+    tied = {graph.index(end) for edge in ties for end in (edge.a, edge.b)} & new
+    assert {min(new), max(new)} <= tied  # on both sides
+    assert any(edge.kind is EdgeKind.PROXIMITY for edge in graph.edges)
+    assert len(set(graph.components().tolist())) == 1
+
+
+def test_a_parallel_experience_is_in_the_neighbourhood(path: Path) -> None:
+    first = map_simulated(path, drive(WORLD, ROAD))
+    seen = drive(WORLD, ROAD, looks(10, 60), seed=1, start_ns=LATER_NS)
+    second = map_simulated(path, seen, "r2")
+    graph = graph_of(path)
+    seen_count = beside_count = 0
+    for node, world_from_node in first.saved.items():
+        near = graph.neighbourhood(
+            graph.index(node), SE3.identity(), np.zeros((6, 6)), radius_m=8.0, view_gate_rad=1.0
+        )
+        found = set(graph.node_ids(near.nodes))
+        for other, world_from_other in second.saved.items():
+            if (world_from_node.inverse() @ world_from_other).distance_m <= 8.0:
+                beside_count += 1
+                seen_count += other in found
+    assert seen_count / beside_count >= 0.95
+
+
+def test_paths_hold_what_was_matched_and_what_was_saved(path: Path) -> None:
+    map_simulated(path, drive(WORLD, ROAD))
+    seen = drive(WORLD, ROAD, looks(40, 99), seed=1, start_ns=LATER_NS)
+    mapped = map_simulated(path, seen, "r2")
+    with MapStore.open(path) as store:
+        memory = OpenMap(store).path_memory
+    assert len(memory.paths) == 2
+    entries = memory.entries(memory.paths[1])
+    saved = [entry.node for entry in entries if entry.kind is PathEntryKind.SAVED]
+    assert saved == list(mapped.saved)
+    matched = [entry.node for entry in entries if entry.kind is PathEntryKind.MATCHED]
+    assert len(matched) == pytest.approx(40 * 0.7 / 1.4, abs=2)  # each node once
+    assert all(a != b for a, b in pairwise(matched))
+
+
+def test_a_drive_closes_its_own_loop(path: Path) -> None:
+    lap_m = 2 * np.pi * 12.0
+    ring = World(lap_m, radius_m=12.0)
+    mapped = map_simulated(path, drive(ring, np.arange(0.0, 1.5 * lap_m, 0.7)))
+    lap = int(lap_m / 0.7)
+    # In the second lap the first one's nodes are more than 30 m back.
+    second = np.array(mapped.statuses[lap + 8 :])
+    assert (second == "localised").mean() > 0.9
+    assert len(set(graph_of(path).components().tolist())) == 1
+
+
+def test_unusable_frames_are_neither_saved_nor_matched(path: Path) -> None:
+    seen = drive(WORLD, ROAD)
+    for i in range(10, 15):
+        dark = dataclasses.replace(seen[i].frame, status=FrameStatus.DARK)
+        nothing = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+        seen[i] = dataclasses.replace(seen[i], frame=dark, odometry=nothing)
+    across = seen[9].world_from_live.inverse() @ seen[15].world_from_live
+    bridging = dataclasses.replace(seen[15].odometry, prev_from_curr=across)
+    seen[15] = dataclasses.replace(seen[15], odometry=bridging)
+    mapped = map_simulated(path, seen)
+    assert mapped.statuses[10:15] == ["no_odometry"] * 5
+    assert not any(step.saved for step in mapped.steps[10:15])
+    # The motion across the gap was measured: still one chain.
+    assert len(set(graph_of(path).experiences.tolist())) == 1
+
+
+def test_lost_track_breaks_the_chain_instead_of_inventing_motion(path: Path) -> None:
+    seen = drive(WORLD, ROAD)
+    lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
+    seen[20] = dataclasses.replace(seen[20], odometry=lost_track)
+    map_simulated(path, seen)
+    assert len(set(graph_of(path).components().tolist())) == 2
+
+
+def test_the_same_input_gives_the_same_map(tmp_path: Path) -> None:
+    hashes = []
+    for name in ("one", "two"):
+        path = tmp_path / f"{name}.engram"
+        map_simulated(path, drive(WORLD, ROAD))
+        seen = drive(WORLD, ROAD, looks(30, 50), seed=1, start_ns=LATER_NS)
+        map_simulated(path, seen, "r2")
+        with MapStore.open(path) as store:
+            hashes.append(store.content_hash())
+    assert hashes[0] == hashes[1]
+
+
+def test_a_robot_switched_on_anywhere_finds_itself(path: Path) -> None:
+    first = map_simulated(path, drive(WORLD, ROAD))
+    for start in np.random.default_rng(0).uniform(0, 40, 8):
+        seen = drive(WORLD, np.arange(start, start + 10, 0.4), seed=2, start_ns=LATER_NS)
+        found = localise_simulated(path, seen)
+        # 40 nodes at four attempts a frame: the whole map within ten frames.
+        assert [one.status.value for one in found[10:]] == ["localised"] * len(found[10:])
+        assert errors_m(found, seen, first.saved).max() < 0.5
+
+
+def test_a_kidnapped_robot_is_found_again(path: Path) -> None:
+    first = map_simulated(path, drive(WORLD, ROAD))
+    here = drive(WORLD, np.arange(0, 10, 0.4), seed=2, start_ns=LATER_NS)
+    there = drive(WORLD, np.arange(35, 45, 0.4), seed=3, start_ns=2 * LATER_NS)
+    lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
+    there[0] = dataclasses.replace(there[0], odometry=lost_track)
+    found = localise_simulated(path, here + there)
+    assert all(one.node is not None for one in found[-10:])
+    assert errors_m(found, here + there, first.saved).max() < 0.5

@@ -1,0 +1,109 @@
+"""Maps simulated drives into a real map file, and localises others in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from engram.drive import OpenMap, Settings
+from engram.experience.model import Clock, NodeId, Session, session_id
+from engram.geometry import SE3
+from engram.localiser import Budget, Localisation
+from engram.mapper import Mapper, MappingStep, Saver
+from engram.store import MapStore
+from synthetic_world import Seen
+
+
+@dataclass
+class Mapped:
+    """What mapping a drive came to, beside the truth."""
+
+    steps: list[MappingStep]
+    drive: list[Seen]
+
+    @property
+    def statuses(self) -> list[str]:
+        return [step.localisation.status.value for step in self.steps]
+
+    @property
+    def saved(self) -> dict[NodeId, SE3]:
+        """Truth of each node that was saved."""
+        return {
+            step.saved: seen.world_from_live
+            for step, seen in zip(self.steps, self.drive, strict=True)
+            if step.saved is not None
+        }
+
+
+def session_for(drive: list[Seen], name: str) -> Session:
+    first = drive[0].frame
+    return Session(
+        session_id(name, first.camera.id, first.stamp_ns, name),
+        name,
+        first.camera.id,
+        first.stamp_ns,
+        Clock.RELATIVE,
+    )
+
+
+def map_simulated(
+    path: Path, drive: list[Seen], name: str = "r1", policy: str = "path", **budget: int
+) -> Mapped:
+    first = drive[0].frame
+    opening = MapStore.open_for_writing if path.exists() else MapStore.create
+    with opening(path) as store:
+        session = session_for(drive, name)
+        writer = store.begin_session(
+            session,
+            first.camera,
+            descriptor=first.descriptor,
+            frontend=first.frontend,
+            author=name,
+            configuration={},
+        )
+        opened = OpenMap(store)
+        saver = Saver(writer, store.frames)
+        localiser = opened.localiser(
+            first.camera, Settings(), policy=policy, budget=Budget(**budget), session=session.id
+        )
+        with localiser:
+            mapper = Mapper(opened.graph, localiser, saver, session)
+            steps = [mapper.process(seen.frame, seen.odometry) for seen in drive]
+        saver.finish()
+        writer.commit()
+    return Mapped(steps, drive)
+
+
+def localise_simulated(
+    path: Path,
+    drive: list[Seen],
+    policy: str = "path",
+    relocaliser: str | None = "exhaustive",
+    budget: Budget | None = None,
+) -> list[Localisation]:
+    with OpenMap(MapStore.open(path)) as opened:
+        localiser = opened.localiser(
+            drive[0].frame.camera,
+            Settings(),
+            policy=policy,
+            budget=budget,
+            relocaliser=relocaliser,
+        )
+        with localiser:
+            return [localiser.localise(seen.frame, seen.odometry) for seen in drive]
+
+
+def errors_m(found: list[Localisation], drive: list[Seen], nodes: dict[NodeId, SE3]) -> np.ndarray:
+    """Distance between measured and true position of each localised frame."""
+    return np.array(
+        [
+            np.linalg.norm(
+                (nodes[one.node].inverse() @ seen.world_from_live).translation
+                - one.node_from_live.translation
+            )
+            for one, seen in zip(found, drive, strict=True)
+            if one.node is not None
+        ]
+    )
