@@ -50,15 +50,32 @@ IMAGES = {
 @pytest.mark.parametrize("threshold", [1, 7, 40])
 @pytest.mark.parametrize("image", IMAGES.values(), ids=IMAGES)
 def test_corners_and_scores_equal_the_definition(image: np.ndarray, threshold: int) -> None:
-    positions, scores = _core.detect_corners(image, threshold)
+    positions, scores, offsets = _core.detect_corners(image, threshold)
     expected_positions, expected_scores = corners.detect(image, threshold)
     np.testing.assert_array_equal(positions, expected_positions)
     np.testing.assert_array_equal(scores, expected_scores)
+    expected_offsets = corners.refine(corners.fast_scores(image), expected_positions)
+    np.testing.assert_allclose(offsets, expected_offsets, rtol=1e-6)
+
+
+def test_sub_pixel_corners_follow_a_shift_of_the_image() -> None:
+    fine = shifted_pair(200, 300, 10.25, seed=30)  # the right image is shifted by 10 1/4 px
+    left, right = (_core.detect_corners(image, 20) for image in fine)
+    theirs = {(int(x), int(y)): o for (x, y), o in zip(right[0], right[2], strict=True)}
+    error = []
+    for (x, y), offset in zip(left[0], left[2], strict=True):
+        for whole in (10, 11):
+            other = theirs.get((int(x) - whole, int(y)))
+            if other is not None:
+                error.append(offset - other + (whole, 0) - (10.25, 0))
+    assert len(error) > 200
+    # Whole pixels would be off by 0.25 px at least along x.
+    assert 1.4826 * np.median(np.abs(error), axis=0).max() < 0.12
 
 
 def test_corners_agree_with_opencv() -> None:
     image = texture(300, 400, 6)
-    positions, scores = _core.detect_corners(image, 10)
+    positions, scores, _ = _core.detect_corners(image, 10)
     # OpenCV's response is the largest threshold at which it is a corner; it drops ties.
     theirs = {
         (round(k.pt[0]), round(k.pt[1])): k.response + 1
@@ -82,7 +99,7 @@ def test_images_without_an_inside_have_no_corners(shape: tuple[int, int]) -> Non
 
 def test_order_takes_the_best_of_each_cell_in_turn() -> None:
     image = texture(200, 300, 7)
-    positions, scores = _core.detect_corners(image, 5)
+    positions, scores, _ = _core.detect_corners(image, 5)
     order = _core.order_corners(positions, scores, 300, 200, 32)
     np.testing.assert_array_equal(order, corners.spread_order(positions, scores, 32))
     first = positions[order[:40]] // 32
@@ -99,7 +116,7 @@ def test_smoothing_and_halving_equal_the_definition(shape: tuple[int, int]) -> N
 
 def test_descriptors_equal_the_definition() -> None:
     image = _core.smooth(texture(120, 160, 9))
-    positions, _ = _core.detect_corners(image, 5)
+    positions, _, _ = _core.detect_corners(image, 5)
     assert len(positions) > 50
     expected = brief.describe(image, positions)
     np.testing.assert_array_equal(_core.describe(image, positions), expected)
@@ -113,7 +130,7 @@ def measure_all(left: np.ndarray, right: np.ndarray, positions: np.ndarray, **ch
 def test_disparities_equal_the_definition(noise: float) -> None:
     left, right = shifted_pair(100, 220, 12.25, seed=10, noise=noise)
     right[:, 100:110] = 40  # an occluder, so that some are refused
-    positions, _ = _core.detect_corners(left, 10)
+    positions, _, _ = _core.detect_corners(left, 10)
     measured, sigma = measure_all(left, right, positions)
     accepted = 0
     for (x, y), d, s in zip(positions, measured, sigma, strict=True):
@@ -129,7 +146,7 @@ def test_disparities_equal_the_definition(noise: float) -> None:
 @pytest.mark.parametrize("truth_px", [3.0, 17.25, 30.5, 41.75])
 def test_sub_pixel_disparity_is_true_and_its_sigma_honest(truth_px: float) -> None:
     left, right = shifted_pair(240, 400, truth_px, seed=11, noise=8.0)
-    positions, _ = _core.detect_corners(left, 10)
+    positions, _, _ = _core.detect_corners(left, 10)
     measured, sigma = measure_all(left, right, positions, sigma_floor_px=0.0)
     error = measured[measured > 0] - truth_px
     predicted = sigma[measured > 0]
@@ -143,14 +160,14 @@ def test_sub_pixel_disparity_is_true_and_its_sigma_honest(truth_px: float) -> No
 def test_a_repeated_pattern_has_no_disparity() -> None:
     tile = texture(120, 16, 12)
     image = np.tile(tile, (1, 20))
-    positions, _ = _core.detect_corners(image, 5)
+    positions, _, _ = _core.detect_corners(image, 5)
     assert len(positions) > 50
     assert not measure_all(image, image, positions)[0].any()
 
 
 def test_what_the_right_image_does_not_show_has_no_disparity() -> None:
     left, other = texture(120, 300, 13), texture(120, 300, 14)
-    positions, _ = _core.detect_corners(left, 10)
+    positions, _, _ = _core.detect_corners(left, 10)
     measured, _ = measure_all(left, other, positions)
     # Chance likeness passes uniqueness and mutual check now and then.
     assert (measured > 0).mean() < 0.02
@@ -162,13 +179,15 @@ def test_extract_is_its_steps_put_together() -> None:
     pixels, measured, sigma, descriptors, octaves, found = _core.extract(
         left, right, with_descriptors=True, **settings
     )
-    positions, scores = _core.detect_corners(left, 7)
+    positions, scores, offsets = _core.detect_corners(left, 7)
     order = _core.order_corners(positions, scores, 260, 150, 32)
-    d, s = measure_all(left, right, positions)
+    places = positions + offsets
+    nearest = np.floor(places + 0.5).astype(np.int16).clip([17, 17], [260 - 18, 150 - 18])
+    d, s = measure_all(left, right, nearest)
     taken = np.sort([i for i in order if d[i] > 0][:60])
     assert found == len(positions)
     assert len(taken) == 60
-    np.testing.assert_array_equal(pixels, positions[taken])
+    np.testing.assert_allclose(pixels, places[taken], atol=1e-5)
     np.testing.assert_array_equal(measured, d[taken])
     np.testing.assert_array_equal(sigma, s[taken])
     expected = _core.describe(_core.smooth(left), positions[taken])

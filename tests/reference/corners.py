@@ -50,3 +50,20 @@ def spread_order(positions: np.ndarray, scores: np.ndarray, cell_px: int) -> np.
         rounds[i] = seen.get(cell, 0)
         seen[cell] = rounds[i] + 1
     return by_score[np.argsort(rounds[by_score], kind="stable")]
+
+
+def refine(scores: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """(N, 2) sub-pixel offsets: peaks of parabolas through the scores smoothed with 1 2 1."""
+    weights = np.outer((1, 2, 1), (1, 2, 1))
+
+    def smoothed(x: int, y: int) -> int:
+        return int((weights * scores[y - 1 : y + 2, x - 1 : x + 2]).sum())
+
+    offsets = np.zeros((len(positions), 2))
+    for row, (x, y) in enumerate(positions):
+        for axis, (dx, dy) in enumerate([(1, 0), (0, 1)]):
+            before, here, after = (smoothed(x + k * dx, y + k * dy) for k in (-1, 0, 1))
+            if 2 * here - before - after > 0:
+                peak = 0.5 * (after - before) / (2 * here - before - after)
+                offsets[row, axis] = np.clip(peak, -0.45, 0.45)
+    return offsets

@@ -69,19 +69,24 @@ auto detect_corners(const GreyImage &array, int threshold) {
   const Image image = view(array);
   require_threshold(threshold);
   std::vector<Corner> corners(engram::most_corners(image.width, image.height));
+  std::vector<uint8_t> map(engram::score_stride(image.width) * image.height), scores;
   std::vector<int16_t> positions;
-  std::vector<uint8_t> scores;
+  std::vector<float> offsets;
   {
     nb::gil_scoped_release unlocked;
-    corners.resize(ENGRAM_CALL(detect_corners, image, threshold, corners.data()));
+    corners.resize(ENGRAM_CALL(detect_corners, image, threshold, corners.data(), map.data()));
     for (const Corner &corner : corners) {
       positions.insert(positions.end(), {corner.x, corner.y});
       scores.push_back(corner.score);
+      float offset[2];
+      ENGRAM_CALL(refine_corner, corner, map.data(), image.width, offset);
+      offsets.insert(offsets.end(), {offset[0], offset[1]});
     }
   }
   const size_t count = corners.size();
   return nb::make_tuple(engram::to_numpy(std::move(positions), {count, 2}),
-                        engram::to_numpy(std::move(scores), {count}));
+                        engram::to_numpy(std::move(scores), {count}),
+                        engram::to_numpy(std::move(offsets), {count, 2}));
 }
 
 auto order_corners(const Positions &positions, const engram::Input<uint8_t, 1> &scores, int width,
@@ -206,7 +211,8 @@ auto extract(const GreyImage &left_array, const GreyImage &right_array, int land
 
 void bind_extraction(nb::module_ &module) {
   module.def("detect_corners", &detect_corners, "image"_a, "threshold"_a,
-             "FAST-9 corners: positions (N, 2) int16 x, y in raster order, scores (N,) uint8.");
+             "FAST-9 corners: positions (N, 2) int16 x, y in raster order, scores (N,) uint8, "
+             "sub-pixel offsets (N, 2) float32.");
   module.def("order_corners", &order_corners, "positions"_a, "scores"_a, "width"_a, "height"_a,
              "cell_px"_a, "Indices (N,) int32: best corner of each cell first, then the second.");
   module.def("smooth", &smooth, "image"_a, "Binomial 5×5 blur; the outer two pixels are zero.");

@@ -8,6 +8,9 @@
 namespace engram::ENGRAM_ISA {
 namespace {
 
+// Less than half a pixel, so that the place still rounds to the corner's pixel once it is stored.
+constexpr float most_offset = 0.45f;
+
 // The circle of 16 pixels, clockwise from the top.
 constexpr int circle_x[16] = {0, 1, 2, 3, 3, 3, 2, 1, 0, -1, -2, -3, -3, -3, -2, -1};
 constexpr int circle_y[16] = {-3, -3, -2, -1, 0, 1, 2, 3, 3, 3, 2, 1, 0, -1, -2, -3};
@@ -75,26 +78,43 @@ Corner *keep_maxima(const uint8_t *above, const uint8_t *middle, const uint8_t *
 
 } // namespace
 
-int64_t detect_corners(const Image &image, int threshold, Corner *corners) {
+int64_t detect_corners(const Image &image, int threshold, Corner *corners, uint8_t *scores) {
   const int64_t width = image.width;
   const int64_t from = corner_border, to = width - corner_border;
   const int64_t top = corner_border, bottom = image.height - corner_border;
   if (from >= to || top >= bottom)
     return 0;
-  // Blocks overrun a row's end: into the rows below, of which corner_border are left, and in the
-  // scores into padding.
-  static thread_local Buffer<uint8_t> scratch;
-  const int64_t stride = width + 2 * lanes;
-  uint8_t *rows = scratch.room_for(3 * stride);
-  std::memset(rows, 0, 3 * stride);
+  // Blocks overrun a row's end: into the rows below, of which enough are left, and in the scores
+  // into padding. Two more pixels on each side are for refine_corner().
+  const int64_t stride = score_stride(width);
   Corner *end = corners;
-  for (int64_t y = top - 1; y <= bottom; ++y) {
-    score_row(image.pixels + y * width, width, from - 1, to + 1, rows + y % 3 * stride);
-    if (y > top)
-      end = keep_maxima(rows + (y - 2) % 3 * stride, rows + (y - 1) % 3 * stride,
-                        rows + y % 3 * stride, from, to, threshold, y - 1, end);
+  for (int64_t y = top - 2; y < bottom + 2; ++y) {
+    uint8_t *row = scores + y * stride;
+    score_row(image.pixels + y * width, width, from - 2, to + 2, row);
+    if (y > top && y <= bottom)
+      end = keep_maxima(row - 2 * stride, row - stride, row, from, to, threshold, y - 1, end);
   }
   return end - corners;
+}
+
+void refine_corner(const Corner &corner, const uint8_t *scores, int64_t width, float *offset) {
+  const int64_t stride = score_stride(width);
+  const uint8_t *centre = scores + corner.y * stride + corner.x;
+  // Sixteen times the smoothed score.
+  const auto smoothed = [=](int64_t shift) {
+    const uint8_t *at = centre + shift;
+    const int corners_sum = at[-stride - 1] + at[-stride + 1] + at[stride - 1] + at[stride + 1];
+    return 4 * at[0] + 2 * (at[-1] + at[1] + at[-stride] + at[stride]) + corners_sum;
+  };
+  const int here = smoothed(0);
+  for (int axis = 0; axis < 2; ++axis) {
+    const int64_t step = axis == 0 ? 1 : stride;
+    const int before = smoothed(-step), after = smoothed(step);
+    const int curvature = 2 * here - before - after;
+    const float peak =
+        curvature > 0 ? static_cast<float>(after - before) / static_cast<float>(2 * curvature) : 0;
+    offset[axis] = peak < -most_offset ? -most_offset : peak > most_offset ? most_offset : peak;
+  }
 }
 
 void order_corners(const Corner *corners, int64_t count, const Image &image, int64_t cell_px,

@@ -1,7 +1,6 @@
 #include "kernels/extraction.hpp"
 
 #include <algorithm>
-#include <cstring>
 
 #include "kernels/brief.hpp"
 #include "kernels/buffer.hpp"
@@ -12,10 +11,10 @@ namespace engram::ENGRAM_ISA {
 namespace {
 
 struct Workspace {
-  Buffer<uint8_t> left_levels[most_octaves], right_half, smoothed;
+  Buffer<uint8_t> left_levels[most_octaves], right_half, smoothed, scores;
   Buffer<Corner> corners, kept;
   Buffer<int32_t> order;
-  Buffer<float> disparities; // two per corner: disparity, σ
+  Buffer<float> measured; // four per corner: u, v, disparity, σ
 };
 
 Image halved(const Image &image, Buffer<uint8_t> &memory) {
@@ -26,8 +25,8 @@ Image halved(const Image &image, Buffer<uint8_t> &memory) {
 }
 
 // The corner's position in the full-size image: pixel centres are at integers.
-inline float at_full_size(int coordinate, int scale) {
-  return (static_cast<float>(coordinate) + 0.5f) * static_cast<float>(scale) - 0.5f;
+inline float at_full_size(float coordinate, int scale) {
+  return (coordinate + 0.5f) * static_cast<float>(scale) - 0.5f;
 }
 
 inline bool inside_border(const Image &image, int64_t x, int64_t y) {
@@ -40,38 +39,44 @@ int64_t extract_octave(const Image &level, int octave, int64_t wanted, const Ste
                        const ExtractionSettings &settings, const ExtractedLandmarks &out,
                        int64_t first, int64_t *corner_count, Workspace &work) {
   Corner *corners = work.corners.room_for(most_corners(level.width, level.height));
-  const int64_t count = detect_corners(level, settings.fast_threshold, corners);
+  uint8_t *scores = work.scores.room_for(score_stride(level.width) * level.height);
+  const int64_t count = detect_corners(level, settings.fast_threshold, corners, scores);
   *corner_count += count;
   int32_t *order = work.order.room_for(count);
   order_corners(corners, count, level, settings.cell_px, order);
 
-  float *disparities = work.disparities.room_for(2 * count);
-  std::memset(disparities, 0, 2 * count * sizeof(float));
+  float *measured = work.measured.room_for(4 * count);
+  for (int64_t i = 0; i < count; ++i)
+    measured[4 * i + 2] = 0;
   const int scale = 1 << octave;
   int64_t found = 0;
   for (int64_t i = 0; i < count && found < wanted; ++i) {
     const Corner &corner = corners[order[i]];
-    const int64_t x = corner.x * scale + scale / 2, y = corner.y * scale + scale / 2;
-    float *measured = disparities + 2 * order[i];
+    float *own = measured + 4 * order[i];
+    refine_corner(corner, scores, level.width, own);
+    own[0] = at_full_size(static_cast<float>(corner.x) + own[0], scale);
+    own[1] = at_full_size(static_cast<float>(corner.y) + own[1], scale);
+    const auto x = static_cast<int64_t>(own[0] + 0.5f), y = static_cast<int64_t>(own[1] + 0.5f);
     if (inside_border(images.left, x, y) &&
-        measure_disparity(images, x, y, settings.stereo, measured, measured + 1))
+        measure_disparity(images, x, y, settings.stereo, own + 2, own + 3))
       ++found;
     else
-      measured[0] = 0;
+      own[2] = 0;
   }
 
   // Back to raster order: neighbours in the image are neighbours in memory.
   Corner *kept = work.kept.room_for(found);
   int64_t at = 0;
   for (int64_t i = 0; i < count; ++i) {
-    if (disparities[2 * i] == 0)
+    const float *own = measured + 4 * i;
+    if (own[2] == 0)
       continue;
     kept[at] = corners[i];
     const int64_t row = first + at++;
-    out.pixels[2 * row] = at_full_size(corners[i].x, scale);
-    out.pixels[2 * row + 1] = at_full_size(corners[i].y, scale);
-    out.disparity_px[row] = disparities[2 * i];
-    out.sigma_px[row] = disparities[2 * i + 1];
+    out.pixels[2 * row] = own[0];
+    out.pixels[2 * row + 1] = own[1];
+    out.disparity_px[row] = own[2];
+    out.sigma_px[row] = own[3];
     out.octaves[row] = static_cast<uint8_t>(octave);
   }
   if (out.descriptors != nullptr && found > 0) {
