@@ -1,4 +1,4 @@
-"""Accuracy on the real clips that ENGRAM_DATA names, each row with what must be and what is aimed at.
+"""Accuracy on the real clips that ENGRAM_DATA names; each row says what must be and the aim.
 
     python benchmarks/accuracy.py                       # all of them
     python benchmarks/accuracy.py odometry basin --json results.json
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -21,7 +22,6 @@ import numpy as np
 
 from engram.frontend import (
     Frame,
-    FrameStatus,
     Frontend,
     FrontendConfig,
     Match,
@@ -97,7 +97,7 @@ def odometry(data: Path) -> Iterator[Row]:
     yield Row("translation over 10–50 m segments", 100 * translation, "%", "≤ 1.0", "≤ 0.6")
     yield Row("rotation", np.degrees(rotation), "°/m", "≤ 0.02", "≤ 0.01")
     end = truth[-1].inverse() @ poses[-1]
-    length = sum((a.inverse() @ b).distance_m for a, b in zip(truth, truth[1:], strict=False))
+    length = sum((a.inverse() @ b).distance_m for a, b in itertools.pairwise(truth))
     yield Row("first to last frame", 100 * end.distance_m / length, "%")
     yield Row("normalised error, root of mean χ²/6", float(np.sqrt(np.mean(chi2) / 6)), "", "0.5–2")
     yield Row("inliers, median", float(np.median([s.inliers for s in steps[1:]])), "")
@@ -108,9 +108,7 @@ def segment_errors(poses: list[SE3], truth: list[SE3]) -> tuple[float, float]:
     driven = np.concatenate(
         [
             [0],
-            np.cumsum(
-                [(a.inverse() @ b).distance_m for a, b in zip(truth, truth[1:], strict=False)]
-            ),
+            np.cumsum([(a.inverse() @ b).distance_m for a, b in itertools.pairwise(truth)]),
         ]
     )
     translation, rotation = [], []
@@ -192,9 +190,7 @@ def revisits(data: Path) -> Iterator[Row]:
     }
     with (data / EUROC / "revisit_pairs.csv").open() as lines:
         pairs = [(int(r["earlier_ns"]), int(r["later_ns"])) for r in csv.DictReader(lines)]
-    found = [
-        error_of(match(frames[a], frames[b]), truth[a].inverse() @ truth[b]) for a, b in pairs
-    ]
+    found = [error_of(match(frames[a], frames[b]), truth[a].inverse() @ truth[b]) for a, b in pairs]
     passed = [error for error in found if error is not None]
     near = sum(error[0] < NEAR_M for error in passed)
     yield Row("within 0.25 m", 100 * near / len(pairs), "%", "≥ 65", "≥ 85")
@@ -208,8 +204,13 @@ def revisits(data: Path) -> Iterator[Row]:
         if a < b and truth[a].rotation[:, 2] @ truth[b].rotation[:, 2] < np.cos(np.radians(75))
     ]
     inliers = [match(frames[a], frames[b]).inliers for a, b in apart]
-    yield Row(f"pass, of {len(apart)} pairs with axes > 75° apart",
-              float(np.sum(np.array(inliers) >= MIN_INLIERS)), "pairs", "0", "0")
+    yield Row(
+        f"pass, of {len(apart)} pairs with axes > 75° apart",
+        float(np.sum(np.array(inliers) >= MIN_INLIERS)),
+        "pairs",
+        "0",
+        "0",
+    )
     yield Row("most inliers among them", float(max(inliers)), "")
 
 
@@ -225,10 +226,15 @@ def cross_rig(data: Path) -> Iterator[Row]:
             if m.reference_from_live is not None
         ]
         name = "colour rig" if channel == "grey" else "blue channel"
-        yield Row(f"{name}, matched at the same instant", 100 * len(errors) / len(grey), "%",
-                  must, aim)
-        yield Row(f"{name}, error of cam0_from_cam2, median", 100 * float(np.median(errors)), "cm",
-                  *(("≤ 2", "≤ 1") if channel == "grey" else ()))
+        yield Row(
+            f"{name}, matched at the same instant", 100 * len(errors) / len(grey), "%", must, aim
+        )
+        yield Row(
+            f"{name}, error of cam0_from_cam2, median",
+            100 * float(np.median(errors)),
+            "cm",
+            *(("≤ 2", "≤ 1") if channel == "grey" else ()),
+        )
         yield Row(f"{name}, inliers, median", float(np.median([m.inliers for m in found])), "")
 
 
@@ -236,10 +242,15 @@ def wrong_places(data: Path) -> Iterator[Row]:
     """Inliers between places that have nothing to do with each other."""
     street, room = frames_of(data / KITTI_06)[::5], frames_of(data / EUROC)[::6]
     trams = frames_of(data / DRIVE_0001)[::5]
-    for name, a, b in (("KITTI 06 / drive 0001", street, trams), ("KITTI 06 / EuRoC", street, room),
-                       ("drive 0001 / EuRoC", trams, room)):
+    for name, a, b in (
+        ("KITTI 06 / drive 0001", street, trams),
+        ("KITTI 06 / EuRoC", street, room),
+        ("drive 0001 / EuRoC", trams, room),
+    ):
         inliers = np.array([match(x, y).inliers for x in a for y in b])
-        yield Row(f"{name}: any consensus, of {len(inliers)}", 100 * float(np.mean(inliers > 0)), "%")
+        yield Row(
+            f"{name}: any consensus, of {len(inliers)}", 100 * float(np.mean(inliers > 0)), "%"
+        )
         yield Row(f"{name}: most inliers", float(inliers.max()), "")
 
 
@@ -270,7 +281,9 @@ def main() -> None:
         print(f"\n{part}: {(PARTS[part].__doc__ or '').splitlines()[0]}")
         rows = list(PARTS[part](data))
         for row in rows:
-            asked = f"   must {row.must or '–'}, aim {row.aim or '–'}" if row.must or row.aim else ""
+            asked = (
+                f"   must {row.must or '–'}, aim {row.aim or '–'}" if row.must or row.aim else ""
+            )
             print(f"  {row.name:<52}{row.value:9.3f} {row.unit:<6}{asked}")
         results[part] = [
             {"name": r.name, "value": r.value, "unit": r.unit, "must": r.must, "aim": r.aim}

@@ -30,13 +30,15 @@ class Scene:
         *,
         pixel_sigma_px: float = 0.5,
         disparity_sigma_px: float = 0.15,
+        offset_px: float = 0.0,
         flipped_bits: float = 0.08,
         outliers: float = 0.0,
         stamp_ns: int = 0,
     ) -> tuple[Frame, np.ndarray]:
         """A frame, and for each landmark the row of its point (−1 for an outlier).
 
-        An outlier has the descriptor of a point and the place of another.
+        `offset_px` is what all disparities are too large by. An outlier has the descriptor of a
+        point and the place of another.
         """
         rng = self.rng
         points = world_from_cam.inverse() @ self.points
@@ -50,7 +52,11 @@ class Scene:
         rows = np.flatnonzero(inside)
         rng.shuffle(rows)
         pixels = pixels[rows] + rng.normal(0, pixel_sigma_px, (len(rows), 2))
-        disparity = camera.focal_baseline / z[rows] + rng.normal(0, disparity_sigma_px, len(rows))
+        disparity = (
+            camera.focal_baseline / z[rows]
+            + offset_px
+            + rng.normal(0, disparity_sigma_px, len(rows))
+        )
         disparity = np.maximum(disparity, 0.3).astype(np.float32)
         flips = rng.random((len(rows), 256)) < flipped_bits
         descriptors = self.descriptors[rows] ^ np.packbits(flips, axis=1)

@@ -118,14 +118,20 @@ class MatchSettings:
     octave_scale: float
     patch_ratio: float
     pixel_sigma_px: float
+    disparity_sigma_px: float
+    offset_sigma_px: float
+    offset_drift_px: float
     gate_sigmas: float
     max_radius_px: float
     chi2: float
+    independent_landmarks: float
     min_consensus: int
     max_samples: int
     max_hypotheses: int
     confidence: float
+    max_view_angle_cosine: float
     second_pass: bool
+    same_camera: bool
     def __init__(self) -> None: ...
 
 class Features:
@@ -295,4 +301,8 @@ def adjust_window(
     fixed: int,
     iterations: int,
     chi2: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float] | None: ...
+    offset_px: float,
+    offset_sigma_px: float,
+) -> (
+    tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float, float, float] | None
+): ...

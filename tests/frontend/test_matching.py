@@ -25,6 +25,14 @@ from engram.geometry import SE3, StereoCamera
 from scenes import CAMERA, Scene, normalised_error
 
 CONFIG = MatcherConfig()
+# What the scenes' noise is: independent, without a common offset.
+AS_SIMULATED = MatcherConfig(
+    pixel_sigma_px=0.5,
+    disparity_sigma_px=1e-6,
+    offset_sigma_px=1e-3,
+    offset_drift_px=1e-3,
+    independent_landmarks=1e9,
+)
 REFERENCE_FROM_LIVE = SE3.exp([0.2, -0.05, 1.0, 0.02, 0.1, 0.01])
 WIDER = StereoCamera(fx=220.0, fy=225.0, cx=330.0, cy=236.0, baseline_m=0.5, width=640, height=480)
 
@@ -51,7 +59,7 @@ def test_covariance_is_honest() -> None:
         scene = Scene(400, seed)
         reference, _ = scene.seen_from(SE3.identity())
         live, _ = scene.seen_from(REFERENCE_FROM_LIVE, outliers=0.3)
-        match = match_frames(reference, live, CONFIG, seed)
+        match = match_frames(reference, live, AS_SIMULATED, seed)
         assert match.reference_from_live is not None
         assert match.covariance is not None
         errors.append(
@@ -106,7 +114,7 @@ def test_refinement_reaches_the_minimum() -> None:
     scene = Scene(300, 8)
     reference, _ = scene.seen_from(SE3.identity())
     live, _ = scene.seen_from(REFERENCE_FROM_LIVE, WIDER)
-    match = match_frames(reference, live, CONFIG, 8)
+    match = match_frames(reference, live, AS_SIMULATED, 8)
     assert match.reference_from_live is not None
     assert match.covariance is not None
 
@@ -133,14 +141,14 @@ def test_refinement_reaches_the_minimum() -> None:
         )
         total = 0.0
         for i in range(len(rows)):
-            pixel_variance = CONFIG.pixel_sigma_px**2 * (1 + magnification[i] ** 2)
+            pixel_variance = AS_SIMULATED.pixel_sigma_px**2 * (1 + magnification[i] ** 2)
             information = np.diag(
                 [1 / pixel_variance, 1 / pixel_variance, b.disparity_sigma_px[columns[i]] ** -2]
             )
             covariance = np.linalg.inv(information)
             covariance += relative_sigma[i] ** 2 * np.outer(by_depth[i], by_depth[i])
             chi2 = residual[i] @ np.linalg.solve(covariance, residual[i])
-            total += chi2 / (1 + chi2 / CONFIG.chi2)
+            total += chi2 / (1 + chi2 / AS_SIMULATED.chi2)
         return total
 
     # Half a standard deviation to either side along each principal axis costs about 1/4 each;

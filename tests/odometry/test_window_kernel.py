@@ -15,12 +15,15 @@ from scenes import CAMERA
 
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.baseline_m)
 SCALE = 11.34
+OFFSET_SIGMA = 0.3
 
 
 class Problem:
     """Frames moving forward past random points, with noise and a few gross errors."""
 
-    def __init__(self, frames: int, points: int, seed: int, gross: int = 0) -> None:
+    def __init__(
+        self, frames: int, points: int, seed: int, gross: int = 0, offset_px: float = 0.0
+    ) -> None:
         rng = np.random.default_rng(seed)
         motion = SE3.exp([0.05, 0.0, 0.4, 0.0, 0.02, 0.0])
         self.truth = [SE3.identity()]
@@ -34,7 +37,9 @@ class Problem:
         clean = np.concatenate([project(CAMERA, t.inverse() @ self.points) for t in self.truth])
         self.sigmas = np.tile([0.5, 0.5, 0.15], (len(clean), 1))
         self.stereo = (clean + rng.normal(0, 1, clean.shape) * self.sigmas).astype(np.float32)
-        wrong = rng.choice(len(clean), gross, replace=False)
+        self.stereo[:, 2] += offset_px
+        # In the first frame, the farthest: the first guess comes from the closest one.
+        wrong = rng.choice(points, gross, replace=False)
         self.stereo[wrong, :2] += 40
         self.start = [self.truth[0]] + [
             SE3.exp(rng.normal(0, [0.03, 0.03, 0.05, 0.003, 0.003, 0.003])) @ t
@@ -53,6 +58,8 @@ class Problem:
             "fixed": 1,
             "iterations": iterations,
             "chi2": SCALE,
+            "offset_px": 0.0,
+            "offset_sigma_px": OFFSET_SIGMA,
         }
         return _core.adjust_window(**{**arguments, **changes})
 
@@ -60,18 +67,20 @@ class Problem:
 @pytest.mark.parametrize(("seed", "gross"), [(0, 0), (1, 6)])
 def test_agrees_with_the_plain_twin(seed: int, gross: int) -> None:
     problem = Problem(frames=4, points=25, seed=seed, gross=gross)
-    matrices, covariance, points, before, after = problem.solve()
-    poses, cost, expected_covariance = adjust(
+    matrices, covariance, _, offset, before, after = problem.solve()
+    poses, expected_offset, cost, expected_covariance = adjust(
         CAMERA,
         problem.start,
-        points,  # near the minimum, so that the slow twin ends in the same one
+        problem.points,  # near the minimum, so that the slow twin ends in the same one
         problem.frame,
         problem.track,
         problem.stereo.astype(float),
         problem.sigmas,
         fixed=1,
         scale=SCALE,
+        offset_sigma=OFFSET_SIGMA,
     )
+    assert offset == pytest.approx(expected_offset, abs=0.005)  # a tenth of its σ
     # The kernel stops once a step gains less than a thousandth of the cost.
     assert after <= cost * 1.002
     assert after < before
@@ -94,11 +103,17 @@ def test_gross_errors_hardly_move_the_poses() -> None:
         assert error @ np.linalg.solve(block, error) < 22.5  # χ²(6), 99.9 %
 
 
+def test_a_common_offset_of_all_disparities_is_found() -> None:
+    problem = Problem(frames=6, points=300, seed=11, offset_px=0.25)
+    _, _, _, offset, _, _ = problem.solve()
+    assert offset == pytest.approx(0.25, abs=0.08)
+
+
 def test_held_poses_stay_and_lonely_tracks_are_ignored() -> None:
     problem = Problem(frames=4, points=30, seed=4)
     lonely = problem.track == 7
     keep = ~lonely | (problem.frame == 2)
-    matrices, covariance, points, _, _ = problem.solve(
+    matrices, covariance, points, *_ = problem.solve(
         fixed=2,
         frame=problem.frame[keep],
         track=problem.track[keep],

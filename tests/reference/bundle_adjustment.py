@@ -24,12 +24,13 @@ def chi2_of(
     track: np.ndarray,
     stereo: np.ndarray,
     sigmas: np.ndarray,
+    offset: float,
 ) -> np.ndarray:
     """(K, 3) residuals in standard deviations; `sigmas` is (K, 3)."""
     in_cam = np.array(
         [world_from_cam[f].inverse() @ points[t] for f, t in zip(frame, track, strict=True)]
     )
-    return (project(camera, in_cam) - stereo) / sigmas
+    return (project(camera, in_cam) + np.array([0, 0, offset]) - stereo) / sigmas
 
 
 def adjust(
@@ -43,67 +44,51 @@ def adjust(
     *,
     fixed: int,
     scale: float,
-) -> tuple[list[SE3], float, np.ndarray]:
-    """Minimises Σ χ² / (1 + χ²/scale) over the free poses and all points.
+    offset_sigma: float,
+) -> tuple[list[SE3], float, float, np.ndarray]:
+    """Minimises Σ χ² / (1 + χ²/scale) + (offset/σ)² over free poses, points and offset.
 
     Returns:
-        The poses, the cost, and the covariance of the free poses by plain inversion of the dense
-        Gauss–Newton matrix with Geman–McClure weights.
+        The poses, the offset, the cost, and the covariance of the free poses by plain inversion of
+        the dense Gauss–Newton matrix with Geman–McClure weights.
     """
     free = len(world_from_cam) - fixed
+    observations = (frame, track, stereo, sigmas)
 
-    def unpack(x: np.ndarray) -> tuple[list[SE3], np.ndarray]:
-        moved = [
-            SE3.exp(step) @ pose
-            for step, pose in zip(x[: 6 * free].reshape(-1, 6), world_from_cam[fixed:], strict=True)
-        ]
-        return world_from_cam[:fixed] + moved, points + x[6 * free :].reshape(-1, 3)
-
-    def whitened(x: np.ndarray) -> np.ndarray:
-        return chi2_of(camera, *unpack(x), frame, track, stereo, sigmas)
-
-    def robust(x: np.ndarray) -> np.ndarray:
-        # Residuals whose squares sum to the robust cost.
-        chi2 = (whitened(x) ** 2).sum(axis=1)
-        return np.sqrt(chi2 / (1 + chi2 / scale))
-
-    start = np.zeros(6 * free + 3 * len(points))
-
-    # The square root above has a kink at zero, so its parts are what the solver gets.
     def parts(x: np.ndarray) -> np.ndarray:
-        r = whitened(x)
+        poses, moved = _moved(x[1:], world_from_cam, points, fixed)
+        r = chi2_of(camera, poses, moved, *observations, x[0])
         chi2 = (r**2).sum(axis=1, keepdims=True)
-        return (r / np.sqrt(1 + chi2 / scale)).ravel()
+        # Residuals whose squares sum to the robust cost.
+        return np.append((r / np.sqrt(1 + chi2 / scale)).ravel(), x[0] / offset_sigma)
 
+    start = np.zeros(1 + 6 * free + 3 * len(points))
     x = least_squares(parts, start, method="trf", x_scale="jac", xtol=1e-12, ftol=1e-12).x
-    poses, moved_points = unpack(x)
-    return (
-        poses,
-        float((robust(x) ** 2).sum()),
-        _covariance(camera, poses, moved_points, frame, track, stereo, sigmas, fixed, scale),
-    )
+    poses, moved = _moved(x[1:], world_from_cam, points, fixed)
+    covariance = _covariance(camera, poses, moved, *observations, x[0], fixed, scale, offset_sigma)
+    return poses, x[0], float((parts(x) ** 2).sum()), covariance
 
 
-def _covariance(camera, poses, points, frame, track, stereo, sigmas, fixed, scale) -> np.ndarray:
+def _moved(
+    x: np.ndarray, poses: list[SE3], points: np.ndarray, fixed: int
+) -> tuple[list[SE3], np.ndarray]:
     free = len(poses) - fixed
-    size = 6 * free + 3 * len(points)
+    steps = x[: 6 * free].reshape(-1, 6)
+    free_poses = [SE3.exp(step) @ pose for step, pose in zip(steps, poses[fixed:], strict=True)]
+    return poses[:fixed] + free_poses, points + x[6 * free :].reshape(-1, 3)
+
+
+def _covariance(
+    camera, poses, points, frame, track, stereo, sigmas, offset, fixed, scale, offset_sigma
+) -> np.ndarray:
+    free = len(poses) - fixed
 
     def whitened(x: np.ndarray) -> np.ndarray:
-        moved = [
-            SE3.exp(step) @ pose
-            for step, pose in zip(x[: 6 * free].reshape(-1, 6), poses[fixed:], strict=True)
-        ]
-        return chi2_of(
-            camera,
-            poses[:fixed] + moved,
-            points + x[6 * free :].reshape(-1, 3),
-            frame,
-            track,
-            stereo,
-            sigmas,
-        )
+        moved_poses, moved = _moved(x[1:], poses, points, fixed)
+        return chi2_of(camera, moved_poses, moved, frame, track, stereo, sigmas, offset + x[0])
 
     step = 1e-6
+    size = 1 + 6 * free + 3 * len(points)
     jacobian = np.empty((3 * len(frame), size))
     for i in range(size):
         at = np.zeros(size)
@@ -112,4 +97,5 @@ def _covariance(camera, poses, points, frame, track, stereo, sigmas, fixed, scal
     chi2 = (whitened(np.zeros(size)) ** 2).sum(axis=1)
     weights = np.repeat((1 + chi2 / scale) ** -2, 3)
     information = jacobian.T @ (weights[:, None] * jacobian)
-    return np.linalg.inv(information)[: 6 * free, : 6 * free]
+    information[0, 0] += offset_sigma**-2
+    return np.linalg.inv(information)[1 : 1 + 6 * free, 1 : 1 + 6 * free]

@@ -166,14 +166,20 @@ void bind_matching(nb::module_ &module) {
       .def_rw("octave_scale", &MatchSettings::octave_scale)
       .def_rw("patch_ratio", &MatchSettings::patch_ratio)
       .def_rw("pixel_sigma_px", &MatchSettings::pixel_sigma_px)
+      .def_rw("disparity_sigma_px", &MatchSettings::disparity_sigma_px)
+      .def_rw("offset_sigma_px", &MatchSettings::offset_sigma_px)
+      .def_rw("offset_drift_px", &MatchSettings::offset_drift_px)
       .def_rw("gate_sigmas", &MatchSettings::gate_sigmas)
       .def_rw("max_radius_px", &MatchSettings::max_radius_px)
       .def_rw("chi2", &MatchSettings::chi2)
+      .def_rw("independent_landmarks", &MatchSettings::independent_landmarks)
       .def_rw("min_consensus", &MatchSettings::min_consensus)
       .def_rw("max_samples", &MatchSettings::max_samples)
       .def_rw("max_hypotheses", &MatchSettings::max_hypotheses)
       .def_rw("confidence", &MatchSettings::confidence)
-      .def_rw("second_pass", &MatchSettings::second_pass);
+      .def_rw("max_view_angle_cosine", &MatchSettings::max_view_angle_cosine)
+      .def_rw("second_pass", &MatchSettings::second_pass)
+      .def_rw("same_camera", &MatchSettings::same_camera);
   nb::class_<Features>(module, "Features", "The landmarks of a frame, checked for shape.")
       .def(nb::init<Input<float, 2>, Input<float, 1>, Input<float, 1>, Input<float, 2>,
                     Descriptors, Input<uint8_t, 1>, std::array<double, 5>>(),

@@ -15,7 +15,8 @@ nb::object adjust_window(const std::array<double, 5> &camera,
                          const Input<int32_t, 1> &track, const Input<float, 2> &stereo,
                          const Input<float, 1> &pixel_sigma_px,
                          const Input<float, 1> &disparity_sigma_px, int32_t fixed,
-                         int32_t iterations, double chi2) {
+                         int32_t iterations, double chi2, double offset_px,
+                         double offset_sigma_px) {
   const size_t poses = world_from_cam.shape(0), count = frame.shape(0);
   if (world_from_cam.shape(1) != 4 || world_from_cam.shape(2) != 4)
     throw nb::value_error("world_from_cam must have shape (P, 4, 4)");
@@ -25,6 +26,8 @@ nb::object adjust_window(const std::array<double, 5> &camera,
                              disparity_sigma_px.shape(0)})
     if (other != count)
       throw nb::value_error("the arrays of the observations must have one row each");
+  if (!(offset_sigma_px > 0))
+    throw nb::value_error("offset_sigma_px must be > 0");
   if (fixed < 0)
     throw nb::value_error("fixed must not be negative");
   int32_t tracks = 0;
@@ -51,7 +54,7 @@ nb::object adjust_window(const std::array<double, 5> &camera,
   {
     nb::gil_scoped_release unlocked;
     result = ENGRAM_CALL(adjust_window, view, before, observations,
-                         WindowSettings{fixed, iterations, chi2});
+                         WindowSettings{fixed, iterations, chi2, offset_px, offset_sigma_px});
   }
   if (!result.solved)
     return nb::none();
@@ -62,7 +65,7 @@ nb::object adjust_window(const std::array<double, 5> &camera,
   return nb::make_tuple(to_numpy(std::move(matrices), {poses, 4, 4}),
                         to_numpy(std::move(result.covariance), {free, free}),
                         to_numpy(std::move(result.points), {static_cast<size_t>(tracks), 3}),
-                        result.cost_before, result.cost_after);
+                        result.offset_px, result.cost_before, result.cost_after);
 }
 
 } // namespace
@@ -70,8 +73,8 @@ nb::object adjust_window(const std::array<double, 5> &camera,
 void bind_window_ba(nb::module_ &module) {
   module.def("adjust_window", &adjust_window, "camera"_a, "world_from_cam"_a, "frame"_a, "track"_a,
              "stereo"_a, "pixel_sigma_px"_a, "disparity_sigma_px"_a, "fixed"_a, "iterations"_a,
-             "chi2"_a,
-             "Optimises poses (P, 4, 4) and landmarks together: (world_from_cam (P, 4, 4), "
-             "covariance of the free poses (6F, 6F), points (T, 3), cost before, cost after), or "
+             "chi2"_a, "offset_px"_a, "offset_sigma_px"_a,
+             "Optimises poses (P, 4, 4), landmarks and the offset of all disparities together: (world_from_cam (P, 4, 4), "
+             "covariance of the free poses (6F, 6F), points (T, 3), offset px, cost before, cost after), or "
              "None where the observations do not determine the poses.");
 }

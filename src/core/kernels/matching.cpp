@@ -212,11 +212,13 @@ bool predict(const FrameView &reference, int64_t row, const FrameView &live,
                                     {point[0], point[1], point[2]});
   if (!seen.in_front)
     return false;
-  const double depth_doubt = reference.disparity_sigma_px[row] / reference.disparity_px[row];
+  const double sigma = reference.disparity_sigma_px[row], disparity = reference.disparity_px[row];
+  const double offset = settings.offset_sigma_px;
+  const double depth_variance = (sigma * sigma + offset * offset) / (disparity * disparity);
   const double scale = power(settings.octave_scale, reference.octaves[row]);
   const double pixel = settings.pixel_sigma_px * (scale + 1);
   for (int k = 0; k < 3; ++k) {
-    double variance = pixel * pixel + depth_doubt * depth_doubt * seen.by_depth[k] * seen.by_depth[k];
+    double variance = pixel * pixel + depth_variance * seen.by_depth[k] * seen.by_depth[k];
     for (int a = 0; a < 6; ++a)
       for (int b = 0; b < 6; ++b)
         variance += seen.by_pose[k][a] * prediction.covariance[6 * a + b] * seen.by_pose[k][b];

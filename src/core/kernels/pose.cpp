@@ -44,16 +44,31 @@ Vec3 point_of(const FrameView &frame, int32_t row) {
   return {p[0], p[1], p[2]};
 }
 
-double relative_depth_sigma(const FrameView &frame, int32_t row) {
-  return frame.disparity_sigma_px[row] / frame.disparity_px[row];
+// While a pose is sought, the cameras' common disparity offsets count as noise of each landmark;
+// once there is one, they are estimated.
+enum class OffsetsAre { noise, estimated };
+
+double disparity_variance(const FrameView &frame, int32_t row, const MatchSettings &settings,
+                          OffsetsAre offsets) {
+  const double sigma = frame.disparity_sigma_px[row];
+  const double views = settings.disparity_sigma_px;
+  const double common = offsets == OffsetsAre::noise ? settings.offset_sigma_px : 0;
+  return sigma * sigma + views * views + common * common;
+}
+
+double relative_depth_variance(const FrameView &frame, int32_t row, const MatchSettings &settings,
+                               OffsetsAre offsets) {
+  const double disparity = frame.disparity_px[row];
+  return disparity_variance(frame, row, settings, offsets) / (disparity * disparity);
 }
 
 double pixel_sigma(const FrameView &frame, int32_t row, const MatchSettings &settings) {
-  return settings.pixel_sigma_px * power(settings.octave_scale, frame.octaves[row]);
+  return settings.pixel_sigma_px * std::sqrt(power(settings.octave_scale, frame.octaves[row]));
 }
 
 Correspondences correspondences(const FrameView &reference, const FrameView &live,
-                                const std::vector<RowPair> &pairs, const MatchSettings &settings) {
+                                const std::vector<RowPair> &pairs, const MatchSettings &settings,
+                                OffsetsAre offsets) {
   Correspondences matches(live.camera);
   for (const RowPair &pair : pairs) {
     const Vec3 x = point_of(reference, pair.reference), y = point_of(live, pair.live);
@@ -62,11 +77,11 @@ Correspondences correspondences(const FrameView &reference, const FrameView &liv
         live.camera.fx * x[2] / (reference.camera.fx * std::max(y[2], kNearest_m));
     const double own = pixel_sigma(live, pair.live, settings);
     const double other = magnification * pixel_sigma(reference, pair.reference, settings);
-    const double disparity = live.disparity_sigma_px[pair.live];
-    const double depth = relative_depth_sigma(reference, pair.reference);
     const float *pixel = live.pixels + 2 * pair.live;
-    matches.add(x, {pixel[0], pixel[1], live.disparity_px[pair.live]}, own * own + other * other,
-                disparity * disparity, depth * depth);
+    matches.add(x, reference.disparity_px[pair.reference],
+                {pixel[0], pixel[1], live.disparity_px[pair.live]}, own * own + other * other,
+                disparity_variance(live, pair.live, settings, offsets),
+                relative_depth_variance(reference, pair.reference, settings, offsets));
   }
   matches.pad();
   return matches;
@@ -100,27 +115,51 @@ Score score(const Correspondences &matches, const Pose &pose, float chi2, float 
   return result;
 }
 
-// Robust normal equations H δ = −g of the left perturbation of reference_from_live.
-struct NormalEquations {
-  double hessian[36];
-  double gradient[6];
+// What is estimated: the left perturbation of reference_from_live, and where asked for the offsets.
+constexpr int kPose = 6, kPoseAndOffsets = 8;
+
+struct Estimate {
+  Pose pose;
+  Offsets offsets;
+};
+
+// Information of the prior on (reference offset, live offset), both of mean zero. One camera has
+// one offset, but for the little that it drifts.
+struct OffsetPrior {
+  double own = 0, cross = 0;
+
+  explicit OffsetPrior(const MatchSettings &settings) {
+    const double spread = 1 / (settings.offset_sigma_px * settings.offset_sigma_px);
+    const double tie =
+        settings.same_camera ? 1 / (settings.offset_drift_px * settings.offset_drift_px) : 0;
+    own = spread + tie;
+    cross = -tie;
+  }
+};
+
+// Robust normal equations H δ = −g.
+template <int size> struct NormalEquations {
+  double hessian[size * size];
+  double gradient[size];
   double cost;
 };
 
 // Geman–McClure's ρ(χ²) = χ² / (1 + χ²/c²), c² = `scale`.
-NormalEquations normal_equations(const Correspondences &matches, const Pose &pose, float scale) {
-  const FloatPose live_from_reference(pose);
+template <int size>
+NormalEquations<size> normal_equations(const Correspondences &matches, const Estimate &estimate,
+                                       float scale) {
+  const FloatPose live_from_reference(estimate.pose, estimate.offsets);
   const float *m = live_from_reference.m;
-  Floats h[21] = {}, g[6] = {}, cost{};
+  Floats h[size * (size + 1) / 2] = {}, g[size] = {}, cost{};
   const float inverse_scale = 1 / scale;
   for (int64_t i = 0; i < matches.padded; i += kLanes) {
     const Block b(matches, i, live_from_reference);
-    const Floats point[3] = {load(&matches.x[i]), load(&matches.y[i]), load(&matches.z[i])};
+    const Floats point[3] = {b.x, b.y, b.z};
     const Floats zero{};
     const Floats shrink = 1.0f / (1.0f + b.chi2 * inverse_scale);
     const Floats weight = b.usable ? shrink * shrink : zero;
     cost += b.usable ? b.chi2 * shrink : load(&matches.valid[i]) * scale;
-    Floats ju[6], jv[6], jd[6], along[6];
+    Floats ju[size], jv[size], jd[size];
     for (int k = 0; k < 3; ++k) {
       ju[k] = -(b.along_u * m[k] + b.u_by_z * m[6 + k]);
       jv[k] = -(b.along_v * m[3 + k] + b.v_by_z * m[6 + k]);
@@ -129,48 +168,79 @@ NormalEquations normal_equations(const Correspondences &matches, const Pose &pos
     for (Floats *j : {ju, jv, jd})
       for (int k = 0; k < 3; ++k)
         j[3 + k] = point[(k + 1) % 3] * j[(k + 2) % 3] - point[(k + 2) % 3] * j[(k + 1) % 3];
+    if constexpr (size == kPoseAndOffsets) {
+      ju[6] = b.ju * b.by_offset, jv[6] = b.jv * b.by_offset, jd[6] = b.jd * b.by_offset;
+      ju[7] = zero, jv[7] = zero, jd[7] = zero + 1.0f;
+    }
     const Floats wp = weight * b.wp, wd = weight * b.wd, wk = weight * b.kappa;
-    for (int k = 0; k < 6; ++k)
+    Floats along[size];
+    for (int k = 0; k < size; ++k)
       along[k] = b.wp * (b.ju * ju[k] + b.jv * jv[k]) + b.wd * b.jd * jd[k];
     int entry = 0;
-    for (int row = 0; row < 6; ++row) {
+    for (int row = 0; row < size; ++row) {
       const Floats pu = wp * ju[row], pv = wp * jv[row], pd = wd * jd[row], pk = wk * along[row];
       g[row] += pu * b.ru + pv * b.rv + pd * b.rd - pk * b.hr;
       for (int column = 0; column <= row; ++column)
         h[entry++] += pu * ju[column] + pv * jv[column] + pd * jd[column] - pk * along[column];
     }
   }
-  NormalEquations result;
+  NormalEquations<size> result;
   int entry = 0;
-  for (int row = 0; row < 6; ++row) {
+  for (int row = 0; row < size; ++row) {
     result.gradient[row] = sum(g[row]);
     for (int column = 0; column <= row; ++column)
-      result.hessian[6 * row + column] = result.hessian[6 * column + row] = sum(h[entry++]);
+      result.hessian[size * row + column] = result.hessian[size * column + row] = sum(h[entry++]);
   }
   result.cost = sum(cost);
   return result;
 }
 
-// Levenberg–Marquardt. Returns the normal equations at the pose reached.
-NormalEquations refine(const Correspondences &matches, Pose &pose, float scale, int iterations) {
+void add_prior(const OffsetPrior &prior, const Offsets &offsets,
+               NormalEquations<kPoseAndOffsets> &equations) {
+  double *h = equations.hessian, *g = equations.gradient;
+  const double reference = prior.own * offsets.reference + prior.cross * offsets.live;
+  const double live = prior.cross * offsets.reference + prior.own * offsets.live;
+  h[6 * 8 + 6] += prior.own, h[7 * 8 + 7] += prior.own;
+  h[6 * 8 + 7] += prior.cross, h[7 * 8 + 6] += prior.cross;
+  g[6] += reference, g[7] += live;
+  equations.cost += offsets.reference * reference + offsets.live * live;
+}
+
+template <int size>
+NormalEquations<size> equations_at(const Correspondences &matches, const Estimate &estimate,
+                                   float scale, [[maybe_unused]] const OffsetPrior &prior) {
+  auto equations = normal_equations<size>(matches, estimate, scale);
+  if constexpr (size == kPoseAndOffsets)
+    add_prior(prior, estimate.offsets, equations);
+  return equations;
+}
+
+// Levenberg–Marquardt. Returns the normal equations at the estimate reached.
+template <int size>
+NormalEquations<size> refine(const Correspondences &matches, Estimate &estimate, float scale,
+                             int iterations, const OffsetPrior &prior) {
   constexpr double kConverged = 1e-5; // relative fall of the cost that is no longer worth a step
-  NormalEquations equations = normal_equations(matches, pose, scale);
+  auto equations = equations_at<size>(matches, estimate, scale, prior);
   double damping = 1e-4;
   for (int i = 0; i < iterations; ++i) {
-    double factor[36], step[6];
-    std::copy(equations.hessian, equations.hessian + 36, factor);
-    for (int k = 0; k < 6; ++k) {
-      factor[7 * k] *= 1 + damping;
+    double factor[size * size], step[size];
+    std::copy(equations.hessian, equations.hessian + size * size, factor);
+    for (int k = 0; k < size; ++k) {
+      factor[(size + 1) * k] *= 1 + damping;
       step[k] = -equations.gradient[k];
     }
-    if (!factorise(factor, 6))
+    if (!factorise(factor, size))
       break;
-    solve_factorised(factor, 6, step);
-    const Pose moved = perturbed(pose, step);
-    const NormalEquations there = normal_equations(matches, moved, scale);
+    solve_factorised(factor, size, step);
+    Estimate moved{perturbed(estimate.pose, step), estimate.offsets};
+    if constexpr (size == kPoseAndOffsets) {
+      moved.offsets.reference += step[6];
+      moved.offsets.live += step[7];
+    }
+    const auto there = equations_at<size>(matches, moved, scale, prior);
     if (there.cost < equations.cost) {
       const bool converged = equations.cost - there.cost < kConverged * equations.cost;
-      pose = moved;
+      estimate = moved;
       equations = there;
       damping = std::max(damping * 0.1, 1e-9);
       if (converged)
@@ -241,13 +311,14 @@ public:
 private:
   struct End {
     Vec3 point;
-    double relative_sigma, lateral_variance;
+    double relative_variance, lateral_variance;
   };
 
   static End end_of(const FrameView &frame, int32_t row, const MatchSettings &settings) {
     const Vec3 point = point_of(frame, row);
     const double lateral = pixel_sigma(frame, row, settings) * point[2] / frame.camera.fx;
-    return {point, relative_depth_sigma(frame, row), lateral * lateral};
+    return {point, relative_depth_variance(frame, row, settings, OffsetsAre::noise),
+            lateral * lateral};
   }
 
   static bool keep_distance(const End &xi, const End &xj, const End &yi, const End &yj,
@@ -259,9 +330,9 @@ private:
       const Vec3 apart = a.point - b.point;
       squared[side] = dot(apart, apart);
       // Depth errors move the points along their rays, pixel errors across.
-      const double da = dot(apart, a.point) * a.relative_sigma;
-      const double db = dot(apart, b.point) * b.relative_sigma;
-      variance += (da * da + db * db) / (squared[side] + 1e-6) + a.lateral_variance +
+      const double da = dot(apart, a.point), db = dot(apart, b.point);
+      variance += (da * da * a.relative_variance + db * db * b.relative_variance) /
+                      (squared[side] + 1e-6) + a.lateral_variance +
                   b.lateral_variance;
     }
     // (p − q)² ≤ g²σ² without a square root: p² + q² − g²σ² ≤ 2pq.
@@ -326,7 +397,8 @@ public:
   Consensus(const FrameView &reference, const FrameView &live, const std::vector<RowPair> &pairs,
             const MatchSettings &settings, uint64_t seed)
       : reference_(reference), live_(live), settings_(settings), random_(seed), pairs_(pairs),
-        matches_(correspondences(reference, live, pairs, settings)) {
+        prior_(settings),
+        matches_(correspondences(reference, live, pairs, settings, OffsetsAre::noise)) {
     order_.resize(pairs.size());
     for (size_t i = 0; i < order_.size(); ++i)
       order_[i] = static_cast<int32_t>(i);
@@ -351,27 +423,45 @@ private:
   // graph's cost grows with the square.
   static constexpr size_t kGraphSize = 256;
 
+  struct Edge {
+    int i = 0, j = 0, common = -1;
+  };
+
+  // Every other edge is the one of several with the most common neighbours, which right matches
+  // have; the rest is drawn evenly, since far points have many neighbours too, and fix no pose.
+  static constexpr int kRivals = 4;
+
+  Edge draw_edge(const DistanceGraph &graph, int rivals) {
+    Edge best;
+    for (int rival = 0; rival < rivals; ++rival) {
+      const int i = static_cast<int>(random_.below(static_cast<uint32_t>(order_.size())));
+      const int neighbours = graph.degree(i);
+      if (neighbours == 0)
+        continue;
+      const int j = graph.nth_common(i, i, static_cast<int>(random_.below(neighbours)));
+      const int common = graph.common(i, j);
+      if (common > best.common)
+        best = {i, j, common};
+    }
+    return best;
+  }
+
   void search() {
     std::vector<RowPair> drawn_from;
     for (const int32_t i : order_)
       drawn_from.push_back(pairs_[i]);
     const DistanceGraph graph(reference_, live_, drawn_from, settings_);
-    const auto count = static_cast<uint32_t>(order_.size());
     double chance = chance_of_success(graph);
     int hypotheses = 0;
     for (int sample = 0; sample < settings_.max_samples && hypotheses < settings_.max_hypotheses;
          ++sample) {
       if (power(1 - chance, sample) < 1 - settings_.confidence)
         break;
-      const int i = static_cast<int>(random_.below(count));
-      const int neighbours = graph.degree(i);
-      if (neighbours == 0)
-        continue;
-      const int j = graph.nth_common(i, i, static_cast<int>(random_.below(neighbours)));
-      const int both = graph.common(i, j);
+      const Edge edge = draw_edge(graph, sample % 2 ? kRivals : 1);
       // All of a consensus keep their distances from each other.
-      if (both + 2 < settings_.min_consensus)
+      if (edge.common < std::max(settings_.min_consensus - 2, 1))
         continue;
+      const auto [i, j, both] = edge;
       const int k = graph.nth_common(i, j, static_cast<int>(random_.below(both)));
       ++hypotheses;
       Pose pose;
@@ -394,7 +484,9 @@ private:
     // Rigid alignment trusts all coordinates alike; two steps on the residuals weigh them.
     sample_.pad();
     constexpr float kNoShrinking = 1e6;
-    refine(sample_, pose, kNoShrinking, 2);
+    Estimate estimate{pose, {}};
+    refine<kPose>(sample_, estimate, kNoShrinking, 2, prior_);
+    pose = estimate.pose;
     return true;
   }
 
@@ -404,13 +496,13 @@ private:
     Score found = score(matches_, pose, loose, best_.cost);
     if (found.cost >= best_.cost || found.inliers < 4)
       return false;
-    Pose better = pose;
-    refine(matches_, better, loose, 3);
-    refine(matches_, better, static_cast<float>(settings_.chi2), 3);
-    const Score optimised = score(matches_, better, loose, found.cost);
+    Estimate better{pose, {}};
+    refine<kPose>(matches_, better, loose, 3, prior_);
+    refine<kPose>(matches_, better, static_cast<float>(settings_.chi2), 3, prior_);
+    const Score optimised = score(matches_, better.pose, loose, found.cost);
     if (optimised.cost < found.cost) {
       found = optimised;
-      pose = better;
+      pose = better.pose;
     }
     best_ = found;
     pose_ = pose;
@@ -418,11 +510,12 @@ private:
   }
 
   double chance_of_success(const DistanceGraph &graph) const {
-    // A triple of inliers gives a good hypothesis about every other time: noise and degeneracy.
-    constexpr double kGoodSample = 0.5;
+    // A triple of inliers gives a good hypothesis about every fourth time: noise and degeneracy.
+    constexpr double kGoodSample = 0.25;
     if (best_.inliers == 0)
       return 0;
-    const std::vector<uint8_t> inlier = inliers(kLoose * settings_.chi2);
+    const std::vector<uint8_t> inlier =
+        inliers(matches_, {pose_, {}}, kLoose * settings_.chi2);
     std::vector<uint64_t> members(graph.words(), 0);
     for (size_t i = 0; i < order_.size(); ++i)
       if (inlier[order_[i]])
@@ -430,11 +523,12 @@ private:
     return kGoodSample * graph.chance(members);
   }
 
-  std::vector<uint8_t> inliers(double chi2) const {
-    const FloatPose live_from_reference(pose_);
-    std::vector<uint8_t> result(matches_.padded);
-    for (int64_t i = 0; i < matches_.padded; i += kLanes) {
-      const Block block(matches_, i, live_from_reference);
+  static std::vector<uint8_t> inliers(const Correspondences &matches, const Estimate &estimate,
+                                      double chi2) {
+    const FloatPose live_from_reference(estimate.pose, estimate.offsets);
+    std::vector<uint8_t> result(matches.padded);
+    for (int64_t i = 0; i < matches.padded; i += kLanes) {
+      const Block block(matches, i, live_from_reference);
       const Ints inlier = block.usable & (block.chi2 < static_cast<float>(chi2));
       for (int lane = 0; lane < kLanes; ++lane)
         result[i + lane] = inlier[lane] != 0;
@@ -442,34 +536,48 @@ private:
     return result;
   }
 
-  PoseEstimate finish() {
-    PoseEstimate estimate;
+  // Estimates pose and offsets from all matches, and who agrees with them.
+  PoseEstimate finish() const {
+    PoseEstimate result;
     if (best_.inliers < settings_.min_consensus)
-      return estimate;
+      return result;
     constexpr int kIterations = 10;
-    const NormalEquations equations =
-        refine(matches_, pose_, static_cast<float>(settings_.chi2), kIterations);
-    const std::vector<uint8_t> agrees = inliers(settings_.chi2);
+    const Correspondences matches =
+        correspondences(reference_, live_, pairs_, settings_, OffsetsAre::estimated);
+    // The pose alone first: with the offsets free, a start far off could bend them instead.
+    Estimate estimate{pose_, {}};
+    refine<kPose>(matches_, estimate, static_cast<float>(settings_.chi2), kIterations, prior_);
+    const auto equations = refine<kPoseAndOffsets>(
+        matches, estimate, static_cast<float>(settings_.chi2), kIterations, prior_);
+    const std::vector<uint8_t> agrees = inliers(matches, estimate, settings_.chi2);
     for (size_t i = 0; i < pairs_.size(); ++i)
       if (agrees[i])
-        estimate.inliers.push_back(pairs_[i]);
-    double factor[36];
-    std::copy(equations.hessian, equations.hessian + 36, factor);
-    estimate.found = static_cast<int32_t>(estimate.inliers.size()) >= settings_.min_consensus &&
-                     factorise(factor, 6);
-    if (!estimate.found) {
-      estimate.inliers.clear();
-      return estimate;
+        result.inliers.push_back(pairs_[i]);
+    double factor[64], covariance[64];
+    std::copy(equations.hessian, equations.hessian + 64, factor);
+    result.found = static_cast<int32_t>(result.inliers.size()) >= settings_.min_consensus &&
+                   estimate.pose.rotation[8] >= settings_.max_view_angle_cosine &&
+                   factorise(factor, kPoseAndOffsets);
+    if (!result.found) {
+      result.inliers.clear();
+      return result;
     }
-    invert_factorised(factor, 6, estimate.covariance.data());
-    estimate.reference_from_live = pose_;
-    return estimate;
+    invert_factorised(factor, kPoseAndOffsets, covariance);
+    // Errors that landmarks share: more of them do not average them out.
+    const double shared =
+        1 + static_cast<double>(result.inliers.size()) / settings_.independent_landmarks;
+    for (int row = 0; row < 6; ++row)
+      for (int column = 0; column < 6; ++column)
+        result.covariance[6 * row + column] = shared * covariance[8 * row + column];
+    result.reference_from_live = estimate.pose;
+    return result;
   }
 
   const FrameView &reference_, &live_;
   const MatchSettings &settings_;
   Random random_;
   const std::vector<RowPair> &pairs_;
+  OffsetPrior prior_;
   Correspondences matches_;
   Correspondences sample_{live_.camera};
   std::vector<int32_t> order_;

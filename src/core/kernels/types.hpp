@@ -40,14 +40,20 @@ struct MatchSettings {
   double octave_scale = 0;
   double patch_ratio = 0;
   double pixel_sigma_px = 0;
+  double disparity_sigma_px = 0;
+  double offset_sigma_px = 0;
+  double offset_drift_px = 0;
   double gate_sigmas = 0;
   double max_radius_px = 0;
   double chi2 = 0;
+  double independent_landmarks = 0;
   int32_t min_consensus = 0;
   int32_t max_samples = 0;
   int32_t max_hypotheses = 0;
   double confidence = 0;
+  double max_view_angle_cosine = -1;
   bool second_pass = true;
+  bool same_camera = false;
 };
 
 struct RowPair {

@@ -1,5 +1,6 @@
 // Bundle adjustment by the Schur complement (Triggs et al. 2000, §6; Hartley & Zisserman, A6.3):
-// landmarks are eliminated one by one, what remains is a dense system of the poses.
+// landmarks are eliminated one by one, what remains is a dense system of the poses and of the
+// disparity offset that all observations share.
 #include "kernels/window_ba.hpp"
 
 #include <cmath>
@@ -60,7 +61,8 @@ public:
   Window(const Camera &camera, const std::vector<RigidTransform> &world_from_cam,
          const WindowObservations &observations, const WindowSettings &settings)
       : camera_(camera), settings_(settings), poses_(world_from_cam),
-        free_(static_cast<int>(world_from_cam.size()) - settings.fixed) {
+        free_(static_cast<int>(world_from_cam.size()) - settings.fixed),
+        offset_(settings.offset_px) {
     group_by_landmark(observations);
   }
 
@@ -74,6 +76,7 @@ public:
     for (int i = 0; i < settings_.iterations; ++i) {
       const std::vector<Pose> poses = poses_;
       const std::vector<Landmark> landmarks = landmarks_;
+      const double offset = offset_;
       if (!eliminate(damping) || !step())
         break;
       const double there = cost_only();
@@ -88,6 +91,7 @@ public:
       } else {
         poses_ = poses;
         landmarks_ = landmarks;
+        offset_ = offset;
         damping *= 10;
       }
     }
@@ -126,6 +130,7 @@ private:
     point_hessians_.resize(6 * landmarks_.size());
     point_inverses_.resize(6 * landmarks_.size());
     point_gradients_.resize(landmarks_.size());
+    point_by_offset_.resize(landmarks_.size());
   }
 
   // Where the closest of its observations puts it.
@@ -135,7 +140,9 @@ private:
       if (observations_[k].stereo[2] > observations_[closest].stereo[2])
         closest = k;
     const Observation &seen = observations_[closest];
-    const double depth = camera_.fx * camera_.baseline_m / seen.stereo[2];
+    // An offset cannot be all there is of a disparity.
+    const double disparity = std::max(seen.stereo[2] - offset_, 0.1 * seen.stereo[2]);
+    const double depth = camera_.fx * camera_.baseline_m / disparity;
     return transform(poses_[seen.frame], {(seen.stereo[0] - camera_.cx) / camera_.fx * depth,
                                           (seen.stereo[1] - camera_.cy) / camera_.fy * depth,
                                           depth});
@@ -146,25 +153,41 @@ private:
     const Tangent zero{};
     pose_hessians_.assign(6 * free_, zero);
     pose_gradients_.assign(free_, zero);
-    double cost = 0;
+    pose_by_offset_.assign(free_, zero);
+    offset_hessian_ = prior_information();
+    offset_gradient_ = prior_information() * (offset_ - settings_.offset_px);
+    double cost = prior_cost();
     for (size_t l = 0; l < landmarks_.size(); ++l) {
       double *hll = &point_hessians_[6 * l];
       std::fill(hll, hll + 6, 0.0);
       point_gradients_[l] = {0, 0, 0};
+      point_by_offset_[l] = {0, 0, 0};
       for (int32_t k = landmarks_[l].begin; k < landmarks_[l].end; ++k)
-        cost += linearise_one(k, landmarks_[l].point, hll, point_gradients_[l]);
+        cost += linearise_one(k, l, hll);
     }
     return cost;
   }
 
-  double linearise_one(int32_t k, const Vec3 &point, double hll[6], Vec3 &point_gradient) {
+  double prior_information() const {
+    return 1 / (settings_.offset_sigma_px * settings_.offset_sigma_px);
+  }
+  double prior_cost() const {
+    const double away = offset_ - settings_.offset_px;
+    return prior_information() * away * away;
+  }
+
+  Vec3 residual_of(const Vec3 &stereo, const Observation &seen) const {
+    return stereo + Vec3{0, 0, offset_} - seen.stereo;
+  }
+
+  double linearise_one(int32_t k, size_t l, double hll[6]) {
     const Observation &seen = observations_[k];
     Coupling &coupling = couplings_[k];
     coupling = Coupling{};
-    const Linearised there = linearise(camera_, poses_[seen.frame], point);
+    const Linearised there = linearise(camera_, poses_[seen.frame], landmarks_[l].point);
     if (!there.in_front)
       return settings_.chi2;
-    const Vec3 residual = there.stereo - seen.stereo;
+    const Vec3 residual = residual_of(there.stereo, seen);
     const Vec3 information = {seen.pixel_information, seen.pixel_information,
                               seen.disparity_information};
     double chi2 = 0;
@@ -180,7 +203,15 @@ private:
       const double weight = shrink * shrink * information[i], weighted = weight * residual[i];
       hll[0] += weight * px * px, hll[1] += weight * px * py, hll[2] += weight * px * pz;
       hll[3] += weight * py * py, hll[4] += weight * py * pz, hll[5] += weight * pz * pz;
-      point_gradient = point_gradient + Vec3{weighted * px, weighted * py, weighted * pz};
+      const Vec3 by_point = {px, py, pz};
+      point_gradients_[l] = point_gradients_[l] + weighted * by_point;
+      if (i == 2) { // the disparity
+        offset_hessian_ += weight;
+        offset_gradient_ += weighted;
+        point_by_offset_[l] = point_by_offset_[l] + weight * by_point;
+        if (free >= 0)
+          pose_by_offset_[free] += weight * by_pose;
+      }
       if (free < 0)
         continue;
       coupling.by_x += (weight * px) * by_pose;
@@ -194,7 +225,7 @@ private:
   }
 
   double cost_only() const {
-    double cost = 0;
+    double cost = prior_cost();
     for (const Landmark &landmark : landmarks_)
       for (int32_t k = landmark.begin; k < landmark.end; ++k) {
         const Observation &seen = observations_[k];
@@ -203,7 +234,7 @@ private:
           cost += settings_.chi2;
           continue;
         }
-        const Vec3 r = project(camera_, point) - seen.stereo;
+        const Vec3 r = residual_of(project(camera_, point), seen);
         const double chi2 = seen.pixel_information * (r[0] * r[0] + r[1] * r[1]) +
                             seen.disparity_information * r[2] * r[2];
         cost += chi2 / (1 + chi2 / settings_.chi2);
@@ -211,9 +242,14 @@ private:
     return cost;
   }
 
-  // The reduced system of the poses: S = Hpp − Σ Hpl Hll⁻¹ Hlp, factorised in place.
+  // The unknowns that remain: the free poses, then the offset.
+  int size() const { return 6 * free_ + 1; }
+
+  // The reduced system S = Hpp − Σ Hpl Hll⁻¹ Hlp, factorised in place.
   bool eliminate(double damping) {
-    const int size = 6 * free_;
+    reduced_by_offset_ = pose_by_offset_;
+    reduced_offset_hessian_ = (1 + damping) * offset_hessian_;
+    reduced_offset_gradient_ = offset_gradient_;
     blocks_.assign(static_cast<size_t>(free_) * free_ * 6, Tangent{});
     reduced_gradient_ = pose_gradients_;
     for (int p = 0; p < free_; ++p)
@@ -230,9 +266,21 @@ private:
       double *inverse = &point_inverses_[6 * l];
       if (!invert3(damped, inverse)) // behind the cameras: without weight, without effect
         std::fill(inverse, inverse + 6, 0.0);
-      eliminate_one(landmarks_[l], inverse, point_gradients_[l]);
+      const Vec3 solved = multiply3(inverse, point_by_offset_[l]);
+      reduced_offset_hessian_ -= dot(point_by_offset_[l], solved);
+      reduced_offset_gradient_ -= dot(point_gradients_[l], solved);
+      eliminate_one(landmarks_[l], inverse, point_gradients_[l], solved);
     }
+    return factorise_system();
+  }
+
+  bool factorise_system() {
+    const int size = this->size(), last = size - 1;
     system_.assign(static_cast<size_t>(size) * size, 0);
+    system_[last * size + last] = reduced_offset_hessian_;
+    for (int p = 0; p < free_; ++p)
+      for (int a = 0; a < 6; ++a)
+        system_[last * size + 6 * p + a] = reduced_by_offset_[p][a];
     for (int p = 0; p < free_; ++p)
       for (int q = 0; q <= p; ++q)
         for (int a = 0; a < 6; ++a)
@@ -241,7 +289,9 @@ private:
     return factorise(system_.data(), size);
   }
 
-  void eliminate_one(const Landmark &landmark, const double inverse[6], const Vec3 &gradient) {
+  // `offset` is Hll⁻¹ times the landmark's share in the offset.
+  void eliminate_one(const Landmark &landmark, const double inverse[6], const Vec3 &gradient,
+                     const Vec3 &offset) {
     for (int32_t k = landmark.begin; k < landmark.end; ++k) {
       const int p = observations_[k].frame - settings_.fixed;
       if (p < 0)
@@ -250,6 +300,7 @@ private:
       const Tangent x = inverse[0] * c.by_x + inverse[1] * c.by_y + inverse[2] * c.by_z;
       const Tangent y = inverse[1] * c.by_x + inverse[3] * c.by_y + inverse[4] * c.by_z;
       const Tangent z = inverse[2] * c.by_x + inverse[4] * c.by_y + inverse[5] * c.by_z;
+      reduced_by_offset_[p] -= offset[0] * c.by_x + offset[1] * c.by_y + offset[2] * c.by_z;
       reduced_gradient_[p] -= gradient[0] * x + gradient[1] * y + gradient[2] * z;
       for (int32_t other = landmark.begin; other < landmark.end; ++other) {
         const int q = observations_[other].frame - settings_.fixed;
@@ -265,8 +316,9 @@ private:
 
   // Moves poses and landmarks by the solution of the eliminated system.
   bool step() {
-    const int size = 6 * free_;
+    const int size = this->size();
     std::vector<double> solution(size);
+    solution.back() = -reduced_offset_gradient_;
     for (int p = 0; p < free_; ++p)
       for (int a = 0; a < 6; ++a)
         solution[6 * p + a] = -reduced_gradient_[p][a];
@@ -275,7 +327,7 @@ private:
       if (!std::isfinite(value))
         return false;
     for (size_t l = 0; l < landmarks_.size(); ++l) {
-      Vec3 right = -1.0 * point_gradients_[l];
+      Vec3 right = -1.0 * point_gradients_[l] - solution.back() * point_by_offset_[l];
       for (int32_t k = landmarks_[l].begin; k < landmarks_[l].end; ++k) {
         const int p = observations_[k].frame - settings_.fixed;
         if (p < 0)
@@ -288,6 +340,7 @@ private:
     }
     for (int p = 0; p < free_; ++p)
       poses_[settings_.fixed + p] = perturbed(poses_[settings_.fixed + p], &solution[6 * p]);
+    offset_ += solution.back();
     return true;
   }
 
@@ -297,14 +350,18 @@ private:
   }
 
   void finish(double cost, WindowResult &result) {
-    const int size = 6 * free_;
     if (!eliminate(0))
       return;
     result.solved = true;
     result.cost_after = cost;
+    result.offset_px = offset_;
     result.world_from_cam = poses_;
-    result.covariance.resize(static_cast<size_t>(size) * size);
-    invert_factorised(system_.data(), size, result.covariance.data());
+    const int size = this->size(), poses = size - 1;
+    std::vector<double> covariance(static_cast<size_t>(size) * size);
+    invert_factorised(system_.data(), size, covariance.data());
+    for (int row = 0; row < poses; ++row)
+      result.covariance.insert(result.covariance.end(), covariance.begin() + row * size,
+                               covariance.begin() + row * size + poses);
     for (const Landmark &landmark : landmarks_) {
       result.points.resize(std::max<size_t>(result.points.size(), 3 * (landmark.track + 1)),
                            std::numeric_limits<double>::quiet_NaN());
@@ -321,7 +378,10 @@ private:
   std::vector<Landmark> landmarks_;
   std::vector<Coupling> couplings_;
   std::vector<double> point_hessians_, point_inverses_;
-  std::vector<Vec3> point_gradients_;
+  std::vector<Vec3> point_gradients_, point_by_offset_;
+  std::vector<Tangent> pose_by_offset_, reduced_by_offset_;
+  double offset_, offset_hessian_ = 0, offset_gradient_ = 0;
+  double reduced_offset_hessian_ = 0, reduced_offset_gradient_ = 0;
   std::vector<Tangent> pose_hessians_, pose_gradients_, reduced_gradient_, blocks_;
   std::vector<double> system_;
 };

@@ -10,6 +10,8 @@ struct WindowSettings {
   int32_t fixed;       // so many poses, the first ones, stay as they are
   int32_t iterations;  // at most
   double chi2;         // scale c² of the robust kernel, on χ² of one observation
+  double offset_px;    // what all disparities are too large by, as far as known …
+  double offset_sigma_px; // … and how well
 };
 
 // Observations in any order; `track` names the landmark.
@@ -26,6 +28,7 @@ struct WindowObservations {
 struct WindowResult {
   bool solved = false;
   double cost_before = 0, cost_after = 0;
+  double offset_px = 0;
   std::vector<RigidTransform> world_from_cam;
   std::vector<double> covariance; // of the free poses, left perturbations, 6 rows each
   std::vector<double> points;     // (tracks, 3), world; NaN for tracks seen only once

@@ -64,6 +64,8 @@ def prepare_window(data: BenchData, plain: PlainPipeline | None) -> Prepared:
             fixed=1,
             iterations=5,
             chi2=11.34,
+            offset_px=0.0,
+            offset_sigma_px=0.1,
         )
         assert adjusted is not None
         return {"frames": _FRAMES, "landmarks": int(tracks.max()) + 1, "observations": len(frames)}

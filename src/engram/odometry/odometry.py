@@ -76,7 +76,7 @@ class Odometry:
 
         match = self._track.match(frame)
         if match.inliers < self._config.min_inliers:
-            self._track = _Track(frame, self._config)
+            self._track = _Track(frame, self._config, self._track.offset_px)
             return OdometryStep(_reason(match))
 
         keyframe_from_curr, covariance = self._track.place(frame, match)
@@ -86,13 +86,18 @@ class Odometry:
 class _Track:
     """An unbroken run of frames: the window, the last motion, the pose of the previous frame."""
 
-    def __init__(self, first: Frame, config: OdometryConfig) -> None:
+    def __init__(self, first: Frame, config: OdometryConfig, offset_px: float = 0.0) -> None:
         self._config = config
-        self._window = Window(first, config.window, config.matcher)
+        self._window = Window(first, config.window, config.matcher, offset_px)
         self._stamp_ns = first.stamp_ns
         self._keyframe_from_prev = SE3.identity()
         self._covariance = np.zeros((6, 6))  # of keyframe_from_prev
         self._velocity: NDArray[np.float64] | None = None  # (6,) tangent per second
+
+    @property
+    def offset_px(self) -> float:
+        """The camera's disparity offset as learnt so far: a broken chain does not forget it."""
+        return self._window.offset_px
 
     def match(self, frame: Frame) -> Match:
         """Match to the keyframe, and where that fails to the previous frame."""

@@ -24,11 +24,15 @@ class WindowConfig:
         landmarks: at most so many, those with the longest tracks first; bounds the time.
         iterations: at most so many. The start is good: one or two usually suffice. 0 leaves the
             window as matching put it.
+        offset_sigma_px: how far the disparity offset of a rectified camera may wander between
+            successive windows. Each window takes the last one's estimate for its start, so that
+            the offset is learnt within some ten frames and kept while nothing moves.
     """
 
     frames: int = 7
     landmarks: int = 500
     iterations: int = 5
+    offset_sigma_px: float = 0.1
 
     def __post_init__(self) -> None:
         if self.frames < 2:
@@ -47,7 +51,7 @@ class _Placed:
         world_from_cam: its pose.
         tracks: (N,) int32, the track of each landmark, `_UNSEEN` where no other frame shares it.
         stereo: (N, 3) float32, left u, left v, disparity, px.
-        pixel_sigma_px: (N,) float32.
+        pixel_sigma_px, disparity_sigma_px: (N,) float32, between views.
     """
 
     frame: Frame
@@ -55,6 +59,7 @@ class _Placed:
     tracks: NDArray[np.int32]
     stereo: NDArray[np.float32]
     pixel_sigma_px: NDArray[np.float32]
+    disparity_sigma_px: NDArray[np.float32]
 
 
 class Window:
@@ -64,12 +69,20 @@ class Window:
     `keep_newest` was called, so that the window spans motion, not time.
     """
 
-    def __init__(self, first: Frame, config: WindowConfig, matcher: MatcherConfig) -> None:
+    def __init__(
+        self, first: Frame, config: WindowConfig, matcher: MatcherConfig, offset_px: float = 0.0
+    ) -> None:
         self._config = config
         self._matcher = matcher
         self._keyframes = [self._place(first, SE3.identity())]
         self._newest: _Placed | None = None
         self._next_track = 0
+        self._offset_px = offset_px
+
+    @property
+    def offset_px(self) -> float:
+        """By how much the camera's disparities are found to be too large, px."""
+        return self._offset_px
 
     @property
     def keyframe(self) -> Frame:
@@ -115,33 +128,38 @@ class Window:
         adjusted = self._adjust(placed) if self._config.iterations else None
         if adjusted is None:
             return match.reference_from_live, match.covariance
-        matrices, covariance = adjusted
+        matrices, covariance, self._offset_px = adjusted
         moved = [
             replace(each, world_from_cam=SE3(matrix[:3, :3], matrix[:3, 3]))
             for each, matrix in zip(placed, matrices, strict=True)
         ]
         self._keyframes, self._newest = moved[:-1], moved[-1]
+        # As in a match: landmarks share errors, so that many do not average them out.
+        shared = 1 + match.inliers / self._matcher.independent_landmarks
         keyframe_from_world = moved[-2].world_from_cam.inverse()
         carry = keyframe_from_world.adjoint()
         return (
             keyframe_from_world @ moved[-1].world_from_cam,
-            carry @ _covariance_of_last_step(covariance) @ carry.T,
+            shared * carry @ _covariance_of_last_step(covariance) @ carry.T,
         )
 
     def _place(self, frame: Frame, world_from_cam: SE3) -> _Placed:
         marks = frame.landmarks
-        octave_scale = self._matcher.octave_scale ** marks.octaves.astype(np.float32)
+        growth = np.sqrt(self._matcher.octave_scale) ** marks.octaves.astype(np.float32)
         return _Placed(
             frame,
             world_from_cam,
             tracks=np.full(len(marks), _UNSEEN, dtype=np.int32),
             stereo=np.column_stack([marks.pixels, marks.disparity_px]),
-            pixel_sigma_px=(self._matcher.pixel_sigma_px * octave_scale).astype(np.float32),
+            pixel_sigma_px=(self._matcher.pixel_sigma_px * growth).astype(np.float32),
+            disparity_sigma_px=np.hypot(
+                marks.disparity_sigma_px, np.float32(self._matcher.disparity_sigma_px)
+            ),
         )
 
     def _adjust(
         self, placed: list[_Placed]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
         track = np.concatenate([each.tracks for each in placed])
         used = np.flatnonzero(track != _UNSEEN)
         numbered = _number_longest(track[used], self._config.landmarks)
@@ -156,12 +174,14 @@ class Window:
             numbered,
             np.concatenate([each.stereo for each in placed])[used],
             np.concatenate([each.pixel_sigma_px for each in placed])[used],
-            np.concatenate([each.frame.landmarks.disparity_sigma_px for each in placed])[used],
+            np.concatenate([each.disparity_sigma_px for each in placed])[used],
             fixed=1,
             iterations=self._config.iterations,
             chi2=self._matcher.chi2,
+            offset_px=self._offset_px,
+            offset_sigma_px=self._config.offset_sigma_px,
         )
-        return None if adjusted is None else adjusted[:2]
+        return None if adjusted is None else (adjusted[0], adjusted[1], adjusted[3])
 
 
 def _number_longest(track: NDArray[np.int32], most: int) -> NDArray[np.int32]:
