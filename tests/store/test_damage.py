@@ -88,7 +88,7 @@ def assert_found_or_harmless(path, drives: list[Drive]) -> None:
 
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 @settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 def test_a_flipped_bit_anywhere_is_found_or_harmless(sound, tmp_path, where, bit):
     original, drives = sound

@@ -122,7 +122,7 @@ def unpack(body: bytes, count: int) -> AttemptTable:
     """
     try:
         content = _decoder.decode(body)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise MapCorruptError(f"attempts: the packed body is malformed: {error}") from error
     if content.version != _VERSION or len(content.nodes) % 8 or len(content.rows) % 18:
         raise MapCorruptError(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import Protocol
+from typing import Any, Protocol
 
-from sqlalchemy import Connection, Executable, Table
+from sqlalchemy import Connection, Executable, Select, Table
 
 from engram.store.lock import Holder
 
@@ -36,6 +37,13 @@ class Database(Protocol):
 
     def reading(self) -> AbstractContextManager[Connection]:
         """A connection for selects, from any thread."""
+        ...
+
+    def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
+        """The first row of a select, by the shortest way, from any thread; None if there is none.
+
+        For the one select that runs thousands of times a second.
+        """
         ...
 
     def writing(self) -> AbstractContextManager[Connection]:

@@ -152,8 +152,7 @@ class FrameReader:
         return Frame(row["stamp_ns"], camera, landmarks, frontend[0], frontend[1], status)
 
     def _node_row(self, node: NodeId) -> tuple[Row, bytes | None]:
-        with self._database.reading() as connection:
-            found = connection.execute(_NODE_WITH_LANDMARKS, {"uuid": node.bytes}).first()
+        found = self._database.first(_NODE_WITH_LANDMARKS, {"uuid": node.bytes})
         if found is None:
             raise InputError(f"the map has no node {node}")
         row = next(verified(nodes, [found]))

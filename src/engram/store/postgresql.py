@@ -7,13 +7,15 @@ The address is an SQLAlchemy URL with the map's name in its query, for example
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from sqlalchemy import (
     URL,
     Connection,
     Engine,
+    Select,
     Table,
     create_engine,
     insert,
@@ -101,6 +103,11 @@ class PostgresDatabase:
         """A connection for selects."""
         with _translated(self.name), self._engine.connect() as connection:
             yield connection
+
+    def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
+        """The first row of a select."""
+        with self.reading() as connection:
+            return connection.execute(query, parameters).first()
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:

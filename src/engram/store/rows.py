@@ -110,7 +110,7 @@ def from_json(text: str, what: str) -> dict[str, Any]:
     """Undoes `to_json`."""
     try:
         values = json.loads(text)
-    except (TypeError, ValueError) as error:
+    except (ValueError, RecursionError) as error:
         raise MapCorruptError(f"{what} is no JSON: {error}") from error
     if not isinstance(values, dict):
         raise MapCorruptError(f"{what} is no JSON object")

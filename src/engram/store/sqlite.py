@@ -10,16 +10,18 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import Connection, Engine, Table, create_engine, event, insert
+from sqlalchemy import Connection, Engine, Select, Table, create_engine, event, insert
 from sqlalchemy.dialects.sqlite import Insert
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import QueuePool
+from sqlalchemy.sql.compiler import SQLCompiler
 
 from engram import __version__
 from engram.errors import (
@@ -62,6 +64,8 @@ class SqliteDatabase:
         _check_header(path)
         self._reader = _engine(_reading_uri(path), _prepare_reader)
         self._writer: Engine | None = None
+        self._compiled: dict[Select[Any], tuple[str, tuple[str, ...]]] = {}
+        self._idle: deque[sqlite3.Connection] = deque()  # as many as there were threads at once
         with self.reading() as connection:
             _check_tables(connection, path)
 
@@ -100,6 +104,26 @@ class SqliteDatabase:
         """A connection for selects."""
         with _translated(self.name), self._reader.connect() as connection:
             yield connection
+
+    def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
+        """The first row of a select, without SQLAlchemy between: that takes 100 µs a time."""
+        if query not in self._compiled:
+            compiled = query.compile(dialect=self._reader.dialect)
+            assert isinstance(compiled, SQLCompiler)
+            self._compiled[query] = (str(compiled), tuple(compiled.positiontup or ()))
+        statement, names = self._compiled[query]
+        with _translated(self.name):
+            try:
+                connection = self._idle.pop()
+            except IndexError:
+                connection = _connect(_reading_uri(self.path), _prepare_reader)
+            try:
+                row: tuple[Any, ...] | None = connection.execute(
+                    statement, [parameters[name] for name in names]
+                ).fetchone()
+            finally:
+                self._idle.append(connection)
+        return row
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
@@ -148,6 +172,8 @@ class SqliteDatabase:
     def close(self) -> None:
         """Close all connections; the last one to close empties the write-ahead log."""
         self._reader.dispose()
+        while self._idle:
+            self._idle.pop().close()
         if self._writer is not None:
             with _translated(self.name):
                 self._writer.dispose()
@@ -171,21 +197,25 @@ def _reading_uri(path: Path) -> str:
     return _uri(path, "mode=ro&immutable=1")
 
 
-def _engine(uri: str, prepare: Any) -> Engine:
+def _connect(uri: str, prepare: Callable[[sqlite3.Connection], None]) -> sqlite3.Connection:
+    connection = sqlite3.connect(
+        uri,
+        uri=True,
+        timeout=_BUSY_TIMEOUT_S,
+        check_same_thread=False,  # whoever takes a connection has it alone until giving it back
+        isolation_level=None,  # transactions begin where SQLAlchemy says so
+    )
+    try:
+        prepare(connection)
+    except sqlite3.Error:
+        connection.close()
+        raise
+    return connection
+
+
+def _engine(uri: str, prepare: Callable[[sqlite3.Connection], None]) -> Engine:
     def connect() -> sqlite3.Connection:
-        connection = sqlite3.connect(
-            uri,
-            uri=True,
-            timeout=_BUSY_TIMEOUT_S,
-            check_same_thread=False,  # the pool gives a connection to one thread at a time
-            isolation_level=None,  # transactions begin where SQLAlchemy says so
-        )
-        try:
-            prepare(connection)
-        except sqlite3.Error:
-            connection.close()
-            raise
-        return connection
+        return _connect(uri, prepare)
 
     engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, max_overflow=-1)
     if prepare is _prepare_writer:

@@ -1,0 +1,89 @@
+"""A map of every past format opens for ever; and the page that describes the format is right."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.errors import IncompatibleError
+from engram.experience.model import EdgeKind
+from engram.frontend import DescriptorKind
+from engram.store import MapStore, SessionState
+from engram.store.schema import FORMAT_VERSION, metadata
+
+from .maps import begin, node, session
+
+DATA = Path(__file__).parent / "data"
+PAGE = Path(__file__).parents[2] / "docs" / "format.md"
+
+
+@pytest.fixture
+def old(tmp_path):
+    """Format 1: two committed sessions of 4 and 3 nodes, and one of 2 that was interrupted."""
+    return shutil.copy(DATA / "format-1.engram", tmp_path / "old.engram")
+
+
+def test_format_1_reads_as_it_was_written(old):
+    with MapStore.open(old) as store:
+        contents = store.load()
+        assert contents.sessions == (session("robot-1"), session("robot-2"))
+        expected = [node(session("robot-1"), index) for index in range(4)]
+        expected += [node(session("robot-2"), index) for index in range(3)]
+        assert contents.nodes == tuple(expected)
+        assert len(contents.path_entries) == 7
+        made = contents.attempts_of(session("robot-2").id)
+        assert [(one.iteration, one.rank) for one in made] == [
+            (iteration, rank) for iteration in (1, 2) for rank in range(3)
+        ]
+        for one in contents.nodes:
+            frame = store.frames.frame(one.id)
+            assert len(frame.landmarks) == 20
+            assert frame.descriptor is DescriptorKind.BRIEF
+            assert store.frames.thumbnail(one.id).shape == (30, 40)
+        assert store.statistics() == {"basin": {"g": [0.94, 0.7, 0.4]}}
+        assert [revision.message for revision in store.log()] == ["the first", "the second"]
+        assert [one.session for one in store.interrupted()] == [session("robot-3")]
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [(1, "fdd08fe8b0d456052e442cf7aa78c177"), (2, "6b2b5e50d8e8c3be77655846e443c042")],
+)
+def test_format_1_keeps_its_content_hash(old, at, expected):
+    with MapStore.open(old, at=at) as store:
+        assert store.content_hash() == expected
+
+
+def test_format_1_supersedes_edges(old):
+    with MapStore.open(old, at=1) as before, MapStore.open(old, at=2) as after:
+        (was,) = (e for e in before.load().edges if e.kind is EdgeKind.PROXIMITY)
+        (now,) = (e for e in after.load().edges if e.kind is EdgeKind.PROXIMITY)
+    assert (was.a, was.b) == (now.a, now.b)
+    assert np.abs(was.a_from_b.matrix() - now.a_from_b.matrix()).max() > 0.1
+
+
+def test_format_1_is_sound_and_can_be_written_on(old):
+    assert MapStore.check(old).problems == ()
+    with MapStore.open_for_writing(old) as store:
+        with pytest.raises(IncompatibleError):
+            begin(store, session("robot-4"), descriptor=DescriptorKind.TEBLID)
+        assert store.session_state(session("robot-1").id) is SessionState.COMMITTED
+        assert store.seal(session("robot-3").id).contents["nodes"] == 2
+        begin(store, session("robot-4")).commit()
+        assert store.revision == 4
+    assert MapStore.check(old).problems == ()
+
+
+def test_the_page_on_the_format_names_every_table_and_column():
+    page = PAGE.read_text()
+    assert f"format {FORMAT_VERSION}" in page
+    rows = {
+        line.split("|")[1].strip(" `"): line for line in page.splitlines() if line.startswith("| `")
+    }
+    for table in metadata.sorted_tables:
+        for column in table.columns:
+            if column.name not in {"key", "checksum"}:
+                assert f"`{column.name}`" in rows[table.name], f"{table.name}.{column.name}"
