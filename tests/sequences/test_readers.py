@@ -588,3 +588,11 @@ def test_absurd_numbers_in_a_calibration_are_refused(tmp_path, name: str, number
     _edit(path / "calibration.toml", name, f"{name.partition(' ')[0]} = {number}")
     with pytest.raises(CalibrationError, match=r"calibration\.toml"):
         open_sequence(path)
+
+
+def test_a_gigapixel_first_image_does_not_set_the_size(tmp_path: Path) -> None:
+    path = LAYOUTS["kitti"].write(tmp_path)
+    _gigapixel(LAYOUTS["kitti"].image(path, 0, 0))
+    drive = open_sequence(path, skip_bad=True)
+    assert (drive.camera.width, drive.camera.height) == (WIDTH, HEIGHT)
+    assert len(list(drive)) == PAIRS - 1

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from engram.experience.model import Clock
-from engram.sequences import first_pair_hash, open_sequence
+from engram.frontend import Frontend
+from engram.odometry import Odometry
+from engram.sequences import (
+    FrameLogHeader,
+    FrameLogWriter,
+    LoggedFrame,
+    first_pair_hash,
+    open_sequence,
+    session_of,
+)
 
 pytestmark = pytest.mark.data
 
@@ -98,6 +107,34 @@ def test_at_rest_the_pictures_stay(data_dir: Path) -> None:
         (right_px, down_px), _ = cv2.phaseCorrelate(first, pair.left.astype(np.float32))
         # The exposure drifts, so grey levels differ; 2 px is a quarter of a degree.
         assert np.hypot(right_px, down_px) < 2.0
+
+
+def test_a_log_stands_for_its_drive(data_dir: Path, tmp_path: Path) -> None:
+    drive = open_sequence(data_dir / "kitti_odometry/sequences/06", frames=":5")
+    frontend, odometry = Frontend(), Odometry()
+    path = tmp_path / "06.framelog"
+    wanted, writer = [], None
+    for pair in drive:
+        frame = frontend.extract(pair)
+        writer = writer or FrameLogWriter(
+            path, FrameLogHeader(drive.info, drive.camera, frame.descriptor, frame.frontend)
+        )
+        wanted.append(LoggedFrame(frame, odometry.step(frame)))
+        writer.append(wanted[-1], first_pair_hash(pair))
+    writer.close(complete=True)
+    log = open_sequence(path)
+    for found, made in zip(log, wanted, strict=True):
+        for name in type(made.frame.landmarks).__slots__:
+            np.testing.assert_array_equal(
+                getattr(found.frame.landmarks, name), getattr(made.frame.landmarks, name)
+            )
+        assert found.odometry.status is made.odometry.status
+    # A few tens of kilobytes a frame, where the two images have 800 kB decoded and 450 stored.
+    assert path.stat().st_size / len(wanted) < 60_000
+    first = drive.read(0)
+    assert session_of(
+        log.info, log.camera, int(log.stamps_ns[0]), log.first_pair_hash
+    ) == session_of(drive.info, drive.camera, first.stamp_ns, first_pair_hash(first))
 
 
 @pytest.mark.parametrize("frames", [None, "10:30:3"])

@@ -14,7 +14,13 @@ from engram.drive.settings import Settings
 from engram.errors import SequenceError
 from engram.frontend import Frame, FrameStatus
 from engram.odometry import OdometryStatus
-from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, first_pair_hash
+from engram.sequences import (
+    FrameLogHeader,
+    FrameLogWriter,
+    ImageSequence,
+    LoggedFrame,
+    first_pair_hash,
+)
 
 
 @dataclass(slots=True)
@@ -78,6 +84,7 @@ def extract_log(
 
     Raises:
         SequenceError: the drive is a frame log already, or its images cannot be used.
+        IncompatibleError: the file is the log of another drive or of other frames.
         MapError: the log cannot be written; what was recorded is intact.
     """
     report = ExtractReport(str(out))
@@ -91,21 +98,24 @@ def extract_log(
                 header = _header(sequence, live.frame, settings)
                 writer = FrameLogWriter(out, header)
             _count(report, live.frame.status, live.odometry.status)
-            last_ns = writer.last_stamp_ns
-            if last_ns is not None and live.frame.stamp_ns <= last_ns:
+            pair_hash = first_pair_hash(live.pair)
+            if writer.holds(live.frame.stamp_ns, pair_hash):
                 report.already_recorded += 1
                 advance("recorded already")
                 continue
-            writer.append(LoggedFrame(live.frame, live.odometry), first_pair_hash(live.pair))
+            writer.append(LoggedFrame(live.frame, live.odometry), pair_hash)
             report.frames += 1
             advance(live.odometry.status.value)
+        if writer is None:
+            raise SequenceError(f"{sequence.info.name}: no frame can be read")
+        writer.close(complete=True)
     except KeyboardInterrupt:
         report.interrupted = True
     finally:
         if writer is not None:
-            writer.close(complete=not report.interrupted)
+            writer.close()  # after an error or an interruption: what was done is kept
     report.skipped = sequence.skipped
-    report.bytes = out.stat().st_size
+    report.bytes = out.stat().st_size if out.exists() else 0
     return report
 
 
@@ -116,6 +126,7 @@ def _header(sequence: DriveSequence, frame: Frame, settings: Settings) -> FrameL
         frame.descriptor,
         frame.frontend,
         config_hash(settings.odometry),
+        str(sequence.frames) if isinstance(sequence, ImageSequence) else "",
     )
 
 

@@ -81,11 +81,7 @@ def check_zone(zone: str | None) -> None:
         return
     try:
         ZoneInfo(zone)
-    except (OSError, ValueError):  # ZoneInfoNotFoundError is a KeyError, below
-        raise ConfigError(_unknown_zone(zone)) from None
-    except KeyError:
-        raise ConfigError(_unknown_zone(zone)) from None
-
-
-def _unknown_zone(zone: str) -> str:
-    return f"time zone {zone!r} is unknown; give an IANA name such as Europe/Berlin"
+    except (KeyError, ValueError, OSError):  # not found; malformed; a folder of the database
+        raise ConfigError(
+            f"time zone {zone!r} is unknown; give an IANA name such as Europe/Berlin"
+        ) from None

@@ -15,6 +15,7 @@ from engram.experience.model import Clock
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
 from engram.geometry.rectification import Rectification, RemapTable
+from engram.sequences.frame_range import FrameRange
 from engram.sequences.images import Channel, read_image
 from engram.sequences.listing import BadPlace, Listing, PairFiles, usable_pairs
 from engram.sequences.options import OpenOptions
@@ -51,6 +52,7 @@ class ImageSequence:
         *,
         channel: Channel = Channel.GREY,
         skip_bad: bool = False,
+        frames: FrameRange | None = None,
     ) -> None:
         self._drive = drive
         self._pairs = tuple(pairs)
@@ -58,6 +60,7 @@ class ImageSequence:
         self._reading_faults: list[str] = []
         self._channel = channel
         self._skip_bad = skip_bad
+        self._frames = frames or FrameRange()
 
     @property
     def info(self) -> SequenceInfo:
@@ -73,6 +76,11 @@ class ImageSequence:
     def rectification(self) -> Rectification | None:
         """How raw images become rectified; None for a drive that is delivered rectified."""
         return self._drive.rectification
+
+    @property
+    def frames(self) -> FrameRange:
+        """Which frames of the drive these are."""
+        return self._frames
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -149,6 +157,7 @@ def open_drive(drive: ImageDrive, options: OpenOptions) -> ImageSequence:
         pairs,
         faults,
         channel=options.channel,
+        frames=options.frames,
         skip_bad=options.skip_bad,
     )
 

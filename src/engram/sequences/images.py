@@ -116,6 +116,7 @@ def image_size(path: Path) -> tuple[int, int]:
         if image is None:
             raise SequenceError(f"{path}: no readable image ({len(content)} bytes)")
         size = (image.shape[1], image.shape[0])
+    _check_not_huge(path, size)
     return size
 
 
@@ -154,15 +155,20 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _check_size(path: Path, size: tuple[int, int] | None, width: int, height: int) -> None:
-    if size is None or size == (width, height):
+    if size is None:
         return
+    _check_not_huge(path, size)
+    if size != (width, height):
+        raise SequenceError(
+            f"{path}: the image is {size[0]}×{size[1]} px, the calibration says {width}×{height}"
+        )
+
+
+def _check_not_huge(path: Path, size: tuple[int, int]) -> None:
     if size[0] * size[1] > _MAX_PIXELS:
         raise SequenceError(
             f"{path}: claims {size[0]}×{size[1]} px, more than {_MAX_PIXELS:,}: not decoded"
         )
-    raise SequenceError(
-        f"{path}: the image is {size[0]}×{size[1]} px, the calibration says {width}×{height}"
-    )
 
 
 def _jpeg_segments(content: bytes) -> tuple[tuple[int, int] | None, int]:

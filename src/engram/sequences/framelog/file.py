@@ -64,7 +64,7 @@ frames_table = Table(
     "frames",
     metadata,
     Column("number", _INT64, primary_key=True, autoincrement=False),
-    Column("stamp_ns", _INT64, nullable=False),
+    Column("stamp_ns", _INT64, nullable=False, unique=True),
     Column("status", Text(), nullable=False),
     Column("pair_hash", Text(), nullable=False),
     Column("odometry_status", Text(), nullable=False),
@@ -146,6 +146,7 @@ def check_kind(connection: Connection, path: Path) -> None:
     Raises:
         SequenceError: another kind of file.
         FormatVersionError: written by a newer Engram.
+        MapCorruptError: its tables are not those of a frame log.
     """
     if _pragma(connection, "application_id") != _APPLICATION_ID:
         raise SequenceError(f"{path}: is an SQLite file, but no frame log")
@@ -155,6 +156,12 @@ def check_kind(connection: Connection, path: Path) -> None:
             f"{path}: frame log of format {version}, this Engram reads up to {FORMAT_VERSION}: "
             "upgrade it"
         )
+    # Views and triggers in a file from elsewhere could run without end.
+    kinds = connection.exec_driver_sql(
+        "SELECT type, tbl_name FROM sqlite_schema WHERE type != 'index' ORDER BY tbl_name"
+    ).all()
+    if [tuple(kind) for kind in kinds] != [("table", name) for name in sorted(metadata.tables)]:
+        raise MapCorruptError(f"{path}: holds other tables than a frame log's")
 
 
 def _pragma(connection: Connection, name: str) -> int:
@@ -174,6 +181,11 @@ def plain_errors(path: Path) -> Iterator[None]:
     """
     try:
         yield
+    except UnicodeDecodeError as error:
+        # Python's driver cannot even form the message when damage has reached the schema.
+        raise MapCorruptError(
+            f"{path}: damaged ({error}); restore a copy or extract it anew"
+        ) from error
     except exc.DBAPIError as error:
         fact = str(error.orig)
         if _is(error, "SQLITE_NOTADB"):

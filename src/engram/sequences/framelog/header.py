@@ -29,6 +29,7 @@ class FrameLogHeader:
         descriptor: the kind of all descriptors.
         frontend: hash of the front-end's version and configuration.
         odometry: hash of the odometry's version and configuration.
+        frames: which frames of the source were recorded, `str` of a `FrameRange`.
     """
 
     info: SequenceInfo
@@ -36,6 +37,7 @@ class FrameLogHeader:
     descriptor: DescriptorKind
     frontend: str
     odometry: str = ""
+    frames: str = ""
 
     def to_json(self) -> str:
         """Canonical: equal headers give equal text."""
@@ -50,6 +52,7 @@ class FrameLogHeader:
             "descriptor": self.descriptor.value,
             "frontend": self.frontend,
             "odometry": self.odometry,
+            "frames": self.frames,
             "camera": {
                 **{name: float(getattr(camera, name)) for name in _CAMERA_NUMBERS},
                 **{name: int(getattr(camera, name)) for name in _CAMERA_SIZES},
@@ -90,6 +93,7 @@ class FrameLogHeader:
                 DescriptorKind(values["descriptor"]),
                 _text(values["frontend"]),
                 _text(values["odometry"]),
+                _text(values["frames"]),
             )
         except (ValueError, KeyError, TypeError, RecursionError, EngramError) as error:
             raise MapCorruptError(f"the frame log's header cannot be read: {error}") from error

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
-from engram.errors import MapCorruptError, SequenceError
+from engram.errors import ConfigError, MapCorruptError, SequenceError
 from engram.geometry import StereoCamera, propagate_covariance
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.sequences.framelog import file
@@ -19,6 +19,7 @@ from engram.sequences.framelog.file import frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
 from engram.sequences.image_sequence import with_options
+from engram.sequences.images import Channel
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
 from engram.store.blob import content_digest
@@ -36,7 +37,16 @@ def is_framelog(path: Path) -> bool:
 
 
 def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
-    """A frame log as a drive; see `FrameLog` for what is raised."""
+    """A frame log as a drive; see `FrameLog` for what else is raised.
+
+    Raises:
+        ConfigError: a colour channel is asked for.
+    """
+    if options.channel is not Channel.GREY:
+        raise ConfigError(
+            f"{path}: a frame log has no images to take channel {options.channel.value!r} of; "
+            "choose the channel when it is extracted"
+        )
     return FrameLog(path, options)
 
 
@@ -241,7 +251,11 @@ def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
         MapCorruptError: it is missing or does not match its hash.
     """
     rows = connection.execute(select(log_table).order_by(log_table.c.key)).all()
-    if len(rows) != 1 or content_digest(rows[0].header.encode()) != rows[0].digest:
+    if (
+        len(rows) != 1
+        or not isinstance(rows[0].header, str)
+        or content_digest(rows[0].header.encode()) != rows[0].digest
+    ):
         raise MapCorruptError("the frame log's header is missing or does not match its hash")
     return FrameLogHeader.from_json(rows[0].header), bool(rows[0].complete)
 
@@ -252,6 +266,8 @@ def _read_stamps(connection: Connection) -> NDArray[np.int64]:
     ).all()
     if not rows:
         raise SequenceError("the frame log holds no frame")
+    if not all(isinstance(value, int) for row in rows for value in row):
+        raise MapCorruptError("the frame log has stamps that are no numbers")
     table = np.array(rows, dtype=np.int64).reshape(-1, 2)
     if (table[:, 0] != np.arange(len(table))).any():
         raise MapCorruptError("frames are missing in the frame log: their numbers have gaps")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import types
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +34,20 @@ STEP_COLUMNS = (
     func.substr(frames_table.c.landmarks, 1, HASH_BYTES).label("landmarks_hash"),
     func.substr(frames_table.c.thumbnail, 1, HASH_BYTES).label("thumbnail_hash"),
 )
+
+_COLUMN_KINDS: dict[str, type | types.UnionType] = {
+    "number": int,
+    "stamp_ns": int,
+    "status": str,
+    "pair_hash": str,
+    "odometry_status": str,
+    "inliers": int,
+    "prev_from_curr": bytes | None,
+    "covariance": bytes | None,
+    "digest": bytes,
+    "landmarks_hash": bytes,
+    "thumbnail_hash": bytes | None,
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +106,9 @@ def decode_step(row: Any) -> StepRow:
     """
     columns = dict(row._mapping)
     where = f"frame {columns['number']}"
+    for name, kinds in _COLUMN_KINDS.items():
+        if not isinstance(columns[name], kinds):
+            raise MapCorruptError(f"{where} of the frame log: {name} is {columns[name]!r:.40}")
     if _digest(columns, columns["landmarks_hash"], columns["thumbnail_hash"]) != columns["digest"]:
         raise MapCorruptError(f"{where} of the frame log does not match its hash")
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -9,7 +11,7 @@ from typing import Self
 from sqlalchemy import Connection, func, insert, select, update
 
 from engram import __version__
-from engram.errors import IncompatibleError, InputError
+from engram.errors import IncompatibleError, InputError, MapError
 from engram.sequences.framelog import file
 from engram.sequences.framelog.file import frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
@@ -91,25 +93,50 @@ class FrameLogWriter:
                 f"({self._last_stamp_ns} ns)"
             )
         row = encode_row(self._recorded, logged, pair_hash)
-        with file.plain_errors(self._path):
-            self._open_connection().execute(insert(frames_table), row)
+        with self._or_abandon() as connection:
+            connection.execute(insert(frames_table), row)
         self._recorded += 1
         self._last_stamp_ns = frame.stamp_ns
         self._since_checkpoint += 1
         if self._since_checkpoint >= self._checkpoint_every:
             self.checkpoint()
 
+    def holds(self, stamp_ns: int, pair_hash: str) -> bool:
+        """Whether an earlier run recorded this frame already, so that it is passed over.
+
+        Raises:
+            IncompatibleError: other images are recorded at its place: the log is that of another
+                drive, rig, channel or choice of frames.
+        """
+        if self._last_stamp_ns is None or stamp_ns > self._last_stamp_ns:
+            return False
+        with self._or_abandon() as connection:
+            found = connection.execute(
+                select(frames_table.c.pair_hash)
+                .where(frames_table.c.stamp_ns == stamp_ns)
+                .order_by(frames_table.c.number)
+            ).scalar()
+        if found != pair_hash:
+            raise IncompatibleError(
+                f"{self._path}: holds {'other images' if found else 'no frame'} at {stamp_ns} ns: "
+                "it is the log of another drive, rig, channel or choice of frames; choose another "
+                "file or remove it"
+            )
+        return True
+
     def checkpoint(self) -> None:
         """Commit: what was appended so far survives the process."""
-        connection = self._open_connection()
-        with file.plain_errors(self._path):
+        with self._or_abandon() as connection:
             connection.commit()
             # Begun again at once, so that no second writer gets between two checkpoints.
             file.begin_writing(connection)
         self._since_checkpoint = 0
 
     def close(self, *, complete: bool = False) -> None:
-        """Commit and close; `complete` says that the drive ends here. Closing twice is fine."""
+        """Commit and close; `complete` says that the drive ends here. Closing twice is fine.
+
+        After an error of the file the writer is closed already, as of its last checkpoint.
+        """
         connection = self._connection
         if connection is None:
             return
@@ -150,7 +177,7 @@ class FrameLogWriter:
         if found.to_json() != self._header.to_json():
             raise IncompatibleError(
                 f"{self._path}: holds the log of another drive, or one made with another camera, "
-                "front-end or odometry; choose another file or remove it"
+                "front-end, odometry or choice of frames; choose another file or remove it"
             )
         count, last_ns = connection.execute(
             select(func.count(), func.max(frames_table.c.stamp_ns)).select_from(frames_table)
@@ -173,10 +200,20 @@ class FrameLogWriter:
         connection.commit()
         file.begin_writing(connection)
 
-    def _open_connection(self) -> Connection:
+    @contextmanager
+    def _or_abandon(self) -> Iterator[Connection]:
+        """The connection; after an error of SQLite the writer is closed as of its last checkpoint.
+
+        SQLite may have rolled the transaction back, and then what this writer counts is wrong.
+        """
         if self._connection is None:
             raise InputError(f"{self._path}: this writer is closed")
-        return self._connection
+        try:
+            with file.plain_errors(self._path):
+                yield self._connection
+        except MapError:
+            self._abandon()
+            raise
 
     def _abandon(self) -> None:
         if self._connection is not None:
