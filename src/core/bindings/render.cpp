@@ -259,6 +259,7 @@ private:
   std::vector<int32_t> in_window(const Window &window, int first_mesh, int last_mesh) const;
   std::vector<Lamp> lamps_near(const double *centre);
   void build_lamp(StoredLamp &lamp);
+  LampGrid lamp_grid(const std::vector<Lamp> &lamps, const double *centre);
 
   std::vector<StoredMesh> meshes_; // the first holds what moves
   std::vector<int32_t> free_meshes_, free_textures_;
@@ -268,6 +269,7 @@ private:
   std::vector<Mesh> mesh_table_;
   std::vector<Texture> texture_table_;
   std::vector<float> sun_, moving_sun_, openness_;
+  std::vector<int32_t> lamp_starts_, lamp_items_;
   std::vector<int32_t> ids_;
   std::vector<float> depths_;
   DepthMap sun_map_ = {}, moving_map_ = {};
@@ -546,6 +548,34 @@ std::vector<Lamp> Scene::lamps_near(const double *centre) {
   return near;
 }
 
+// Which lamps reach which square of the ground around the camera.
+LampGrid Scene::lamp_grid(const std::vector<Lamp> &lamps, const double *centre) {
+  constexpr int kSide = 36;
+  LampGrid grid = {};
+  if (lamps.empty())
+    return grid;
+  grid.width = grid.height = kSide;
+  grid.west_m = static_cast<float>(centre[0]) - kSide / 2 * kLampCell_m;
+  grid.south_m = static_cast<float>(centre[1]) - kSide / 2 * kLampCell_m;
+  lamp_starts_.clear();
+  lamp_items_.clear();
+  for (int cell = 0; cell < kSide * kSide; ++cell) {
+    lamp_starts_.push_back(static_cast<int32_t>(lamp_items_.size()));
+    const float x = grid.west_m + (static_cast<float>(cell % kSide) + 0.5f) * kLampCell_m;
+    const float y = grid.south_m + (static_cast<float>(cell / kSide) + 0.5f) * kLampCell_m;
+    for (size_t k = 0; k < lamps.size(); ++k) {
+      const float dx = lamps[k].position[0] - x, dy = lamps[k].position[1] - y;
+      const float reach = lamps[k].range + 0.71f * kLampCell_m;
+      if (dx * dx + dy * dy < reach * reach)
+        lamp_items_.push_back(static_cast<int32_t>(k));
+    }
+  }
+  lamp_starts_.push_back(static_cast<int32_t>(lamp_items_.size()));
+  grid.starts = lamp_starts_.data();
+  grid.lamps = lamp_items_.data();
+  return grid;
+}
+
 auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
                    const Input<double, 1> &centre, const Light &light, int threads) {
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
@@ -558,7 +588,7 @@ auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
     follow(centre.data(), forward, light);
     const std::vector<Lamp> lamps = lamps_near(centre.data());
     const Surroundings world = {mesh_table_.data(), texture_table_.data(), sun_map_, moving_map_,
-                                openness_map_, lamps.data(), static_cast<int32_t>(lamps.size()),
+                                openness_map_, lamps.data(), lamp_grid(lamps, centre.data()),
                                 noise_.data()};
     const auto order = order_from(centre.data(), kFarthest_m, 0, static_cast<int>(meshes_.size()));
     const size_t samples = pixels * kSamples * kSamples;

@@ -73,6 +73,14 @@ struct Lamp {
   const float *depth; // five faces (down, ±x, ±y) of 1/distance along the face's axis, or null
 };
 
+constexpr float kLampCell_m = 6;
+
+struct LampGrid { // which lamps reach a square of the ground: lamps[starts[cell] … starts[cell + 1])
+  const int32_t *starts, *lamps; // null without lamps
+  float west_m, south_m;
+  int32_t width, height; // cells
+};
+
 struct Light {
   float sun[3];      // towards the sun
   float sun_power;   // irradiance / π on a surface facing the sun
@@ -104,7 +112,7 @@ struct Surroundings {
   DepthMap sun_static, sun_moving; // heights may be null
   Openness openness;
   const Lamp *lamps;
-  int32_t lamp_count;
+  LampGrid lamp_grid;
   const uint8_t *noise; // 256×256, tiles
 };
 

@@ -145,14 +145,10 @@ float sky(const Surroundings &world, const Light &light, Vec d) {
   const float y = d.y / (up + 0.12f) * 22 + light.cloud_shift[1];
   const float field = 0.62f * noise_at(world.noise, x, y) + 0.28f * noise_at(world.noise, 2.3f * x + 37, 2.3f * y + 11) +
                       0.1f * noise_at(world.noise, 6.1f * x + 5, 6.1f * y + 91);
-  const float edge = 0.74f - 0.52f * light.cloud;
-  const float cover = smooth(edge - 0.06f, edge + 0.06f, field);
+  const float edge = 0.97f - 1.05f * light.cloud;
+  const float cover = smooth(edge - 0.09f, edge + 0.09f, field);
   const float lit = (0.62f + 0.45f * (1 - field) + 0.2f * up) * (light.sky_power + 0.09f * light.sun_power);
   return mix(blue, 1.15f * lit, cover);
-}
-
-inline bool in_shadow(const DepthMap &map, int32_t x, int32_t y, float height) {
-  return map.heights[static_cast<int64_t>(y) * map.window.width + x] > height;
 }
 
 // Share of the sun that reaches a point: a 3×3 tent over the map's texels, which is about as wide as
@@ -169,12 +165,17 @@ float sunlit(const DepthMap &map, Vec p) {
   if (i < 1 || j < 1 || i + 2 >= map.window.width || j + 2 >= map.window.height)
     return 1;
   const float a = x - x_floor, b = y - y_floor;
-  const float across[4] = {1 - a, 1, 1, a}, down[4] = {1 - b, 1, 1, b};
-  float shaded = 0;
-  for (int row = 0; row < 4; ++row)
-    for (int column = 0; column < 4; ++column)
-      shaded += in_shadow(map, i - 1 + column, j - 1 + row, height) ? across[column] * down[row] : 0;
-  return 1 - shaded * (1 / 9.0f);
+  const f32x4 across = {1 - a, 1, 1, a};
+  const float down[4] = {1 - b, 1, 1, b};
+  f32x4 shaded = {0, 0, 0, 0};
+  for (int row = 0; row < 4; ++row) {
+    f32x4 heights;
+    memcpy(&heights, map.heights + static_cast<int64_t>(j - 1 + row) * map.window.width + i - 1, 16);
+    const f32x4 weights = across * down[row];
+    shaded += reinterpret_cast<f32x4>(reinterpret_cast<i32x4>(weights) & (heights > height));
+  }
+  const float sum = (shaded[0] + shaded[1]) + (shaded[2] + shaded[3]);
+  return 1 - sum * (1 / 9.0f);
 }
 
 float openness(const Openness &map, float x, float y) {
@@ -225,7 +226,8 @@ struct Point {
   float cosine; // between flat normal and to_eye
   float distance_m;
   uint32_t flags;
-  float wet; // how much of a water film lies here
+  float wet;    // how much of a water film lies here
+  float across; // where on a carriageway, 0…1 between its kerbs
 };
 
 float mirror(float cosine) { // Schlick, of water and glass
@@ -249,22 +251,29 @@ struct Shine {
 
 Shine lamps_at(const Surroundings &world, const Point &point) {
   Shine shine = {0, 0};
-  for (int32_t k = 0; k < world.lamp_count; ++k) {
-    const Lamp &lamp = world.lamps[k];
+  const LampGrid &grid = world.lamp_grid;
+  const auto column = static_cast<int32_t>((point.at.x - grid.west_m) / kLampCell_m);
+  const auto row = static_cast<int32_t>((point.at.y - grid.south_m) / kLampCell_m);
+  if (grid.starts == nullptr || point.at.x < grid.west_m || point.at.y < grid.south_m ||
+      column >= grid.width || row >= grid.height)
+    return shine;
+  const int32_t *start = grid.starts + row * grid.width + column;
+  for (int32_t k = start[0]; k < start[1]; ++k) {
+    const Lamp &lamp = world.lamps[grid.lamps[k]];
     const Vec to_lamp = vec(lamp.position) - point.at;
-    const float d2 = dot(to_lamp, to_lamp);
-    if (d2 > lamp.range * lamp.range || to_lamp.z < -0.3f)
+    const float d2 = dot(to_lamp, to_lamp), range2 = lamp.range * lamp.range;
+    const float facing = dot(to_lamp, point.normal);
+    const bool through = point.flags & kTranslucent;
+    if (d2 > range2 || to_lamp.z < -0.3f || (facing <= 0 && point.wet <= 0 && !through))
       continue;
-    const float inverse = 1 / sqrtf(d2), down = clamp01(to_lamp.z * inverse + 0.08f);
-    const float facing = dot(to_lamp, point.normal) * inverse;
-    const float lean = point.flags & kTranslucent ? 0.3f + 0.7f * fabsf(facing) : facing;
-    const float fade = 1 - d2 / (lamp.range * lamp.range);
+    const float inverse = 1 / sqrtf(d2 + 1e-4f), down = clamp01(to_lamp.z * inverse + 0.08f);
+    const float cosine = facing * inverse;
+    const float lean = through ? 0.3f + 0.7f * fabsf(cosine) : cosine;
+    const float fade = 1 - d2 / range2;
     const float power = lamp.power * down * fade * fade / (d2 + 0.3f);
-    if (lean <= 0 && point.wet <= 0)
-      continue;
     const float seen = lamplit(lamp, (-1.0f) * to_lamp + 0.12f * point.flat_normal);
     shine.diffuse += lean > 0 ? power * lean * seen : 0;
-    if (point.wet > 0)
+    if (point.wet > 0 && seen > 0)
       shine.gloss += 5 * power * seen * streak(point, inverse * to_lamp, 160);
   }
   return shine;
@@ -293,8 +302,12 @@ float snow_cover(const Surroundings &world, const Light &light, const Point &poi
   const float patch = noise_at(world.noise, 1.9f * point.at.x, 1.9f * point.at.y) * 0.6f +
                       noise_at(world.noise, 7.7f * point.at.x, 7.7f * point.at.y) * 0.4f;
   float amount = light.snow;
-  if (point.flags & kRoad)
-    amount *= 0.55f + 0.45f * smooth(0.35f, 0.6f, noise_at(world.noise, 0.9f * point.at.y + 31, 0.9f * point.at.x));
+  if (point.flags & kRoad) { // two tracks on each side, worn out and winding a little
+    const float wind = 0.02f * noise_at(world.noise, 0.8f * point.at.x + 31, 0.8f * point.at.y);
+    const float half = fabsf(point.across - 0.5f + wind);
+    const float track = fabsf(fabsf(half - 0.17f) - 0.075f);
+    amount *= 0.35f + 0.65f * smooth(0.015f, 0.05f, track);
+  }
   const float lies = smooth(0.62f - 0.75f * amount, 0.8f - 0.75f * amount, 0.25f + 0.5f * patch);
   return lies * smooth(0.35f, 0.75f, point.normal.z);
 }
@@ -420,9 +433,11 @@ float shade_sample(const Surroundings &world, const Light &light, const Eye &eye
   const Texture &texture = world.textures[surface.texture];
   const Vec slide = towards + cosine * normal; // the ray's shadow on the surface
   const Vec along = (1 / sqrtf(dot(slide, slide) + 1e-12f)) * slide;
-  const Texels texels = sample(texture, surface, dot(vec(surface.along_u), point.at) + surface.u_at_origin,
-                               dot(vec(surface.along_v), point.at) + surface.v_at_origin, along,
-                               point.distance_m * eye.pixel_rad, 1 / cosine);
+  const float u = dot(vec(surface.along_u), point.at) + surface.u_at_origin;
+  const float v = dot(vec(surface.along_v), point.at) + surface.v_at_origin;
+  point.across = u;
+  const Texels texels =
+      sample(texture, surface, u, v, along, point.distance_m * eye.pixel_rad, 1 / cosine);
   point.normal = bumped(surface, normal, texels.slope_u, texels.slope_v);
   return shade_point(world, light, surface, point, texels);
 }

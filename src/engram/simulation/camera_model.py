@@ -149,7 +149,7 @@ class CameraModel:
             centre = (int(sitting.uniform(0, width)), int(sitting.uniform(0, height)))
             cv2.circle(drops, centre, int(sitting.uniform(5, 13)), 1.0, -1)
         soft = cv2.GaussianBlur(drops, (0, 0), 1.6)
-        through = cv2.blur(cv2.flip(light, 0) * 0.3 + light * 0.7, (19, 19))
+        through = cv2.blur(np.minimum(light, 2 * air), (19, 19))
         return np.asarray(light * (1 - soft) + through * soft, dtype=np.float32)
 
 

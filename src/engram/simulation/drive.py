@@ -64,8 +64,12 @@ def driving_line(plan: StreetPlan, route: Route, reverse: bool) -> Line:
         left /= np.linalg.norm(left, axis=1, keepdims=True)
         aside_m = min(1.7, 0.42 * plan.half_width_m(start, end))
         pieces.append((centre + aside_m * left)[:-1])
-    corners = np.concatenate(pieces)
-    smooth = _rounded(_resampled(corners, _STEP_M), _ROUND_M / _STEP_M)
+    return closed_line(np.concatenate(pieces), _ROUND_M)
+
+
+def closed_line(corners: Array, round_m: float) -> Line:
+    """The curve through corners (N, 2) and back to the first, smoothed over so many metres."""
+    smooth = _rounded(_resampled(corners, _STEP_M), round_m / _STEP_M)
     even = _resampled(smooth, _STEP_M)
     steps = np.linalg.norm(np.roll(even, -1, 0) - even, axis=1)
     return Line(even, float(steps.sum()))

@@ -16,7 +16,6 @@ from engram.simulation.textures import (
     Texels,
     grass,
     leaves,
-    letters,
     pack,
     plain,
     railing,
@@ -39,7 +38,7 @@ class Materials:
         foliage: (season, variant) → texture; seasons are 0 summer, 1 autumn, 2 bare.
         hedges: the same for hedges, which stay green.
         railing: bars.
-        signs, boards: traffic signs; boards with words.
+        signs, plates: traffic signs; number plates.
     """
 
     stone: int
@@ -56,7 +55,7 @@ class Materials:
     hedges: tuple[int, ...]
     railing: int
     signs: tuple[int, ...]
-    boards: tuple[int, ...]
+    plates: tuple[int, ...]
 
 
 def shared_materials(scene: _core.Scene, noise: NoiseFields, style: Style, seed: int) -> Materials:
@@ -85,12 +84,7 @@ def shared_materials(scene: _core.Scene, noise: NoiseFields, style: Style, seed:
         hedges=tuple(scene.add_texture(leaves(rng, 1.5, 0.11), coverage=True) for _ in range(2)),
         railing=scene.add_texture(railing(), coverage=True),
         signs=tuple(scene.add_texture(_traffic_sign(k), coverage=True) for k in range(6)),
-        boards=tuple(
-            scene.add_texture(
-                pack(letters(rng, (64, 256)), np.zeros((64, 256), np.float32), 0.0, 64, style)
-            )
-            for _ in range(6)
-        ),
+        plates=tuple(scene.add_texture(_number_plate(rng)) for _ in range(8)),
     )
 
 
@@ -105,6 +99,16 @@ def _roof_tiles(rng: np.random.Generator, noise: NoiseFields, style: Style) -> T
 def _stripes() -> Texels:
     texels = sheet(0.7).repeat(32, 0).repeat(32, 1)
     texels[:, (np.arange(128) // 16) % 2 == 0, 0] = 60
+    return texels
+
+
+def _number_plate(rng: np.random.Generator) -> Texels:
+    face = np.full((40, 184), 205, np.uint8)
+    text = "".join(chr(65 + int(k)) for k in rng.integers(0, 26, 2)) + f"{rng.integers(10, 80)} "
+    text += "".join(chr(65 + int(k)) for k in rng.integers(0, 26, 3))
+    cv2.putText(face, text, (6, 31), cv2.FONT_HERSHEY_DUPLEX, 1.05, 20, 3, cv2.LINE_AA)
+    texels = np.full((40, 184, 4), 128, dtype=np.uint8)
+    texels[..., 0], texels[..., 3] = face, 0
     return texels
 
 
@@ -181,18 +185,19 @@ def add_tree(
     trunk_m, radius_m = rng.uniform(2.4, 3.4), rng.uniform(1.4, 2.3)
     tall_m = rng.uniform(1.0, 1.4) * radius_m
     thick_m = rng.uniform(0.11, 0.2)
-    add_post(wood, foot, trunk_m + 0.4 * tall_m, thick_m, materials.bark, Kind.VEGETATION)
     crown = foot + _up(trunk_m + 0.75 * tall_m)
+    add_post(wood, foot, trunk_m, thick_m, materials.bark, Kind.VEGETATION)
+    _add_limb(wood, materials, foot + _up(trunk_m - 0.05), crown + _up(0.7 * tall_m), 0.6 * thick_m)
     for _ in range(7):
         lean = rng.normal(0, 1, 3) * [1, 1, 0.3] + _up(0.9)
         lean /= np.linalg.norm(lean)
-        long_m = rng.uniform(0.5, 0.95) * radius_m
         start = foot + _up(trunk_m * rng.uniform(0.75, 1.1))
-        across = np.cross(lean, [0.3, 0.9, 0.1])
-        across /= np.linalg.norm(across)
-        axes = [across * 0.04, np.cross(lean, across) * 0.04, lean * long_m / 2]
-        middle = start + lean * long_m / 2
-        wood.box(middle, axes, materials.bark, Kind.VEGETATION, faces="ewns")
+        end = start + lean * rng.uniform(0.7, 1.1) * radius_m
+        _add_limb(wood, materials, start, end, 0.045)
+        for _ in range(3):
+            fork = start + (end - start) * rng.uniform(0.4, 0.95)
+            tip = fork + (lean + rng.normal(0, 0.7, 3)) * 0.35 * radius_m
+            _add_limb(wood, materials, fork, tip, 0.022)
     for _ in range(int(55 * radius_m)):
         direction = rng.standard_normal(3)
         direction *= rng.uniform(0.25, 1) ** 0.4 / np.linalg.norm(direction)
@@ -206,6 +211,18 @@ def add_tree(
         square = [(0, 1), (1, 1), (1, 0), (0, 0)]
         tint = float(np.clip(1 + 0.12 * rng.standard_normal(), 0.6, 1.4))
         green.quad(corners, square, texture, Kind.VEGETATION, _LEAF, tint)
+
+
+def _add_limb(
+    wood: MeshBuilder, materials: Materials, start: Vector, end: Vector, half_m: float
+) -> None:
+    """A branch from point to point (3,), square across."""
+    along = end - start
+    across = np.cross(along, [0.31, 0.92, 0.13])
+    across *= half_m / np.linalg.norm(across)
+    other = np.cross(along, across) / np.linalg.norm(along)
+    axes = [across, other, along / 2]
+    wood.box((start + end) / 2, axes, materials.bark, Kind.VEGETATION, faces="ewns")
 
 
 def add_hedge(

@@ -14,6 +14,8 @@ from engram.simulation.campaigns import Campaign, SessionPlan
 from engram.simulation.changes import alterations_on
 from engram.simulation.conditions import Conditions
 from engram.simulation.drive import DrivingStyle, Line, Pose, drive, driving_line
+from engram.simulation.life import Life
+from engram.simulation.mesh import Mesh
 from engram.simulation.rendering import TownRenderer
 from engram.simulation.robots import Robot, robot_named
 from engram.simulation.streets import Route, StreetPlan
@@ -46,6 +48,7 @@ class SimulatedDrive:
         )
         self._threads = threads
         self._stage: TownRenderer | None = None
+        self._life: Life | None = None
         self._streets, self._route = campaign.plan()
         self.line: Line = driving_line(self._streets, self._route, self.plan.reverse)
         count = int(self.line.length_m // campaign.spacing_m)
@@ -69,7 +72,7 @@ class SimulatedDrive:
         for k, pose in enumerate(self.poses[start:stop], start):
             moment = self.conditions.at(pose.driven_m, pose.elapsed_s)
             luminance, inverse_depths = self._renderer().render(
-                pose.world_from_cam, self.camera, moment
+                pose.world_from_cam, self.camera, moment, self._moving(pose)
             )
             left, right = camera_model.expose(luminance, inverse_depths, pose, moment.rain, k)
             yield StereoPair(self.stamp_ns(k), left, right, self.camera)
@@ -77,7 +80,9 @@ class SimulatedDrive:
     def truths(self, start: int = 0, stop: int | None = None) -> Iterator[FrameTruth]:
         """Truth of frames `start` to `stop`."""
         for pose in self.poses[start:stop]:
-            depth_m, kinds = self._renderer().depth(pose.world_from_cam, self.camera)
+            depth_m, kinds = self._renderer().depth(
+                pose.world_from_cam, self.camera, self._moving(pose)
+            )
             yield FrameTruth(pose.world_from_cam, self.camera, depth_m, kinds)
 
     def stamp_ns(self, frame: int) -> int:
@@ -106,6 +111,15 @@ class SimulatedDrive:
             town = _town(self._streets, self._route)
             self._stage = TownRenderer(town, self.today(), self._threads)
         return self._stage
+
+    def _moving(self, pose: Pose) -> Mesh:
+        if self._life is None:
+            self._life = Life(
+                _town(self._streets, self._route).cast, self._streets, self._route, self.line,
+                self.plan.reverse, self.campaign.traffic, self.plan.seed,
+            )  # fmt: skip
+        position = pose.world_from_cam.translation[:2]
+        return self._life.around(position, pose.driven_m, pose.elapsed_s)
 
 
 @lru_cache(maxsize=2)

@@ -55,7 +55,7 @@ class StreetPlan:
     def half_width_m(self, start: Junction, end: Junction) -> float:
         """Half the width of a street between its kerbs."""
         first, last = min(start, end), max(start, end)
-        widths = (3.6, 4.6, 5.0) if self.spacing_m > 45 else (3.4, 3.8)
+        widths = (3.6, 4.6, 5.0) if self.spacing_m > 45 else (3.6, 4.6)
         return float(self.rng("width", first, last).choice(widths))
 
     def rng(self, subject: str, *where: Junction) -> np.random.Generator:

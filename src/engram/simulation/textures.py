@@ -134,7 +134,7 @@ def _wall(
     rough = noise.cut(noise.rough, rng, (h, w))
     grain = noise.cut(noise.grain, rng, (h, w))
     albedo = np.full((h, w), base, dtype=np.float32)
-    height = 0.008 * rough + 0.0010 * grain
+    height = 0.005 * rough + 0.0012 * grain
     kind = rng.integers(3)
     rows, columns = np.arange(h)[:, None], np.arange(w)[None, :]
     if kind == 0:  # bricks or blocks of stone
@@ -326,7 +326,7 @@ def carriageway(
     h, w = int(length_m * GROUND_PER_M), int(width_m * GROUND_PER_M)
     grain = noise.cut(noise.grain, rng, (h, w))
     albedo = 0.15 * np.exp(0.12 * noise.cut(noise.rough, rng, (h, w)) + 0.08 * grain)
-    height = 0.004 * grain + 0.003 * noise.cut(noise.rough, rng, (h, w))
+    height = 0.0028 * grain + 0.0014 * noise.cut(noise.rough, rng, (h, w))
     per_m2 = width_m * length_m
     for _ in range(int(per_m2 / 14)):  # mended places
         top, left = rng.integers(0, h), rng.integers(0, w)
@@ -405,10 +405,10 @@ def leaves(rng: np.random.Generator, density: float, tone: float) -> Texels:
     side, scale = 128, 4
     cover = np.zeros((side * scale, side * scale), dtype=np.uint8)
     albedo = np.full((side, side), tone, dtype=np.float32)
-    for _ in range(9):  # twigs from the middle outwards
+    for _ in range(9 if density > 0 else 26):  # twigs from the middle outwards
         angle, reach = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 0.95) * side * scale / 2
         middle = np.array([side * scale / 2] * 2)
-        bends = rng.normal(0, 12 * scale / 4, (5, 2))
+        bends = np.cumsum(rng.normal(0, 2.5 * scale, (5, 2)), axis=0) * [[0], [1], [1], [1], [1]]
         steps = np.linspace(0, 1, 5)[:, None] * reach * [np.cos(angle), np.sin(angle)]
         cv2.polylines(cover, [(middle + steps + bends).astype(np.int32)], False, 255, scale)
     for _ in range(int(density * 150)):

@@ -28,6 +28,7 @@ from engram.simulation.furniture import (
     add_tree,
     shared_materials,
 )
+from engram.simulation.life import Cast
 from engram.simulation.mesh import Kind, Mesh, MeshBuilder, SurfaceFlag
 from engram.simulation.noise import NoiseFields
 from engram.simulation.streets import Junction, Points, Route, StreetPlan
@@ -103,6 +104,12 @@ def _level(point: Points, height_m: float = KERB_M) -> Points:
     return np.array([point[0], point[1], height_m])
 
 
+def _hand_over(scene: _core.Scene, mesh: Mesh) -> int:
+    return scene.add_mesh(
+        mesh.vertices, mesh.uv, mesh.textures, mesh.flags, mesh.tint, mesh.glow, mesh.kinds
+    )
+
+
 class Tenant(Protocol):
     """Who has tiles in the scene; there is one at a time, since two days do not mix."""
 
@@ -128,6 +135,7 @@ class Town:
         self.scene = _core.Scene(self.noise.tile())
         self.tenant: Tenant | None = None  # whose tiles the scene holds
         self.materials: Materials = shared_materials(self.scene, self.noise, style, plan.seed)
+        self.cast = Cast.of_seed(self.materials, plan.seed)
         self._driven = set(route.streets())
         self._pool = [
             facade(
@@ -142,6 +150,17 @@ class Town:
             carriageway(rng, self.noise, style, 10.0, _SHARED_STREET_M, crossing=False)
         )
         self._slabs = self.scene.add_texture(pavement(rng, self.noise, style, 3.0, 9.0))
+        self._add_country()
+
+    def _add_country(self) -> None:
+        """Meadows to the horizon, below everything else."""
+        builder = MeshBuilder()
+        middle = np.mean([self.plan.junction(at) for at in self.route.junctions], axis=0)
+        corners = [middle + 3000.0 * np.array(c) for c in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        uv = [tuple(c / 40) for c in corners]
+        flat = [_level(c, -0.06) for c in corners]
+        builder.quad(flat, uv, self.materials.grass, Kind.GROUND, SurfaceFlag.NO_SHADOW)
+        _hand_over(self.scene, builder.build())
 
     def blocks_near(self, position: Points, reach_m: float) -> list[Junction]:
         """Blocks whose middle is within reach of a point (2,), nearest first."""
@@ -207,7 +226,7 @@ class _TileBuilder:
         self._add_pavement(sides, pavement_m)
         character = self.plan.rng("use", self.block).random()
         if character < 0.68:
-            self._add_terrace(sides)
+            self._add_terrace(sides, front)
         elif character < 0.82:
             self._add_villas(sides, front)
         elif character < 0.92:
@@ -223,12 +242,7 @@ class _TileBuilder:
         tile = Tile(self.block, np.array(self.lamps, dtype=np.float32).reshape(-1, 3))
         for mesh in (self.solid.build(), self.green.build(), Mesh.joined(self.parts)):
             if len(mesh):
-                tile.meshes.append(
-                    scene.add_mesh(
-                        mesh.vertices, mesh.uv, mesh.textures, mesh.flags, mesh.tint, mesh.glow,
-                        mesh.kinds,
-                    )
-                )  # fmt: skip
+                tile.meshes.append(_hand_over(scene, mesh))
         tile.textures = self.textures
         return tile
 
@@ -305,9 +319,7 @@ class _TileBuilder:
             texture, size = self.town._tarmac, 40.0
         origin = self.plan.junction((i, j))
         uv = [tuple((c - origin) / size + 0.5) for c in corners]
-        self.solid.quad(
-            [_level(c, 0.0) for c in corners], uv, texture, Kind.GROUND, SurfaceFlag.ROAD
-        )
+        self.solid.quad([_level(c, 0.0) for c in corners], uv, texture, Kind.GROUND)
 
     def _add_pavement(self, sides: list[_Side], width_m: float) -> None:
         noise, style = self.town.noise, self.town.style
@@ -345,7 +357,8 @@ class _TileBuilder:
 
     # Buildings.
 
-    def _add_terrace(self, sides: list[_Side]) -> None:
+    def _add_terrace(self, sides: list[_Side], front: Points) -> None:
+        self._add_lawn(front, self.materials.grass, 0.2)
         for side in sides:
             at = 0.0
             while side.length_m - at > 4.0:
@@ -356,7 +369,6 @@ class _TileBuilder:
                 self._add_house(side, at, width, setback, depth_m=8.5)
                 gap = float(self.rng.choice([0, 0, 0, 0, 2.2]))
                 at += width + gap
-        self._add_lawn(self.plan.block_outline(self.block, 3.0), self.materials.grass, 0.2)
 
     def _add_villas(self, sides: list[_Side], front: Points) -> None:
         self._add_lawn(front, self.materials.grass, 0.2)

@@ -36,9 +36,10 @@ def car(materials: Materials, rng: np.random.Generator, kind: Kind = Kind.PARKED
     tint = float(rng.uniform(0.85, 1.2))
     points = [(x * stretch, z * rise) for x, z, _ in profile]
     waist = max(points[2][1], points[5][1])
+    lean = 0.07 if profile is _VAN else 0.22
 
     def half_width(z: float) -> float:
-        return 0.86 - max(0.0, z - waist) * 0.22  # the cabin leans in
+        return 0.86 - max(0.0, z - waist) * lean  # the cabin leans in
 
     for k in range(len(points) - 1):
         (x0, z0), (x1, z1) = points[k], points[k + 1]
@@ -198,7 +199,7 @@ def _add_lights(
         light = [(x, side * 0.68 + 0.12, 0.68), (x, side * 0.68 - 0.12, 0.68)]
         light += [(x, side * 0.68 - 0.12, 0.84), (x, side * 0.68 + 0.12, 0.84)]
         builder.quad(light, _SQUARE, materials.light, kind, SurfaceFlag.GLASS, 0.25, 1.2 * on)
-    board = materials.boards[int(rng.integers(len(materials.boards)))]
+    plate_texture = materials.plates[int(rng.integers(len(materials.plates)))]
     for x, turn in ((points[0][0] + 0.06, 1.0), (points[7][0] - 0.06, -1.0)):
         plate = [
             (x, -0.26 * turn, 0.42),
@@ -206,7 +207,7 @@ def _add_lights(
             (x, 0.26 * turn, 0.53),
             (x, -0.26 * turn, 0.53),
         ]
-        builder.quad(plate, _SQUARE, board, kind)
+        builder.quad(plate, _SQUARE, plate_texture, kind)
 
 
 def pedestrian(materials: Materials, rng: np.random.Generator, stride: float = 0.0) -> Mesh:
