@@ -10,6 +10,7 @@ from engram.drive.pictures import PictureWriter
 from engram.drive.results import FrameResult, summarise
 from engram.drive.session import DriveSequence, open_drive, session_of_drive
 from engram.drive.settings import Settings, load_settings
+from engram.drive.simulating import SimulateReport, campaign_folder, simulate
 from engram.drive.there_and_back import ThereAndBack
 from engram.drive.trajectory import chain_trajectory, write_trajectory
 
@@ -26,7 +27,9 @@ __all__ = [
     "OpenMap",
     "PictureWriter",
     "Settings",
+    "SimulateReport",
     "ThereAndBack",
+    "campaign_folder",
     "chain_trajectory",
     "check_map",
     "describe_map",
@@ -39,6 +42,7 @@ __all__ = [
     "open_map",
     "seal_map",
     "session_of_drive",
+    "simulate",
     "summarise",
     "write_trajectory",
 ]

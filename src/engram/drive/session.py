@@ -12,12 +12,13 @@ from engram.experience.model import Session
 from engram.sequences import (
     FrameLog,
     ImageSequence,
+    SimulatedSequence,
     first_pair_hash,
     open_sequence,
     session_of,
 )
 
-DriveSequence: TypeAlias = ImageSequence | FrameLog | ThereAndBack
+DriveSequence: TypeAlias = ImageSequence | FrameLog | ThereAndBack | SimulatedSequence
 
 
 def open_drive(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 
@@ -18,6 +18,9 @@ from engram.simulation.streets import Route, StreetPlan, crossing_loops, loop_of
 WORLD_VERSION = 1
 
 
+_SUMMER_TIME = timedelta(hours=1)
+
+
 class Size(StrEnum):
     """How much of a campaign: what fits working machines, or the papers' own sizes."""
 
@@ -30,7 +33,7 @@ class SessionPlan:
     """One drive.
 
     Attributes:
-        number: within the campaign, in the order of time.
+        number: within its home campaign, in the order of time.
         start: UTC.
         weather: key in `WEATHERS`.
         robot: key in `ROBOTS`.
@@ -65,6 +68,9 @@ class Campaign:
         crossing: a route of several loops that meet, instead of one loop.
         sessions: in the order of time.
         traffic: how many cars and people move, 0…1.
+        size: how much of it this is.
+        home: campaign whose town and drives these are: `begbroke` at standard size is the part
+            of `begbroke24h` by day, and is not rendered again.
         parked_share: of the parking places that are taken.
         spacing_m: way between frames.
         place: where on earth.
@@ -77,14 +83,18 @@ class Campaign:
     crossing: bool
     sessions: tuple[SessionPlan, ...]
     traffic: float
+    size: Size
+    home: str
     parked_share: float = 0.6
     spacing_m: float = 0.7
     place: Place = OXFORD
 
     @property
     def first_day(self) -> int:
-        """Proleptic ordinal of the first drive's date."""
-        return self.sessions[0].start.toordinal()
+        """Proleptic ordinal of the first drive's date; a part of a campaign begins with it."""
+        if self.name == self.home:
+            return self.sessions[0].start.toordinal()
+        return CAMPAIGNS[self.home](self.seed, self.size).first_day
 
     def plan(self) -> tuple[StreetPlan, Route]:
         """Where its streets run and the way that is driven."""
@@ -153,7 +163,7 @@ def _spread(
     ]
 
 
-def _hamlet(seed: int, _: Size) -> Campaign:
+def _hamlet(seed: int, size: Size) -> Campaign:
     first = datetime(2025, 7, 14, tzinfo=UTC)
     drives = [
         (0, 8.5, "clear", "wildcat"), (0, 17.0, "clear", "courier"),
@@ -164,10 +174,10 @@ def _hamlet(seed: int, _: Size) -> Campaign:
     sessions = _planned(
         "hamlet", seed, starts, [d[2] for d in drives], [d[3] for d in drives], [False] * 6
     )
-    return Campaign("hamlet", seed, 150, False, sessions, traffic=0.4)
+    return Campaign("hamlet", seed, 150, False, sessions, 0.4, size, "hamlet")
 
 
-def _village(seed: int, _: Size) -> Campaign:
+def _village(seed: int, size: Size) -> Campaign:
     """24 drives that meet every condition there is, by two robots."""
     first = datetime(2025, 6, 20, tzinfo=UTC)
     drives = [
@@ -183,17 +193,21 @@ def _village(seed: int, _: Size) -> Campaign:
     sessions = _planned(
         "village", seed, starts, [d[2] for d in drives], robots, [k % 8 == 5 for k in range(24)]
     )
-    return Campaign("village", seed, 700, False, sessions, traffic=0.4)
+    return Campaign("village", seed, 700, False, sessions, 0.4, size, "village")
 
 
-def _begbroke(seed: int, _: Size) -> Campaign:
-    """107 laps in two months, 7 h to 19 h (local, UTC + 1)."""
+def _begbroke(seed: int, size: Size) -> Campaign:
+    """107 laps in two months, 7 h to 19 h local; at standard size begbroke24h's by day."""
+    if size is Size.STANDARD:
+        whole = _begbroke24h(seed, size)
+        by_day = [s for s in whole.sessions if 7 <= (s.start + _SUMMER_TIME).hour < 19]
+        return replace(whole, name="begbroke", sessions=tuple(by_day))
     rng = np.random.default_rng([seed, 0xBE6])
     starts = _spread(rng, datetime(2025, 6, 1, tzinfo=UTC), 61, 107, (6.0, 18.0))
     sessions = _planned(
         "begbroke", seed, starts, _drawn(rng, 107), ["wildcat"] * 107, [False] * 107
     )
-    return Campaign("begbroke", seed, 700, False, sessions, traffic=0.25)
+    return Campaign("begbroke", seed, 700, False, sessions, 0.25, size, "begbroke")
 
 
 def _begbroke24h(seed: int, size: Size) -> Campaign:
@@ -206,7 +220,7 @@ def _begbroke24h(seed: int, size: Size) -> Campaign:
     sessions = _planned(
         "begbroke24h", seed, starts, _drawn(rng, count), ["wildcat"] * count, [False] * count
     )
-    return Campaign("begbroke24h", seed, 700, False, sessions, traffic=0.25)
+    return Campaign("begbroke24h", seed, 700, False, sessions, 0.25, size, "begbroke24h")
 
 
 def _keble(seed: int, size: Size) -> Campaign:
@@ -217,7 +231,7 @@ def _keble(seed: int, size: Size) -> Campaign:
     sessions = _planned(
         "keble", seed, starts, _drawn(rng, count), ["bicycle"] * count, [False] * count
     )
-    return Campaign("keble", seed, 2200, True, sessions, traffic=1.0)
+    return Campaign("keble", seed, 2200, True, sessions, 1.0, size, "keble")
 
 
 def _oxford(seed: int, size: Size) -> Campaign:
@@ -228,7 +242,7 @@ def _oxford(seed: int, size: Size) -> Campaign:
         "oxford", seed, starts, _drawn(rng, 10), ["wildcat"] * 10, [k % 2 == 1 for k in range(10)]
     )
     length = 7600 if size is Size.FULL else 3000
-    return Campaign("oxford", seed, length, False, sessions, traffic=0.9, parked_share=0.75)
+    return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.75)
 
 
 CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {
