@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import sqlite3
@@ -19,6 +20,7 @@ from engram.errors import (
     InputError,
     MapCorruptError,
     MapError,
+    MapLockedError,
     NotAMapError,
 )
 from engram.experience.model import path_id
@@ -181,6 +183,25 @@ def test_creating_never_replaces_anything(tmp_path, broken):
     assert broken.read_bytes() == before
     with pytest.raises(InputError, match="no folder"):
         MapStore.create(tmp_path / "nowhere" / "town.engram")
+
+
+def test_a_link_to_a_map_is_the_same_map(tmp_path, broken):
+    link = tmp_path / "link.engram"
+    link.symlink_to(broken)
+    with MapStore.open_for_writing(broken), pytest.raises(MapLockedError):
+        MapStore.open_for_writing(link)
+
+
+def test_a_map_is_made_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "no hard links")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "town.engram"
+    MapStore.create(path).close()
+    assert MapStore.check(path).problems == ()
+    with pytest.raises(InputError, match="exists already"):
+        MapStore.create(path)
 
 
 def change(path, statement: str, *values: object) -> None:

@@ -7,12 +7,15 @@ import os
 
 import numpy as np
 import pytest
+from sqlalchemy import insert
 
 from engram.errors import IncompatibleError, InputError, MapLockedError, RevisionError
 from engram.experience.model import EdgeKind, NodeId, PathEntry, PathEntryKind
 from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.store import MapStore, SessionState
+from engram.store.rows import sealed
+from engram.store.schema import hidden
 
 from .frames import CAMERA, assert_same_landmarks
 from .maps import (
@@ -237,6 +240,16 @@ class TestRecords:
         writer.commit()
         assert store.load().nodes == (good,)
 
+    @pytest.mark.parametrize(
+        "changes", [{"author": "\udcff"}, {"message": "a\0b"}, {"configuration": {"x": np.nan}}]
+    )
+    def test_what_no_database_can_keep_is_refused(self, store, changes):
+        with pytest.raises(InputError):
+            begin(store, session(), **changes)
+        with pytest.raises(InputError, match="64 bits"):
+            begin(store, session(start_ns=2**63))
+        assert store.session_state(session().id) is SessionState.ABSENT
+
     def test_thumbnails_are_read_apart(self, store, location):
         writer = begin(store, session())
         drive = write_drive(writer, 1)
@@ -289,6 +302,58 @@ class TestHistory:
             assert_holds(again, late, early)
         with MapStore.open(location, at=1) as old:
             assert_holds(old, late)
+
+
+class TestHidden:
+    """`revert` will hide rows; what readers make of hidden rows stands already."""
+
+    def hide(self, store: MapStore, name: str, record: str, target: int, hide: int) -> None:
+        """A new revision with one `hidden` row."""
+        writer = begin(store, session(name))
+        row = {
+            "key": store._keys.next(hidden),
+            "revision": writer._revision_key,
+            "record": record,
+            "target": target,
+            "hidden": hide,
+        }
+        with store._database.writing() as connection:
+            connection.execute(insert(hidden), [sealed(hidden, row)])
+        writer.commit()
+
+    def test_a_hidden_node_takes_along_what_refers_to_it_and_may_come_back(self, store, location):
+        writer = begin(store, session())
+        drive = write_drive(writer)
+        writer.commit()
+        self.hide(store, "hides", "nodes", target=3, hide=1)
+        gone = drive.nodes[2].id
+        contents = store.load()
+        assert contents.nodes == tuple(one for one in drive.nodes if one.id != gone)
+        assert_same_edges(contents.edges, [e for e in drive.edges if gone not in {e.a, e.b}])
+        assert [e.sequence for e in contents.path_entries] == [0, 1, 3, 4]
+        assert {a.iteration for a in contents.attempts_of(session().id)} == {1, 4}
+        info = store.info()
+        assert (info.nodes, info.edges, info.path_entries) == (4, 2, 4)
+        with MapStore.open(location) as reader, pytest.raises(InputError, match="not part"):
+            reader.frames.frame(gone)
+        self.hide(store, "shows", "nodes", target=3, hide=0)
+        assert store.load().nodes == tuple(drive.nodes)
+        with MapStore.open(location) as reader, MapStore.open(location, at=2) as older:
+            assert_same_landmarks(reader.frames.frame(gone).landmarks, drive.frames[gone].landmarks)
+            assert len(older.load().nodes) == 4
+        assert MapStore.check(location).problems == ()
+
+    def test_a_hidden_edge_shows_the_one_it_superseded(self, store):
+        writer = begin(store, session())
+        drive = write_drive(writer, 2)
+        writer.commit()
+        ends = (drive.nodes[0].id, drive.nodes[1].id)
+        writer = begin(store, session("robot-2"))
+        writer.add_edge(edge(*ends, seed=5))
+        writer.commit()
+        assert_same_edges(store.load().edges, [edge(*ends, seed=5)])
+        self.hide(store, "hides", "edges", target=2, hide=1)
+        assert_same_edges(store.load().edges, drive.edges)
 
 
 class TestContentHash:

@@ -34,6 +34,7 @@ from engram.store.records import (
 )
 from engram.store.rows import (
     Row,
+    checked_text,
     node_from_row,
     sealed,
     session_from_row,
@@ -316,8 +317,8 @@ class WritableMapStore(MapStore):
             "number": None,
             "status": "open",
             "parent": None,
-            "author": author,
-            "message": message,
+            "author": checked_text(author, "author"),
+            "message": checked_text(message, "message"),
             "tool_version": __version__,
             "configuration": configuration,
             "contents": "{}",

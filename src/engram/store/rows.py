@@ -6,6 +6,7 @@ import json
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import product
 from typing import Any
 from uuid import UUID
 
@@ -64,9 +65,7 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
     count = len(names)
     for row in rows:
         values = list(row[:count])
-        if checksum(values[:-1]) != values[-1] or not all(
-            type(value) in kind for value, kind in zip(values, kinds, strict=True)
-        ):
+        if checksum(values[:-1]) != values[-1] or tuple(map(type, values)) not in kinds:
             raise MapCorruptError(
                 f"table {table.name}: {describe(table, values)} does not match its checksum; "
                 "run engram check, and restore a copy"
@@ -75,13 +74,15 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
 
 
 @cache
-def _shape(table: Table) -> tuple[list[str], list[frozenset[type]]]:
-    """Names of a table's columns and the types that their values may have."""
-    kinds = [
-        frozenset({column.type.python_type, *([type(None)] if column.nullable else [])})
-        for column in table.columns
-    ]
-    return [column.name for column in table.columns], kinds
+def _shape(table: Table) -> tuple[list[str], set[tuple[type, ...]]]:
+    """Names of a table's columns, and all that the types of a row's values may be."""
+    kinds = product(
+        *(
+            (column.type.python_type, *([type(None)] if column.nullable else []))
+            for column in table.columns
+        )
+    )
+    return [column.name for column in table.columns], set(kinds)
 
 
 def describe(table: Table, values: Sequence[Any]) -> str:
@@ -101,7 +102,7 @@ def to_json(values: Mapping[str, Any]) -> str:
         InputError: a value is no plain data, or not finite.
     """
     try:
-        return json.dumps(dict(values), sort_keys=True, allow_nan=False, ensure_ascii=False)
+        return json.dumps(dict(values), sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise InputError(f"cannot be kept as JSON: {error}") from error
 
@@ -115,6 +116,32 @@ def from_json(text: str, what: str) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise MapCorruptError(f"{what} is no JSON object")
     return values
+
+
+def checked_text(value: str, what: str) -> str:
+    """A text that every database takes.
+
+    Raises:
+        InputError: it is not valid Unicode, or holds a zero character.
+    """
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{what} {value!r} is not valid Unicode") from error
+    if "\0" in value:
+        raise InputError(f"{what} {value!r} holds a zero character")
+    return value
+
+
+def checked_int(value: int, what: str) -> int:
+    """An integer of 64 bits.
+
+    Raises:
+        InputError: it has more.
+    """
+    if not -(2**63) <= value < 2**63:
+        raise InputError(f"{what} is {value}, must fit into 64 bits")
+    return int(value)
 
 
 def transform_bytes(target_from_source: SE3) -> bytes:
@@ -162,7 +189,7 @@ def camera_row(camera: StereoCamera, key: int) -> Row:
         "width": int(camera.width),
         "height": int(camera.height),
         "cam_from_rig": None if mounting is None else transform_bytes(mounting),
-        "rectification": camera.rectification,
+        "rectification": checked_text(camera.rectification, "rectification"),
     }
 
 
@@ -191,13 +218,13 @@ def session_row(session: Session, key: int, revision: int, camera: int, frontend
         "key": key,
         "uuid": session.id.bytes,
         "revision": revision,
-        "robot": session.robot,
+        "robot": checked_text(session.robot, "robot"),
         "camera": camera,
         "frontend": frontend,
-        "start_ns": int(session.start_ns),
+        "start_ns": checked_int(session.start_ns, "start_ns"),
         "clock": str(session.clock),
         "longitude_deg": None if session.longitude_deg is None else float(session.longitude_deg),
-        "zone": session.zone,
+        "zone": None if session.zone is None else checked_text(session.zone, "zone"),
     }
 
 

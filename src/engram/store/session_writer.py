@@ -30,7 +30,16 @@ from engram.store.frame_reader import FrameReader
 from engram.store.keys import KeyBook
 from engram.store.reading import log
 from engram.store.records import Revision, StoredSession
-from engram.store.rows import Row, edge_row, sealed, to_json, transform_from_bytes, verified
+from engram.store.rows import (
+    Row,
+    checked_int,
+    checked_text,
+    edge_row,
+    sealed,
+    to_json,
+    transform_from_bytes,
+    verified,
+)
 from engram.store.schema import (
     VERSIONED,
     attempts,
@@ -115,7 +124,7 @@ class SessionWriter:
                 "session": self._session_key,
                 "camera": self._camera_key,
                 "frontend": self._frontend_key,
-                "stamp_ns": int(node.stamp_ns),
+                "stamp_ns": checked_int(node.stamp_ns, "stamp_ns"),
                 "driven_m": float(node.driven_m),
                 "status": str(frame.status),
                 "landmark_hash": blob_hash(landmarks),
@@ -166,10 +175,10 @@ class SessionWriter:
                 "key": self._keys.next(path_entries),
                 "revision": self._revision_key,
                 "path": self._path_key,
-                "sequence": int(entry.sequence),
+                "sequence": checked_int(entry.sequence, "sequence"),
                 "node": self._node_key(entry.node, "path entry"),
                 "kind": str(entry.kind),
-                "stamp_ns": int(entry.stamp_ns),
+                "stamp_ns": checked_int(entry.stamp_ns, "stamp_ns"),
             }
             self._rows[path_entries].append(sealed(path_entries, row))
             self._next_sequence = entry.sequence + 1
@@ -203,7 +212,7 @@ class SessionWriter:
             row = {
                 "key": self._keys.next(statistics),
                 "revision": self._revision_key,
-                "name": name,
+                "name": checked_text(name, "name of the statistic"),
                 "body": body,
             }
             self._statistics[name] = sealed(statistics, row)

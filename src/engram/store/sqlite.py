@@ -1,13 +1,14 @@
 """A map as one SQLite file: all that is said to SQLite and to no other database stands here.
 
 Write-ahead log, so that readers and the writer never wait for each other. `synchronous=FULL`: a
-checkpoint that has returned survives a power cut, not only a kill; it costs one fsync per
-checkpoint, on the saving thread (measured in docs/performance.md). No memory mapping: a file that
-is cut while it is mapped would kill the process.
+checkpoint that has returned survives a power cut, not only a kill; that costs one fsync, on the
+saving thread (20 nodes of 25 kB on ext4: 2.1 ms a checkpoint, 1.5 ms with NORMAL). No memory
+mapping: a file that is cut while it is mapped would kill the process.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import sqlite3
 from collections import deque
@@ -60,6 +61,7 @@ class SqliteDatabase:
     """
 
     def __init__(self, path: Path) -> None:
+        path = path.resolve()  # one lock per map, whatever links lead to it
         self.path = path
         _check_header(path)
         self._reader = _engine(_reading_uri(path), _prepare_reader)
@@ -85,7 +87,7 @@ class SqliteDatabase:
         try:
             _remove(draft)
             _write_empty(draft)
-            os.link(draft, path)  # unlike a rename, never replaces a map that came meanwhile
+            _publish(draft, path)
             _sync_folder(path.parent)
         except FileExistsError as error:
             raise InputError(f"{path} exists already; open it, or choose another name") from error
@@ -306,6 +308,18 @@ def _write_empty(path: Path) -> None:
             _enter_wal(engine)
     finally:
         engine.dispose()
+
+
+def _publish(draft: Path, path: Path) -> None:
+    """Give the draft its name, never replacing a map that came meanwhile as a rename would."""
+    try:
+        os.link(draft, path)
+    except OSError as error:
+        if error.errno not in {errno.EPERM, errno.ENOTSUP, errno.ENOSYS}:
+            raise
+        # No hard links here (FAT): take the name first, then fill it.
+        os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        draft.replace(path)
 
 
 def _enter_wal(engine: Engine) -> None:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, Select, Table, and_, func, or_, select
 
 from engram.store.rows import Row, verified
-from engram.store.schema import hidden, revisions
+from engram.store.schema import hidden, nodes, revisions
 
 # Rows of the writer's own open revision are newer than all that is committed.
 _NEWEST = 2**62
+# What refers to a hidden node is hidden with it.
+_NODE_COLUMNS = {"a", "b", "node"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +41,16 @@ class View:
         other the newest is last.
         """
         place = func.coalesce(revisions.c.number, _NEWEST)
-        return (
+        query = (
             select(*table.columns)
             .select_from(table.join(revisions, revisions.c.key == table.c.revision))
             .where(table.c.revision.in_(self.revision_keys()))
             .where(table.primary_key.columns[0].not_in(self.hidden_keys(table)))
             .order_by(place, table.primary_key.columns[0])
         )
+        for end in sorted(_NODE_COLUMNS & set(table.columns.keys())):
+            query = query.where(table.c[end].not_in(self.hidden_keys(nodes)))
+        return query
 
     def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
         """The rows that are seen, verified, in the order of `select`."""
