@@ -56,6 +56,7 @@ def extract(
 
 # --- graph search
 
+def pivoted_error(covariance: NDArray[np.float64]) -> NDArray[np.float64]: ...
 def graph_candidates(
     first_half: NDArray[np.int32],
     next_half: NDArray[np.int32],

@@ -115,9 +115,19 @@ auto graph_chains(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &
                         engram::to_numpy(std::move(errors_out), {count, 6}));
 }
 
+auto pivoted_error(const Input<double, 2> &covariance) {
+  if (covariance.shape(0) != 6 || covariance.shape(1) != 6)
+    throw std::invalid_argument("pivoted_error: expected a covariance (6, 6)");
+  std::vector<double> error(5);
+  ENGRAM_CALL(pivoted_error, covariance.data(), error.data());
+  return engram::to_numpy(std::move(error), {5});
+}
+
 } // namespace
 
 void bind_graph_search(nb::module_ &module) {
+  module.def("pivoted_error", &pivoted_error, "covariance"_a,
+             "The error model (5,) tau, v, pivot of a covariance (6, 6).");
   module.def("graph_candidates", &graph_candidates, "first_half"_a, "next_half"_a, "target"_a,
              "a_from_b"_a, "errors"_a, "reference"_a, "reference_from_live"_a, "live_error"_a,
              "radius_m"_a, "margin_m"_a, "view_gate_rad"_a, "slack_sigmas"_a, "slack_m"_a, "sessions"_a,

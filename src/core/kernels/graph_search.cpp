@@ -1,6 +1,7 @@
 #include "kernels/graph_search.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <stdexcept>
 #include <utility>
@@ -180,6 +181,11 @@ private:
     const int32_t known = scratch.row_of[static_cast<size_t>(target)];
     if (known >= 0 && scratch.settled[static_cast<size_t>(known)])
       return;
+    const double *error = graph_.errors + 8 * (half / 2);
+    const double least =
+        seen_[static_cast<size_t>(row)].cost + error[0] + error[1] * lever_m * lever_m;
+    if (known >= 0 && least >= seen_[static_cast<size_t>(known)].cost)
+      return; // without working out where the pivot is
     const double cost = seen_[static_cast<size_t>(row)].cost + edge_cost(row, half);
     if (known >= 0 && cost >= seen_[static_cast<size_t>(known)].cost)
       return;
@@ -265,7 +271,79 @@ void add_candidate(const CandidateQuery &query, const Reached &row, Candidates &
   found.pivot_in_node.insert(found.pivot_in_node.end(), node_from_pivot + 9, node_from_pivot + 12);
 }
 
+using Symmetric = std::array<double, 9>;
+
+double trace(const Symmetric &m) { return m[0] + m[4] + m[8]; }
+
+double determinant(const double *a, const double *b, const double *c) {
+  return a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) +
+         a[2] * (b[0] * c[1] - b[1] * c[0]);
+}
+
+// Largest eigenvalue of a symmetric 3×3 matrix, in closed form (Smith 1961).
+double largest_eigenvalue(const Symmetric &m) {
+  const double mean = trace(m) / 3;
+  Symmetric centred = m;
+  for (int i = 0; i < 9; i += 4)
+    centred[static_cast<size_t>(i)] -= mean;
+  double square = 0;
+  for (const double value : centred)
+    square += value * value;
+  const double spread = std::sqrt(square / 6);
+  if (!(spread > 0))
+    return mean;
+  const double *rows = centred.data();
+  const double ratio =
+      determinant(rows, rows + 3, rows + 6) / (2 * spread * spread * spread);
+  return mean + 2 * spread * std::cos(std::acos(std::clamp(ratio, -1.0, 1.0)) / 3);
+}
+
+Symmetric block(const double *covariance, int row, int column) {
+  Symmetric out;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j)
+      out[static_cast<size_t>(3 * i + j)] = covariance[6 * (row + i) + column + j];
+  return out;
+}
+
+// The point p where the trace of cov(t + r × p) = pᵀ A p - 2 g·p + const is smallest, with
+// A = tr(R) I - R and R the covariance of r. About one axis only, p is free along it, and the
+// little that is added to A takes the one nearest to the origin.
+void quietest_point(const Symmetric &rotation, const Symmetric &cross, double *point) {
+  const double scale = trace(rotation);
+  point[0] = point[1] = point[2] = 0;
+  if (!(scale > 1e-18))
+    return;
+  const double g[3] = {cross[5] - cross[7], cross[6] - cross[2], cross[1] - cross[3]};
+  Symmetric a;
+  for (size_t i = 0; i < 9; ++i)
+    a[i] = (i % 4 == 0 ? scale * (1 + 1e-9) : 0) - rotation[i];
+  const double whole = determinant(a.data(), a.data() + 3, a.data() + 6);
+  point[0] = determinant(g, a.data() + 3, a.data() + 6) / whole;
+  point[1] = determinant(a.data(), g, a.data() + 6) / whole;
+  point[2] = determinant(a.data(), a.data() + 3, g) / whole;
+}
+
 } // namespace
+
+void pivoted_error(const double *covariance, double *error) {
+  const Symmetric rotation = block(covariance, 3, 3), cross = block(covariance, 3, 0);
+  double *p = error + 2;
+  quietest_point(rotation, cross, p);
+  // cov(t - [p]× r) = T - [p]× X - ([p]× X)ᵀ + [p]× R [p]×ᵀ, with X = cov(r, t).
+  const Symmetric lever = {0, -p[2], p[1], p[2], 0, -p[0], -p[1], p[0], 0};
+  Symmetric at_pivot = block(covariance, 0, 0);
+  for (size_t i = 0; i < 3; ++i)
+    for (size_t j = 0; j < 3; ++j)
+      for (size_t k = 0; k < 3; ++k) {
+        at_pivot[3 * i + j] -= lever[3 * i + k] * cross[3 * k + j];
+        at_pivot[3 * i + j] -= lever[3 * j + k] * cross[3 * k + i];
+        for (size_t l = 0; l < 3; ++l)
+          at_pivot[3 * i + j] += lever[3 * i + k] * rotation[3 * k + l] * lever[3 * j + l];
+      }
+  error[0] = std::max(largest_eigenvalue(at_pivot), 0.0);
+  error[1] = std::max(largest_eigenvalue(rotation), 0.0);
+}
 
 void search_chains(const GraphView &graph, int32_t root, const SearchLimits &limits,
                    std::vector<Reached> &reached) {
@@ -297,6 +375,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
     Search search(graph, limits, seen);
     order = search.run(query.reference);
   }
+  found.node_from_live.reserve(16 * order.size());
   for (const int32_t row : order)
     if (!is_own_recent(query, seen[static_cast<size_t>(row)].node))
       add_candidate(query, seen[static_cast<size_t>(row)], found);

@@ -68,6 +68,10 @@ struct CandidateQuery {
 } // namespace engram
 
 ENGRAM_DECLARE_KERNELS(
+    // tau, v and the pivot (3) of a covariance (6, 6), left perturbation, [translation, rotation]:
+    // the pivot is where the translational error is smallest.
+    void pivoted_error(const double *covariance, double *error);
+
     // Every node within the limits, in the order in which the search settles them: least uncertain
     // first, ties by node index. Throws std::invalid_argument when the arrays are inconsistent.
     void search_chains(const GraphView &graph, int32_t root, const SearchLimits &limits,

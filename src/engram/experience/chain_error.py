@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.errors import InputError
 from engram.geometry import SE3, skew
 
@@ -56,16 +57,8 @@ class PivotedError:
                 f"a covariance must be positive semi-definite; smallest eigenvalue "
                 f"{eigenvalues[0]:.3g}"
             )
-        rotation = covariance[3:, 3:]
-        pivot = _quietest_point(covariance)
-        at_pivot = np.zeros((3, 6))
-        at_pivot[:, :3], at_pivot[:, 3:] = np.eye(3), -skew(pivot)
-        translation = at_pivot @ covariance @ at_pivot.T
-        return PivotedError(
-            max(float(np.linalg.eigvalsh(translation)[-1]), 0.0),
-            max(float(np.linalg.eigvalsh(rotation)[-1]), 0.0),
-            pivot,
-        )
+        tau, v, *pivot = _core.pivoted_error(np.ascontiguousarray(covariance))
+        return PivotedError(float(tau), float(v), np.array(pivot))
 
     def covariance(self) -> Array:
         """The (6, 6) covariance, left perturbation, [translation, rotation], of this model."""
@@ -120,21 +113,3 @@ def edge_error_row(a_from_b: SE3, covariance: Array) -> Array:
     row[2:5] = error.pivot_in_a
     row[5:] = a_from_b.inverse() @ error.pivot_in_a
     return row
-
-
-def _quietest_point(covariance: Array) -> Array:
-    """The (3,) point p where the trace of cov(t + r × p) is smallest.
-
-    The trace is ``pᵀAp − 2g·p + const`` with ``A = tr(Σ_rr)·I − Σ_rr``.
-    """
-    rotation, cross = covariance[3:, 3:], covariance[3:, :3]
-    scale = float(np.trace(rotation))
-    if scale <= 1e-18:
-        return np.zeros(3)
-    quadratic = scale * np.eye(3) - rotation
-    linear = np.array(
-        [cross[1, 2] - cross[2, 1], cross[2, 0] - cross[0, 2], cross[0, 1] - cross[1, 0]]
-    )
-    # With one axis of rotation only, the point is free along that axis: the pseudo-inverse takes
-    # the one nearest to the origin.
-    return np.asarray(np.linalg.pinv(quadratic, rcond=1e-6, hermitian=True) @ linear)

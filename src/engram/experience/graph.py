@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from engram import _core
 from engram.errors import InputError
-from engram.experience.chain_error import ChainError, PivotedError, edge_error_row
+from engram.experience.chain_error import ChainError, edge_error_row
 from engram.experience.growing import Column
 from engram.experience.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.experience.neighbourhood import Neighbourhood
@@ -305,13 +305,12 @@ class ExperienceGraph:
             slack_sigmas: see above.
             slack_m: see above.
         """
-        live = PivotedError.from_covariance(np.asarray(covariance, dtype=np.float64))
         number = None if own_session is None else self._session_index.get(own_session)
         columns = _core.graph_candidates(
             *self._arrays(),
             reference,
             _pose_row(reference_from_live),
-            np.array([live.translation_var, live.rotation_var, *live.pivot_in_a]),
+            _core.pivoted_error(np.ascontiguousarray(covariance)),
             radius_m,
             margin_m,
             view_gate_rad,
