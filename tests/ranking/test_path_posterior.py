@@ -118,3 +118,29 @@ def test_excluded_path_counts_neither_in_likelihood_nor_in_prior() -> None:
     excluded, _ = posterior_of(with_live, *situation, excluded=path_uuid(2))
     np.testing.assert_array_equal(excluded, posterior_of(without, *situation)[0])
     assert not np.allclose(posterior_of(with_live, *situation)[0], excluded)
+
+
+@pytest.mark.parametrize("path_count", [63, 64, 65, 600, 2000])
+def test_co_occurrence_equals_set_intersection_at_any_size(path_count: int) -> None:
+    rng = np.random.default_rng(path_count)
+    nodes = 70
+    membership = rng.random((nodes, path_count)) < rng.choice([0.01, 0.5, 0.98], (nodes, 1))
+    memory = memory_of(flat_graph(nodes), [np.flatnonzero(m).tolist() for m in membership.T])
+    a, b = np.arange(0, 40, dtype=np.int32), np.arange(5, 70, dtype=np.int32)
+    expected = membership[a].astype(int) @ membership[b].T.astype(int)
+    np.testing.assert_array_equal(memory.co_occurrence(a, b), expected)
+
+
+@pytest.mark.parametrize("count", [2, 511, 512, 513, 1300])
+def test_scores_equal_numpy_for_any_number_of_observations(count: int) -> None:
+    rng = np.random.default_rng(count)
+    membership = rng.random((1400, 90)) < 0.25
+    memory = memory_of(flat_graph(1400), [np.flatnonzero(m).tolist() for m in membership.T])
+    candidates = rng.choice(1400, 9, replace=False).astype(np.int32)
+    observed = rng.choice(1400, count, replace=False).astype(np.int32)
+    outcomes = rng.random(count) < 0.3
+    counts = membership[candidates].astype(float) @ membership[observed].T
+    theta = (counts + 0.5) / (counts + 0.5).sum(axis=1, keepdims=True)
+    expected = np.log(np.where(outcomes, theta, 1 - theta)).sum(axis=1)
+    scores = memory.scores(candidates, observed, outcomes, None, alpha=0.5)
+    np.testing.assert_allclose(scores, expected, rtol=1e-12)

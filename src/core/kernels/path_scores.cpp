@@ -2,13 +2,18 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <vector>
+
+#ifdef __AVX512VPOPCNTDQ__
+#include <immintrin.h>
+#endif
 
 // How |Y| x |W| co-occurrence counts over thousands of paths fit into a fraction of a millisecond:
 // a node is on few of all paths, so for a candidate only the rows of *its* paths are added up. A row
 // says in one bit each which of 512 observed nodes are on the path; rows are added bit-sliced, 512
-// counters at once, by carry-save adders (Harley-Seal). Most counts are small: those below 8 are
-// tallied by value, mask by mask, and the others one by one.
+// counters at once, by carry-save adders (Harley-Seal). The counts are tallied by value: which
+// counters hold it is a mask, and how many, its popcount.
 
 namespace engram::ENGRAM_ISA {
 namespace {
@@ -18,87 +23,145 @@ typedef uint64_t u64x8 __attribute__((vector_size(64)));
 constexpr int64_t lanes = 8;
 constexpr int64_t nodes_per_vector = 512;
 constexpr int plane_count = 24; // counts below 2^24
-constexpr uint64_t small_counts = 8;
+constexpr int64_t octet = 8;    // values whose masks share all planes but the lowest three
 
-u64x8 popcount(u64x8 x) {
 #ifdef __AVX512VPOPCNTDQ__
-  return (u64x8)__builtin_ia32_vpopcountq_v8di((long long __attribute__((vector_size(64))))x);
+u64x8 popcount(u64x8 x) { return (u64x8)_mm512_popcnt_epi64((__m512i)x); }
+bool any(u64x8 x) { return _mm512_test_epi64_mask((__m512i)x, (__m512i)x) != 0; }
 #else
+u64x8 popcount(u64x8 x) {
   x -= (x >> 1) & 0x5555555555555555;
   x = (x & 0x3333333333333333) + ((x >> 2) & 0x3333333333333333);
   x = (x + (x >> 4)) & 0x0F0F0F0F0F0F0F0F;
   x += x >> 8;
   x += x >> 16;
   return (x + (x >> 32)) & 0x7F;
-#endif
 }
-
-uint64_t sum_of(u64x8 x) {
-  uint64_t sum = 0;
-  for (int lane = 0; lane < lanes; ++lane)
-    sum += x[lane];
-  return sum;
-}
-
 bool any(u64x8 x) {
   return (x[0] | x[1] | x[2] | x[3] | x[4] | x[5] | x[6] | x[7]) != 0;
 }
+#endif
 
-// Eight 64x64 bit matrices at once, one per lane: bit c of row r goes to bit r of row c.
-void transpose(u64x8 *rows) {
-  uint64_t mask = 0x00000000FFFFFFFF;
-  for (int width = 32; width > 0; width >>= 1, mask ^= mask << width)
-    for (int k = 0; k < 64; k = ((k | width) + 1) & ~width) {
+uint64_t sum_of(u64x8 x) {
+  x += __builtin_shuffle(x, u64x8{4, 5, 6, 7, 0, 1, 2, 3});
+  x += __builtin_shuffle(x, u64x8{2, 3, 0, 1, 6, 7, 4, 5});
+  return x[0] + x[1];
+}
+
+// Swaps the off-diagonal blocks of all 2 width x 2 width blocks on the diagonal.
+template <int width> void swap_blocks(u64x8 *rows, uint64_t mask) {
+  for (int top = 0; top < 64; top += 2 * width)
+    for (int k = top; k < top + width; ++k) {
       const u64x8 swapped = ((rows[k] >> width) ^ rows[k + width]) & mask;
       rows[k] ^= swapped << width;
       rows[k + width] ^= swapped;
     }
 }
 
+// Eight 64x64 bit matrices at once, one per lane: bit c of row r goes to bit r of row c.
+void transpose(u64x8 *rows) {
+  swap_blocks<32>(rows, 0x00000000FFFFFFFF);
+  swap_blocks<16>(rows, 0x0000FFFF0000FFFF);
+  swap_blocks<8>(rows, 0x00FF00FF00FF00FF);
+  swap_blocks<4>(rows, 0x0F0F0F0F0F0F0F0F);
+  swap_blocks<2>(rows, 0x3333333333333333);
+  swap_blocks<1>(rows, 0x5555555555555555);
+}
+
+// Lane g of row l goes to lane l of row g.
+void transpose_words(const u64x8 *in, int64_t in_step, u64x8 *out, int64_t out_step) {
+  u64x8 a[8], b[8];
+  for (int i = 0; i < 4; ++i) {
+    a[2 * i] = __builtin_shuffle(in[i * in_step], in[(i + 4) * in_step],
+                                 u64x8{0, 8, 1, 9, 2, 10, 3, 11});
+    a[2 * i + 1] = __builtin_shuffle(in[i * in_step], in[(i + 4) * in_step],
+                                     u64x8{4, 12, 5, 13, 6, 14, 7, 15});
+  }
+  for (int i = 0; i < 4; ++i) {
+    b[2 * i] = __builtin_shuffle(a[i], a[i + 4], u64x8{0, 8, 1, 9, 2, 10, 3, 11});
+    b[2 * i + 1] = __builtin_shuffle(a[i], a[i + 4], u64x8{4, 12, 5, 13, 6, 14, 7, 15});
+  }
+  for (int i = 0; i < 4; ++i) {
+    out[(2 * i) * out_step] = __builtin_shuffle(b[i], b[i + 4], u64x8{0, 8, 1, 9, 2, 10, 3, 11});
+    out[(2 * i + 1) * out_step] =
+        __builtin_shuffle(b[i], b[i + 4], u64x8{4, 12, 5, 13, 6, 14, 7, 15});
+  }
+}
+
 // Which of some nodes are on each path: bit j % 512 of row(j / 512, path).
-class NodesByPath {
+class NodesByPath { // one at a time on a thread
 public:
   NodesByPath(const PathBits &paths, const int32_t *nodes, int64_t count)
-      : vectors_((count + nodes_per_vector - 1) / nodes_per_vector), paths_(64 * paths.words),
-        rows_(static_cast<size_t>(vectors_ * paths_ + 1)) {
+      : vectors_((count + nodes_per_vector - 1) / nodes_per_vector),
+        paths_((paths.words + lanes - 1) / lanes * lanes * 64) {
+    // A megabyte for 10,000 paths: kept between calls, since fresh pages cost more than the work.
+    static thread_local std::vector<u64x8> kept;
+    if (kept.size() < static_cast<size_t>(vectors_ * paths_ + 1))
+      kept.resize(static_cast<size_t>(vectors_ * paths_ + 1));
+    rows_ = kept.data();
+    rows_[vectors_ * paths_] = u64x8{};
     for (int64_t v = 0; v < vectors_; ++v)
-      for (int64_t w = 0; w < paths.words; ++w) {
-        u64x8 *block = rows_.data() + v * paths_ + 64 * w;
-        for (int64_t r = 0; r < 64; ++r)
-          for (int64_t lane = 0; lane < lanes; ++lane) {
-            const int64_t j = v * nodes_per_vector + 64 * lane + r;
-            block[r][lane] = j < count ? paths.bits[nodes[j] * paths.stride + w] : 0;
-          }
-        transpose(block);
-      }
+      for (int64_t w = 0; w < paths.words; w += lanes)
+        fill(paths, nodes + v * nodes_per_vector, std::min(nodes_per_vector, count - v * 512), w,
+             rows_ + v * paths_ + 64 * w);
     if (paths.excluded >= 0)
       for (int64_t v = 0; v < vectors_; ++v)
-        rows_[static_cast<size_t>(v * paths_ + paths.excluded)] = u64x8{};
+        rows_[v * paths_ + paths.excluded] = u64x8{};
   }
 
   int64_t vectors() const { return vectors_; }
-  const u64x8 *rows(int64_t vector) const { return rows_.data() + vector * paths_; }
+  const u64x8 *rows(int64_t vector) const { return rows_ + vector * paths_; }
   // A row of nothing, for padding.
-  const u64x8 *empty() const { return rows_.data() + vectors_ * paths_; }
+  const u64x8 *empty() const { return rows_ + vectors_ * paths_; }
 
 private:
+  // The rows of 8 x 64 paths, from word w on, for up to 512 nodes.
+  static void fill(const PathBits &paths, const int32_t *nodes, int64_t count, int64_t w,
+                   u64x8 *rows) {
+    u64x8 groups[8 * 64];
+    const size_t bytes = sizeof(uint64_t) * static_cast<size_t>(std::min(lanes, paths.words - w));
+    for (int64_t g = 0; g < 8; ++g) {
+      u64x8 *block = groups + 64 * g;
+      for (int64_t r = 0; r < 64; ++r) {
+        block[r] = u64x8{};
+        if (64 * g + r < count)
+          std::memcpy(block + r, paths.bits + nodes[64 * g + r] * paths.stride + w, bytes);
+      }
+      if (64 * g < count)
+        transpose(block);
+    }
+    for (int64_t q = 0; q < 64; ++q)
+      transpose_words(groups + q, 64, rows + q, 64);
+  }
+
   int64_t vectors_, paths_;
-  std::vector<u64x8> rows_;
+  u64x8 *rows_;
 };
 
-// The numbers of a node's paths.
-void list_paths(const PathBits &paths, int32_t node, std::vector<int32_t> &list) {
-  list.clear();
+// The numbers of a node's paths. `list` has room for four more than there are paths.
+int64_t list_paths(const PathBits &paths, int32_t node, int32_t *list) {
+  int64_t count = 0;
   const uint64_t *row = paths.bits + node * paths.stride;
-  for (int64_t w = 0; w < paths.words; ++w)
-    for (uint64_t rest = row[w]; rest != 0; rest &= rest - 1)
-      list.push_back(static_cast<int32_t>(64 * w + __builtin_ctzll(rest)));
+  for (int64_t w = 0; w < paths.words; ++w) {
+    uint64_t rest = row[w];
+    const int64_t bits = __builtin_popcountll(rest);
+    const auto first = static_cast<int32_t>(64 * w);
+    // Most words hold a few bits or none: four are written without asking, so that no branch
+    // depends on the data.
+    int64_t i = 0;
+    do
+      for (const int64_t end = i + 4; i < end; ++i, rest &= rest - 1)
+        list[count + i] = first + __builtin_ctzll(rest | (uint64_t{1} << 63));
+    while (__builtin_expect(i < bits, 0));
+    count += bits;
+  }
+  return count;
 }
 
 // 512 counters, bit-sliced: bit l of a counter stands in plane l.
 struct Counters {
-  u64x8 planes[plane_count] = {};
-  int used = 3;
+  u64x8 planes[plane_count];
+  int used; // planes that may hold a bit
 
   // Sum and carry of three bits per counter.
   static u64x8 add(u64x8 &sum, u64x8 b, u64x8 c) {
@@ -108,60 +171,110 @@ struct Counters {
     return carry;
   }
 
-  void add_eight(const u64x8 *const *rows) {
-    u64x8 fours[2];
-    for (int half = 0; half < 2; ++half) {
-      const u64x8 *const *four = rows + 4 * half;
-      const u64x8 first = add(planes[0], *four[0], *four[1]);
-      const u64x8 second = add(planes[0], *four[2], *four[3]);
-      fours[half] = add(planes[1], first, second);
+  // Rows come eight at a time; a carry out of a plane waits for the next, so that two of them
+  // cost one adder.
+  Counters(const int32_t *list, int64_t count, const u64x8 *rows, const u64x8 *empty) {
+    u64x8 ones = {}, twos = {}, fours = {}, waiting[plane_count];
+    int64_t eights = 0;
+    used = 3;
+    for (int64_t i = 0; i < count; i += 8, ++eights) {
+      const u64x8 *row[8];
+      for (int64_t k = 0; k < 8; ++k)
+        row[k] = i + k < count ? rows + list[i + k] : empty;
+      const u64x8 two_a = add(ones, *row[0], *row[1]), two_b = add(ones, *row[2], *row[3]);
+      const u64x8 four_a = add(twos, two_a, two_b);
+      const u64x8 two_c = add(ones, *row[4], *row[5]), two_d = add(ones, *row[6], *row[7]);
+      const u64x8 four_b = add(twos, two_c, two_d);
+      u64x8 carry = add(fours, four_a, four_b);
+      int level = 3;
+      for (int64_t bit = eights; bit & 1; bit >>= 1, ++level)
+        carry = add(plane(level), waiting[level], carry);
+      waiting[level] = carry;
     }
-    u64x8 carry = add(planes[2], fours[0], fours[1]);
-    for (int level = 3; level < plane_count && any(carry); ++level) {
-      const u64x8 next = planes[level] & carry;
+    planes[0] = ones, planes[1] = twos, planes[2] = fours;
+    for (int level = 3; eights >> (level - 3); ++level)
+      if ((eights >> (level - 3)) & 1)
+        ripple(level, waiting[level]);
+  }
+
+  // The plane of a level, empty at first.
+  u64x8 &plane(int level) {
+    for (; used <= level; ++used)
+      planes[used] = u64x8{};
+    return planes[level];
+  }
+
+  void ripple(int level, u64x8 carry) {
+    for (; any(carry); ++level) {
+      const u64x8 next = plane(level) & carry;
       planes[level] ^= carry;
       carry = next;
-      used = std::max(used, level + 1);
+    }
+  }
+};
+
+// How many of the observed nodes have each count, successes and failures apart.
+class Tally {
+public:
+  struct Entry {
+    uint64_t value, successes, failures;
+  };
+
+  explicit Tally(int64_t greatest)
+      : octets_(static_cast<size_t>(greatest / octet + 1)), seen_(octets_.size()) {}
+
+  void clear() { std::fill(seen_.begin(), seen_.end(), uint8_t{0}); }
+
+  void count(const Counters &counters, u64x8 successes, u64x8 failures) {
+    split(counters, counters.used - 1, 0, successes | failures, successes);
+  }
+
+  // What was counted, values rising; those that no counter holds are left out.
+  const std::vector<Entry> &entries() {
+    entries_.clear();
+    for (size_t o = 0; o < octets_.size(); ++o)
+      for (size_t k = 0; seen_[o] && k < octet; ++k)
+        if (any(octets_[o].all[k])) {
+          const uint64_t successes = sum_of(octets_[o].successes[k]);
+          entries_.push_back(
+              {octet * o + k, successes, sum_of(octets_[o].all[k]) - successes});
+        }
+    return entries_;
+  }
+
+private:
+  struct Octet {
+    u64x8 all[octet], successes[octet];
+  };
+
+  // Parts the counters by plane after plane, from the highest; empty parts end.
+  void split(const Counters &counters, int level, uint64_t value, u64x8 mask, u64x8 successes) {
+    if (!any(mask))
+      return;
+    if (level < 3)
+      return tally_octet(counters, static_cast<size_t>(value), mask, successes);
+    const u64x8 plane = counters.planes[level];
+    split(counters, level - 1, 2 * value, mask & ~plane, successes);
+    split(counters, level - 1, 2 * value + 1, mask & plane, successes);
+  }
+
+  void tally_octet(const Counters &counters, size_t number, u64x8 mask, u64x8 successes) {
+    Octet &tally = octets_[number];
+    if (!seen_[number])
+      tally = Octet{};
+    seen_[number] = 1;
+    for (size_t k = 0; k < octet; ++k) {
+      u64x8 equal = mask;
+      for (size_t level = 0; level < 3; ++level)
+        equal &= (k >> level) & 1 ? counters.planes[level] : ~counters.planes[level];
+      tally.all[k] += popcount(equal);
+      tally.successes[k] += popcount(equal & successes);
     }
   }
 
-  void add_paths(const std::vector<int32_t> &list, const u64x8 *rows, const u64x8 *empty) {
-    const size_t count = list.size();
-    for (size_t i = 0; i < count; i += 8) {
-      const u64x8 *eight[8];
-      for (size_t k = 0; k < 8; ++k)
-        eight[k] = i + k < count ? rows + list[i + k] : empty;
-      add_eight(eight);
-    }
-  }
-
-  u64x8 large() const {
-    u64x8 mask = {};
-    for (int level = 3; level < used; ++level)
-      mask |= planes[level];
-    return mask;
-  }
-
-  // The counters that hold a small count.
-  u64x8 equal_to(uint64_t count) const {
-    u64x8 mask = ~large();
-    for (int level = 0; level < 3; ++level)
-      mask &= (count >> level) & 1 ? planes[level] : ~planes[level];
-    return mask;
-  }
-
-  uint64_t at(int64_t word, int bit) const {
-    uint64_t count = 0;
-    for (int level = 0; level < used; ++level)
-      count |= ((planes[level][word] >> bit) & 1) << level;
-    return count;
-  }
-
-  template <class Visit> void each(u64x8 mask, const Visit &visit) const {
-    for (int64_t word = 0; word < lanes; ++word)
-      for (uint64_t rest = mask[word]; rest != 0; rest &= rest - 1)
-        visit(64 * word + __builtin_ctzll(rest), at(word, __builtin_ctzll(rest)));
-  }
+  std::vector<Octet> octets_;
+  std::vector<uint8_t> seen_;
+  std::vector<Entry> entries_;
 };
 
 // A product of many positive factors that neither overflows nor underflows.
@@ -184,55 +297,28 @@ private:
   int64_t exponent_ = 0;
 };
 
-// The counts of one candidate against all observed nodes, tallied.
-struct Tally {
-  u64x8 small_successes[small_counts] = {}, small_failures[small_counts] = {};
-  std::vector<uint64_t> large_successes, large_failures;
-
-  void clear() {
-    std::fill_n(small_successes, small_counts, u64x8{});
-    std::fill_n(small_failures, small_counts, u64x8{});
-    large_successes.clear();
-    large_failures.clear();
+// log of the product over j of theta_ij where it succeeded, 1 - theta_ij where it failed:
+// theta_ij = (Z_ij + alpha) / total, so the numerators multiply up and the total is taken out.
+// Equal tallies give equal bits, whichever nodes they come from.
+double log_likelihood(const std::vector<Tally::Entry> &tally, double observed, double alpha,
+                      const std::vector<double> &log_of_success) {
+  uint64_t all = 0;
+  for (const Tally::Entry &entry : tally)
+    all += entry.value * (entry.successes + entry.failures);
+  const double total = static_cast<double>(all) + observed * alpha;
+  double score = -observed * std::log(total);
+  Product product;
+  for (const Tally::Entry &entry : tally) {
+    score += static_cast<double>(entry.successes) * log_of_success[entry.value];
+    const double factor = (total - alpha) - static_cast<double>(entry.value);
+    if (entry.failures > 8) // a logarithm costs as much as some multiplications
+      score += static_cast<double>(entry.failures) * std::log(factor);
+    else
+      for (uint64_t i = 0; i < entry.failures; ++i)
+        product.multiply(factor);
   }
-
-  void count(const Counters &counters, u64x8 successes, u64x8 failures) {
-    for (uint64_t value = 0; value < small_counts; ++value) {
-      const u64x8 equal = counters.equal_to(value);
-      small_successes[value] += popcount(equal & successes);
-      small_failures[value] += popcount(equal & failures);
-    }
-    const u64x8 large = counters.large();
-    counters.each(large & successes, [&](int64_t, uint64_t z) { large_successes.push_back(z); });
-    counters.each(large & failures, [&](int64_t, uint64_t z) { large_failures.push_back(z); });
-  }
-
-  // log of the product over j of theta_ij where it succeeded, 1 - theta_ij where it failed:
-  // theta_ij = (Z_ij + alpha) / total, so the numerators multiply up and the total is taken out.
-  double log_likelihood(double observed, double alpha) const {
-    uint64_t all = 0;
-    for (uint64_t value = 1; value < small_counts; ++value)
-      all += value * sum_of(small_successes[value] + small_failures[value]);
-    for (const std::vector<uint64_t> *large : {&large_successes, &large_failures})
-      for (const uint64_t value : *large)
-        all += value;
-    const double total = static_cast<double>(all) + observed * alpha;
-    double score = -observed * std::log(total);
-    for (uint64_t value = 0; value < small_counts; ++value) {
-      const double z = static_cast<double>(value);
-      if (const uint64_t times = sum_of(small_successes[value]))
-        score += static_cast<double>(times) * std::log(z + alpha);
-      if (const uint64_t times = sum_of(small_failures[value]))
-        score += static_cast<double>(times) * std::log((total - alpha) - z);
-    }
-    Product product;
-    for (const uint64_t z : large_successes)
-      product.multiply(static_cast<double>(z) + alpha);
-    for (const uint64_t z : large_failures)
-      product.multiply((total - alpha) - static_cast<double>(z));
-    return score + product.log();
-  }
-};
+  return score + product.log();
+}
 
 // One bit per observed node: whether it succeeded, and whether it failed.
 void outcome_masks(const PathEvidence &evidence, std::vector<u64x8> &successes,
@@ -257,22 +343,35 @@ uint64_t shared_paths(const PathBits &paths, int32_t a, int32_t b) {
   return count;
 }
 
+// The most paths that any of the nodes is on.
+int64_t most_paths(const PathBits &paths, const int32_t *nodes, int64_t count) {
+  int64_t most = 0;
+  for (int64_t i = 0; i < count; ++i) {
+    const uint64_t *row = paths.bits + nodes[i] * paths.stride;
+    int64_t bits = 0;
+    for (int64_t w = 0; w < paths.words; ++w)
+      bits += __builtin_popcountll(row[w]);
+    most = std::max(most, bits);
+  }
+  return most;
+}
+
 } // namespace
 
 void co_occurrence(const PathBits &paths, const int32_t *a, int64_t a_count, const int32_t *b,
                    int64_t b_count, int32_t *counts) {
   const NodesByPath others(paths, b, b_count);
-  std::vector<int32_t> list;
-  std::fill_n(counts, a_count * b_count, 0);
+  std::vector<int32_t> list(static_cast<size_t>(64 * paths.words + 4));
   for (int64_t i = 0; i < a_count; ++i) {
-    list_paths(paths, a[i], list);
+    const int64_t length = list_paths(paths, a[i], list.data());
     for (int64_t v = 0; v < others.vectors(); ++v) {
-      Counters counters;
-      counters.add_paths(list, others.rows(v), others.empty());
-      int32_t *row = counts + i * b_count + v * nodes_per_vector;
-      counters.each(~counters.equal_to(0), [&](int64_t j, uint64_t count) {
-        row[j] = static_cast<int32_t>(count);
-      });
+      const Counters counters(list.data(), length, others.rows(v), others.empty());
+      for (int64_t j = v * nodes_per_vector; j < std::min(b_count, (v + 1) * 512); ++j) {
+        int32_t count = 0;
+        for (int level = 0; level < counters.used; ++level)
+          count |= ((counters.planes[level][j % 512 / 64] >> (j % 64)) & 1) << level;
+        counts[i * b_count + j] = count;
+      }
     }
   }
 }
@@ -286,8 +385,12 @@ void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count
       failures(static_cast<size_t>(others.vectors()));
   if (observed > 0)
     outcome_masks(evidence, successes, failures);
-  std::vector<int32_t> list;
-  Tally tally;
+  const int64_t most = most_paths(paths, candidates, count);
+  std::vector<double> log_of_success(static_cast<size_t>(most + octet));
+  for (size_t z = 0; z < log_of_success.size(); ++z)
+    log_of_success[z] = std::log(static_cast<double>(z) + evidence.alpha);
+  std::vector<int32_t> list(static_cast<size_t>(most + 4));
+  Tally tally(most);
   for (int64_t i = 0; i < count; ++i) {
     scores[i] = 0;
     if (evidence.reference >= 0) {
@@ -297,14 +400,13 @@ void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count
     }
     if (observed == 0)
       continue;
-    list_paths(paths, candidates[i], list);
+    const int64_t length = list_paths(paths, candidates[i], list.data());
     tally.clear();
-    for (int64_t v = 0; v < others.vectors(); ++v) {
-      Counters counters;
-      counters.add_paths(list, others.rows(v), others.empty());
-      tally.count(counters, successes[static_cast<size_t>(v)], failures[static_cast<size_t>(v)]);
-    }
-    scores[i] += tally.log_likelihood(static_cast<double>(observed), evidence.alpha);
+    for (int64_t v = 0; v < others.vectors(); ++v)
+      tally.count(Counters(list.data(), length, others.rows(v), others.empty()),
+                  successes[static_cast<size_t>(v)], failures[static_cast<size_t>(v)]);
+    scores[i] += log_likelihood(tally.entries(), static_cast<double>(observed),
+                                evidence.alpha, log_of_success);
   }
 }
 

@@ -7,10 +7,6 @@ from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
 
-# Candidates with the same counts in another order have equal posteriors and must tie, but their
-# products differ in the last bits: 1,000 factors, each to 1e-16. Scores are compared to this.
-_SCORE_DECIMALS = 9
-
 
 class PathLiteralPolicy:
     """By p(y = i | Z, θ, π) over path memory, for all of Y (SPEC §4).
@@ -31,8 +27,11 @@ class PathLiteralPolicy:
         return order_by(context, -self.scores(context, context.neighbourhood.nodes))
 
     def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(N,) log posterior of nodes up to a common constant, rounded so that equals tie."""
-        scores = context.path_memory.scores(
+        """(N,) log posterior of nodes up to a common constant.
+
+        Nodes that share as many paths with as many of W tie to the last bit.
+        """
+        return context.path_memory.scores(
             nodes,
             context.observations.nodes,
             context.observations.succeeded,
@@ -41,4 +40,3 @@ class PathLiteralPolicy:
             alpha=self._alpha,
             gamma=self._gamma,
         )
-        return np.round(scores, _SCORE_DECIMALS)
