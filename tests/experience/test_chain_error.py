@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from tests.reference import chain_error as oracle
 from tests.worlds import covariance_of, forward
@@ -30,6 +30,7 @@ def test_model_of_a_covariance_equals_numpy(seed: int) -> None:
     np.testing.assert_allclose(error.pivot_in_a, pivot, atol=1e-5 * (1 + np.linalg.norm(pivot)))
 
 
+@example(0.0, 1e-8, [0.0, 1e-8, 6e-104])  # squares underflow
 @given(st.floats(0, 1), st.floats(1e-8, 1), st.lists(st.floats(-50, 50), min_size=3, max_size=3))
 def test_covariance_of_a_model_has_that_model(tau: float, v: float, pivot: list[float]) -> None:
     error = PivotedError(tau, v, np.array(pivot))

@@ -290,11 +290,12 @@ double largest_eigenvalue(const Symmetric &m) {
   for (const double value : centred)
     square += value * value;
   const double spread = std::sqrt(square / 6);
-  if (!(spread > 0))
+  if (!(spread > 1e-150)) // below, its square has underflown
     return mean;
+  for (double &value : centred)
+    value /= spread;
   const double *rows = centred.data();
-  const double ratio =
-      determinant(rows, rows + 3, rows + 6) / (2 * spread * spread * spread);
+  const double ratio = determinant(rows, rows + 3, rows + 6) / 2;
   return mean + 2 * spread * std::cos(std::acos(std::clamp(ratio, -1.0, 1.0)) / 3);
 }
 
