@@ -45,6 +45,7 @@ _MAGIC = b"SQLite format 3\x00"
 # Writers hold the file only for a checkpoint; somebody who waits longer than this is stuck.
 _BUSY_TIMEOUT_S = 30.0
 _CACHE_KIB = 8192
+_OLDEST_SQLITE = (3, 37, 0)  # knows STRICT tables
 
 
 class SqliteDatabase:
@@ -79,6 +80,7 @@ class SqliteDatabase:
             InputError: something is there already, or the folder is not.
             MapError: it cannot be written.
         """
+        _check_version()
         if path.exists() or path.is_symlink():
             raise InputError(f"{path} exists already; open it, or choose another name")
         if not path.parent.is_dir():
@@ -245,8 +247,17 @@ def _prepare_writer(connection: sqlite3.Connection) -> None:
     connection.execute("PRAGMA synchronous=FULL")
 
 
+def _check_version() -> None:
+    if sqlite3.sqlite_version_info < _OLDEST_SQLITE:
+        raise MapError(
+            f"this Python comes with SQLite {sqlite3.sqlite_version}; maps need "
+            f"{'.'.join(map(str, _OLDEST_SQLITE))} or newer"
+        )
+
+
 def _check_header(path: Path) -> None:
     """What can be said from the first 100 bytes, without letting SQLite near the file."""
+    _check_version()
     if not path.exists():
         raise NotAMapError(f"{path}: there is no such file")
     if path.is_dir():
