@@ -124,27 +124,46 @@ int16_t take_row(const int16_t *distances, int16_t i, int64_t begin, int64_t end
   return least;
 }
 
+bool any(Shorts lanes) {
+  typedef int64_t Longs __attribute__((vector_size(64)));
+  Longs words;
+  std::memcpy(&words, &lanes, sizeof words);
+  int64_t all = 0;
+  for (int k = 0; k < 8; ++k)
+    all |= words[k];
+  return all != 0;
+}
+
+bool apart(const SortedFrame &sorted, int32_t a, int32_t b, double limit_px) {
+  return std::abs(sorted.u[a] - sorted.u[b]) > limit_px ||
+         std::abs(sorted.v[a] - sorted.v[b]) > limit_px;
+}
+
 // The first column at the smallest distance, or -1 where another corner is nearly as close. The
 // same corner found in a second octave is no rival.
 int64_t distinct_column(const int16_t *distances, int64_t begin, int64_t end, int16_t least,
-                        double ratio, double same_corner_px, const SortedFrame &sorted) {
+                        double ratio, double same_corner_px, const SortedFrame &sorted,
+                        std::vector<int32_t> &close) {
   const auto limit = static_cast<int16_t>(std::min(least / ratio, 256.0));
-  int64_t best = -1;
-  for (int64_t j = begin; j < end && best < 0; ++j)
-    if (distances[j] == least)
-      best = j;
+  close.clear();
+  int32_t best = -1;
   for (int64_t block = begin; block < end; block += kColumns) {
-    int16_t near = 0;
-    for (int64_t j = block; j < block + kColumns; ++j)
-      near = static_cast<int16_t>(near | (distances[j] <= limit ? 1 : 0));
-    if (!near)
+    if (!any(load(distances + block) <= limit))
       continue;
-    for (int64_t j = block; j < block + kColumns; ++j)
-      if (distances[j] <= limit && j != best &&
-          (std::abs(sorted.u[j] - sorted.u[best]) > same_corner_px ||
-           std::abs(sorted.v[j] - sorted.v[best]) > same_corner_px))
+    for (auto j = static_cast<int32_t>(block); j < block + kColumns; ++j) {
+      if (distances[j] > limit)
+        continue;
+      // Two so far apart cannot both be the best one's corner.
+      if (!close.empty() && apart(sorted, close.front(), j, 2 * same_corner_px))
         return -1;
+      close.push_back(j);
+      if (best < 0 && distances[j] == least)
+        best = j;
+    }
   }
+  for (const int32_t j : close)
+    if (apart(sorted, j, best, same_corner_px))
+      return -1;
   return best;
 }
 
@@ -157,6 +176,7 @@ public:
       right = std::max(right, frame.pixels[2 * row]);
       bottom = std::max(bottom, frame.pixels[2 * row + 1]);
     }
+    right_ = right, bottom_ = bottom;
     columns_ = static_cast<int>(std::min(right, kExtent) / kCell) + 1;
     rows_ = static_cast<int>(std::min(bottom, kExtent) / kCell) + 1;
     starts_.assign(columns_ * rows_ + 1, 0);
@@ -168,6 +188,11 @@ public:
     std::vector<int32_t> next(starts_.begin(), starts_.end() - 1);
     for (int64_t row = 0; row < frame.count; ++row)
       members_[next[cell_of(row)]++] = static_cast<int32_t>(row);
+  }
+
+  // Whether a place is closer than the margin to the image's landmarks.
+  bool within(double u, double v, double margin) const {
+    return u >= -margin && v >= -margin && u <= right_ + margin && v <= bottom_ + margin;
   }
 
   template <class Visit>
@@ -195,6 +220,7 @@ private:
   }
 
   const FrameView &frame_;
+  double right_, bottom_;
   int columns_, rows_;
   std::vector<int32_t> starts_, members_;
 };
@@ -205,27 +231,40 @@ struct Window {
   Vec3 radius;
 };
 
-bool predict(const FrameView &reference, int64_t row, const FrameView &live,
+double variance_along(const double row[6], const std::array<double, 36> &covariance) {
+  double total = 0;
+  for (int a = 0; a < 6; ++a) {
+    double cross = 0.5 * covariance[7 * a] * row[a];
+    for (int b = 0; b < a; ++b)
+      cross += covariance[6 * a + b] * row[b];
+    total += 2 * row[a] * cross;
+  }
+  return total;
+}
+
+bool predict(const FrameView &reference, int64_t row, const FrameView &live, const Grid &grid,
              const Prediction &prediction, const MatchSettings &settings, Window &window) {
-  const float *point = reference.points_in_cam + 3 * row;
-  const Linearised seen = linearise(live.camera, prediction.reference_from_live,
-                                    {point[0], point[1], point[2]});
-  if (!seen.in_front)
+  const float *p = reference.points_in_cam + 3 * row;
+  const Vec3 point = {p[0], p[1], p[2]};
+  const Vec3 in_live = transform_back(prediction.reference_from_live, point);
+  if (in_live[2] <= kNearest_m)
     return false;
+  window.stereo = project(live.camera, in_live);
+  if (!grid.within(window.stereo[0], window.stereo[1], settings.max_radius_px))
+    return false;
+  const Linearised seen = linearise(live.camera, prediction.reference_from_live, point);
   const double sigma = reference.disparity_sigma_px[row], disparity = reference.disparity_px[row];
   const double offset = settings.offset_sigma_px;
   const double depth_variance = (sigma * sigma + offset * offset) / (disparity * disparity);
   const double scale = power(settings.octave_scale, reference.octaves[row]);
   const double pixel = settings.pixel_sigma_px * (scale + 1);
   for (int k = 0; k < 3; ++k) {
-    double variance = pixel * pixel + depth_variance * seen.by_depth[k] * seen.by_depth[k];
-    for (int a = 0; a < 6; ++a)
-      for (int b = 0; b < 6; ++b)
-        variance += seen.by_pose[k][a] * prediction.covariance[6 * a + b] * seen.by_pose[k][b];
+    const double variance = pixel * pixel +
+                            depth_variance * seen.by_depth[k] * seen.by_depth[k] +
+                            variance_along(seen.by_pose[k], prediction.covariance);
     window.radius[k] =
         std::min(settings.gate_sigmas * std::sqrt(std::max(variance, 0.0)), settings.max_radius_px);
   }
-  window.stereo = seen.stereo;
   return true;
 }
 
@@ -240,6 +279,7 @@ void match_all(const FrameView &reference, const FrameView &live, const MatchSet
   std::vector<int16_t> distances(sorted.padded, kFar), nearest_distance(sorted.padded, kFar),
       nearest_row(sorted.padded, -1);
   std::vector<RowPair> forward; // `live` is still a column
+  std::vector<int32_t> close;
   for (int64_t i = 0; i < reference.count; ++i) {
     const Patch patch = patch_of(reference, i, settings);
     const double reach = settings.patch_ratio * patch.doubt * patch.doubt;
@@ -258,7 +298,7 @@ void match_all(const FrameView &reference, const FrameView &live, const MatchSet
     if (least > settings.max_distance)
       continue;
     const int64_t column = distinct_column(distances.data(), begin, end, least, settings.ratio,
-                                           settings.same_corner_px, sorted);
+                                           settings.same_corner_px, sorted, close);
     if (column >= 0)
       forward.push_back({static_cast<int32_t>(i), static_cast<int32_t>(column), least});
   }
@@ -277,7 +317,7 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
   std::vector<std::pair<int32_t, int32_t>> candidates; // distance, live row
   for (int64_t i = 0; i < reference.count; ++i) {
     Window window;
-    if (!predict(reference, i, live, prediction, settings, window))
+    if (!predict(reference, i, live, grid, prediction, settings, window))
       continue;
     uint64_t descriptor[4];
     std::memcpy(descriptor, reference.descriptors + 4 * i, sizeof descriptor);

@@ -263,16 +263,22 @@ public:
                 const std::vector<RowPair> &pairs, const MatchSettings &settings)
       : count_(static_cast<int>(pairs.size())), words_((count_ + 63) / 64),
         bits_(static_cast<size_t>(count_) * words_, 0) {
-    std::vector<End> x, y;
+    Ends x, y;
     for (const RowPair &pair : pairs) {
-      x.push_back(end_of(reference, pair.reference, settings));
-      y.push_back(end_of(live, pair.live, settings));
+      x.add(reference, pair.reference, settings);
+      y.add(live, pair.live, settings);
     }
-    const double gate2 = settings.gate_sigmas * settings.gate_sigmas;
-    for (int i = 0; i < count_; ++i)
-      for (int j = 0; j < i; ++j)
-        if (keep_distance(x[i], x[j], y[i], y[j], gate2))
-          join(i, j);
+    x.pad();
+    y.pad();
+    const auto gate2 = static_cast<float>(settings.gate_sigmas * settings.gate_sigmas);
+    for (int i = 0; i < count_; ++i) {
+      uint64_t *row = bits_.data() + static_cast<size_t>(i) * words_;
+      for (int j = 0; j < count_; j += kLanes)
+        row[j / 64] |= keep_distance(x, y, i, j, gate2) << (j % 64);
+      row[i / 64] &= ~(uint64_t{1} << (i % 64));
+      if (count_ % 64)
+        row[words_ - 1] &= (uint64_t{1} << (count_ % 64)) - 1;
+    }
   }
 
   int degree(int i) const { return popcount(row(i), row(i)); }
@@ -309,35 +315,52 @@ public:
   int words() const { return words_; }
 
 private:
-  struct End {
-    Vec3 point;
-    double relative_variance, lateral_variance;
+  // One side's landmarks. Depth errors move them along their rays, pixel errors across.
+  struct Ends {
+    std::vector<float> x, y, z, relative_variance, lateral_variance;
+
+    void add(const FrameView &frame, int32_t row, const MatchSettings &settings) {
+      const float *point = frame.points_in_cam + 3 * row;
+      const double lateral = pixel_sigma(frame, row, settings) * point[2] / frame.camera.fx;
+      x.push_back(point[0]), y.push_back(point[1]), z.push_back(point[2]);
+      relative_variance.push_back(static_cast<float>(
+          relative_depth_variance(frame, row, settings, OffsetsAre::noise)));
+      lateral_variance.push_back(static_cast<float>(lateral * lateral));
+    }
+
+    void pad() {
+      const size_t padded = (x.size() + kLanes - 1) / kLanes * kLanes;
+      for (auto *values : {&x, &y, &z, &relative_variance, &lateral_variance})
+        values->resize(padded, 0);
+    }
   };
 
-  static End end_of(const FrameView &frame, int32_t row, const MatchSettings &settings) {
-    const Vec3 point = point_of(frame, row);
-    const double lateral = pixel_sigma(frame, row, settings) * point[2] / frame.camera.fx;
-    return {point, relative_depth_variance(frame, row, settings, OffsetsAre::noise),
-            lateral * lateral};
+  // Squared distance of landmark i to sixteen others, and its variance times that distance.
+  static void distances(const Ends &ends, int i, int j, Floats &squared, Floats &spread) {
+    const Floats x = load(&ends.x[j]), y = load(&ends.y[j]), z = load(&ends.z[j]);
+    const Floats dx = ends.x[i] - x, dy = ends.y[i] - y, dz = ends.z[i] - z;
+    squared = dx * dx + dy * dy + dz * dz;
+    const Floats here = dx * ends.x[i] + dy * ends.y[i] + dz * ends.z[i];
+    const Floats there = dx * x + dy * y + dz * z;
+    spread = here * here * ends.relative_variance[i] +
+             there * there * load(&ends.relative_variance[j]);
   }
 
-  static bool keep_distance(const End &xi, const End &xj, const End &yi, const End &yj,
-                            double gate2) {
-    double squared[2], variance = 0;
-    const End *ends[2][2] = {{&xi, &xj}, {&yi, &yj}};
-    for (int side = 0; side < 2; ++side) {
-      const End &a = *ends[side][0], &b = *ends[side][1];
-      const Vec3 apart = a.point - b.point;
-      squared[side] = dot(apart, apart);
-      // Depth errors move the points along their rays, pixel errors across.
-      const double da = dot(apart, a.point), db = dot(apart, b.point);
-      variance += (da * da * a.relative_variance + db * db * b.relative_variance) /
-                      (squared[side] + 1e-6) + a.lateral_variance +
-                  b.lateral_variance;
-    }
-    // (p − q)² ≤ g²σ² without a square root: p² + q² − g²σ² ≤ 2pq.
-    const double left = squared[0] + squared[1] - gate2 * variance;
-    return left <= 0 || left * left <= 4 * squared[0] * squared[1];
+  // Bit k says whether matches i and j + k keep their distance: with p, q the distances on either
+  // side, (p − q)² ≤ g²σ². As (p² − q²)² ≤ g²σ² (p + q)² it needs no root, and (p + q)² is
+  // 2 (p² + q²) where p ≈ q.
+  static uint64_t keep_distance(const Ends &x, const Ends &y, int i, int j, float gate2) {
+    Floats squared_x, squared_y, spread_x, spread_y;
+    distances(x, i, j, squared_x, spread_x);
+    distances(y, i, j, squared_y, spread_y);
+    const Floats lateral = (x.lateral_variance[i] + y.lateral_variance[i]) +
+                           load(&x.lateral_variance[j]) + load(&y.lateral_variance[j]);
+    const Floats apart = squared_x - squared_y, both = squared_x + squared_y;
+    const Ints keep =
+        apart * apart <= gate2 * (4.0f * (spread_x + spread_y) + 2.0f * both * lateral);
+    const Ints bit = {1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
+                      1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
+    return static_cast<uint64_t>(sum(keep & bit));
   }
 
   static int popcount_words(const uint64_t *a, const uint64_t *b, int words) {
@@ -348,11 +371,6 @@ private:
   }
   int popcount(const uint64_t *a, const uint64_t *b) const { return popcount_words(a, b, words_); }
   const uint64_t *row(int i) const { return bits_.data() + static_cast<size_t>(i) * words_; }
-  void join(int i, int j) {
-    bits_[static_cast<size_t>(i) * words_ + j / 64] |= uint64_t{1} << (j % 64);
-    bits_[static_cast<size_t>(j) * words_ + i / 64] |= uint64_t{1} << (i % 64);
-  }
-
   int count_, words_;
   std::vector<uint64_t> bits_;
 };
@@ -388,6 +406,55 @@ bool align(const Vec3 x[3], const Vec3 y[3], Pose &reference_from_live) {
   return true;
 }
 
+std::vector<uint8_t> inliers(const Correspondences &matches, const Estimate &estimate,
+                             double chi2) {
+  const FloatPose live_from_reference(estimate.pose, estimate.offsets);
+  std::vector<uint8_t> result(matches.padded);
+  for (int64_t i = 0; i < matches.padded; i += kLanes) {
+    const Block block(matches, i, live_from_reference);
+    const Ints inlier = block.usable & (block.chi2 < static_cast<float>(chi2));
+    for (int lane = 0; lane < kLanes; ++lane)
+      result[i + lane] = inlier[lane] != 0;
+  }
+  return result;
+}
+
+constexpr int kIterations = 8; // Newton's method needs three or four from a good start
+
+// Estimates pose and offsets from all matches, starting close by, and who agrees with them.
+PoseEstimate settle(const FrameView &reference, const FrameView &live,
+                    const std::vector<RowPair> &pairs, const MatchSettings &settings,
+                    Estimate estimate) {
+  const Correspondences matches =
+      correspondences(reference, live, pairs, settings, OffsetsAre::estimated);
+  const auto equations =
+      refine<kPoseAndOffsets>(matches, estimate, static_cast<float>(settings.chi2), kIterations,
+                              OffsetPrior(settings));
+  const std::vector<uint8_t> agrees = inliers(matches, estimate, settings.chi2);
+  PoseEstimate result;
+  for (size_t i = 0; i < pairs.size(); ++i)
+    if (agrees[i])
+      result.inliers.push_back(pairs[i]);
+  double factor[64], covariance[64];
+  std::copy(equations.hessian, equations.hessian + 64, factor);
+  result.found = static_cast<int32_t>(result.inliers.size()) >= settings.min_consensus &&
+                 estimate.pose.rotation[8] >= settings.max_view_angle_cosine &&
+                 factorise(factor, kPoseAndOffsets);
+  if (!result.found) {
+    result.inliers.clear();
+    return result;
+  }
+  invert_factorised(factor, kPoseAndOffsets, covariance);
+  // Errors that landmarks share: more of them do not average them out.
+  const double shared =
+      1 + static_cast<double>(result.inliers.size()) / settings.independent_landmarks;
+  for (int row = 0; row < 6; ++row)
+    for (int column = 0; column < 6; ++column)
+      result.covariance[6 * row + column] = shared * covariance[8 * row + column];
+  result.reference_from_live = estimate.pose;
+  return result;
+}
+
 // Thresholds on χ² with three degrees of freedom, as multiples of the final one: a hypothesis from
 // three points is judged loosely, since its own error adds to that of the matches.
 constexpr float kLoose = 4;
@@ -409,13 +476,19 @@ public:
     order_.resize(std::min<size_t>(order_.size(), kGraphSize));
   }
 
+  // Searches for the pose that most matches agree on, and settles it.
   PoseEstimate run(const RigidTransform *first_guess) {
-    if (static_cast<int32_t>(pairs_.size()) >= std::max(settings_.min_consensus, 3)) {
-      if (first_guess)
-        consider(*first_guess);
-      search();
-    }
-    return finish();
+    if (static_cast<int32_t>(pairs_.size()) < std::max(settings_.min_consensus, 3))
+      return {};
+    if (first_guess)
+      consider(*first_guess);
+    search();
+    if (best_.inliers < settings_.min_consensus)
+      return {};
+    Estimate estimate{pose_, {}};
+    // The pose alone first: with the offsets free, a start far off could bend them instead.
+    refine<kPose>(matches_, estimate, static_cast<float>(settings_.chi2), kIterations, prior_);
+    return settle(reference_, live_, pairs_, settings_, estimate);
   }
 
 private:
@@ -523,56 +596,6 @@ private:
     return kGoodSample * graph.chance(members);
   }
 
-  static std::vector<uint8_t> inliers(const Correspondences &matches, const Estimate &estimate,
-                                      double chi2) {
-    const FloatPose live_from_reference(estimate.pose, estimate.offsets);
-    std::vector<uint8_t> result(matches.padded);
-    for (int64_t i = 0; i < matches.padded; i += kLanes) {
-      const Block block(matches, i, live_from_reference);
-      const Ints inlier = block.usable & (block.chi2 < static_cast<float>(chi2));
-      for (int lane = 0; lane < kLanes; ++lane)
-        result[i + lane] = inlier[lane] != 0;
-    }
-    return result;
-  }
-
-  // Estimates pose and offsets from all matches, and who agrees with them.
-  PoseEstimate finish() const {
-    PoseEstimate result;
-    if (best_.inliers < settings_.min_consensus)
-      return result;
-    constexpr int kIterations = 10;
-    const Correspondences matches =
-        correspondences(reference_, live_, pairs_, settings_, OffsetsAre::estimated);
-    // The pose alone first: with the offsets free, a start far off could bend them instead.
-    Estimate estimate{pose_, {}};
-    refine<kPose>(matches_, estimate, static_cast<float>(settings_.chi2), kIterations, prior_);
-    const auto equations = refine<kPoseAndOffsets>(
-        matches, estimate, static_cast<float>(settings_.chi2), kIterations, prior_);
-    const std::vector<uint8_t> agrees = inliers(matches, estimate, settings_.chi2);
-    for (size_t i = 0; i < pairs_.size(); ++i)
-      if (agrees[i])
-        result.inliers.push_back(pairs_[i]);
-    double factor[64], covariance[64];
-    std::copy(equations.hessian, equations.hessian + 64, factor);
-    result.found = static_cast<int32_t>(result.inliers.size()) >= settings_.min_consensus &&
-                   estimate.pose.rotation[8] >= settings_.max_view_angle_cosine &&
-                   factorise(factor, kPoseAndOffsets);
-    if (!result.found) {
-      result.inliers.clear();
-      return result;
-    }
-    invert_factorised(factor, kPoseAndOffsets, covariance);
-    // Errors that landmarks share: more of them do not average them out.
-    const double shared =
-        1 + static_cast<double>(result.inliers.size()) / settings_.independent_landmarks;
-    for (int row = 0; row < 6; ++row)
-      for (int column = 0; column < 6; ++column)
-        result.covariance[6 * row + column] = shared * covariance[8 * row + column];
-    result.reference_from_live = estimate.pose;
-    return result;
-  }
-
   const FrameView &reference_, &live_;
   const MatchSettings &settings_;
   Random random_;
@@ -606,10 +629,8 @@ PoseEstimate attempt(const FrameView &reference, const FrameView &live,
     return first;
   const Prediction found{first.reference_from_live, first.covariance};
   match_near(reference, live, found, settings, pairs);
-  MatchSettings no_search = settings;
-  no_search.max_samples = 0;
   PoseEstimate second =
-      estimate_pose(reference, live, pairs, no_search, seed, &first.reference_from_live);
+      settle(reference, live, pairs, settings, {first.reference_from_live, {}});
   return second.inliers.size() >= first.inliers.size() ? second : first;
 }
 

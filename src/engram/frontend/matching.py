@@ -85,7 +85,7 @@ class MatcherConfig:
     independent_landmarks: float = 10.0
     min_consensus: int = 6
     max_samples: int = 3000
-    max_hypotheses: int = 400
+    max_hypotheses: int = 600
     confidence: float = 0.999
     max_view_angle_rad: float = 1.2
     second_pass: bool = True
