@@ -7,12 +7,14 @@ from collections.abc import Callable
 import typer
 
 from engram.cli.benchmark import bench
+from engram.cli.demonstration import demo
 from engram.cli.extraction import extract
 from engram.cli.inspection import check, info, log, seal
 from engram.cli.localisation import localise
 from engram.cli.mapping import map_
 
 VERBS: dict[str, Callable[..., None]] = {
+    "demo": demo,
     "extract": extract,
     "map": map_,
     "localise": localise,
