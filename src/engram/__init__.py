@@ -1,3 +1,64 @@
-"""Engram: lifelong visual localisation for fleets of robots with stereo cameras."""
+"""Engram: lifelong visual localisation for fleets of robots with stereo cameras.
+
+The names below are what integrators need; each is documented where it is defined. They are
+imported when first used, so that ``import engram`` and ``engram --help`` cost nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from engram.drive import LiveRobot, OpenMap, Settings, map_drive, open_drive, open_map
+    from engram.errors import EngramError
+    from engram.frontend import StereoPair
+    from engram.geometry import SE3, StereoCamera
+    from engram.localiser import Budget, Localisation, LocalisationStatus, Position
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "SE3",
+    "Budget",
+    "EngramError",
+    "LiveRobot",
+    "Localisation",
+    "LocalisationStatus",
+    "OpenMap",
+    "Position",
+    "Settings",
+    "StereoCamera",
+    "StereoPair",
+    "__version__",
+    "map_drive",
+    "open_drive",
+    "open_map",
+]
+
+_HOMES = {
+    "SE3": "engram.geometry",
+    "Budget": "engram.localiser",
+    "EngramError": "engram.errors",
+    "LiveRobot": "engram.drive",
+    "Localisation": "engram.localiser",
+    "LocalisationStatus": "engram.localiser",
+    "OpenMap": "engram.drive",
+    "Position": "engram.localiser",
+    "Settings": "engram.drive",
+    "StereoCamera": "engram.geometry",
+    "StereoPair": "engram.frontend",
+    "map_drive": "engram.drive",
+    "open_drive": "engram.drive",
+    "open_map": "engram.drive",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'engram' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

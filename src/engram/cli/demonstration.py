@@ -63,8 +63,9 @@ def _tell(report: DemoReport) -> None:
         )
     console.print(found)
     console.print(
-        f"In {report.out}: one_place.png (the same place in six conditions), matches_path/ (live\n"
-        "image and node side by side, inliers joined), map_from_above.png (experiences in colour),\n"
-        "attempts.png (what each frame cost). With one attempt a frame it matters which experience\n"
-        "is tried: `distance` takes the nearest node, `path` the one that drives like this one used."
+        f"In {report.out}: one_place.png, the same place in six conditions; matches_path/, live "
+        "image and node side by side with their inliers joined; map_from_above.png, experiences "
+        "in colour; attempts.png, what each frame cost. With one attempt a frame it matters which "
+        "experience is tried: `distance` takes the nearest node, `path` one that went together "
+        "with those that matched just now in earlier drives."
     )

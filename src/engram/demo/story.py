@@ -26,6 +26,7 @@ from engram.drive import (
     open_drive,
     summarise,
 )
+from engram.drive.live import ignore
 from engram.errors import InputError
 from engram.sequences import SimulatedSequence
 from engram.simulation import SimulatedDrive, campaign_named
@@ -72,7 +73,7 @@ class DemoReport:
 def silent(what: str, total: int) -> Iterator[Callable[[str], None]]:
     """Progress that is not shown."""
     del what, total
-    yield lambda word: None if word else None
+    yield ignore
 
 
 def run_demo(out: Path, progress: Progress = silent, threads: int = 2) -> DemoReport:

@@ -1,0 +1,26 @@
+"""What `import engram` offers, and what it costs."""
+
+import subprocess
+import sys
+
+import engram
+
+
+def test_every_public_name_is_there() -> None:
+    for name in engram.__all__:
+        assert getattr(engram, name) is not None
+    assert set(engram._HOMES) == set(engram.__all__) - {"__version__"}
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    assert not hasattr(engram, "no_such_name")
+
+
+def test_importing_engram_and_its_program_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, engram, engram.cli.verbs\n"
+        "heavy = {'numpy', 'cv2', 'scipy', 'sqlalchemy', 'matplotlib', 'rich'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
