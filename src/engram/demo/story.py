@@ -95,10 +95,11 @@ def run_demo(out: Path, progress: Progress = silent, threads: int = 2) -> DemoRe
     except OSError as error:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from error
     campaign = campaign_named(_CAMPAIGN)
-    drives = [SimulatedDrive(campaign, i, threads) for i in range(len(campaign.sessions))]
+    sequences = [SimulatedSequence(campaign, i, threads) for i in range(len(campaign.sessions))]
+    drives = [sequence.drive for sequence in sequences]
     report = DemoReport(out)
     report.conditions = [_condition(drive) for drive in drives]
-    logs = [_render(drive, out, progress) for drive in drives]
+    logs = [_render(sequence, out, progress) for sequence in sequences]
     map_path = out / f"{_CAMPAIGN}.engram"
     map_path.unlink(missing_ok=True)
     for log, condition in zip(logs[:-1], report.conditions, strict=False):
@@ -116,12 +117,12 @@ def _condition(drive: SimulatedDrive) -> str:
     return f"{plan.start:%a %H:%M}, {plan.weather}, {plan.robot}"
 
 
-def _render(drive: SimulatedDrive, out: Path, progress: Progress) -> Path:
+def _render(sequence: SimulatedSequence, out: Path, progress: Progress) -> Path:
     """The drive's frame log; rendered where it is not there yet."""
+    drive = sequence.drive
     log = out / f"{_CAMPAIGN}_{drive.plan.number}.framelog"
     if log.exists() and open_drive(log).complete:  # type: ignore[union-attr]  # a frame log is
         return log
-    sequence = SimulatedSequence(drive)
     with progress(f"drive: {_condition(drive)}", len(sequence)) as advance:
         extract_log(sequence, log, Settings(), advance)
     return log

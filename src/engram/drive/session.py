@@ -18,11 +18,7 @@ from engram.sequences import (
     session_of,
 )
 
-<<<<<<< HEAD
 DriveSequence: TypeAlias = ImageSequence | FrameLog | ThereAndBack | SimulatedSequence
-=======
-DriveSequence: TypeAlias = ImageSequence | FrameLog | SimulatedSequence | ThereAndBack
->>>>>>> d6985e7 (wip demo)
 
 
 def open_drive(
