@@ -19,7 +19,7 @@ def demo(
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Where logs, map and pictures go.")
     ] = Path("demo"),
-    threads: Annotated[int, typer.Option("--threads", min=1, help="Of the renderer.")] = 2,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes that render.")] = 2,
     as_json: options.Json = False,
 ) -> None:
     """Drive a small simulated town with two robots, map it, and localise another drive in it.
@@ -27,12 +27,12 @@ def demo(
     \b
     Examples:
       engram demo
-      engram demo --out /tmp/demo --threads 4
+      engram demo --out /tmp/demo --workers 4
     """
     from engram.cli.progress import progress
     from engram.demo import run_demo
 
-    report = run_demo(out, progress, threads)
+    report = run_demo(out, progress, workers)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

@@ -21,14 +21,13 @@ from engram.drive import (
     OpenMap,
     PictureWriter,
     Settings,
-    extract_log,
     map_drive,
     open_drive,
+    simulate,
     summarise,
 )
 from engram.drive.live import ignore
 from engram.errors import InputError
-from engram.sequences import SimulatedSequence
 from engram.simulation import SimulatedDrive, campaign_named
 from engram.store import MapStore
 from engram.viewing import Track, draw_attempts, draw_from_above
@@ -76,7 +75,7 @@ def silent(what: str, total: int) -> Iterator[Callable[[str], None]]:
     yield ignore
 
 
-def run_demo(out: Path, progress: Progress = silent, threads: int = 2) -> DemoReport:
+def run_demo(out: Path, progress: Progress = silent, workers: int = 2) -> DemoReport:
     """Renders the drives, maps all but the last, localises the last, and draws pictures.
 
     What an earlier run has rendered is not rendered again.
@@ -84,7 +83,7 @@ def run_demo(out: Path, progress: Progress = silent, threads: int = 2) -> DemoRe
     Args:
         out: folder to write to, made where there is none.
         progress: makes a progress bar: a context manager of title and length.
-        threads: of the renderer.
+        workers: processes that render.
 
     Raises:
         InputError: the folder cannot be made.
@@ -95,11 +94,12 @@ def run_demo(out: Path, progress: Progress = silent, threads: int = 2) -> DemoRe
     except OSError as error:
         raise InputError(f"{out}: cannot be made: {error.strerror}") from error
     campaign = campaign_named(_CAMPAIGN)
-    sequences = [SimulatedSequence(campaign, i, threads) for i in range(len(campaign.sessions))]
-    drives = [sequence.drive for sequence in sequences]
+    drives = [SimulatedDrive(campaign, i) for i in range(len(campaign.sessions))]
     report = DemoReport(out)
     report.conditions = [_condition(drive) for drive in drives]
-    logs = [_render(sequence, out, progress) for sequence in sequences]
+    with progress("drive", sum(len(drive) for drive in drives)) as advance:
+        rendered = simulate(campaign, out, workers=workers, advance=advance)
+    logs = [Path(file) for file in rendered.files]
     map_path = out / f"{_CAMPAIGN}.engram"
     map_path.unlink(missing_ok=True)
     for log, condition in zip(logs[:-1], report.conditions, strict=False):
@@ -115,17 +115,6 @@ def run_demo(out: Path, progress: Progress = silent, threads: int = 2) -> DemoRe
 def _condition(drive: SimulatedDrive) -> str:
     plan = drive.plan
     return f"{plan.start:%a %H:%M}, {plan.weather}, {plan.robot}"
-
-
-def _render(sequence: SimulatedSequence, out: Path, progress: Progress) -> Path:
-    """The drive's frame log; rendered where it is not there yet."""
-    drive = sequence.drive
-    log = out / f"{_CAMPAIGN}_{drive.plan.number}.framelog"
-    if log.exists() and open_drive(log).complete:  # type: ignore[union-attr]  # a frame log is
-        return log
-    with progress(f"drive: {_condition(drive)}", len(sequence)) as advance:
-        extract_log(sequence, log, Settings(), advance)
-    return log
 
 
 def _localise(
