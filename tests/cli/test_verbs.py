@@ -1,0 +1,246 @@
+"""The program as a user meets it: every verb, and what it says when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.cli.verbs import VERBS
+
+FRAME_KEYS = {
+    "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
+    "candidates", "open_loop_m", "ms",
+}  # fmt: skip
+STATUSES = {"localised", "dead_reckoning", "lost", "no_odometry"}
+
+
+@pytest.fixture
+def town(engram, street: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "town.engram"
+    assert engram("map", path, street).status == 0
+    return path
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_every_verb_has_help_with_an_example_to_paste(engram, verb: str) -> None:
+    ran = engram(verb, "--help")
+    assert ran.status == 0
+    assert "Examples:" in ran.out
+    assert f"engram {verb}" in ran.out
+
+
+def test_mapping_reports_what_it_saved(engram, street: Path, tmp_path: Path) -> None:
+    report = engram("map", tmp_path / "a.engram", street, "--json").json
+    assert report["frames"] == 12
+    # 12 frames 0.8 m apart, a node for each metre begun.
+    assert 5 <= report["nodes_saved"] <= 12
+    assert report["revision"] == 1
+
+
+def test_the_same_drive_again_changes_nothing(engram, street: Path, town: Path) -> None:
+    before = engram("info", town, "--json").json
+    again = engram("map", town, street, "--json").json
+    assert again["known"]
+    assert engram("info", town, "--json").json == before
+
+
+def test_localise_gives_the_documented_json(engram, street: Path, town: Path) -> None:
+    result = engram("localise", town, street, "--json").json
+    assert set(result) == {"summary", "frames"}
+    assert result["summary"]["frames"] == len(result["frames"]) == 12
+    for frame in result["frames"]:
+        assert set(frame) == FRAME_KEYS
+        assert frame["status"] in STATUSES
+        localised = frame["status"] == "localised"
+        assert (frame["node_from_live"] is not None) == localised
+        if localised:
+            matrix = np.array(frame["node_from_live"]).reshape(4, 4)
+            np.testing.assert_allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-9)
+            np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+    # The very images that the map was made of.
+    assert result["summary"]["share_localised"] == 1.0
+    assert result["summary"]["attempts_per_frame"] <= 4
+
+
+def test_budget_bounds_the_attempts(engram, street: Path, town: Path) -> None:
+    arguments = ("--lanes", 1, "--rounds", 1, "--policy", "random", "--json")
+    result = engram("localise", town, street, *arguments).json
+    assert all(frame["attempts"] <= 1 for frame in result["frames"])
+
+
+@pytest.mark.parametrize("policy", ["distance", "path", "path-literal", "random"])
+def test_every_policy_localises(engram, street: Path, town: Path, policy: str) -> None:
+    result = engram("localise", town, street, "--policy", policy, "--json").json
+    assert result["summary"]["share_localised"] > 0.5
+
+
+def test_a_frame_log_localises_exactly_as_its_images(
+    engram, street: Path, town: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "street.framelog"
+    assert engram("extract", street, log, "--json").json["frames"] == 12
+    from_images = engram("localise", town, street, "--json").json["frames"]
+    from_log = engram("localise", town, log, "--json").json["frames"]
+    for one, other in zip(from_images, from_log, strict=True):
+        assert {**one, "ms": 0} == {**other, "ms": 0}
+
+
+def test_trajectory_is_tum_and_close_to_the_drive(
+    engram, street: Path, town: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "street.tum"
+    engram("localise", town, street, "--trajectory", out)
+    lines = out.read_text().splitlines()
+    assert "not globally consistent" in "\n".join(line for line in lines if line[0] == "#")
+    rows = np.array([line.split() for line in lines if line[0] != "#"], dtype=float)
+    assert rows.shape == (12, 8)
+    # 11 steps of 0.8 m straight on.
+    assert np.linalg.norm(rows[-1, 1:4]) == pytest.approx(8.8, rel=0.05)
+
+
+def test_pictures_show_chosen_frames(engram, street: Path, town: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "pictures"
+    engram("localise", town, street, "--pictures", folder, "--every", 5)
+    assert [path.name for path in sorted(folder.iterdir())] == [
+        "000000_localised.png", "000005_localised.png", "000010_localised.png",
+    ]  # fmt: skip
+
+
+def test_replay_in_real_time_counts_late_frames(engram, street: Path, town: Path) -> None:
+    # At 2,000 Hz nothing can be in time but what waits for no one.
+    ran = engram("localise", town, street, "--rate", 2000, "--preload", "--json").json
+    assert ran["summary"]["late_frames"] > 0
+    # Without a rate there is no schedule to be late for.
+    assert engram("localise", town, street, "--json").json["summary"]["late_frames"] == 0
+
+
+def test_there_and_back_is_a_drive_of_its_own(engram, street: Path, tmp_path: Path) -> None:
+    path = tmp_path / "loop.engram"
+    report = engram("map", path, street, "--there-and-back", 40, "--json").json
+    assert report["frames"] == 40
+    assert not engram("map", path, street, "--json").json["known"]
+
+
+def test_log_and_check_speak_of_a_sound_map(engram, town: Path) -> None:
+    assert engram("log", town, "--json").json[0]["number"] == 1
+    ran = engram("check", town, "--json")
+    assert ran.status == 0
+    assert ran.json["sound"]
+    assert ran.json["problems"] == []
+
+
+def test_check_finds_a_flipped_byte_and_ends_with_one(engram, town: Path) -> None:
+    content = bytearray(town.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    town.write_bytes(content)
+    ran = engram("check", town, "--json")
+    assert ran.status == 1
+    assert ran.json["problems"]
+    assert all(problem["fact"] for problem in ran.json["problems"])
+
+
+def test_nothing_to_seal(engram, town: Path) -> None:
+    assert "no session was interrupted" in engram("seal", town).out
+
+
+def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Path) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text("[mapper]\nsave_every_m = 2.0\n")
+    sparse = engram("map", tmp_path / "b.engram", street, "--config", settings, "--json").json
+    dense = engram("map", tmp_path / "c.engram", street, "--json").json
+    assert sparse["nodes_saved"] < dense["nodes_saved"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("localise", "absent.engram", "STREET"), "absent.engram"),
+        (("localise", "TOWN", "nowhere"), "nowhere"),
+        (("localise", "TOWN", "STREET", "--policy", "best"), "known: "),
+        (("localise", "TOWN", "STREET", "--relocaliser", "gps"), "known: "),
+        (("localise", "TOWN", "STREET", "--at", 7), "not 7"),
+        (("localise", "TOWN", "STREET", "--frames", "1:x"), "1:x"),
+        (("localise", "TOWN", "STREET", "--config", "CALIBRATION"), "unknown setting"),
+        (("localise", "CALIBRATION", "STREET"), "calibration.toml"),
+        (("map", "CALIBRATION", "STREET"), "calibration.toml"),
+        (("map", "no/such/folder/a.engram", "STREET"), "no/such/folder"),
+        (("map", "TOWN", "STREET", "--start", "yesterday"), "yesterday"),
+        (("map", "TOWN", "STREET", "--longitude", 400), "400"),
+        (("extract", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
+        (("info", "STREET"), "street"),
+        (("bench", "--only", "warp"), "warp"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_status_two(
+    engram, street: Path, town: Path, arguments: tuple[object, ...], says: str
+) -> None:
+    places = {"TOWN": town, "STREET": street, "CALIBRATION": street / "calibration.toml"}
+    ran = engram(*(places.get(one, one) for one in arguments))
+    assert ran.status == 2
+    assert ran.err.startswith("engram: ")
+    assert says in ran.err
+    assert "Traceback" not in ran.err
+
+
+def test_errors_are_json_where_json_was_asked_for(engram, street: Path) -> None:
+    ran = engram("localise", "absent.engram", street, "--json")
+    assert ran.status == 2
+    assert ran.json["error"]["kind"] == "NotAMapError"
+    assert "absent.engram" in ran.json["error"]["message"]
+
+
+def test_a_bad_image_stops_the_drive_or_is_skipped_and_counted(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(street, broken)
+    (broken / "left" / "000005.png").write_bytes(b"no image at all")
+    ran = engram("map", tmp_path / "a.engram", broken)
+    assert ran.status == 2
+    assert "000005.png" in ran.err
+    report = engram("map", tmp_path / "b.engram", broken, "--skip-bad", "--json").json
+    assert report["skipped_pairs"] == 1
+    assert report["frames"] == 11
+
+
+def test_a_second_writer_is_told_who_writes(engram, street: Path, town: Path) -> None:
+    holder = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            "import sys; from engram.store import MapStore\n"
+            f"with MapStore.open_for_writing({str(town)!r}):\n"
+            "    print('open', flush=True); sys.stdin.read()",
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"open\n"
+    try:
+        ran = engram("map", town, street, "--robot", "other", "--json")
+        assert ran.status == 2
+        assert ran.json["error"]["kind"] == "MapLockedError"
+        assert str(holder.pid) in ran.json["error"]["message"]
+        # Reading goes on meanwhile.
+        assert engram("localise", town, street, "--json").json["summary"]["frames"] == 12
+    finally:
+        holder.communicate()
+
+
+def test_bench_gives_the_documented_json(engram) -> None:
+    ran = engram("bench", "--only", "attempt_512,rank_150_paths", "--repeats", 3, "--json")
+    stages = ran.json["stages"]
+    assert set(stages) == {"attempt_512", "rank_150_paths"}
+    for stage in stages.values():
+        assert {"ms", "p99_ms", "reference_ms", "ratio"} <= set(stage)
+        assert math.isfinite(stage["ms"])
+    assert ran.json["machine"]
+    json.dumps(ran.json)
