@@ -66,7 +66,12 @@ def map_simulated(
         opened = OpenMap(store)
         saver = Saver(writer, store.frames)
         localiser = opened.localiser(
-            first.camera, Settings(), policy=policy, budget=Budget(**budget), session=session.id
+            first.camera,
+            Settings(),
+            policy=policy,
+            budget=Budget(**budget),
+            live=session.id,
+            saves=True,
         )
         with localiser:
             mapper = Mapper(opened.graph, localiser, saver, session)

@@ -63,6 +63,19 @@ def test_quaternion_round_trip(tangent) -> None:
     np.testing.assert_allclose(again.matrix(), transform.matrix(), atol=1e-12)
 
 
+@given(tangents())
+def test_a_stored_matrix_comes_back_to_the_bit(tangent) -> None:
+    transform = SE3.exp(tangent)
+    np.testing.assert_array_equal(SE3.from_matrix(transform.matrix()).matrix(), transform.matrix())
+
+
+def test_a_rough_rotation_is_projected() -> None:
+    rough = np.eye(4)
+    rough[0, 1] = 1e-4
+    rotation = SE3.from_matrix(rough).rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
+
+
 def test_yaw_is_positive_to_the_right() -> None:
     turned_right = SE3.exp([0, 0, 0, 0, 0.3, 0])  # about y, which points down
     assert turned_right.yaw_rad == pytest.approx(0.3)

@@ -26,7 +26,7 @@ from engram.errors import (
 from engram.experience.model import Clock
 from engram.geometry import SE3, propagate_covariance
 from engram.odometry import OdometryStatus
-from engram.sequences import FrameLog, FrameLogWriter, LoggedFrame, open_sequence
+from engram.sequences import FrameLog, FrameLogWriter, FrameRange, LoggedFrame, open_sequence
 
 from .synthetic import (
     PAIRS,
@@ -129,6 +129,30 @@ def test_a_failed_step_makes_the_composed_step_fail(tmp_path: Path, failed: int)
     assert composed[1].status is OdometryStatus.NO_CONSENSUS
     assert composed[1].prev_from_curr is None
     assert composed[1].inliers == 0
+
+
+@pytest.mark.parametrize("frames", ["0::2", "0::3", "1::2"])
+def test_no_motion_is_lost_across_an_unusable_frame(tmp_path: Path, frames: str) -> None:
+    # Frame 3 is dark: step 4 spans it, from frame 2.
+    recorded = [
+        logged(index, OdometryStatus.UNUSABLE_FRAME if index == 3 else None)
+        for index in range(PAIRS)
+    ]
+    path = write_log(tmp_path / "a.framelog", recorded)
+    chosen = [int(index) for index in np.arange(PAIRS)[FrameRange.parse(frames).indices(PAIRS)]]
+    log = open_sequence(path, frames=frames)
+    whole = SE3.identity()
+    for entry in log:
+        if entry.odometry.prev_from_curr is not None:
+            whole = whole @ entry.odometry.prev_from_curr
+    expected = SE3.identity()
+    last_usable = max(index for index in chosen if index != 3)
+    for index in range(chosen[0] + 1, last_usable + 1):
+        if index != 3:
+            expected = expected @ recorded[index].odometry.prev_from_curr
+    np.testing.assert_allclose(whole.matrix(), expected.matrix(), atol=1e-13)
+    by_index = [log.read(i).odometry.status for i in range(len(log))]
+    assert by_index == [entry.odometry.status for entry in log]
 
 
 def test_a_start_time_makes_a_relative_clock_utc(tmp_path: Path) -> None:

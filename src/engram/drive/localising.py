@@ -11,7 +11,7 @@ from types import TracebackType
 from engram.drive.live import LiveFrame, live_frames
 from engram.drive.opened_map import open_map
 from engram.drive.results import FrameResult
-from engram.drive.session import DriveSequence
+from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
 from engram.localiser import Budget, Localiser
 
@@ -61,6 +61,7 @@ class LocaliseRun:
             policy=options.policy,
             budget=Budget(options.lanes, options.rounds),
             relocaliser=options.relocaliser,
+            live=session_of_drive(sequence).id,
         )
 
     def __enter__(self) -> LocaliseRun:

@@ -200,7 +200,8 @@ def _map_frames(
         policy=options.policy,
         budget=Budget(options.lanes, options.rounds),
         relocaliser=options.relocaliser,
-        session=writer.session.id,
+        live=writer.session.id,
+        saves=True,
     )
     with localiser:
         mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper)

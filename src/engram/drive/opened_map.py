@@ -14,7 +14,13 @@ from engram.experience.model import SessionId
 from engram.experience.path_memory import PathMemory
 from engram.frontend import DescriptorKind, Frontend, StereoPair
 from engram.geometry import StereoCamera
-from engram.localiser import RELOCALISERS, Budget, Localisation, Localiser
+from engram.localiser import (
+    RELOCALISERS,
+    UNNAMED_LIVE_SESSION,
+    Budget,
+    Localisation,
+    Localiser,
+)
 from engram.odometry import Odometry
 from engram.ranking import POLICIES
 from engram.store import MapStore
@@ -75,7 +81,8 @@ class OpenMap:
         policy: str = "path",
         budget: Budget | None = None,
         relocaliser: str | None = "exhaustive",
-        session: SessionId | None = None,
+        live: SessionId = UNNAMED_LIVE_SESSION,
+        saves: bool = False,
     ) -> Localiser:
         """A localiser for one session in this map.
 
@@ -85,7 +92,8 @@ class OpenMap:
             policy: key of `POLICIES`.
             budget: by default 2 lanes × 2 rounds.
             relocaliser: key of `RELOCALISERS`; None for none.
-            session: the session that is being mapped; None for one that saves nothing.
+            live: the live session.
+            saves: whether it is being mapped.
 
         Raises:
             ConfigError: there is no such policy or relocaliser.
@@ -104,7 +112,8 @@ class OpenMap:
             budget=budget or Budget(),
             relocaliser=None if relocaliser is None else RELOCALISERS[relocaliser](self.graph),
             basin=MatchBasin.of(camera.fx, self.attempts),
-            session=session,
+            live=live,
+            saves=saves,
             config=settings.localiser,
         )
 
@@ -160,7 +169,6 @@ class LiveRobot:
             policy=policy,
             budget=budget,
             relocaliser=relocaliser,
-            session=None,
         )
 
     def __enter__(self) -> LiveRobot:

@@ -44,6 +44,9 @@ class SE3:
     def from_matrix(matrix: ArrayLike) -> SE3:
         """From a (4, 4) or (3, 4) matrix; the rotation is projected onto SO(3).
 
+        One that is a rotation to within rounding is kept to the bit, so that what was stored
+        comes back as it was.
+
         Raises:
             InputError: the shape is wrong, a value is not finite, or the upper left 3×3 block is
                 further than 1e-3 from a rotation.
@@ -53,9 +56,12 @@ class SE3:
             raise InputError(f"a transform has shape (4, 4) or (3, 4), not {values.shape}")
         if not np.isfinite(values).all():
             raise InputError("a transform must be finite")
-        left, _, right = np.linalg.svd(values[:3, :3])
+        given = values[:3, :3]
+        if np.abs(given @ given.T - np.eye(3)).max() < 1e-12 and np.linalg.det(given) > 0:
+            return SE3(given.copy(), values[:3, 3].copy())
+        left, _, right = np.linalg.svd(given)
         rotation = left @ right
-        if np.linalg.det(rotation) < 0 or np.abs(rotation - values[:3, :3]).max() > 1e-3:
+        if np.linalg.det(rotation) < 0 or np.abs(rotation - given).max() > 1e-3:
             raise InputError("the upper left 3×3 block of a transform must be a rotation")
         return SE3(rotation, values[:3, 3].copy())
 

@@ -2,12 +2,13 @@
 
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
-from engram.localiser.localiser import Localiser, LocaliserConfig
+from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
 from engram.localiser.relocalisation import RELOCALISERS, Exhaustive, Relocaliser
 from engram.localiser.walk import Walk
 
 __all__ = [
     "RELOCALISERS",
+    "UNNAMED_LIVE_SESSION",
     "AcceptanceConfig",
     "Budget",
     "Exhaustive",

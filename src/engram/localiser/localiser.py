@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from types import TracebackType
-from uuid import uuid4
+from uuid import uuid5
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from engram.experience.basin import MatchBasin
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import (
+    ENGRAM_NAMESPACE,
     Attempt,
     LandmarkSource,
     Node,
@@ -36,6 +37,8 @@ from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import RankingContext, RankingPolicy, RecentAttempts
 
 _PREFETCH = 16
+# Stands for a drive that is not identified: equal input gives equal results there too.
+UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +80,9 @@ class Localiser:
         budget: how much may be attempted per frame.
         relocaliser: finds a lost robot; None leaves it dead-reckoning with a growing radius.
         basin: the match basin of this session's camera.
-        session: the live session, whose own recent nodes are no candidates; None for a robot
-            that saves nothing.
+        live: the live session; its UUID seeds the matcher, so that the same drive gives the same
+            results.
+        saves: whether the session is being mapped: then its own recent nodes are no candidates.
         config: settings.
     """
 
@@ -92,11 +96,13 @@ class Localiser:
         budget: Budget,
         relocaliser: Relocaliser | None,
         basin: MatchBasin,
-        session: SessionId | None = None,
+        live: SessionId = UNNAMED_LIVE_SESSION,
+        saves: bool = False,
         config: LocaliserConfig | None = None,
     ) -> None:
         self.config = config or LocaliserConfig()
-        self.session = session
+        self.live = live
+        self._own_session = live if saves else None
         self._graph = graph
         self._paths = paths
         self._frames = frames
@@ -105,9 +111,8 @@ class Localiser:
         self._relocaliser = relocaliser
         self._basin = basin
         self._attempter = Attempter(frames, budget, self.config.matcher, self.config.acceptance)
-        self._live_session = session or SessionId(uuid4())
         self._recent = RecentAttempts()
-        self.walk = Walk(path_id(self._live_session))
+        self.walk = Walk(path_id(self.live))
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
@@ -193,7 +198,7 @@ class Localiser:
             clock.lap("rank")
             candidates = self._candidates(live, neighbourhood, order)
             outcomes = self._attempter.run(
-                live, node_id(self._live_session, live.stamp_ns), candidates, deadline
+                live, node_id(self.live, live.stamp_ns), candidates, deadline
             )
             clock.lap("attempts")
             self._remember(neighbourhood, outcomes)
@@ -247,7 +252,7 @@ class Localiser:
             position.covariance,
             radius_m=radius_m,
             view_gate_rad=self.config.view_gate_rad,
-            own_session=self.session,
+            own_session=self._own_session,
             own_driven_m=self._driven_m,
             own_exclusion_m=self.config.own_exclusion_m,
         )
@@ -305,7 +310,7 @@ class Localiser:
     def _is_recent_own(self, index: int) -> bool:
         node = self._graph.node(index)
         return (
-            node.session == self.session
+            node.session == self._own_session
             and node.driven_m > self._driven_m - self.config.own_exclusion_m
         )
 

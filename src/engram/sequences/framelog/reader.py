@@ -74,7 +74,7 @@ class FrameLog:
             with file.plain_errors(self._path), self._engine.connect() as connection:
                 file.check_kind(connection, self._path)
                 self._header, self._complete = read_header(connection)
-                stamps_ns = _read_stamps(connection)
+                stamps_ns, self._usable = _read_stamps(connection)
         except MapCorruptError as error:
             raise self._named(error) from error
         self._info = with_options(self._header.info, options)
@@ -155,7 +155,8 @@ class FrameLog:
                     raise MapCorruptError(f"{error}; --skip-bad goes on without it") from error
                 self._skipped_reasons.append(str(error))
                 continue
-            previous = number
+            if logged.odometry.status is not OdometryStatus.UNUSABLE_FRAME:
+                previous = number
             yield logged
 
     def read(self, index: int) -> LoggedFrame:
@@ -165,20 +166,16 @@ class FrameLog:
             MapCorruptError: its bytes do not match their hash.
         """
         index = range(len(self._numbers))[index]
-        previous = self._numbers[index - 1] if index > 0 else None
-        return self._read(self._numbers[index], previous)
+        usable = (number for number in self._numbers[:index][::-1] if self._usable[number])
+        return self._read(self._numbers[index], next(usable, None))
 
     def _read(self, number: int, previous: int | None) -> LoggedFrame:
-        """A frame with the motion since frame `previous`, FIRST where there is none."""
+        """A frame with the motion since `previous`, the last usable frame that was chosen."""
         try:
             with file.plain_errors(self._path), self._engine.connect() as connection:
                 row, step = self._frame_row(connection, number)
                 frame = decode_frame(step, row.landmarks, row.thumbnail, self._header)
-                odometry = (
-                    OdometryStep(OdometryStatus.FIRST)
-                    if previous is None
-                    else self._motion(connection, previous, step)
-                )
+                odometry = self._motion(connection, previous, step)
         except MapCorruptError as error:
             raise self._named(error) from error
         return LoggedFrame(replace(frame, stamp_ns=frame.stamp_ns + self._shift_ns), odometry)
@@ -192,8 +189,12 @@ class FrameLog:
             raise MapCorruptError(f"frame {number} is gone")
         return row, decode_step(row)
 
-    def _motion(self, connection: Connection, previous: int, last: StepRow) -> OdometryStep:
-        """Motion of a frame since frame `previous`, composed over those between them."""
+    def _motion(self, connection: Connection, previous: int | None, last: StepRow) -> OdometryStep:
+        """Motion of a frame since `previous`, composed over the frames between them."""
+        if last.odometry.status is OdometryStatus.UNUSABLE_FRAME:
+            return last.odometry
+        if previous is None:
+            return OdometryStep(OdometryStatus.FIRST)
         composed: OdometryStep | None = None
         if last.number - previous > 1:
             try:
@@ -226,10 +227,13 @@ class FrameLog:
 def compose(first: OdometryStep | None, second: OdometryStep) -> OdometryStep:
     """Two successive steps as one; a failure of either is the failure of both.
 
+    An unusable frame between them is passed over: the step behind it spans it (`OdometryStep`).
     The covariance is first order with independent errors, the inliers are those of the weaker.
     """
-    if first is None or first.status is not OdometryStatus.OK:
-        return first or second
+    if first is None or first.status is OdometryStatus.UNUSABLE_FRAME:
+        return second
+    if second.status is OdometryStatus.UNUSABLE_FRAME or first.status is not OdometryStatus.OK:
+        return first
     if second.status is not OdometryStatus.OK:
         return second
     assert first.prev_from_curr is not None
@@ -260,17 +264,19 @@ def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
     return FrameLogHeader.from_json(rows[0].header), bool(rows[0].complete)
 
 
-def _read_stamps(connection: Connection) -> NDArray[np.int64]:
-    rows = connection.execute(
-        select(frames_table.c.number, frames_table.c.stamp_ns).order_by(frames_table.c.number)
-    ).all()
+def _read_stamps(connection: Connection) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """(F,) stamps of all frames, and (F,) whether odometry could use them."""
+    columns = frames_table.c
+    query = select(columns.number, columns.stamp_ns, columns.odometry_status)
+    rows = connection.execute(query.order_by(columns.number)).all()
     if not rows:
         raise SequenceError("the frame log holds no frame")
-    if not all(isinstance(value, int) for row in rows for value in row):
+    if not all(isinstance(value, int) for row in rows for value in row[:2]):
         raise MapCorruptError("the frame log has stamps that are no numbers")
-    table = np.array(rows, dtype=np.int64).reshape(-1, 2)
+    table = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
     if (table[:, 0] != np.arange(len(table))).any():
         raise MapCorruptError("frames are missing in the frame log: their numbers have gaps")
     if (np.diff(table[:, 1]) <= 0).any():
         raise MapCorruptError("the frame log's stamps do not rise")
-    return table[:, 1].copy()
+    usable = [row.odometry_status != OdometryStatus.UNUSABLE_FRAME.value for row in rows]
+    return table[:, 1].copy(), np.array(usable)
