@@ -11,6 +11,7 @@ void bind_graph_search(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
 void bind_matching(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
+void bind_places(nb::module_ &module);
 void bind_render(nb::module_ &module);
 void bind_window_ba(nb::module_ &module);
 
@@ -22,6 +23,7 @@ NB_MODULE(_core, module) {
   bind_hamming(module);
   bind_matching(module);
   bind_path_scores(module);
+  bind_places(module);
   bind_render(module);
   bind_window_ba(module);
 }

@@ -1,0 +1,54 @@
+"""Bag of words: the similarity of two images' words, rare words counting more. The baseline.
+
+Source: Sivic & Zisserman, Video Google, ICCV 2003. A word counts once however often an image shows
+it: repeated structure would drown the rest (Jégou et al., On the burstiness of visual elements,
+CVPR 2009).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.places.recogniser import Recognition, best_places
+from engram.places.vocabulary import Vocabulary
+
+
+class BagOfWords:
+    """A `PlaceRecogniser` by the cosine of tf-idf vectors. Knows nothing of new places.
+
+    Args:
+        vocabulary: its training images tell how rare each word is.
+    """
+
+    name = "bag-of-words"
+
+    def __init__(self, vocabulary: Vocabulary) -> None:
+        statistics = vocabulary.statistics
+        self._idf = np.log((statistics.images + 1) / (statistics.seen + 0.5))
+        self._index = _core.PlaceIndex(len(vocabulary))
+        self._norms = np.zeros(16)
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def add(self, words: NDArray[np.int32]) -> int:
+        """See `PlaceRecogniser`."""
+        number = self._index.add(words)
+        if number == len(self._norms):
+            self._norms = np.concatenate([self._norms, np.zeros(max(16, number // 8))])
+        self._norms[number] = self._norm(words)
+        return number
+
+    def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
+        """See `PlaceRecogniser`."""
+        sums = np.zeros(len(self))
+        self._index.add_weights(words, self._idf[words] ** 2, sums)
+        norms = self._norms[: len(self)] * self._norm(words)
+        cosines = np.divide(sums, norms, out=np.zeros_like(sums), where=norms > 0)
+        best = best_places(cosines, count)
+        return Recognition(best, cosines[best], None)
+
+    def _norm(self, words: NDArray[np.int32]) -> float:
+        return float(np.linalg.norm(self._idf[words]))

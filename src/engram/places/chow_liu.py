@@ -1,0 +1,136 @@
+"""The Chow-Liu tree: which word tells most about which.
+
+Source: Chow & Liu, Approximating discrete probability distributions with dependence trees, IEEE
+Transactions on Information Theory 14(3), 1968; used for visual words by Cummins & Newman, FAB-MAP,
+IJRR 27(6), 2008, §4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+# Words whose rows of the mutual information are held at a time: 40 MB at 10,000 words.
+_BLOCK = 512
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WordStatistics:
+    """How often words are seen, alone and together with their parent in the tree: exact counts.
+
+    Attributes:
+        images: number of training images.
+        seen: (W,) int32, images that show each word.
+        parents: (W,) int32, parent of each word in the Chow-Liu tree; -1 for a root. Words that
+            tell nothing about each other hang in trees of their own.
+        seen_with_parent: (W,) int32, images that show both; 0 for a root.
+    """
+
+    images: int
+    seen: NDArray[np.int32]
+    parents: NDArray[np.int32]
+    seen_with_parent: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+
+def learn_statistics(
+    images: list[NDArray[np.int32]], words: int, advance: Callable[[float], None]
+) -> WordStatistics:
+    """Counts words and grows the tree of the greatest total mutual information.
+
+    The mutual information of all pairs is never held at once: of each block of rows only what the
+    maximum spanning forest keeps is carried on. That is exact, since an edge that is the weakest
+    of a cycle among some of the edges is so among all.
+
+    Args:
+        images: the distinct words (n,) of each training image.
+        words: size of the vocabulary, W.
+        advance: called now and then with the share of the work that is done, 0…1.
+    """
+    shown = _occurrences(images, words)
+    seen = np.asarray(shown.sum(axis=0), dtype=np.int32)
+    by_word = shown.T.tocsr()
+    forest: csr_array = csr_array((words, words))
+    for first in range(0, words, _BLOCK):
+        rows = np.arange(first, min(first + _BLOCK, words))
+        both = (by_word[rows] @ shown).toarray()
+        information = mutual_information(both, seen[rows, None], seen[None, :], len(images))
+        information[np.arange(words) <= rows[:, None]] = 0  # each pair once
+        forest = _strongest(forest, information, first)
+        advance((rows[-1] + 1) / words)
+    parents = _rooted(forest, seen)
+    return WordStatistics(len(images), seen, parents, _with_parent(by_word, parents))
+
+
+def mutual_information(
+    both: NDArray[np.float64], a: NDArray[np.int32], b: NDArray[np.int32], images: int
+) -> NDArray[np.float64]:
+    """Of two binary variables in nats, from counts; arrays broadcast against each other.
+
+    Args:
+        both: images that show both words.
+        a, b: images that show the one, and the other.
+        images: their number.
+    """
+    p_a, p_b = a / images, b / images
+    p_both = both / images
+    joint = (p_both, p_a - p_both, p_b - p_both, 1 - p_a - p_b + p_both)
+    apart = (p_a * p_b, p_a * (1 - p_b), (1 - p_a) * p_b, (1 - p_a) * (1 - p_b))
+    total = np.zeros(np.broadcast_shapes(both.shape, a.shape, b.shape))
+    for p, q in zip(joint, apart, strict=True):
+        seen = (p > 0) & (q > 0)
+        ratio = np.divide(p, q, out=np.ones_like(total), where=seen)
+        total += np.where(seen, p, 0) * np.log(ratio)
+    return np.maximum(total, 0)
+
+
+def _occurrences(images: list[NDArray[np.int32]], words: int) -> csr_array:
+    """(images, W) float64, 1 where an image shows a word."""
+    lengths = [len(image) for image in images]
+    columns = np.concatenate([*images, np.zeros(0, np.int32)])
+    starts = np.concatenate([[0], np.cumsum(lengths)])
+    return csr_array((np.ones(len(columns)), columns, starts), shape=(len(images), words))
+
+
+def _strongest(forest: csr_array, information: NDArray[np.float64], first: int) -> csr_array:
+    """The maximum spanning forest of a forest and a block of rows from `first` on."""
+    rows, columns = np.nonzero(information)
+    old = forest.tocoo()
+    words = forest.shape[0]
+    weights = np.concatenate([old.data, -information[rows, columns]])
+    ends = (np.concatenate([old.row, rows + first]), np.concatenate([old.col, columns]))
+    return csr_array(minimum_spanning_tree(coo_array((weights, ends), (words, words)).tocsr()))
+
+
+def _rooted(forest: csr_array, seen: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Parent of each word, when each tree hangs from its most frequent word."""
+    words = len(seen)
+    parents = np.full(words, -1, np.int32)
+    _, tree_of = connected_components(forest, directed=False)
+    _, roots = np.unique(tree_of[np.argsort(-seen, kind="stable")], return_index=True)
+    by_frequency = np.argsort(-seen, kind="stable")
+    edges = forest.tocoo()
+    degree = np.bincount(np.concatenate([edges.row, edges.col]), minlength=words)
+    for root in by_frequency[roots]:
+        if degree[root] == 0:
+            continue
+        order, before = breadth_first_order(forest, int(root), directed=False)
+        parents[order[1:]] = before[order[1:]]
+    return parents
+
+
+def _with_parent(by_word: csr_array, parents: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Images that show a word and its parent."""
+    children = np.flatnonzero(parents >= 0)
+    together = np.zeros(len(parents), np.int32)
+    if len(children):
+        both = by_word[children].multiply(by_word[parents[children]])
+        together[children] = np.asarray(both.sum(axis=1)).ravel()
+    return together

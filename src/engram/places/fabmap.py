@@ -1,0 +1,174 @@
+"""FAB-MAP 2.0 with an inverted index: exact likelihoods at the cost of the words that are seen.
+
+log p(Z | L) is a sum over all words, most of which neither the image nor the place shows. What a
+place's words give when the image shows neither them nor their parents is summed up when the place
+is added; a query corrects that for the words that it shows and for their children in the tree, by
+walking through the places that show them. Nothing is left out or rounded.
+
+Source: Cummins & Newman, FAB-MAP, IJRR 27(6), 2008; Appearance-only SLAM at large scale with
+FAB-MAP 2.0, IJRR 30(9), 2011, §4.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from engram import _core
+from engram.errors import ConfigError
+from engram.places.observation import DetectorModel, ObservationModel
+from engram.places.recogniser import Recognition, best_places
+from engram.places.vocabulary import Vocabulary
+
+
+@dataclass(frozen=True, slots=True)
+class FabMapConfig:
+    """Settings of FAB-MAP.
+
+    Attributes:
+        detector: how well the front-end shows what is there.
+        new_place_prior: probability that an image shows none of the places, before looking. A lost
+            robot may as well be somewhere new.
+        naive_bayes: take words as independent instead of by the Chow-Liu tree.
+    """
+
+    detector: DetectorModel = field(default_factory=DetectorModel)
+    new_place_prior: float = 0.5
+    naive_bayes: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 < self.new_place_prior < 1:
+            raise ConfigError(
+                f"fabmap: new_place_prior is {self.new_place_prior}, must be between 0 and 1"
+            )
+
+
+class FabMap:
+    """A `PlaceRecogniser` that knows probabilities, of new places too.
+
+    Args:
+        vocabulary: words, their company, and samples of places that are not in the map.
+        config: settings.
+    """
+
+    name = "fabmap"
+
+    def __init__(self, vocabulary: Vocabulary, config: FabMapConfig | None = None) -> None:
+        self.config = config or FabMapConfig()
+        model = ObservationModel.of(
+            vocabulary.statistics, self.config.detector, naive=self.config.naive_bayes
+        )
+        self._query = _QueryWeights(model)
+        self._places = _Likelihoods(len(vocabulary), model)
+        self._elsewhere = _Likelihoods(len(vocabulary), model)
+        for sample in vocabulary.samples:
+            self._elsewhere.add(sample)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @property
+    def bytes_per_place(self) -> float:
+        """Memory that each place takes, vocabulary not counted."""
+        return self._places.bytes / max(len(self), 1)
+
+    def add(self, words: NDArray[np.int32]) -> int:
+        """See `PlaceRecogniser`."""
+        return self._places.add(words)
+
+    def log_likelihoods(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Log p(Z | L) (P,) of an image with these words at each place."""
+        return self._places.of(self._query.weigh(words))
+
+    def log_likelihood_elsewhere(self, words: NDArray[np.int32]) -> float:
+        """Log p(Z | none of the places): the mean likelihood over sampled places."""
+        sampled = self._elsewhere.of(self._query.weigh(words))
+        return float(logsumexp(sampled)) - float(np.log(max(len(sampled), 1)))
+
+    def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
+        """See `PlaceRecogniser`. Before looking, all places are equally likely."""
+        if len(self) == 0:
+            return Recognition(np.zeros(0, np.int64), np.zeros(0), 1.0)
+        prior = self.config.new_place_prior
+        weights = self._query.weigh(words)
+        scores = self._places.of(weights)
+        scores += np.log((1 - prior) / len(self))
+        sampled = self._elsewhere.of(weights)
+        elsewhere = float(logsumexp(sampled)) + float(np.log(prior / max(len(sampled), 1)))
+        greatest = max(float(scores.max()), elsewhere)
+        # What is e^-40 of the most likely is lost in the rounding of the sum.
+        near = scores[scores > greatest - 40.0]
+        evidence = greatest + np.log(np.exp(near - greatest).sum() + np.exp(elsewhere - greatest))
+        best = best_places(scores, count)
+        return Recognition(
+            best, np.exp(scores[best] - evidence), float(np.exp(elsewhere - evidence))
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Weighed:
+    """A query, as far as it differs from an image without words.
+
+    Attributes:
+        constant: log-likelihood of the image at a place without words.
+        words: (n,) int32, words seen and their children.
+        weights: (n,) float64, what a place gains by showing each, over what it has gained anyway.
+    """
+
+    constant: float
+    words: NDArray[np.int32]
+    weights: NDArray[np.float64]
+
+
+class _QueryWeights:
+    """Turns the words of a query into weights of words."""
+
+    def __init__(self, model: ObservationModel) -> None:
+        unseen, seen = model.log_p
+        gain = seen - unseen
+        self._has_parent = model.parents >= 0
+        self._parents = np.maximum(model.parents, 0)
+        self._weight = gain - gain[0]
+        self._empty = unseen - unseen[0]
+        self._nothing = float(unseen[0].sum())
+
+    def weigh(self, words: NDArray[np.int32]) -> _Weighed:
+        z = np.zeros(len(self._parents), np.int8)
+        z[words] = 2
+        case = z + ((z[self._parents] > 0) & self._has_parent)
+        touched = np.flatnonzero(case).astype(np.int32)
+        case = case[touched]
+        constant = self._nothing + float(self._empty[case, touched].sum())
+        return _Weighed(constant, touched, self._weight[case, touched])
+
+
+class _Likelihoods:
+    """Places, and the log-likelihood of a query at each."""
+
+    def __init__(self, words: int, model: ObservationModel) -> None:
+        self._index = _core.PlaceIndex(words)
+        self._gain_unseen = model.log_p[1, 0] - model.log_p[0, 0]
+        self._base = np.zeros(16)
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    @property
+    def bytes(self) -> int:
+        return self._index.bytes + self._base.nbytes
+
+    def add(self, words: NDArray[np.int32]) -> int:
+        number = self._index.add(words)
+        if number == len(self._base):
+            self._base = np.concatenate([self._base, np.zeros(max(16, number // 8))])
+        self._base[number] = self._gain_unseen[words].sum()
+        return number
+
+    def of(self, query: _Weighed) -> NDArray[np.float64]:
+        """(P,) float64."""
+        sums = self._base[: len(self)] + query.constant
+        self._index.add_weights(query.words, query.weights, sums)
+        return sums
