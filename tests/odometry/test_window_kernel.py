@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from engram import _core
 from engram.geometry import SE3
@@ -63,10 +64,18 @@ class Problem:
         }
         return _core.adjust_window(**{**arguments, **changes})
 
+    def forget(self, lost: NDArray[np.bool_]) -> None:
+        """Drop observations."""
+        for name in ("frame", "track", "stereo", "sigmas"):
+            setattr(self, name, getattr(self, name)[~lost])
 
-@pytest.mark.parametrize(("seed", "gross"), [(0, 0), (1, 6)])
-def test_agrees_with_the_plain_twin(seed: int, gross: int) -> None:
+
+@pytest.mark.parametrize(("seed", "gross", "partly"), [(0, 0, False), (1, 6, False), (2, 0, True)])
+def test_agrees_with_the_plain_twin(seed: int, gross: int, partly: bool) -> None:
     problem = Problem(frames=4, points=25, seed=seed, gross=gross)
+    if partly:  # tracks of 2, 3 and 4 frames that begin and end anywhere, with gaps
+        problem.forget((problem.frame * 5 + problem.track * 3) % 11 < 3)
+        assert np.bincount(problem.track).min() >= 2
     matrices, covariance, _, offset, before, after = problem.solve()
     poses, expected_offset, cost, expected_covariance = adjust(
         CAMERA,
@@ -165,6 +174,7 @@ def test_what_determines_nothing_is_no_result() -> None:
         ({"frame": np.zeros(59, np.int32)}, ValueError),
         ({"world_from_cam": np.zeros((3, 3, 4))}, ValueError),
         ({"fixed": -1}, ValueError),
+        ({"frame": np.zeros(60, np.int32)}, ValueError),  # a track twice in one frame
     ],
 )
 def test_arguments_that_do_not_fit_are_refused(change: dict, error: type) -> None:

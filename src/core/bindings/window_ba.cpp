@@ -76,5 +76,5 @@ void bind_window_ba(nb::module_ &module) {
              "chi2"_a, "offset_px"_a, "offset_sigma_px"_a,
              "Optimises poses (P, 4, 4), landmarks and the offset of all disparities together: (world_from_cam (P, 4, 4), "
              "covariance of the free poses (6F, 6F), points (T, 3), offset px, cost before, cost after), or "
-             "None where the observations do not determine the poses.");
+             "None where the observations do not determine the poses. A frame sees a track once.");
 }
