@@ -125,6 +125,7 @@ def test_there_and_back_is_a_drive_of_its_own(engram, street: Path, tmp_path: Pa
     path = tmp_path / "loop.engram"
     report = engram("map", path, street, "--there-and-back", 40, "--json").json
     assert report["frames"] == 40
+    assert engram("check", path).status == 0
     assert not engram("map", path, street, "--json").json["known"]
 
 

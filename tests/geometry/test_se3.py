@@ -76,6 +76,15 @@ def test_a_rough_rotation_is_projected() -> None:
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
 
 
+def test_renormalising_squares_what_is_left_of_skew() -> None:
+    rng = np.random.default_rng(4)
+    skewed = SE3.exp([1, 2, 3, 0.5, -0.4, 2.0])
+    skewed = SE3(skewed.rotation + rng.normal(0, 1e-6, (3, 3)), skewed.translation)
+    rotation = skewed.renormalised().rotation
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-10)
+    np.testing.assert_allclose(rotation, skewed.rotation, atol=1e-5)
+
+
 def test_yaw_is_positive_to_the_right() -> None:
     turned_right = SE3.exp([0, 0, 0, 0, 0.3, 0])  # about y, which points down
     assert turned_right.yaw_rad == pytest.approx(0.3)

@@ -27,6 +27,8 @@ _LINKS = frozenset({EdgeKind.PROXIMITY, EdgeKind.MATCH, EdgeKind.TIE})
 # Nodes of one experience that are further apart than this along the drive are different passes of
 # the place, each joined for itself. Also how far back own nodes are no neighbours (SPEC §3.1).
 _PASS_GAP_M = 30.0
+# 99.9 % of χ² with six degrees of freedom: two estimates further apart contradict each other.
+_CONSISTENT_CHI2 = 22.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,14 +270,25 @@ def _junction(one: ChainTree, other: ChainTree, node: int) -> int:
 
 
 def _fused(edge: Edge, a_from_b: SE3, covariance: Array) -> Edge:
-    """The edge moved towards another estimate of it, as far as that is the surer one."""
+    """The edge moved towards another estimate of it, as far as that is the surer one.
+
+    Estimates that contradict each other are not averaged: somewhere a chain is worse than it
+    thinks, and what lies between two wrong places is a third. The surer one stands.
+    """
     difference = (a_from_b @ edge.a_from_b.inverse()).log()
-    gain = edge.covariance @ np.linalg.pinv(edge.covariance + covariance, hermitian=True)
-    fused = edge.covariance - gain @ edge.covariance
+    both = edge.covariance + covariance
+    try:
+        weighted = np.linalg.solve(both, np.column_stack([difference, edge.covariance]))
+    except np.linalg.LinAlgError:  # two edges without any uncertainty
+        return edge
+    if not difference @ weighted[:, 0] <= _CONSISTENT_CHI2:
+        surer = np.trace(covariance[:3, :3]) < np.trace(edge.covariance[:3, :3])
+        return Edge(edge.a, edge.b, edge.kind, a_from_b, covariance) if surer else edge
+    fused = edge.covariance - edge.covariance @ weighted[:, 1:]
     return Edge(
         edge.a,
         edge.b,
         edge.kind,
-        SE3.exp(gain @ difference) @ edge.a_from_b,
+        SE3.exp(edge.covariance @ weighted[:, 0]) @ edge.a_from_b,
         (fused + fused.T) / 2,
     )

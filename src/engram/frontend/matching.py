@@ -185,7 +185,8 @@ def match_frames(
         nothing = np.empty(0, dtype=np.int32)
         return Match(None, None, 0, nothing, nothing)
     matrix, covariance, reference_rows, live_rows = found
-    pose = SE3(matrix[:3, :3], matrix[:3, 3])
+    # Refinement multiplies many small updates in single precision: 1e-6 of skew.
+    pose = SE3(matrix[:3, :3], matrix[:3, 3]).renormalised()
     return Match(pose, covariance, len(live_rows), reference_rows, live_rows)
 
 

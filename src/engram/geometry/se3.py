@@ -125,6 +125,14 @@ class SE3:
         transposed = self.rotation.T
         return SE3(transposed, -(transposed @ self.translation))
 
+    def renormalised(self) -> SE3:
+        """The same with a rotation that has lost no digits: for the end of long products.
+
+        One Newton step towards the nearest rotation squares what is left of skew.
+        """
+        rotation = self.rotation
+        return SE3(1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation, self.translation)
+
     def matrix(self) -> Array:
         """The (4, 4) matrix."""
         matrix = np.eye(4)
