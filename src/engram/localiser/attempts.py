@@ -14,7 +14,7 @@ import numpy as np
 from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
 from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
-from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept, inlier_spread
 from engram.localiser.localisation import Budget
 
 
@@ -127,8 +127,9 @@ class Attempter:
         covariance = None
         if candidate.guided and prediction is not None:
             covariance = np.diag([prediction.sigma_m**2] * 3 + [prediction.sigma_yaw_rad**2] * 3)
+        node = self._frames.frame(candidate.node)
         match = match_frames(
-            self._frames.frame(candidate.node),
+            node,
             live,
             self._matcher,
             seed=pair_seed(live_id, candidate.node),
@@ -137,7 +138,9 @@ class Attempter:
             else None,
             predicted_covariance=covariance,
         )
-        return Outcome(candidate, rank, match, accept(match, prediction, self._acceptance))
+        spread = inlier_spread(match, node, live) if prediction is None else 1.0
+        accepted = accept(match, prediction, self._acceptance, spread)
+        return Outcome(candidate, rank, match, accepted)
 
 
 def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:
