@@ -1,9 +1,24 @@
 """The order in which a lost robot goes through a map."""
 
+from dataclasses import fields, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.localiser.relocalisation import Exhaustive, van_der_corput_order
+from engram.errors import IncompatibleError
+from engram.frontend import DescriptorKind, Frame, Landmarks
+from engram.localiser.relocalisation import (
+    RELOCALISERS,
+    Exhaustive,
+    Searched,
+    spread,
+    van_der_corput_order,
+)
+from engram.places import Vocabulary, default_vocabulary
+from synthetic_world import World, see
 
 
 @given(st.integers(0, 500))
@@ -21,22 +36,119 @@ def test_every_prefix_is_spread_over_the_map(count: int, taken: int) -> None:
 
 
 class _Nodes:
+    """As many nodes as there are frames; node i is named i."""
+
     def __init__(self, count: int) -> None:
         self.count = count
 
     def __len__(self) -> int:
         return self.count
 
+    def node(self, index: int) -> SimpleNamespace:
+        return SimpleNamespace(id=index)
+
+
+def exhaustive(graph: _Nodes) -> Exhaustive:
+    return Exhaustive(Searched(graph, None, None))
+
 
 def test_exhaustive_goes_through_the_map_over_successive_frames_and_starts_again() -> None:
     graph = _Nodes(5)
-    relocaliser = Exhaustive(graph)
-    proposed = [relocaliser.propose(None, 2) for _ in range(3)]
+    relocaliser = exhaustive(graph)
+    proposed = [relocaliser.propose(None, 2, anywhere) for _ in range(3)]
     assert [len(nodes) for nodes in proposed] == [2, 2, 1]
     assert sorted(node for nodes in proposed for node in nodes) == list(range(5))
     graph.count = 6  # a node that joined meanwhile is met in the next pass
-    assert 5 in [node for _ in range(3) for node in relocaliser.propose(None, 2)]
+    assert 5 in [node for _ in range(3) for node in relocaliser.propose(None, 2, anywhere)]
 
 
 def test_an_empty_map_proposes_nothing() -> None:
-    assert Exhaustive(_Nodes(0)).propose(None, 4) == []
+    assert exhaustive(_Nodes(0)).propose(None, 4, anywhere) == []
+
+
+def anywhere(index: int) -> bool:
+    return True
+
+
+class _Drive:
+    """Frames along a road of a synthetic world, as a graph and as a source of landmarks."""
+
+    def __init__(self, places_m: np.ndarray, descriptor=DescriptorKind.BRIEF) -> None:
+        world = World(length_m=float(places_m.max()) + 20, seed=3)
+        self.frames = [
+            replace(see(world, world.pose_at(s), 1000 + i, count=1500), descriptor=descriptor)
+            for i, s in enumerate(places_m)
+        ]
+
+    def frame(self, node: int) -> Frame:
+        return self.frames[node]
+
+
+# One place every 8 m, then the same places again, 1.5 m further on.
+MAPPED = _Drive(np.arange(0, 400, 8.0))
+LIVE = _Drive(np.arange(0, 400, 8.0) + 1.5)
+
+
+@pytest.mark.parametrize("name", ["fabmap", "bag-of-words"])
+def test_a_cold_start_is_proposed_the_right_place_first(name: str) -> None:
+    relocaliser = RELOCALISERS[name](searched(MAPPED))
+    first = [relocaliser.propose(live, 1, anywhere) for live in LIVE.frames]
+    # The vocabulary was not made for this world, whose descriptors are random.
+    right = [nodes[0] in (i, i + 1) for i, nodes in enumerate(first)]
+    assert np.mean(right) > 0.7
+
+
+def test_nodes_that_join_the_map_are_proposed_at_once() -> None:
+    graph = _Nodes(0)
+    relocaliser = RELOCALISERS["fabmap"](Searched(graph, MAPPED, brief))
+    assert relocaliser.propose(LIVE.frames[7], 1, anywhere) == []
+    graph.count = 20
+    assert relocaliser.propose(LIVE.frames[7], 1, anywhere)[0] in (7, 8)
+
+
+def test_only_allowed_nodes_are_proposed() -> None:
+    relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
+    proposed = relocaliser.propose(LIVE.frames[7], 6, lambda index: index % 3 == 0)
+    assert len(proposed) == 6
+    assert all(index % 3 == 0 for index in proposed)
+
+
+def test_what_failed_gives_way_to_places_further_down_the_list() -> None:
+    relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
+    proposed = [relocaliser.propose(LIVE.frames[7], 4, anywhere) for _ in range(5)]
+    assert len({node for nodes in proposed for node in nodes}) == 20
+
+
+def test_one_frame_asks_for_places_apart_from_each_other() -> None:
+    assert spread([10, 11, 9, 40, 12, 70], 3) == [10, 40, 70]
+    assert spread([10, 11, 9], 3) == [10, 11, 9]
+
+
+def test_it_tells_how_likely_a_new_place_is() -> None:
+    relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
+    relocaliser.propose(LIVE.frames[7], 4, anywhere)
+    assert relocaliser.new_place is not None
+    assert relocaliser.new_place < 0.01
+    assert exhaustive(_Nodes(3)).new_place is None
+
+
+def test_a_frame_without_landmarks_is_no_error() -> None:
+    frame = LIVE.frames[0]
+    none = {f.name: getattr(frame.landmarks, f.name)[:0] for f in fields(frame.landmarks)}
+    blind = replace(frame, landmarks=Landmarks(**none))
+    assert len(RELOCALISERS["fabmap"](searched(MAPPED)).propose(blind, 4, anywhere)) == 4
+
+
+def test_a_frame_with_another_kind_of_descriptor_is_refused() -> None:
+    relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
+    other = _Drive(np.array([0.0]), DescriptorKind.TEBLID).frames[0]
+    with pytest.raises(IncompatibleError, match="teblid"):
+        relocaliser.propose(other, 4, anywhere)
+
+
+def searched(drive: _Drive) -> Searched:
+    return Searched(_Nodes(len(drive.frames)), drive, brief)
+
+
+def brief() -> Vocabulary:
+    return default_vocabulary(DescriptorKind.BRIEF)

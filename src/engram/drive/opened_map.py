@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
@@ -20,8 +21,10 @@ from engram.localiser import (
     Budget,
     Localisation,
     Localiser,
+    Searched,
 )
 from engram.odometry import Odometry
+from engram.places import Vocabulary, decode_vocabulary, default_vocabulary
 from engram.ranking import POLICIES
 from engram.store import MapStore
 
@@ -73,6 +76,20 @@ class OpenMap:
         """Kind of all descriptors of the map; None while it is empty."""
         return self.store.info().descriptor
 
+    @cached_property
+    def vocabulary(self) -> Vocabulary | None:
+        """The vocabulary that was trained for this map; None if there is none.
+
+        Raises:
+            MapCorruptError: it is damaged.
+        """
+        body = self.store.vocabulary()
+        return None if body is None else decode_vocabulary(body)
+
+    def _vocabulary_or_default(self, descriptor: DescriptorKind) -> Vocabulary:
+        """The map's vocabulary, or the default one; `descriptor` counts while it is empty."""
+        return self.vocabulary or default_vocabulary(self.descriptor or descriptor)
+
     def localiser(
         self,
         camera: StereoCamera,
@@ -104,13 +121,18 @@ class OpenMap:
             raise ConfigError(
                 f"relocaliser {relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}, none"
             )
+        searched = Searched(
+            self.graph,
+            self.store.frames,
+            lambda: self._vocabulary_or_default(settings.frontend.descriptor),
+        )
         return Localiser(
             self.graph,
             self.path_memory,
             self.store.frames,
             policy=POLICIES[policy](),
             budget=budget or Budget(),
-            relocaliser=None if relocaliser is None else RELOCALISERS[relocaliser](self.graph),
+            relocaliser=None if relocaliser is None else RELOCALISERS[relocaliser](searched),
             basin=MatchBasin.of(camera.fx, self.attempts),
             live=live,
             saves=saves,

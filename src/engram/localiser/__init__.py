@@ -3,7 +3,7 @@
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
-from engram.localiser.relocalisation import RELOCALISERS, Exhaustive, Relocaliser
+from engram.localiser.relocalisation import RELOCALISERS, Exhaustive, Relocaliser, Searched
 from engram.localiser.walk import Walk
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "Position",
     "Prediction",
     "Relocaliser",
+    "Searched",
     "Walk",
     "accept",
 ]

@@ -301,11 +301,7 @@ class Localiser:
     def _proposals(self, live: Frame, count: int) -> list[int]:
         """The relocaliser's nodes, without this session's own recent ones (SPEC §3.1)."""
         assert self._relocaliser is not None
-        return [
-            index
-            for index in self._relocaliser.propose(live, count)
-            if not self._is_recent_own(index)
-        ]
+        return self._relocaliser.propose(live, count, lambda index: not self._is_recent_own(index))
 
     def _is_recent_own(self, index: int) -> bool:
         node = self._graph.node(index)

@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 from engram.experience.graph import ExperienceGraph
+from engram.experience.model import LandmarkSource
 from engram.frontend import Frame
+from engram.places import RECOGNISERS, PlaceRecogniser, Vocabulary
+
+# Neighbours in the order of saving show the same place: where one was not matched, others of that
+# place mostly are not either. Source: nodes are saved every metre, and matched up to 3 to 4 m away.
+_NEIGHBOURS = 3
+# A node that failed is not tried again for so many frames, unless nothing else is left.
+_PATIENCE = 10
+# Places of which those to attempt are chosen.
+_SHORTLIST = 64
 
 
 class Relocaliser(Protocol):
@@ -17,17 +29,42 @@ class Relocaliser(Protocol):
         """Its key in `RELOCALISERS`."""
         ...
 
-    def propose(self, live: Frame, count: int) -> list[int]:
+    @property
+    def new_place(self) -> float | None:
+        """Probability that the last frame showed nothing of the map; None if it cannot tell."""
+        ...
+
+    def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
         """Up to `count` nodes to attempt for this frame, best first.
 
         Args:
             live: the live frame.
             count: how many attempts the frame's budget allows.
+            allowed: whether a node, by its dense index, may be proposed.
 
         Returns:
             Dense indices into the graph, without repeats.
+
+        Raises:
+            IncompatibleError: the frame has another kind of descriptor than the map.
+            MapCorruptError: a node's landmarks do not match their hash.
         """
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class Searched:
+    """What a relocaliser searches.
+
+    Attributes:
+        graph: the nodes; may grow.
+        frames: their landmarks.
+        vocabulary: gives the map's vocabulary; asked only by relocalisers that need one.
+    """
+
+    graph: ExperienceGraph
+    frames: LandmarkSource
+    vocabulary: Callable[[], Vocabulary]
 
 
 class Exhaustive:
@@ -39,20 +76,87 @@ class Exhaustive:
     """
 
     name = "exhaustive"
+    new_place = None
 
-    def __init__(self, graph: ExperienceGraph) -> None:
-        self._graph = graph
+    def __init__(self, searched: Searched) -> None:
+        self._graph = searched.graph
         self._order: list[int] = []
         self._next = 0
 
-    def propose(self, live: Frame, count: int) -> list[int]:
+    def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
         """See `Relocaliser`; `live` is of no interest to it."""
         del live
         if self._next >= len(self._order):
             self._order, self._next = van_der_corput_order(len(self._graph)), 0
         proposed = self._order[self._next : self._next + count]
         self._next += len(proposed)
+        return [index for index in proposed if allowed(index)]
+
+
+class ByAppearance:
+    """Asks a place recogniser which nodes look like the live frame (SPEC §6).
+
+    All nodes are recognised from the first frame on, those that join the map later from the next.
+    A frame's attempts go to different places first, and over several frames to places further
+    down the list: a place that looks right and is not costs one attempt, not the whole budget.
+
+    Args:
+        searched: the map; its landmarks are read when this is made.
+        name: key in `RELOCALISERS`.
+        recogniser: makes the recogniser for a vocabulary.
+    """
+
+    def __init__(
+        self,
+        searched: Searched,
+        name: str,
+        recogniser: Callable[[Vocabulary], PlaceRecogniser],
+    ) -> None:
+        self.name = name
+        self._graph = searched.graph
+        self._frames = searched.frames
+        self._vocabulary = searched.vocabulary()
+        self._recogniser = recogniser(self._vocabulary)
+        self._frames_seen = 0
+        self._tried: dict[int, int] = {}
+        self.new_place: float | None = None
+        self._learn_new_nodes()
+
+    def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
+        """See `Relocaliser`."""
+        self._learn_new_nodes()
+        words = self._vocabulary.words_of(live.landmarks.descriptors, live.descriptor)
+        found = self._recogniser.recognise(words, _SHORTLIST)
+        self.new_place = found.new_place
+        self._frames_seen += 1
+        places = [int(place) for place in found.places if allowed(int(place))]
+        fresh = [
+            place
+            for place in places
+            if self._frames_seen - self._tried.get(place, -_PATIENCE) >= _PATIENCE
+        ]
+        proposed = spread(fresh, count)
+        proposed += [place for place in places if place not in proposed][: count - len(proposed)]
+        self._tried.update(dict.fromkeys(proposed, self._frames_seen))
         return proposed
+
+    def _learn_new_nodes(self) -> None:
+        """Adds the nodes that the recogniser does not know: its places are the graph's nodes."""
+        for index in range(len(self._recogniser), len(self._graph)):
+            frame = self._frames.frame(self._graph.node(index).id)
+            self._recogniser.add(
+                self._vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
+            )
+
+
+def spread(places: list[int], count: int) -> list[int]:
+    """The first `count` places of which no two are neighbours, then the rest in order."""
+    apart: list[int] = []
+    for place in places:
+        if len(apart) < count and all(abs(place - other) > _NEIGHBOURS for other in apart):
+            apart.append(place)
+    rest = [place for place in places if place not in apart]
+    return (apart + rest)[:count]
 
 
 def van_der_corput_order(count: int) -> list[int]:
@@ -62,6 +166,10 @@ def van_der_corput_order(count: int) -> list[int]:
     return [number for number in reversed_numbers if number < count]
 
 
-RELOCALISERS: dict[str, Callable[[ExperienceGraph], Relocaliser]] = {
+RELOCALISERS: dict[str, Callable[[Searched], Relocaliser]] = {
     Exhaustive.name: Exhaustive,
+    **{
+        name: partial(ByAppearance, name=name, recogniser=recogniser)
+        for name, recogniser in RECOGNISERS.items()
+    },
 }

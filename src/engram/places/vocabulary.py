@@ -22,17 +22,21 @@ from engram.places.tree import TreeArrays
 
 VOCABULARY_FORMAT = 1
 _METADATA_KEY = "engram.vocabulary"
-_MOST_WORDS = 1 << 20
+_MOST_WORDS = 1 << 16
 _SHAPES: dict[str, tuple[str, int]] = {  # dtype and number of dimensions
     "centres": ("U8", 2),
     "bounds": ("I32", 1),
     "seen": ("I32", 1),
     "parents": ("I32", 1),
     "seen_with_parent": ("I32", 1),
-    "sample_words": ("I32", 1),
+    "sample_words": ("U16", 1),
     "sample_lengths": ("I32", 1),
 }
-_DTYPES: dict[str, np.dtype[Any]] = {"U8": np.dtype("u1"), "I32": np.dtype("<i4")}
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "U8": np.dtype("u1"),
+    "U16": np.dtype("<u2"),
+    "I32": np.dtype("<i4"),
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,12 +172,12 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
         int(about["images"]), arrays["seen"], arrays["parents"], arrays["seen_with_parent"]
     )
     _check_statistics(statistics)
-    lengths, words = arrays["sample_lengths"], arrays["sample_words"]
+    lengths, words = arrays["sample_lengths"], arrays["sample_words"].astype(np.int32)
     if (lengths < 0).any() or int(lengths.sum(dtype=np.int64)) != len(words):
         raise ValueError("its samples do not fit their lengths")
     samples = tuple(np.split(words, np.cumsum(lengths)[:-1])) if len(lengths) else ()
     for sample in samples:
-        if len(sample) and (sample[0] < 0 or sample[-1] >= len(statistics)):
+        if len(sample) and sample[-1] >= len(statistics):
             raise ValueError("a sample shows a word that there is not")
         if (np.diff(sample) <= 0).any():
             raise ValueError("the words of a sample do not rise")

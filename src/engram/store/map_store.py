@@ -15,6 +15,7 @@ from engram.experience.model import Session, SessionId, path_id
 from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.store import reading
+from engram.store.blob import content_digest
 from engram.store.checking import check
 from engram.store.collecting import collect_abandoned
 from engram.store.content import content_hash
@@ -42,8 +43,8 @@ from engram.store.rows import (
     to_json,
     verified,
 )
-from engram.store.schema import nodes, path_entries, paths, revisions, sessions
-from engram.store.session_writer import SessionWriter, change_revision
+from engram.store.schema import nodes, path_entries, paths, revisions, sessions, vocabularies
+from engram.store.session_writer import SessionWriter, change_revision, commit_revision
 from engram.store.sqlite import SqliteDatabase
 from engram.store.view import View, head
 
@@ -154,6 +155,15 @@ class MapStore:
         """The newest of every statistic of the map, by name."""
         with self._database.reading() as connection:
             return reading.load_statistics(connection, self._view)
+
+    def vocabulary(self) -> bytes | None:
+        """The newest vocabulary of the map as it was put in; None if there is none.
+
+        Raises:
+            MapCorruptError: it does not match its hash.
+        """
+        with self._database.reading() as connection:
+            return reading.load_vocabulary(connection, self._view)
 
     def session_state(self, session: SessionId) -> SessionState:
         """What the map knows of a session: ask before handing one in."""
@@ -297,6 +307,36 @@ class WritableMapStore(MapStore):
             IncompatibleError: meanwhile another kind of descriptor came into the map.
         """
         return self.resume_session(session).commit()
+
+    def put_vocabulary(
+        self, body: bytes, *, author: str, message: str, configuration: Mapping[str, Any]
+    ) -> Revision:
+        """Keep a vocabulary in the map, in a revision of its own; the newest counts.
+
+        Args:
+            body: the vocabulary, encoded.
+            author: who, or which robot.
+            message: what `log` shows.
+            configuration: how it was trained, plain JSON data.
+
+        Raises:
+            RevisionError: a session is being written.
+            StorageFullError: no space; the map is as it was.
+        """
+        self._check_none_open()
+        opened = self._revision_row(author, message, to_json(configuration))
+        row: Row = {
+            "key": self._keys.next(vocabularies),
+            "revision": opened["key"],
+            "hash": content_digest(body),
+            "body": body,
+        }
+        with self._database.writing() as connection:
+            connection.execute(insert(revisions), [sealed(revisions, opened)])
+            connection.execute(insert(vocabularies), [sealed(vocabularies, row)])
+            revision = commit_revision(connection, self._keys, opened["key"])
+        self._see(View(revision.number))
+        return revision
 
     def clean(self) -> int:
         """Remove the rows of abandoned revisions; returns how many there were."""

@@ -13,6 +13,7 @@ from engram.experience.model import Edge, EdgeKind, Node, NodeId, PathEntry, Pat
 from engram.frontend import DescriptorKind
 from engram.geometry import CameraId, StereoCamera
 from engram.store.attempts import AttemptTable, concatenate, unpack
+from engram.store.blob import content_digest
 from engram.store.records import AttemptArrays, MapContents, MapInfo, Revision
 from engram.store.rows import (
     Row,
@@ -38,6 +39,7 @@ from engram.store.schema import (
     revisions,
     sessions,
     statistics,
+    vocabularies,
 )
 from engram.store.view import View
 
@@ -161,6 +163,17 @@ def load_statistics(connection: Connection, view: View) -> dict[str, dict[str, A
     """The newest of every statistic by name."""
     rows = view.rows(connection, statistics)
     return {row["name"]: from_json(row["body"], f"statistic {row['name']}") for row in rows}
+
+
+def load_vocabulary(connection: Connection, view: View) -> bytes | None:
+    """The newest vocabulary; None if there is none."""
+    kept = list(view.rows(connection, vocabularies))
+    if not kept:
+        return None
+    body: bytes = kept[-1]["body"]
+    if content_digest(body) != kept[-1]["hash"]:
+        raise MapCorruptError("the vocabulary does not match its hash; run engram check")
+    return body
 
 
 def attempt_tables(connection: Connection, view: View) -> dict[int, AttemptTable]:
