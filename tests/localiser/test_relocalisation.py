@@ -119,6 +119,13 @@ def test_what_failed_gives_way_to_places_further_down_the_list() -> None:
     assert len({node for nodes in proposed for node in nodes}) == 20
 
 
+def test_after_it_was_found_the_best_places_come_first_again() -> None:
+    relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
+    first, second = (relocaliser.propose(LIVE.frames[7], 4, anywhere) for _ in range(2))
+    relocaliser.forget_failures()
+    assert relocaliser.propose(LIVE.frames[7], 4, anywhere) == first != second
+
+
 def test_one_frame_asks_for_places_apart_from_each_other() -> None:
     assert spread([10, 11, 9, 40, 12, 70], 3) == [10, 40, 70]
     assert spread([10, 11, 9], 3) == [10, 11, 9]

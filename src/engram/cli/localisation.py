@@ -20,8 +20,12 @@ def localise(
     rounds: options.Rounds = 2,
     deadline: options.Deadline = None,
     relocaliser: Annotated[
-        str, typer.Option("--relocaliser", help="How a lost robot is found: exhaustive or none.")
-    ] = "exhaustive",
+        str,
+        typer.Option(
+            "--relocaliser",
+            help="How a lost robot is found: fabmap, bag-of-words, exhaustive or none.",
+        ),
+    ] = "fabmap",
     at: options.At = None,
     trajectory: Annotated[
         Path | None,

@@ -34,7 +34,7 @@ class LocaliseOptions:
     lanes: int = 2
     rounds: int = 2
     deadline_ms: float | None = None
-    relocaliser: str | None = "exhaustive"
+    relocaliser: str | None = "fabmap"
     at: int | None = None
     rate_hz: float | None = None
     preload: bool = False

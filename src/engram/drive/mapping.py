@@ -42,7 +42,7 @@ class MapOptions:
     lanes: int = 2
     rounds: int = 2
     deadline_ms: float | None = None
-    relocaliser: str | None = "exhaustive"
+    relocaliser: str | None = "fabmap"
     author: str | None = None
     rate_hz: float | None = None
 

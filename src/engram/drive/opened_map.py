@@ -97,7 +97,7 @@ class OpenMap:
         *,
         policy: str = "path",
         budget: Budget | None = None,
-        relocaliser: str | None = "exhaustive",
+        relocaliser: str | None = "fabmap",
         live: SessionId = UNNAMED_LIVE_SESSION,
         saves: bool = False,
     ) -> Localiser:
@@ -147,7 +147,7 @@ class OpenMap:
         policy: str = "path",
         lanes: int = 2,
         rounds: int = 2,
-        relocaliser: str | None = "exhaustive",
+        relocaliser: str | None = "fabmap",
     ) -> LiveRobot:
         """A robot that hands in image pairs one by one; see `LiveRobot.localise`.
 

@@ -358,6 +358,8 @@ class Localiser:
         self.position = Position(success.candidate.node, node_from_live, covariance)
         self._open_loop_m = 0.0
         self._adrift = False
+        if self._relocaliser is not None:
+            self._relocaliser.forget_failures()
         self.walk.visit(success.candidate.node, PathEntryKind.MATCHED, stamp_ns)
 
     def _result(

@@ -51,6 +51,10 @@ class Relocaliser(Protocol):
         """
         ...
 
+    def forget_failures(self) -> None:
+        """The robot was found, or told where it is: what failed before says nothing any more."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class Searched:
@@ -91,6 +95,9 @@ class Exhaustive:
         proposed = self._order[self._next : self._next + count]
         self._next += len(proposed)
         return [index for index in proposed if allowed(index)]
+
+    def forget_failures(self) -> None:
+        """See `Relocaliser`; the pass over the map goes on where it was."""
 
 
 class ByAppearance:
@@ -139,6 +146,10 @@ class ByAppearance:
         proposed += [place for place in places if place not in proposed][: count - len(proposed)]
         self._tried.update(dict.fromkeys(proposed, self._frames_seen))
         return proposed
+
+    def forget_failures(self) -> None:
+        """See `Relocaliser`."""
+        self._tried.clear()
 
     def _learn_new_nodes(self) -> None:
         """Adds the nodes that the recogniser does not know: its places are the graph's nodes."""
