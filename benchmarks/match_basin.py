@@ -76,9 +76,11 @@ class Truth:
     furthest: int
 
     def node_from_live(self, node: int, live: int) -> SE3:
+        """True pose of a live frame's camera in a node."""
         return self.world_from_node[node].inverse() @ self.world_from_live[live]
 
     def distance_m(self, apart: int) -> float:
+        """Median distance of frames that are so many frames apart."""
         pairs = range(len(self.world_from_node) - apart)
         return float(np.median([self.node_from_live(k, k + apart).distance_m for k in pairs]))
 

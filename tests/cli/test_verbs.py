@@ -151,6 +151,30 @@ def test_nothing_to_seal(engram, town: Path) -> None:
     assert "no session was interrupted" in engram("seal", town).out
 
 
+def test_a_teblid_map_is_localised_in_with_teblid(engram, street: Path, tmp_path: Path) -> None:
+    path = tmp_path / "teblid.engram"
+    assert engram("map", path, street, "--descriptor", "teblid").status == 0
+    assert engram("info", path, "--json").json["descriptor"] == "teblid"
+    found = engram("localise", path, street, "--json").json
+    assert found["summary"]["share_localised"] == 1.0
+
+
+def test_two_kinds_of_descriptor_do_not_mix(engram, street: Path, town: Path, tmp_path) -> None:
+    log = tmp_path / "teblid.framelog"
+    assert engram("extract", street, log, "--descriptor", "teblid").status == 0
+    for verb in ("localise", "map"):
+        ran = engram(verb, town, log, "--robot", "r2", "--json")
+        assert ran.status == 2
+        assert ran.json["error"]["kind"] == "IncompatibleError"
+        assert "teblid" in ran.json["error"]["message"]
+
+
+def test_simulate_refuses_a_drive_that_is_not_there(engram, tmp_path: Path) -> None:
+    ran = engram("simulate", "hamlet", "--sessions", "9", "--out", tmp_path)
+    assert ran.status == 2
+    assert "9" in ran.err
+
+
 def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text("[mapper]\nsave_every_m = 2.0\n")
@@ -177,6 +201,10 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("extract", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
         (("info", "STREET"), "street"),
         (("bench", "--only", "warp"), "warp"),
+        (("map", "TOWN", "STREET", "--descriptor", "sift"), "sift"),
+        (("simulate", "atlantis"), "atlantis"),
+        (("simulate", "hamlet", "--size", "huge"), "huge"),
+        (("simulate", "hamlet", "--sessions", "one"), "one"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_status_two(

@@ -24,6 +24,7 @@ def extract(
     start: options.Start = None,
     longitude: options.Longitude = None,
     zone: options.Zone = None,
+    descriptor: options.Descriptor = None,
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
@@ -53,7 +54,7 @@ def extract(
         zone=zone,
     )
     with progress("extract", len(sequence)) as advance:
-        report = extract_log(sequence, out, load_settings(config), advance)
+        report = extract_log(sequence, out, load_settings(config, descriptor), advance)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

@@ -27,6 +27,7 @@ def map_(
     start: options.Start = None,
     longitude: options.Longitude = None,
     zone: options.Zone = None,
+    descriptor: options.Descriptor = None,
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
@@ -59,7 +60,7 @@ def map_(
     )
     asked = MapOptions(policy=policy, lanes=lanes, rounds=rounds, deadline_ms=deadline)
     with progress("map", len(sequence)) as advance:
-        report = map_drive(map_path, sequence, load_settings(config), asked, advance)
+        report = map_drive(map_path, sequence, load_settings(config, descriptor), asked, advance)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

@@ -67,3 +67,9 @@ ThereAndBack: TypeAlias = Annotated[
         help="Drive the sequence there and back until so many frames have passed.",
     ),
 ]
+Descriptor: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--descriptor", help="brief or teblid, for a new map or log [default: the map's, or brief]."
+    ),
+]

@@ -12,6 +12,7 @@ from engram.cli.extraction import extract
 from engram.cli.inspection import check, info, log, seal
 from engram.cli.localisation import localise
 from engram.cli.mapping import map_
+from engram.cli.simulation import simulate
 
 VERBS: dict[str, Callable[..., None]] = {
     "demo": demo,
@@ -22,6 +23,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "log": log,
     "check": check,
     "seal": seal,
+    "simulate": simulate,
     "bench": bench,
 }
 

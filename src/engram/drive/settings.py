@@ -29,14 +29,27 @@ class Settings:
         return replace(self, frontend=replace(self.frontend, descriptor=descriptor))
 
 
-def load_settings(path: Path | None) -> Settings:
+def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:
     """Settings from a TOML file, or the defaults.
 
+    Args:
+        path: the file; None for the defaults.
+        descriptor: kind of descriptor that takes the place of the file's; None leaves it.
+
     Raises:
-        ConfigError: the file cannot be read, or a setting in it is unknown or out of range.
+        ConfigError: the file cannot be read, or a setting is unknown or out of range.
     """
-    if path is None:
-        return Settings()
+    settings = Settings() if path is None else _read_settings(path)
+    if descriptor is None:
+        return settings
+    try:
+        return settings.for_descriptor(DescriptorKind(descriptor))
+    except ValueError:
+        known = ", ".join(DescriptorKind)
+        raise ConfigError(f"descriptor {descriptor!r} is unknown; known: {known}") from None
+
+
+def _read_settings(path: Path) -> Settings:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
