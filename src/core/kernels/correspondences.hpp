@@ -34,6 +34,12 @@ struct Correspondences {
 
   explicit Correspondences(const Camera &live) : live(live) {}
 
+  void reserve(size_t wanted) {
+    for (auto *values : {&x, &y, &z, &u, &v, &d, &inverse_disparity, &pixel_information,
+                         &disparity_information, &depth_variance, &valid})
+      values->reserve(wanted + kLanes);
+  }
+
   void add(const Vec3 &point, double reference_disparity, const Vec3 &stereo,
            double pixel_variance, double disparity_variance, double relative_depth_variance) {
     const auto f = [](double value) { return static_cast<float>(value); };
@@ -107,6 +113,8 @@ struct Block {
   Floats ju, jv, jd;                               // by relative depth
   Floats wp, wd;                                   // information of pixel and disparity
   Floats kappa, hr;                                // rank-one part of C⁻¹, and its dot with r
+  Floats depth_information;                        // jᵀ D⁻¹ j
+  Floats kept;                                     // the share of it that C⁻¹ leaves
   Floats chi2;                                     // rᵀ C⁻¹ r
   Ints usable;                                     // −1 where in front and valid, else 0
 
@@ -140,14 +148,15 @@ struct Block {
     wp = load(&matches.pixel_information[i]);
     wd = load(&matches.disparity_information[i]);
     const Floats variance = load(&matches.depth_variance[i]);
-    const Floats shrink = 1.0f / (1.0f + variance * (wp * (ju * ju + jv * jv) + wd * jd * jd));
-    kappa = variance * shrink;
+    depth_information = wp * (ju * ju + jv * jv) + wd * jd * jd;
+    kept = 1.0f / (1.0f + variance * depth_information);
+    kappa = variance * kept;
     hr = wp * (ju * ru + jv * rv) + wd * jd * rd;
     // As a sum of squares, with the depth error that fits best: rᵀD⁻¹r − κ(jᵀD⁻¹r)² would cancel
     // to anything, even below zero, where residuals are large.
     const Floats depth_error = kappa * hr;
     const Floats eu = ru - depth_error * ju, ev = rv - depth_error * jv, ed = rd - depth_error * jd;
-    chi2 = wp * (eu * eu + ev * ev) + wd * ed * ed + depth_error * hr * shrink;
+    chi2 = wp * (eu * eu + ev * ev) + wd * ed * ed + depth_error * hr * kept;
   }
 };
 

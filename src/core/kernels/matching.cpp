@@ -1,9 +1,15 @@
 #include "kernels/matching.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
+#ifdef __AVX512VPOPCNTDQ__
+#include <immintrin.h>
+#endif
+
+#include "kernels/double_lanes.hpp"
 #include "kernels/float_lanes.hpp"
 #include "kernels/projection.hpp"
 #include "kernels/rigid.hpp"
@@ -54,115 +60,188 @@ Patch patch_of(const FrameView &frame, int64_t row, const MatchSettings &setting
           1 + settings.gate_sigmas * relative_sigma};
 }
 
-// The live landmarks in the order of their patch size, so that those of like size are neighbours;
-// descriptors as four arrays of words, padded to whole blocks.
-struct SortedFrame {
-  std::vector<int32_t> rows;
-  std::vector<double> sizes_m;
-  std::vector<uint64_t> words;
+// The live landmarks in blocks of 32, those of like patch size together.
+struct Blocks {
+  // A block's descriptors: word w of landmark 4 i + g of the block stands at 32 w + 8 g + i, so
+  // that four vectors of counts in 64 bits shift into one of 16 bits.
+  struct Words {
+    uint64_t values[4 * kColumns];
+  };
+
+  std::vector<int32_t> rows; // of the live frame, by column
   std::vector<float> u, v;
-  int64_t padded;
-  double most_doubt = 1;
+  std::vector<Words> words;
+  std::vector<double> least_m, most_m; // patch sizes in a block
+  Shorts beyond{};                     // in the last block: far where there is no landmark
+
+  int64_t count() const { return static_cast<int64_t>(words.size()); }
 };
 
-SortedFrame sort_by_patch(const FrameView &frame, const MatchSettings &settings) {
-  SortedFrame sorted;
-  const int64_t count = frame.count;
-  sorted.padded = (count + kColumns - 1) / kColumns * kColumns;
-  std::vector<double> sizes(count);
-  sorted.rows.resize(count);
-  for (int64_t row = 0; row < count; ++row) {
-    const Patch patch = patch_of(frame, row, settings);
-    sizes[row] = patch.size_m;
-    sorted.rows[row] = static_cast<int32_t>(row);
-  }
-  std::sort(sorted.rows.begin(), sorted.rows.end(), [&](int32_t a, int32_t b) {
-    return sizes[a] < sizes[b] || (sizes[a] == sizes[b] && a < b);
-  });
-  sorted.words.assign(4 * sorted.padded, 0);
-  for (int64_t column = 0; column < count; ++column) {
-    const int32_t row = sorted.rows[column];
-    sorted.sizes_m.push_back(sizes[row]);
-    sorted.u.push_back(frame.pixels[2 * row]);
-    sorted.v.push_back(frame.pixels[2 * row + 1]);
+// In the order of their size, but for 3 %: blocks are compared by their true bounds.
+std::vector<int32_t> rows_by_size(const std::vector<double> &sizes) {
+  constexpr int kBuckets = 1024; // of 1/32 octave, from 2⁻¹⁶ m on
+  const auto bucket_of = [](double size) {
+    const auto exact = static_cast<float>(size);
+    int32_t bits;
+    std::memcpy(&bits, &exact, sizeof bits);
+    return std::clamp((bits >> 18) - (111 << 5), 0, kBuckets - 1);
+  };
+  std::array<int32_t, kBuckets + 1> starts{};
+  for (const double size : sizes)
+    ++starts[bucket_of(size) + 1];
+  for (int bucket = 0; bucket < kBuckets; ++bucket)
+    starts[bucket + 1] += starts[bucket];
+  std::vector<int32_t> rows(sizes.size());
+  for (size_t row = 0; row < sizes.size(); ++row)
+    rows[starts[bucket_of(sizes[row])]++] = static_cast<int32_t>(row);
+  return rows;
+}
+
+Blocks blocks_of(const FrameView &frame, const MatchSettings &settings) {
+  Blocks blocks;
+  std::vector<double> sizes(frame.count);
+  for (int64_t row = 0; row < frame.count; ++row)
+    sizes[row] = patch_of(frame, row, settings).size_m;
+  blocks.rows = rows_by_size(sizes);
+  const int64_t count = (frame.count + kColumns - 1) / kColumns;
+  blocks.words.resize(count);
+  blocks.least_m.assign(count, std::numeric_limits<double>::max());
+  blocks.most_m.assign(count, 0);
+  blocks.u.resize(frame.count), blocks.v.resize(frame.count);
+  for (int64_t column = 0; column < frame.count; ++column) {
+    const int32_t row = blocks.rows[column];
+    const int64_t block = column / kColumns, within = column % kColumns;
+    blocks.u[column] = frame.pixels[2 * row];
+    blocks.v[column] = frame.pixels[2 * row + 1];
+    blocks.least_m[block] = std::min(blocks.least_m[block], sizes[row]);
+    blocks.most_m[block] = std::max(blocks.most_m[block], sizes[row]);
     for (int64_t word = 0; word < 4; ++word)
-      std::memcpy(&sorted.words[word * sorted.padded + column], frame.descriptors + 4 * row + word,
-                  sizeof(uint64_t));
+      std::memcpy(&blocks.words[block].values[kColumns * word + 8 * (within % 4) + within / 4],
+                  frame.descriptors + 4 * row + word, sizeof(uint64_t));
   }
-  return sorted;
+  for (int64_t lane = frame.count - kColumns * (count - 1); lane < kColumns; ++lane)
+    blocks.beyond[lane] = kFar;
+  return blocks;
 }
 
-// distances[j] for the columns of whole blocks; `count` columns are real, the rest is far.
-void distances_to(const uint64_t *descriptor, const SortedFrame &sorted, int64_t begin, int64_t end,
-                  int16_t *distances) {
-  const uint64_t *words = sorted.words.data();
-  const int64_t padded = sorted.padded;
-  for (int64_t j = begin; j < end; ++j)
-    distances[j] = static_cast<int16_t>(
-        popcount(descriptor[0] ^ words[j]) + popcount(descriptor[1] ^ words[padded + j]) +
-        popcount(descriptor[2] ^ words[2 * padded + j]) +
-        popcount(descriptor[3] ^ words[3 * padded + j]));
-  for (int64_t j = static_cast<int64_t>(sorted.rows.size()); j < end; ++j)
-    distances[j] = kFar;
+// Bits in which the descriptor differs from each of a block.
+Shorts distances_to(const uint64_t *descriptor, const Blocks::Words &block) {
+#ifdef __AVX512VPOPCNTDQ__
+  typedef uint64_t Counts __attribute__((vector_size(64)));
+  Counts totals[4] = {};
+  for (int group = 0; group < 4; ++group)
+    for (int word = 0; word < 4; ++word) {
+      Counts other;
+      std::memcpy(&other, block.values + kColumns * word + 8 * group, sizeof other);
+      totals[group] += (Counts)_mm512_popcnt_epi64((__m512i)(descriptor[word] ^ other));
+    }
+  return (Shorts)((totals[0] | totals[1] << 16) | (totals[2] | totals[3] << 16) << 32);
+#else
+  int32_t totals[kColumns];
+  for (int64_t column = 0; column < kColumns; ++column) {
+    const uint64_t *other = block.values + column;
+    totals[column] = popcount(descriptor[0] ^ other[0]) +
+                     popcount(descriptor[1] ^ other[kColumns]) +
+                     popcount(descriptor[2] ^ other[2 * kColumns]) +
+                     popcount(descriptor[3] ^ other[3 * kColumns]);
+  }
+  int16_t distances[kColumns];
+  for (int i = 0; i < 8; ++i)
+    for (int group = 0; group < 4; ++group)
+      distances[4 * i + group] = static_cast<int16_t>(totals[8 * group + i]);
+  return load(distances);
+#endif
 }
 
-// Takes row i into the nearest row of each column; returns the smallest distance of the row.
-int16_t take_row(const int16_t *distances, int16_t i, int64_t begin, int64_t end,
-                 int16_t *nearest_distance, int16_t *nearest_row) {
-  Shorts smallest = Shorts{} + kFar;
-  const Shorts row = Shorts{} + i;
-  for (int64_t j = begin; j < end; j += kColumns) {
-    const Shorts here = load(distances + j), before = load(nearest_distance + j);
-    const Shorts closer = here < before;
-    smallest = here < smallest ? here : smallest;
-    store(nearest_distance + j, closer ? here : before);
-    store(nearest_row + j, closer ? row : load(nearest_row + j));
-  }
+int16_t least_of(Shorts lanes) {
+  typedef int16_t Half __attribute__((vector_size(32)));
+  typedef int16_t Quarter __attribute__((vector_size(16)));
+  Half halves[2];
+  std::memcpy(halves, &lanes, sizeof halves);
+  const Half half = halves[0] < halves[1] ? halves[0] : halves[1];
+  Quarter quarters[2];
+  std::memcpy(quarters, &half, sizeof quarters);
+  const Quarter quarter = quarters[0] < quarters[1] ? quarters[0] : quarters[1];
   int16_t least = kFar;
-  for (int lane = 0; lane < kColumns; ++lane)
-    least = std::min(least, smallest[lane]);
+  for (int lane = 0; lane < 8; ++lane)
+    least = std::min(least, quarter[lane]);
   return least;
 }
 
-bool any(Shorts lanes) {
-  typedef int64_t Longs __attribute__((vector_size(64)));
-  Longs words;
-  std::memcpy(&words, &lanes, sizeof words);
-  int64_t all = 0;
-  for (int k = 0; k < 8; ++k)
-    all |= words[k];
-  return all != 0;
-}
+// Distances of one reference landmark to the blocks of like size, and of each column to the nearest
+// of all reference landmarks.
+class Distances {
+public:
+  explicit Distances(const Blocks &blocks)
+      : blocks_(blocks), here_(blocks.count()), nearest_(blocks.count(), Shorts{} + kFar),
+        nearest_row_(blocks.count(), Shorts{} - int16_t{1}) {}
 
-bool apart(const SortedFrame &sorted, int32_t a, int32_t b, double limit_px) {
-  return std::abs(sorted.u[a] - sorted.u[b]) > limit_px ||
-         std::abs(sorted.v[a] - sorted.v[b]) > limit_px;
+  // Returns the least.
+  int16_t measure(const uint64_t *descriptor, int16_t row, double least_m, double most_m) {
+    touched_.clear();
+    Shorts smallest = Shorts{} + kFar;
+    for (int64_t block = 0; block < blocks_.count(); ++block) {
+      if (blocks_.most_m[block] < least_m || blocks_.least_m[block] > most_m)
+        continue;
+      Shorts here = distances_to(descriptor, blocks_.words[block]);
+      if (block == blocks_.count() - 1)
+        here |= blocks_.beyond;
+      const Shorts before = nearest_[block], closer = here < before;
+      smallest = here < smallest ? here : smallest;
+      here_[block] = here;
+      nearest_[block] = closer ? here : before;
+      nearest_row_[block] = closer ? Shorts{} + row : nearest_row_[block];
+      touched_.push_back(static_cast<int32_t>(block));
+    }
+    return least_of(smallest);
+  }
+
+  // Calls visit(column, distance) for those measured last within the limit, until it returns false.
+  template <class Visit> void within(int16_t limit, Visit visit) const {
+    for (const int32_t block : touched_)
+      for (uint32_t bits = bits_of(here_[block] <= limit); bits != 0; bits &= bits - 1) {
+        const int lane = __builtin_ctz(bits);
+        if (!visit(static_cast<int32_t>(kColumns * block + lane), here_[block][lane]))
+          return;
+      }
+  }
+
+  int16_t nearest_row(int32_t column) const {
+    return nearest_row_[column / kColumns][column % kColumns];
+  }
+
+private:
+  const Blocks &blocks_;
+  std::vector<Shorts> here_, nearest_, nearest_row_;
+  std::vector<int32_t> touched_;
+};
+
+bool apart(const Blocks &blocks, int32_t a, int32_t b, double limit_px) {
+  return std::abs(blocks.u[a] - blocks.u[b]) > limit_px ||
+         std::abs(blocks.v[a] - blocks.v[b]) > limit_px;
 }
 
 // The first column at the smallest distance, or -1 where another corner is nearly as close. The
 // same corner found in a second octave is no rival.
-int64_t distinct_column(const int16_t *distances, int64_t begin, int64_t end, int16_t least,
-                        double ratio, double same_corner_px, const SortedFrame &sorted,
-                        std::vector<int32_t> &close) {
-  const auto limit = static_cast<int16_t>(std::min(least / ratio, 256.0));
+int32_t distinct_column(const Distances &distances, int16_t least, const MatchSettings &settings,
+                        const Blocks &blocks, std::vector<int32_t> &close) {
+  const auto limit = static_cast<int16_t>(std::min(least / settings.ratio, 256.0));
   close.clear();
   int32_t best = -1;
-  for (int64_t block = begin; block < end; block += kColumns) {
-    if (!any(load(distances + block) <= limit))
-      continue;
-    for (auto j = static_cast<int32_t>(block); j < block + kColumns; ++j) {
-      if (distances[j] > limit)
-        continue;
-      // Two so far apart cannot both be the best one's corner.
-      if (!close.empty() && apart(sorted, close.front(), j, 2 * same_corner_px))
-        return -1;
-      close.push_back(j);
-      if (best < 0 && distances[j] == least)
-        best = j;
+  distances.within(limit, [&](int32_t column, int16_t distance) {
+    // Two so far apart cannot both be the best one's corner.
+    if (!close.empty() && apart(blocks, close.front(), column, 2 * settings.same_corner_px)) {
+      best = -1;
+      close.clear();
+      return false;
     }
-  }
-  for (const int32_t j : close)
-    if (apart(sorted, j, best, same_corner_px))
+    close.push_back(column);
+    if (best < 0 && distance == least)
+      best = column;
+    return true;
+  });
+  for (const int32_t column : close)
+    if (apart(blocks, column, best, settings.same_corner_px))
       return -1;
   return best;
 }
@@ -225,48 +304,101 @@ private:
   std::vector<int32_t> starts_, members_;
 };
 
-// Where a reference landmark should be seen, and how far from it to look.
-struct Window {
-  Vec3 stereo;
-  Vec3 radius;
+// Where reference landmarks should be seen, how far from there to look, and whether to look at all.
+struct Windows {
+  Vec3Lanes stereo, radius;
+  Longs worth;
 };
 
-double variance_along(const double row[6], const std::array<double, 36> &covariance) {
-  double total = 0;
-  for (int a = 0; a < 6; ++a) {
-    double cross = 0.5 * covariance[7 * a] * row[a];
-    for (int b = 0; b < a; ++b)
-      cross += covariance[6 * a + b] * row[b];
-    total += 2 * row[a] * cross;
+class Predictor {
+public:
+  Predictor(const FrameView &reference, const Camera &live, const Prediction &prediction,
+            const MatchSettings &settings)
+      : reference_(reference), live_(live), settings_(settings), covariance_(prediction.covariance),
+        live_from_reference_(inverse(prediction.reference_from_live)) {
+    int most = 0;
+    for (int64_t row = 0; row < reference.count; ++row)
+      most = std::max<int>(most, reference.octaves[row]);
+    for (int octave = 0; octave <= most; ++octave)
+      pixel_variances_.push_back(
+          square(settings.pixel_sigma_px * (power(settings.octave_scale, octave) + 1)));
   }
-  return total;
-}
 
-bool predict(const FrameView &reference, int64_t row, const FrameView &live, const Grid &grid,
-             const Prediction &prediction, const MatchSettings &settings, Window &window) {
-  const float *p = reference.points_in_cam + 3 * row;
-  const Vec3 point = {p[0], p[1], p[2]};
-  const Vec3 in_live = transform_back(prediction.reference_from_live, point);
-  if (in_live[2] <= kNearest_m)
-    return false;
-  window.stereo = project(live.camera, in_live);
-  if (!grid.within(window.stereo[0], window.stereo[1], settings.max_radius_px))
-    return false;
-  const Linearised seen = linearise(live.camera, prediction.reference_from_live, point);
-  const double sigma = reference.disparity_sigma_px[row], disparity = reference.disparity_px[row];
-  const double offset = settings.offset_sigma_px;
-  const double depth_variance = (sigma * sigma + offset * offset) / (disparity * disparity);
-  const double scale = power(settings.octave_scale, reference.octaves[row]);
-  const double pixel = settings.pixel_sigma_px * (scale + 1);
-  for (int k = 0; k < 3; ++k) {
-    const double variance = pixel * pixel +
-                            depth_variance * seen.by_depth[k] * seen.by_depth[k] +
-                            variance_along(seen.by_pose[k], prediction.covariance);
-    window.radius[k] =
-        std::min(settings.gate_sigmas * std::sqrt(std::max(variance, 0.0)), settings.max_radius_px);
+  // Of the landmarks from `row` on; lanes past the last one repeat it.
+  Windows windows(int64_t row) const {
+    Vec3Lanes point{};
+    Doubles pixel_variance{}, depth_variance{};
+    for (int lane = 0; lane < kDoubleLanes; ++lane) {
+      const int64_t at = std::min(row + lane, reference_.count - 1);
+      for (int i = 0; i < 3; ++i)
+        point[i][lane] = reference_.points_in_cam[3 * at + i];
+      const double disparity = reference_.disparity_px[at];
+      pixel_variance[lane] = pixel_variances_[reference_.octaves[at]];
+      depth_variance[lane] =
+          (square(reference_.disparity_sigma_px[at]) + square(settings_.offset_sigma_px)) /
+          square(disparity);
+    }
+    return windows(point, pixel_variance, depth_variance);
   }
-  return true;
-}
+
+private:
+  static double square(double x) { return x * x; }
+
+  Windows windows(const Vec3Lanes &point, Doubles pixel_variance, Doubles depth_variance) const {
+    const auto &r = live_from_reference_.rotation;
+    Vec3Lanes ray, seen;
+    for (int i = 0; i < 3; ++i) {
+      ray[i] = r[3 * i] * point[0] + r[3 * i + 1] * point[1] + r[3 * i + 2] * point[2];
+      seen[i] = ray[i] + live_from_reference_.translation[i];
+    }
+    Windows result;
+    result.worth = seen[2] > kNearest_m;
+    const Doubles iz = 1.0 / (result.worth ? seen[2] : Doubles{} + 1.0);
+    const Doubles along_u = live_.fx * iz, along_v = live_.fy * iz, d = along_u * live_.baseline_m;
+    result.stereo = {along_u * seen[0] + live_.cx, along_v * seen[1] + live_.cy, d};
+    // By the point, in the live camera; then by the pose, and by the depth along the ray.
+    const Doubles zero{};
+    const Vec3Lanes gradients[3] = {{along_u, zero, -along_u * seen[0] * iz},
+                                    {zero, along_v, -along_v * seen[1] * iz},
+                                    {zero, zero, -d * iz}};
+    for (int k = 0; k < 3; ++k) {
+      const Vec3Lanes &g = gradients[k];
+      Vec3Lanes moving;
+      for (int i = 0; i < 3; ++i)
+        moving[i] = -(r[i] * g[0] + r[3 + i] * g[1] + r[6 + i] * g[2]);
+      const Vec3Lanes turning = cross(point, moving);
+      const Doubles by_depth = dot(g, ray);
+      const Doubles variance = pixel_variance + depth_variance * by_depth * by_depth +
+                               variance_along({moving[0], moving[1], moving[2], turning[0],
+                                               turning[1], turning[2]});
+      for (int lane = 0; lane < kDoubleLanes; ++lane) {
+        const double radius = settings_.gate_sigmas * std::sqrt(std::max(variance[lane], 0.0));
+        // So that what is no number becomes the bound.
+        result.radius[k][lane] =
+            radius < settings_.max_radius_px ? radius : settings_.max_radius_px;
+      }
+    }
+    return result;
+  }
+
+  Doubles variance_along(const std::array<Doubles, 6> &row) const {
+    Doubles total{};
+    for (int a = 0; a < 6; ++a) {
+      Doubles cross = 0.5 * covariance_[7 * a] * row[a];
+      for (int b = 0; b < a; ++b)
+        cross += covariance_[6 * a + b] * row[b];
+      total += 2.0 * row[a] * cross;
+    }
+    return total;
+  }
+
+  const FrameView &reference_;
+  const Camera &live_;
+  const MatchSettings &settings_;
+  const std::array<double, 36> &covariance_;
+  Pose live_from_reference_;
+  std::vector<double> pixel_variances_; // by octave
+};
 
 } // namespace
 
@@ -275,36 +407,26 @@ void match_all(const FrameView &reference, const FrameView &live, const MatchSet
   pairs.clear();
   if (reference.count == 0 || live.count == 0)
     return;
-  const SortedFrame sorted = sort_by_patch(live, settings);
-  std::vector<int16_t> distances(sorted.padded, kFar), nearest_distance(sorted.padded, kFar),
-      nearest_row(sorted.padded, -1);
+  const Blocks blocks = blocks_of(live, settings);
+  Distances distances(blocks);
   std::vector<RowPair> forward; // `live` is still a column
   std::vector<int32_t> close;
   for (int64_t i = 0; i < reference.count; ++i) {
     const Patch patch = patch_of(reference, i, settings);
     const double reach = settings.patch_ratio * patch.doubt * patch.doubt;
-    const auto first = std::lower_bound(sorted.sizes_m.begin(), sorted.sizes_m.end(),
-                                        patch.size_m / reach);
-    const auto last = std::upper_bound(first, sorted.sizes_m.end(), patch.size_m * reach);
-    const int64_t begin = (first - sorted.sizes_m.begin()) / kColumns * kColumns;
-    const int64_t end = (last - sorted.sizes_m.begin() + kColumns - 1) / kColumns * kColumns;
-    if (first == last)
-      continue;
     uint64_t descriptor[4];
     std::memcpy(descriptor, reference.descriptors + 4 * i, sizeof descriptor);
-    distances_to(descriptor, sorted, begin, end, distances.data());
-    const int16_t least = take_row(distances.data(), static_cast<int16_t>(i), begin, end,
-                                   nearest_distance.data(), nearest_row.data());
+    const int16_t least = distances.measure(descriptor, static_cast<int16_t>(i),
+                                            patch.size_m / reach, patch.size_m * reach);
     if (least > settings.max_distance)
       continue;
-    const int64_t column = distinct_column(distances.data(), begin, end, least, settings.ratio,
-                                           settings.same_corner_px, sorted, close);
+    const int32_t column = distinct_column(distances, least, settings, blocks, close);
     if (column >= 0)
-      forward.push_back({static_cast<int32_t>(i), static_cast<int32_t>(column), least});
+      forward.push_back({static_cast<int32_t>(i), column, least});
   }
   for (const RowPair &pair : forward)
-    if (nearest_row[pair.live] == pair.reference)
-      pairs.push_back({pair.reference, sorted.rows[pair.live], pair.distance});
+    if (distances.nearest_row(pair.live) == pair.reference)
+      pairs.push_back({pair.reference, blocks.rows[pair.live], pair.distance});
 }
 
 void match_near(const FrameView &reference, const FrameView &live, const Prediction &prediction,
@@ -315,18 +437,23 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
   const Grid grid(live);
   std::vector<int32_t> nearest_distance(live.count, kFar), nearest_row(live.count, -1);
   std::vector<std::pair<int32_t, int32_t>> candidates; // distance, live row
+  const Predictor predictor(reference, live.camera, prediction, settings);
+  Windows windows;
   for (int64_t i = 0; i < reference.count; ++i) {
-    Window window;
-    if (!predict(reference, i, live, grid, prediction, settings, window))
+    const int lane = static_cast<int>(i % kDoubleLanes);
+    if (lane == 0)
+      windows = predictor.windows(i);
+    const double u = windows.stereo[0][lane], v = windows.stereo[1][lane];
+    if (!windows.worth[lane] || !grid.within(u, v, settings.max_radius_px))
       continue;
     uint64_t descriptor[4];
     std::memcpy(descriptor, reference.descriptors + 4 * i, sizeof descriptor);
     candidates.clear();
-    grid.visit(window.stereo[0], window.stereo[1], window.radius[0], window.radius[1],
+    grid.visit(u, v, windows.radius[0][lane], windows.radius[1][lane],
                [&](int32_t j) {
-                 const double reach =
-                     window.radius[2] + settings.gate_sigmas * live.disparity_sigma_px[j];
-                 if (std::abs(live.disparity_px[j] - window.stereo[2]) > reach)
+                 const double reach = windows.radius[2][lane] +
+                                      settings.gate_sigmas * live.disparity_sigma_px[j];
+                 if (std::abs(live.disparity_px[j] - windows.stereo[2][lane]) > reach)
                    return;
                  uint64_t other[4];
                  std::memcpy(other, live.descriptors + 4 * j, sizeof other);

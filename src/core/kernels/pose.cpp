@@ -1,6 +1,7 @@
 #include "kernels/pose.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
@@ -70,6 +71,7 @@ Correspondences correspondences(const FrameView &reference, const FrameView &liv
                                 const std::vector<RowPair> &pairs, const MatchSettings &settings,
                                 OffsetsAre offsets) {
   Correspondences matches(live.camera);
+  matches.reserve(pairs.size());
   for (const RowPair &pair : pairs) {
     const Vec3 x = point_of(reference, pair.reference), y = point_of(live, pair.live);
     // A reference pixel's error, brought to live pixels by the ratio of focal length and depth.
@@ -144,55 +146,126 @@ template <int size> struct NormalEquations {
   double cost;
 };
 
+// The equations' sums, in lanes. By the pose, a residual's derivative is (a, x × a): a that by the
+// translation, x the point in the reference. So the three residuals of a match, whose information
+// is C⁻¹ = D⁻¹ − κ hhᵀ, come down to a symmetric 3×3 matrix M and a vector m:
+//     H = (M, ([x]× M)ᵀ; [x]× M, −[x]× M [x]×),  g = (m, x × m).
+template <int size> struct Sums {
+  Floats moving[6]; // M: xx, yx, yy, zx, zy, zz
+  Floats mixed[9];  // [x]× M, row-major
+  Floats turning[6];
+  Floats gradient[size];
+  Floats by_offset[2][6], offsets[3]; // rows of the reference's and the live camera's offset
+  Floats cost;
+
+  void add(const Block &b, const FloatPose &pose, Floats valid, float scale) {
+    const float *r = pose.m;
+    const Floats robust = 1.0f / (1.0f + b.chi2 / scale);
+    const Floats weight = b.usable ? robust * robust : Floats{};
+    cost += b.usable ? b.chi2 * robust : valid * scale;
+    Vec3Floats u, v, d, along; // a of each residual, and hᵀA
+    for (int k = 0; k < 3; ++k) {
+      u[k] = -(b.along_u * r[k] + b.u_by_z * r[6 + k]);
+      v[k] = -(b.along_v * r[3 + k] + b.v_by_z * r[6 + k]);
+      d[k] = -(b.d_by_z * r[6 + k]);
+      along[k] = b.wp * (b.ju * u[k] + b.jv * v[k]) + b.wd * b.jd * d[k];
+    }
+    const Floats wp = weight * b.wp, wd = weight * b.wd, wk = weight * b.kappa;
+    Floats matrix[6];
+    Vec3Floats vector;
+    int entry = 0;
+    for (int row = 0; row < 3; ++row) {
+      const Floats pu = wp * u[row], pv = wp * v[row], pd = wd * d[row], pk = wk * along[row];
+      vector[row] = pu * b.ru + pv * b.rv + pd * b.rd - pk * b.hr;
+      for (int column = 0; column <= row; ++column)
+        matrix[entry++] = pu * u[column] + pv * v[column] + pd * d[column] - pk * along[column];
+    }
+    add_pose({b.x, b.y, b.z}, matrix, vector);
+    if constexpr (size == kPoseAndOffsets)
+      add_offsets(b, weight, d, along);
+  }
+
+  NormalEquations<size> equations() const {
+    NormalEquations<size> result;
+    const auto set = [&](int row, int column, Floats lanes) {
+      result.hessian[size * row + column] = result.hessian[size * column + row] = sum(lanes);
+    };
+    int entry = 0;
+    for (int row = 0; row < 3; ++row)
+      for (int column = 0; column <= row; ++column, ++entry) {
+        set(row, column, moving[entry]);
+        set(3 + row, 3 + column, turning[entry]);
+      }
+    for (int row = 0; row < 3; ++row)
+      for (int column = 0; column < 3; ++column)
+        set(3 + row, column, mixed[3 * row + column]);
+    if constexpr (size == kPoseAndOffsets) {
+      for (int row = 0; row < 2; ++row)
+        for (int column = 0; column < 6; ++column)
+          set(6 + row, column, by_offset[row][column]);
+      set(6, 6, offsets[0]), set(7, 6, offsets[1]), set(7, 7, offsets[2]);
+    }
+    for (int row = 0; row < size; ++row)
+      result.gradient[row] = sum(gradient[row]);
+    result.cost = sum(cost);
+    return result;
+  }
+
+private:
+  void add_pose(const Vec3Floats &x, const Floats matrix[6], const Vec3Floats &vector) {
+    const Vec3Floats turned = cross(x, vector);
+    const Vec3Floats columns[3] = {cross(x, {matrix[0], matrix[1], matrix[3]}),
+                                   cross(x, {matrix[1], matrix[2], matrix[4]}),
+                                   cross(x, {matrix[3], matrix[4], matrix[5]})};
+    int entry = 0;
+    for (int row = 0; row < 3; ++row) {
+      gradient[row] += vector[row];
+      gradient[3 + row] += turned[row];
+      for (int column = 0; column < 3; ++column)
+        mixed[3 * row + column] += columns[column][row];
+      const Vec3Floats both = cross(x, {columns[0][row], columns[1][row], columns[2][row]});
+      for (int column = 0; column <= row; ++column, ++entry) {
+        moving[entry] += matrix[entry];
+        turning[entry] += both[column];
+      }
+    }
+  }
+
+  // The reference's offset moves the residuals as depth does, the live one's the disparity alone.
+  void add_offsets(const Block &b, Floats weight, const Vec3Floats &d, const Vec3Floats &along) {
+    const Vec3Floats x = {b.x, b.y, b.z};
+    const Floats reference = weight * b.by_offset * b.kept;
+    const Floats wd = weight * b.wd, hd = b.wd * b.jd, pk = weight * b.kappa * hd;
+    Vec3Floats by_reference, by_live;
+    for (int k = 0; k < 3; ++k) {
+      by_reference[k] = reference * along[k];
+      by_live[k] = wd * d[k] - pk * along[k];
+    }
+    const Vec3Floats turned_reference = cross(x, by_reference), turned_live = cross(x, by_live);
+    for (int k = 0; k < 3; ++k) {
+      by_offset[0][k] += by_reference[k];
+      by_offset[0][3 + k] += turned_reference[k];
+      by_offset[1][k] += by_live[k];
+      by_offset[1][3 + k] += turned_live[k];
+    }
+    offsets[0] += reference * b.by_offset * b.depth_information;
+    offsets[1] += reference * hd;
+    offsets[2] += wd - pk * hd;
+    gradient[6] += reference * b.hr;
+    gradient[7] += wd * b.rd - pk * b.hr;
+  }
+};
+
 // Geman–McClure's ρ(χ²) = χ² / (1 + χ²/c²), c² = `scale`.
 template <int size>
 NormalEquations<size> normal_equations(const Correspondences &matches, const Estimate &estimate,
                                        float scale) {
   const FloatPose live_from_reference(estimate.pose, estimate.offsets);
-  const float *m = live_from_reference.m;
-  Floats h[size * (size + 1) / 2] = {}, g[size] = {}, cost{};
-  const float inverse_scale = 1 / scale;
-  for (int64_t i = 0; i < matches.padded; i += kLanes) {
-    const Block b(matches, i, live_from_reference);
-    const Floats point[3] = {b.x, b.y, b.z};
-    const Floats zero{};
-    const Floats shrink = 1.0f / (1.0f + b.chi2 * inverse_scale);
-    const Floats weight = b.usable ? shrink * shrink : zero;
-    cost += b.usable ? b.chi2 * shrink : load(&matches.valid[i]) * scale;
-    Floats ju[size], jv[size], jd[size];
-    for (int k = 0; k < 3; ++k) {
-      ju[k] = -(b.along_u * m[k] + b.u_by_z * m[6 + k]);
-      jv[k] = -(b.along_v * m[3 + k] + b.v_by_z * m[6 + k]);
-      jd[k] = -(b.d_by_z * m[6 + k]);
-    }
-    for (Floats *j : {ju, jv, jd})
-      for (int k = 0; k < 3; ++k)
-        j[3 + k] = point[(k + 1) % 3] * j[(k + 2) % 3] - point[(k + 2) % 3] * j[(k + 1) % 3];
-    if constexpr (size == kPoseAndOffsets) {
-      ju[6] = b.ju * b.by_offset, jv[6] = b.jv * b.by_offset, jd[6] = b.jd * b.by_offset;
-      ju[7] = zero, jv[7] = zero, jd[7] = zero + 1.0f;
-    }
-    const Floats wp = weight * b.wp, wd = weight * b.wd, wk = weight * b.kappa;
-    Floats along[size];
-    for (int k = 0; k < size; ++k)
-      along[k] = b.wp * (b.ju * ju[k] + b.jv * jv[k]) + b.wd * b.jd * jd[k];
-    int entry = 0;
-    for (int row = 0; row < size; ++row) {
-      const Floats pu = wp * ju[row], pv = wp * jv[row], pd = wd * jd[row], pk = wk * along[row];
-      g[row] += pu * b.ru + pv * b.rv + pd * b.rd - pk * b.hr;
-      for (int column = 0; column <= row; ++column)
-        h[entry++] += pu * ju[column] + pv * jv[column] + pd * jd[column] - pk * along[column];
-    }
-  }
-  NormalEquations<size> result;
-  int entry = 0;
-  for (int row = 0; row < size; ++row) {
-    result.gradient[row] = sum(g[row]);
-    for (int column = 0; column <= row; ++column)
-      result.hessian[size * row + column] = result.hessian[size * column + row] = sum(h[entry++]);
-  }
-  result.cost = sum(cost);
-  return result;
+  Sums<size> sums{};
+  for (int64_t i = 0; i < matches.padded; i += kLanes)
+    sums.add(Block(matches, i, live_from_reference), live_from_reference, load(&matches.valid[i]),
+             scale);
+  return sums.equations();
 }
 
 void add_prior(const OffsetPrior &prior, const Offsets &offsets,
@@ -358,9 +431,7 @@ private:
     const Floats apart = squared_x - squared_y, both = squared_x + squared_y;
     const Ints keep =
         apart * apart <= gate2 * (4.0f * (spread_x + spread_y) + 2.0f * both * lateral);
-    const Ints bit = {1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
-                      1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
-    return static_cast<uint64_t>(sum(keep & bit));
+    return bits_of(keep);
   }
 
   static int popcount_words(const uint64_t *a, const uint64_t *b, int words) {
@@ -466,13 +537,15 @@ public:
       : reference_(reference), live_(live), settings_(settings), random_(seed), pairs_(pairs),
         prior_(settings),
         matches_(correspondences(reference, live, pairs, settings, OffsetsAre::noise)) {
+    // By distance, in the order of the pairs where it is equal.
+    std::array<int32_t, 258> starts{};
+    for (const RowPair &pair : pairs)
+      ++starts[pair.distance + 1];
+    for (size_t distance = 1; distance < starts.size(); ++distance)
+      starts[distance] += starts[distance - 1];
     order_.resize(pairs.size());
-    for (size_t i = 0; i < order_.size(); ++i)
-      order_[i] = static_cast<int32_t>(i);
-    std::sort(order_.begin(), order_.end(), [&](int32_t a, int32_t b) {
-      return pairs[a].distance < pairs[b].distance ||
-             (pairs[a].distance == pairs[b].distance && a < b);
-    });
+    for (size_t i = 0; i < pairs.size(); ++i)
+      order_[starts[pairs[i].distance]++] = static_cast<int32_t>(i);
     order_.resize(std::min<size_t>(order_.size(), kGraphSize));
   }
 
@@ -482,7 +555,8 @@ public:
       return {};
     if (first_guess)
       consider(*first_guess);
-    search();
+    if (!most_agree())
+      search();
     if (best_.inliers < settings_.min_consensus)
       return {};
     Estimate estimate{pose_, {}};
@@ -495,6 +569,13 @@ private:
   // Triples come from at most this many matches, the most alike: enough to find the pose, and the
   // graph's cost grows with the square.
   static constexpr size_t kGraphSize = 256;
+
+  // No other pose can have more matches than one that most of them agree on; what it lacks in
+  // precision, refinement adds.
+  bool most_agree() const {
+    return best_.inliers >= settings_.min_consensus &&
+           2 * best_.inliers > static_cast<int32_t>(pairs_.size());
+  }
 
   struct Edge {
     int i = 0, j = 0, common = -1;
@@ -538,8 +619,11 @@ private:
       const int k = graph.nth_common(i, j, static_cast<int>(random_.below(both)));
       ++hypotheses;
       Pose pose;
-      if (hypothesis({order_[i], order_[j], order_[k]}, pose) && consider(pose))
-        chance = chance_of_success(graph);
+      if (!hypothesis({order_[i], order_[j], order_[k]}, pose) || !consider(pose))
+        continue;
+      if (most_agree())
+        break;
+      chance = chance_of_success(graph);
     }
   }
 

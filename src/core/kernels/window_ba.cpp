@@ -19,34 +19,20 @@
 #include <tuple>
 
 #include "kernels/cholesky.hpp"
+#include "kernels/double_lanes.hpp"
 #include "kernels/projection.hpp"
 
 namespace engram::ENGRAM_ISA {
 namespace {
 
-typedef double Doubles __attribute__((vector_size(64)));
-typedef int64_t Longs __attribute__((vector_size(64)));
-constexpr int kLandmarks = 8; // lanes
+constexpr int kLandmarks = kDoubleLanes;
 
-typedef std::array<Doubles, 3> Vector;
+typedef Vec3Lanes Vector;
 typedef std::array<Doubles, 6> Symmetric; // xx, xy, xz, yy, yz, zz
 typedef std::array<Doubles, 9> Matrix;    // row-major
 
-double sum(Doubles lanes) {
-  double total = 0;
-  for (int lane = 0; lane < kLandmarks; ++lane)
-    total += lanes[lane];
-  return total;
-}
-
-Doubles dot(const Vector &a, const Vector &b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
 Vector operator-(const Vector &a, const Vector &b) {
   return {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
-}
-
-Vector cross(const Vector &a, const Vector &b) {
-  return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
 }
 
 Vector multiply(const Symmetric &m, const Vector &v) {
