@@ -8,7 +8,9 @@ namespace {
 
 typedef float f32x4 __attribute__((vector_size(16)));
 typedef int32_t i32x4 __attribute__((vector_size(16)));
-typedef uint8_t u8x4 __attribute__((vector_size(4)));
+typedef float f32x16 __attribute__((vector_size(64)));
+typedef int32_t i32x16 __attribute__((vector_size(64)));
+typedef uint32_t u32x4 __attribute__((vector_size(16)));
 
 struct Vec {
   float x, y, z;
@@ -55,27 +57,49 @@ inline float power8(float x) {
   return x * x;
 }
 
-inline f32x4 texel(const uint8_t *p) {
-  u8x4 bytes;
+inline uint32_t word(const uint8_t *p) {
+  uint32_t bytes;
   memcpy(&bytes, p, 4);
-  return __builtin_convertvector(bytes, f32x4);
+  return bytes;
 }
 
-inline f32x4 tap(const Texture &texture, int32_t level, float u, float v) {
+// The four texels around a place, each times its weight: lanes 4k … 4k + 3 are texel k's channels,
+// still scaled by where their byte stands in the word (`gathered` undoes it). Compilers turn a
+// conversion of bytes to floats into single bytes; masks and one conversion of words stay vectors.
+inline f32x16 tap(const Texture &texture, int32_t level, float u, float v, float weight) {
   const int32_t width = texture.widths[level], height = texture.heights[level];
   const float x = (u - floorf(u)) * static_cast<float>(width) - 0.5f;
   const float y = (v - floorf(v)) * static_cast<float>(height) - 0.5f;
   const float x_floor = floorf(x), y_floor = floorf(y);
   int32_t i0 = static_cast<int32_t>(x_floor), j0 = static_cast<int32_t>(y_floor);
-  int32_t i1 = i0 + 1 < width ? i0 + 1 : 0, j1 = j0 + 1 < height ? j0 + 1 : 0;
+  const int32_t i1 = i0 + 1 < width ? i0 + 1 : 0, j1 = j0 + 1 < height ? j0 + 1 : 0;
   i0 = i0 < 0 ? width - 1 : i0;
   j0 = j0 < 0 ? height - 1 : j0;
   const float a = x - x_floor, b = y - y_floor;
   const uint8_t *row0 = texture.levels[level] + 4 * static_cast<int64_t>(j0) * width;
   const uint8_t *row1 = texture.levels[level] + 4 * static_cast<int64_t>(j1) * width;
-  const f32x4 top = texel(row0 + 4 * i0) * (1 - a) + texel(row0 + 4 * i1) * a;
-  const f32x4 bottom = texel(row1 + 4 * i0) * (1 - a) + texel(row1 + 4 * i1) * a;
-  return top * (1 - b) + bottom * b;
+  const u32x4 words = {word(row0 + 4 * i0), word(row0 + 4 * i1), word(row1 + 4 * i0),
+                       word(row1 + 4 * i1)};
+  const i32x4 low = reinterpret_cast<i32x4>(words), high = reinterpret_cast<i32x4>(words >> 8);
+  constexpr int32_t b0 = 0xff, b1 = 0xff00, b2 = 0xff0000;
+  const i32x16 masks = {b0, b1, b2, b2, b0, b1, b2, b2, b0, b1, b2, b2, b0, b1, b2, b2};
+  const i32x16 lanes =
+      __builtin_shufflevector(low, high, 0, 0, 0, 4, 1, 1, 1, 5, 2, 2, 2, 6, 3, 3, 3, 7) & masks;
+  const f32x16 values = __builtin_convertvector(lanes, f32x16);
+  const float top = weight * (1 - b), bottom = weight * b;
+  const f32x4 corner = {top * (1 - a), top * a, bottom * (1 - a), bottom * a};
+  const f32x16 weights =
+      __builtin_shufflevector(corner, corner, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3);
+  return values * weights;
+}
+
+inline f32x4 gathered(f32x16 sum) {
+  const f32x4 q0 = __builtin_shufflevector(sum, sum, 0, 1, 2, 3);
+  const f32x4 q1 = __builtin_shufflevector(sum, sum, 4, 5, 6, 7);
+  const f32x4 q2 = __builtin_shufflevector(sum, sum, 8, 9, 10, 11);
+  const f32x4 q3 = __builtin_shufflevector(sum, sum, 12, 13, 14, 15);
+  const f32x4 places = {1, 1.0f / (1 << 8), 1.0f / (1 << 16), 1.0f / (1 << 16)};
+  return ((q0 + q1) + (q2 + q3)) * places;
 }
 
 struct Texels {
@@ -101,17 +125,21 @@ Texels sample(const Texture &texture, const Surface &surface, float u, float v, 
   level = level > top ? top : level;
   const int32_t fine = static_cast<int32_t>(level);
   const int32_t coarse = fine + 1 < texture.level_count ? fine + 1 : fine;
-  const float blend = level - static_cast<float>(fine);
+  // One level alone near each whole number, a blend of two half way between.
+  const float blend = clamp01(2 * (level - static_cast<float>(fine)) - 0.5f);
   const float du = dot(u_axis, along) * step_m, dv = dot(v_axis, along) * step_m;
-  f32x4 sum = {0, 0, 0, 0};
+  const float share = 1.0f / static_cast<float>(taps);
+  const float fine_share = coarse == fine ? share : share * (1 - blend);
+  const float coarse_share = coarse == fine ? 0 : share * blend;
+  f32x16 texels = {};
   for (int k = 0; k < taps; ++k) {
     const float s = static_cast<float>(k) - 0.5f * static_cast<float>(taps - 1);
-    f32x4 colour = tap(texture, fine, u + du * s, v + dv * s);
-    if (blend > 0.04f && coarse != fine)
-      colour += (tap(texture, coarse, u + du * s, v + dv * s) - colour) * blend;
-    sum += colour;
+    if (fine_share > 0)
+      texels += tap(texture, fine, u + du * s, v + dv * s, fine_share);
+    if (coarse_share > 0)
+      texels += tap(texture, coarse, u + du * s, v + dv * s, coarse_share);
   }
-  sum *= 1.0f / static_cast<float>(taps);
+  const f32x4 sum = gathered(texels);
   return {sum[0] * (1 / 255.0f), (sum[1] - 128) * (1 / 100.0f), (sum[2] - 128) * (1 / 100.0f),
           sum[3] * (1 / 255.0f)};
 }

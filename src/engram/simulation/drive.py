@@ -181,6 +181,13 @@ class _Waves:
         )
 
 
+def pose_on(line: Line, robot: Robot, driven_m: float, aside_m: float = 0.0) -> SE3:
+    """The pose of a steady ride: on the line, or so far to the left of it."""
+    position, heading, _ = line.at(driven_m)
+    left = np.array([-np.sin(heading), np.cos(heading)])
+    return _looking(position + aside_m * left, robot.height_m, heading, -robot.pitch_rad, 0.0)
+
+
 def _pose(line: Line, robot: Robot, waves: _Waves, driven_m: float) -> SE3:
     position, heading, curvature = line.at(driven_m)
     left = np.array([-np.sin(heading), np.cos(heading)])
@@ -191,10 +198,15 @@ def _pose(line: Line, robot: Robot, waves: _Waves, driven_m: float) -> SE3:
     if robot.on_handlebars:  # leans into the bend and looks where it steers
         roll += float(np.clip(2.2 * curvature, -0.2, 0.2))
         yaw += float(np.clip(0.9 * curvature, -0.12, 0.12))
+    return _looking(position, robot.height_m + waves.heave_m(driven_m), yaw, pitch, roll)
+
+
+def _looking(position: Array, height_m: float, yaw: float, pitch: float, roll: float) -> SE3:
+    """Yaw anticlockwise from east, pitch upwards, roll clockwise; radians."""
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     level_right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
     level_down = np.cross(forward, level_right)
     right = np.cos(roll) * level_right - np.sin(roll) * level_down
     down = np.cross(forward, right)
-    centre = np.array([*position, robot.height_m + waves.heave_m(driven_m)])
+    centre = np.array([*position, height_m])
     return SE3(np.stack([right, down, forward], axis=1), centre)
