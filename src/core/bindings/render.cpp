@@ -1,4 +1,5 @@
-// The renderer as Python sees it: a Scene that owns meshes, textures and the maps derived from them.
+// The renderer as Python sees it: a Scene that owns meshes, textures and the maps derived from
+// them.
 #include "kernels/raster.hpp"
 #include "kernels/sensor.hpp"
 #include "kernels/shading.hpp"
@@ -27,7 +28,7 @@ using Plane = Input<float, 2>;
 
 constexpr float kReach_m = 85;       // of the sun's map and the openness around its centre
 constexpr float kStray_m = 25;       // how far the camera may leave that centre
-constexpr float kSunTexel_m = 0.06f; // finer than most relief, as coarse as the sun's penumbra
+constexpr float kSunTexel_m = 0.09f; // as coarse as the penumbra of the sun 10 m behind an edge
 constexpr float kMovingTexel_m = 0.1f;
 constexpr float kMovingReach_m = 35;
 constexpr float kOpennessCell_m = 0.25f;
@@ -232,7 +233,10 @@ public:
       : meshes_(1), noise_(noise.data(), noise.data() + 256 * 256) {}
 
   int32_t add_texture(const Image &image, bool coverage);
-  void remove_texture(int32_t texture) { textures_.at(texture) = StoredTexture{{}, {}}; free_textures_.push_back(texture); }
+  void remove_texture(int32_t texture) {
+    textures_.at(texture) = StoredTexture{{}, {}};
+    free_textures_.push_back(texture);
+  }
   int32_t add_mesh(MeshArrays in);
   void remove_mesh(int32_t mesh);
   void set_moving(const MeshArrays &in) {
@@ -240,9 +244,10 @@ public:
     meshes_[0] = stored(in);
   }
   void set_lamps(const Input<float, 2> &lamps);
-  auto render(const Camera &camera, const Input<double, 2> &rotation, const Input<double, 1> &centre,
-              const Light &light, int threads);
-  auto depth(const Camera &camera, const Input<double, 2> &rotation, const Input<double, 1> &centre);
+  auto render(const Camera &camera, const Input<double, 2> &rotation,
+              const Input<double, 1> &centre, const Light &light, int threads);
+  auto depth(const Camera &camera, const Input<double, 2> &rotation,
+             const Input<double, 1> &centre);
   size_t bytes() const;
 
 private:
@@ -280,7 +285,8 @@ private:
 };
 
 int32_t Scene::add_texture(const Image &image, bool coverage) {
-  const auto height = static_cast<int32_t>(image.shape(0)), width = static_cast<int32_t>(image.shape(1));
+  const auto height = static_cast<int32_t>(image.shape(0)),
+             width = static_cast<int32_t>(image.shape(1));
   if (height < 1 || width < 1 || height > 16384 || width > 16384)
     throw nb::value_error("texture: sides must be 1 to 16384 texels");
   StoredTexture texture;
@@ -430,7 +436,8 @@ std::vector<int32_t> Scene::in_window(const Window &window, int first_mesh, int 
       double at[2];
       for (int k = 0; k < 2; ++k) {
         const double *axis = window.axes + 4 * k;
-        at[k] = axis[0] * chunk.centre[0] + axis[1] * chunk.centre[1] + axis[2] * chunk.centre[2] + axis[3];
+        at[k] = axis[0] * chunk.centre[0] + axis[1] * chunk.centre[1] + axis[2] * chunk.centre[2] +
+                axis[3];
       }
       const double radius = chunk.radius * scale;
       if (at[0] < -radius || at[1] < -radius || at[0] > window.width + radius ||
@@ -466,8 +473,11 @@ void Scene::build_moving_sun(const Light &light, const double *centre) {
 void Scene::build_openness() {
   Window window = {};
   window.width = window.height = static_cast<int32_t>(2 * kReach_m / kOpennessCell_m);
-  openness_map_ = {nullptr, static_cast<float>(map_centre_[0]) - kReach_m,
-                   static_cast<float>(map_centre_[1]) - kReach_m, kOpennessCell_m, window.width,
+  openness_map_ = {nullptr,
+                   static_cast<float>(map_centre_[0]) - kReach_m,
+                   static_cast<float>(map_centre_[1]) - kReach_m,
+                   kOpennessCell_m,
+                   window.width,
                    window.height};
   window.axes[0] = window.axes[5] = 1 / kOpennessCell_m;
   window.axes[10] = 1;
@@ -517,8 +527,13 @@ void Scene::build_lamp(StoredLamp &lamp) {
                                           {0, 0, -1, 1, 0, 0, 0, -1, 0},
                                           {1, 0, 0, 0, 0, 1, 0, -1, 0},
                                           {-1, 0, 0, 0, 0, -1, 0, -1, 0}};
-  const Camera square = {0.5f * kLampFace, 0.5f * kLampFace, 0.5f * kLampFace - 0.5f,
-                         0.5f * kLampFace - 0.5f, kLampFace, kLampFace, 0};
+  const Camera square = {0.5f * kLampFace,
+                         0.5f * kLampFace,
+                         0.5f * kLampFace - 0.5f,
+                         0.5f * kLampFace - 0.5f,
+                         kLampFace,
+                         kLampFace,
+                         0};
   const double centre[3] = {lamp.position[0], lamp.position[1], lamp.position[2]};
   const auto order = order_from(centre, lamp.range, 1, static_cast<int>(meshes_.size()));
   lamp.depth.resize(5ULL * kLampFace * kLampFace);
@@ -542,7 +557,9 @@ std::vector<Lamp> Scene::lamps_near(const double *centre) {
     }
     if (lamp.depth.empty() && distance2 < 60 * 60)
       build_lamp(lamp);
-    near.push_back({{lamp.position[0], lamp.position[1], lamp.position[2]}, lamp.power, lamp.range,
+    near.push_back({{lamp.position[0], lamp.position[1], lamp.position[2]},
+                    lamp.power,
+                    lamp.range,
                     lamp.depth.empty() ? nullptr : lamp.depth.data()});
   }
   return near;
@@ -587,8 +604,13 @@ auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
     const double *r = rotation.data(), forward[3] = {r[2], r[5], r[8]};
     follow(centre.data(), forward, light);
     const std::vector<Lamp> lamps = lamps_near(centre.data());
-    const Surroundings world = {mesh_table_.data(), texture_table_.data(), sun_map_, moving_map_,
-                                openness_map_, lamps.data(), lamp_grid(lamps, centre.data()),
+    const Surroundings world = {mesh_table_.data(),
+                                texture_table_.data(),
+                                sun_map_,
+                                moving_map_,
+                                openness_map_,
+                                lamps.data(),
+                                lamp_grid(lamps, centre.data()),
                                 noise_.data()};
     const auto order = order_from(centre.data(), kFarthest_m, 0, static_cast<int>(meshes_.size()));
     const size_t samples = pixels * kSamples * kSamples;
@@ -604,7 +626,8 @@ auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
       ENGRAM_CALL(raster_view, mesh_table_.data(), texture_table_.data(), order.data(),
                   static_cast<int32_t>(order.size() / 2), view, first * kSamples, last * kSamples,
                   ids, depths);
-      ENGRAM_CALL(shade_view, world, light, view, ids, first, last, luminance.data() + eye * pixels);
+      ENGRAM_CALL(shade_view, world, light, view, ids, first, last,
+                  luminance.data() + eye * pixels);
       for (int y = first; y < last; ++y)
         for (int x = 0; x < camera.width; ++x)
           inverse_depth[eye * pixels + static_cast<size_t>(y) * camera.width + x] =
@@ -613,7 +636,8 @@ auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
   }
   const std::initializer_list<size_t> shape = {2, static_cast<size_t>(camera.height),
                                                static_cast<size_t>(camera.width)};
-  return std::make_pair(to_numpy(std::move(luminance), shape), to_numpy(std::move(inverse_depth), shape));
+  return std::make_pair(to_numpy(std::move(luminance), shape),
+                        to_numpy(std::move(inverse_depth), shape));
 }
 
 auto Scene::depth(const Camera &camera, const Input<double, 2> &rotation,
@@ -641,7 +665,8 @@ auto Scene::depth(const Camera &camera, const Input<double, 2> &rotation,
 }
 
 size_t Scene::bytes() const {
-  size_t total = 4 * (sun_.size() + moving_sun_.size() + openness_.size() + ids_.size() + depths_.size());
+  size_t total =
+      4 * (sun_.size() + moving_sun_.size() + openness_.size() + ids_.size() + depths_.size());
   for (const StoredTexture &texture : textures_)
     total += texture.bytes.size();
   for (const StoredMesh &mesh : meshes_)
@@ -651,7 +676,8 @@ size_t Scene::bytes() const {
   return total;
 }
 
-void check_pose(const Camera &camera, const Input<double, 2> &rotation, const Input<double, 1> &centre) {
+void check_pose(const Camera &camera, const Input<double, 2> &rotation,
+                const Input<double, 1> &centre) {
   if (rotation.shape(0) != 3 || rotation.shape(1) != 3 || centre.shape(0) != 3)
     throw nb::value_error("pose: rotation must have shape (3, 3) and position (3,)");
   for (int i = 0; i < 9; ++i)
@@ -684,14 +710,14 @@ auto develop(const Plane &luminance, float gain, float shot, float read, float v
   {
     nb::gil_scoped_release unlocked;
     const Sensor sensor = {gain, shot, read, vignette, seed};
-    ENGRAM_CALL(develop, luminance.data(), static_cast<int32_t>(width), static_cast<int32_t>(height),
-                sensor, grey.data());
+    ENGRAM_CALL(develop, luminance.data(), static_cast<int32_t>(width),
+                static_cast<int32_t>(height), sensor, grey.data());
   }
   return to_numpy(std::move(grey), {height, width});
 }
 
-auto smear(const Plane &luminance, const Plane &inverse_depths, float fx, float fy, float cx, float cy,
-           const Input<float, 1> &twist) {
+auto smear(const Plane &luminance, const Plane &inverse_depths, float fx, float fy, float cx,
+           float cy, const Input<float, 1> &twist) {
   const size_t height = luminance.shape(0), width = luminance.shape(1);
   if (inverse_depths.shape(0) != height || inverse_depths.shape(1) != width || twist.shape(0) != 6)
     throw nb::value_error("smear: inverse_depths must match luminance and twist have length 6");
@@ -712,47 +738,53 @@ void bind_render(nb::module_ &module) {
                   "cloud_x"_a, "cloud_y"_a, "fog_per_m"_a, "haze"_a, "wet"_a, "snow"_a,
                   "headlights"_a, "windows"_a);
   nb::class_<Camera>(module, "RenderCamera")
-      .def("__init__",
-           [](Camera *self, float fx, float fy, float cx, float cy, int32_t width, int32_t height,
-              float baseline_m) {
-             new (self) Camera{fx, fy, cx, cy, width, height, baseline_m};
-           },
-           "fx"_a, "fy"_a, "cx"_a, "cy"_a, "width"_a, "height"_a, "baseline_m"_a);
+      .def(
+          "__init__",
+          [](Camera *self, float fx, float fy, float cx, float cy, int32_t width, int32_t height,
+             float baseline_m) { new (self) Camera{fx, fy, cx, cy, width, height, baseline_m}; },
+          "fx"_a, "fy"_a, "cx"_a, "cy"_a, "width"_a, "height"_a, "baseline_m"_a);
   nb::class_<Scene>(module, "Scene")
-      .def(nb::init<const nb::ndarray<const uint8_t, nb::shape<256, 256>, nb::c_contig> &>(), "noise"_a)
+      .def(nb::init<const nb::ndarray<const uint8_t, nb::shape<256, 256>, nb::c_contig> &>(),
+           "noise"_a)
       .def("add_texture", &Scene::add_texture, "texels"_a, "coverage"_a = false)
       .def("remove_texture", &Scene::remove_texture, "texture"_a)
-      .def("add_mesh",
-           [](Scene &scene, Input<float, 3> vertices, Input<float, 3> uv, Input<int32_t, 1> textures,
-              Input<uint32_t, 1> flags, Input<float, 1> tint, Input<float, 1> glow,
-              Input<int32_t, 1> objects) {
-             return scene.add_mesh({vertices, uv, textures, flags, tint, glow, objects});
-           },
-           "vertices"_a, "uv"_a, "textures"_a, "flags"_a, "tint"_a, "glow"_a, "objects"_a)
+      .def(
+          "add_mesh",
+          [](Scene &scene, Input<float, 3> vertices, Input<float, 3> uv, Input<int32_t, 1> textures,
+             Input<uint32_t, 1> flags, Input<float, 1> tint, Input<float, 1> glow,
+             Input<int32_t, 1> objects) {
+            return scene.add_mesh({vertices, uv, textures, flags, tint, glow, objects});
+          },
+          "vertices"_a, "uv"_a, "textures"_a, "flags"_a, "tint"_a, "glow"_a, "objects"_a)
       .def("remove_mesh", &Scene::remove_mesh, "mesh"_a)
-      .def("set_moving",
-           [](Scene &scene, Input<float, 3> vertices, Input<float, 3> uv, Input<int32_t, 1> textures,
-              Input<uint32_t, 1> flags, Input<float, 1> tint, Input<float, 1> glow,
-              Input<int32_t, 1> objects) {
-             scene.set_moving({vertices, uv, textures, flags, tint, glow, objects});
-           },
-           "vertices"_a, "uv"_a, "textures"_a, "flags"_a, "tint"_a, "glow"_a, "objects"_a)
+      .def(
+          "set_moving",
+          [](Scene &scene, Input<float, 3> vertices, Input<float, 3> uv, Input<int32_t, 1> textures,
+             Input<uint32_t, 1> flags, Input<float, 1> tint, Input<float, 1> glow,
+             Input<int32_t, 1> objects) {
+            scene.set_moving({vertices, uv, textures, flags, tint, glow, objects});
+          },
+          "vertices"_a, "uv"_a, "textures"_a, "flags"_a, "tint"_a, "glow"_a, "objects"_a)
       .def("set_lamps", &Scene::set_lamps, "lamps"_a)
-      .def("render",
-           [](Scene &scene, const Camera &camera, Input<double, 2> rotation, Input<double, 1> position,
-              const Light &light, int threads) {
-             check_pose(camera, rotation, position);
-             return scene.render(camera, rotation, position, light, threads);
-           },
-           "camera"_a, "rotation"_a, "position"_a, "light"_a, "threads"_a = 1)
-      .def("depth",
-           [](Scene &scene, const Camera &camera, Input<double, 2> rotation, Input<double, 1> position) {
-             check_pose(camera, rotation, position);
-             return scene.depth(camera, rotation, position);
-           },
-           "camera"_a, "rotation"_a, "position"_a)
+      .def(
+          "render",
+          [](Scene &scene, const Camera &camera, Input<double, 2> rotation,
+             Input<double, 1> position, const Light &light, int threads) {
+            check_pose(camera, rotation, position);
+            return scene.render(camera, rotation, position, light, threads);
+          },
+          "camera"_a, "rotation"_a, "position"_a, "light"_a, "threads"_a = 1)
+      .def(
+          "depth",
+          [](Scene &scene, const Camera &camera, Input<double, 2> rotation,
+             Input<double, 1> position) {
+            check_pose(camera, rotation, position);
+            return scene.depth(camera, rotation, position);
+          },
+          "camera"_a, "rotation"_a, "position"_a)
       .def_prop_ro("bytes", &Scene::bytes);
-  module.def("develop", &develop, "luminance"_a, "gain"_a, "shot"_a, "read"_a, "vignette"_a, "seed"_a);
+  module.def("develop", &develop, "luminance"_a, "gain"_a, "shot"_a, "read"_a, "vignette"_a,
+             "seed"_a);
   module.def("smear", &smear, "luminance"_a, "inverse_depths"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
              "twist"_a);
 }

@@ -24,14 +24,16 @@ struct Polygon {
   Linear edges[4];
   Linear value;
   double x_min, x_max, y_min, y_max;
-  Linear u, v;          // of texture coordinates, times value when perspective
-  double u_at, v_at;    // added after the division by value
+  Linear u, v;       // of texture coordinates, times value when perspective
+  double u_at, v_at; // added after the division by value
   bool perspective;
-  const uint8_t *mask;  // RGBA level, null for solid surfaces
+  const uint8_t *mask; // RGBA level, null for solid surfaces
   int32_t mask_width, mask_height;
 };
 
-inline double dot(const float *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+inline double dot(const float *a, const double *b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
 
 // The edge from p to q as a plane through the origin: positive on the side of the polygon.
 inline Linear edge_between(const double *p, const double *q, double side, const Linear &x,
@@ -76,8 +78,8 @@ inline bool covered(const Polygon &polygon, int32_t x, double u_row, double v_ro
   return polygon.mask[4 * (row_in * polygon.mask_width + column_in) + 3] >= 128;
 }
 
-inline void fill_cutout(const Polygon &polygon, int32_t *ids, float *values, int32_t from, int32_t to,
-                        float at, float step, int32_t y, int32_t id) {
+inline void fill_cutout(const Polygon &polygon, int32_t *ids, float *values, int32_t from,
+                        int32_t to, float at, float step, int32_t y, int32_t id) {
   const double u_row = polygon.u.dy * y + polygon.u.at, v_row = polygon.v.dy * y + polygon.v.at;
   for (int32_t x = from; x <= to; ++x) {
     const float value = at + step * static_cast<float>(x);
@@ -109,9 +111,11 @@ inline bool interval(const Polygon &polygon, int32_t y, double &low, double &hig
 }
 
 void fill(const Polygon &polygon, const Target &target, int32_t id) {
-  const int32_t first = static_cast<int32_t>(ceil(polygon.y_min > target.row_begin ? polygon.y_min : target.row_begin));
+  const int32_t first = static_cast<int32_t>(
+      ceil(polygon.y_min > target.row_begin ? polygon.y_min : target.row_begin));
   const double last_row = target.row_end - 1;
-  const int32_t last = static_cast<int32_t>(floor(polygon.y_max < last_row ? polygon.y_max : last_row));
+  const int32_t last =
+      static_cast<int32_t>(floor(polygon.y_max < last_row ? polygon.y_max : last_row));
   for (int32_t y = first; y <= last; ++y) {
     double low, high;
     if (!interval(polygon, y, low, high))
@@ -187,8 +191,8 @@ inline void turn(const double *rotation, const double *vector, double *turned) {
     turned[i] = rotation[i] * vector[0] + rotation[3 + i] * vector[1] + rotation[6 + i] * vector[2];
 }
 
-void mask_in_view(Polygon &polygon, const Surface &surface, const Texture &texture, const View &view,
-                  const Grid &grid, double depth) {
+void mask_in_view(Polygon &polygon, const Surface &surface, const Texture &texture,
+                  const View &view, const Grid &grid, double depth) {
   const double along_u[3] = {surface.along_u[0], surface.along_u[1], surface.along_u[2]};
   const double along_v[3] = {surface.along_v[0], surface.along_v[1], surface.along_v[2]};
   double u_cam[3], v_cam[3];
@@ -300,7 +304,8 @@ bool set_up_in_window(Polygon &polygon, const float *vertices, const Surface &su
                  polygon.u.dy * points[0][1];
   polygon.v.at = dot(surface.along_v, corner) + surface.v_at_origin - polygon.v.dx * points[0][0] -
                  polygon.v.dy * points[0][1];
-  take_mask(polygon, textures[surface.texture], fabs(polygon.u.dx) * textures[surface.texture].widths[0]);
+  take_mask(polygon, textures[surface.texture],
+            fabs(polygon.u.dx) * textures[surface.texture].widths[0]);
   return true;
 }
 
@@ -335,8 +340,7 @@ void raster_view(const Mesh *meshes, const Texture *textures, const int32_t *ord
 }
 
 void raster_window(const Mesh *meshes, const Texture *textures, const int32_t *order,
-                   int32_t order_count, const Window &window, uint32_t skip_flags,
-                   float *heights) {
+                   int32_t order_count, const Window &window, uint32_t skip_flags, float *heights) {
   const Target target = {window.width, 0, window.height, nullptr, heights};
   for (int64_t i = 0; i < static_cast<int64_t>(window.width) * window.height; ++i)
     heights[i] = -1e9f;

@@ -2,8 +2,8 @@
 //
 // A point of the picture is inside when it lies on the same side of all edges in homogeneous
 // coordinates (Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997);
-// that needs no clipping at the near plane. The inside of a row is an interval, found from the edges
-// directly, and is filled in one vectorised sweep.
+// that needs no clipping at the near plane. The inside of a row is an interval, found from the
+// edges directly, and is filled in one vectorised sweep.
 #pragma once
 
 #include "dispatch.hpp"

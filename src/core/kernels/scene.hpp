@@ -12,9 +12,9 @@ enum SurfaceFlag : uint32_t {
   kCutout = 1u << 0,      // the texture's fourth channel is coverage: foliage, railings
   kGlass = 1u << 1,       // the fourth channel says how much the surface mirrors
   kTranslucent = 1u << 2, // light passes through: leaves are bright from behind
-  kTwoSided = 1u << 3,    // seen from both sides; others only from where they turn counter-clockwise
-  kNoShadow = 1u << 4,    // throws no shadow
-  kRoad = 1u << 5,        // ground that traffic drives on: wheel tracks in snow, puddles
+  kTwoSided = 1u << 3, // seen from both sides; others only from where they turn counter-clockwise
+  kNoShadow = 1u << 4, // throws no shadow
+  kRoad = 1u << 5,     // ground that traffic drives on: wheel tracks in snow, puddles
 };
 
 // One convex planar polygon of four vertices (a triangle repeats one). Texture coordinates are
@@ -61,7 +61,7 @@ struct View {
   int32_t samples;       // per pixel and axis
 };
 
-struct Window { // parallel rays: column, row and height of a point are affine in it
+struct Window {    // parallel rays: column, row and height of a point are affine in it
   double axes[12]; // 3×4 row-major
   int32_t width, height;
 };
@@ -75,24 +75,25 @@ struct Lamp {
 
 constexpr float kLampCell_m = 6;
 
-struct LampGrid { // which lamps reach a square of the ground: lamps[starts[cell] … starts[cell + 1])
+struct LampGrid { // which lamps reach a square of the ground: lamps[starts[cell] … starts[cell +
+                  // 1])
   const int32_t *starts, *lamps; // null without lamps
   float west_m, south_m;
   int32_t width, height; // cells
 };
 
 struct Light {
-  float sun[3];      // towards the sun
-  float sun_power;   // irradiance / π on a surface facing the sun
-  float sky_power;   // mean luminance of the sky
-  float cloud;       // share of the sky that clouds cover, 0…1
+  float sun[3];    // towards the sun
+  float sun_power; // irradiance / π on a surface facing the sun
+  float sky_power; // mean luminance of the sky
+  float cloud;     // share of the sky that clouds cover, 0…1
   float cloud_shift[2];
-  float fog_per_m;   // extinction
-  float haze;        // luminance of the air itself, as a factor of sky_power
-  float wet, snow;   // 0…1
-  float headlights;  // 0…1
-  float windows;     // factor on the glow of surfaces
-  float vehicle[9];  // left and right headlight, and the direction they shine
+  float fog_per_m;  // extinction
+  float haze;       // luminance of the air itself, as a factor of sky_power
+  float wet, snow;  // 0…1
+  float headlights; // 0…1
+  float windows;    // factor on the glow of surfaces
+  float vehicle[9]; // left and right headlight, and the direction they shine
 };
 
 struct DepthMap { // a Window and what stands in it

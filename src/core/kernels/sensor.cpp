@@ -17,8 +17,9 @@ inline uint64_t scramble(uint64_t x) {
 // The sum of four uniform numbers is normal enough for noise; its variance is made one.
 inline float noise(uint64_t seed, uint64_t pixel) {
   const uint64_t bits = scramble(seed ^ (pixel * 0x2545f4914f6cdd1dull));
-  const int32_t sum = static_cast<int32_t>(bits & 0xffff) + static_cast<int32_t>((bits >> 16) & 0xffff) +
-                      static_cast<int32_t>((bits >> 32) & 0xffff) + static_cast<int32_t>(bits >> 48);
+  const int32_t sum =
+      static_cast<int32_t>(bits & 0xffff) + static_cast<int32_t>((bits >> 16) & 0xffff) +
+      static_cast<int32_t>((bits >> 32) & 0xffff) + static_cast<int32_t>(bits >> 48);
   return (static_cast<float>(sum) - 131070.0f) * (1.7320508f / 65536.0f);
 }
 
@@ -26,12 +27,14 @@ inline float noise(uint64_t seed, uint64_t pixel) {
 
 void develop(const float *luminance, int32_t width, int32_t height, const Sensor &sensor,
              uint8_t *grey) {
-  const float scale_x = 2.0f / static_cast<float>(width), scale_y = 2.0f / static_cast<float>(height);
+  const float scale_x = 2.0f / static_cast<float>(width),
+              scale_y = 2.0f / static_cast<float>(height);
   for (int32_t y = 0; y < height; ++y)
     for (int32_t x = 0; x < width; ++x) {
       const int64_t i = static_cast<int64_t>(y) * width + x;
       const float a = static_cast<float>(x) * scale_x - 1, b = static_cast<float>(y) * scale_y - 1;
-      const float exposed = luminance[i] * sensor.gain * (1 - 0.5f * sensor.vignette * (a * a + b * b));
+      const float exposed =
+          luminance[i] * sensor.gain * (1 - 0.5f * sensor.vignette * (a * a + b * b));
       const float clipped = exposed < 1.5f ? exposed : 1.5f;
       const float sigma = sqrtf(sensor.shot * clipped + sensor.read * sensor.read);
       const float noisy = clipped + sigma * noise(sensor.seed, static_cast<uint64_t>(i));
@@ -64,7 +67,8 @@ void smear(const float *luminance, const float *inverse_depths, int32_t width, i
         const float p = u - static_cast<float>(i0), q = v - static_cast<float>(j0);
         const float *row0 = luminance + static_cast<int64_t>(j0) * width;
         const float *row1 = luminance + static_cast<int64_t>(j1) * width;
-        sum += (row0[i0] * (1 - p) + row0[i1] * p) * (1 - q) + (row1[i0] * (1 - p) + row1[i1] * p) * q;
+        sum +=
+            (row0[i0] * (1 - p) + row0[i1] * p) * (1 - q) + (row1[i0] * (1 - p) + row1[i1] * p) * q;
       }
       smeared[i] = sum * (1.0f / kTaps);
     }

@@ -8,11 +8,11 @@
 namespace engram {
 
 struct Sensor {
-  float gain;      // grey level 255 is luminance 1 / gain
-  float shot;      // variance of the noise per unit of exposed luminance
-  float read;      // its standard deviation in the dark
-  float vignette;  // loss of light in the corners
-  uint64_t seed;   // of the noise
+  float gain;     // grey level 255 is luminance 1 / gain
+  float shot;     // variance of the noise per unit of exposed luminance
+  float read;     // its standard deviation in the dark
+  float vignette; // loss of light in the corners
+  uint64_t seed;  // of the noise
 };
 
 } // namespace engram

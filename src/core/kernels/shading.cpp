@@ -31,8 +31,9 @@ inline float smooth(float low, float high, float x) {
 inline float exp2_of(float x) {
   x = x < -100 ? -100 : x > 100 ? 100 : x;
   const float whole = floorf(x), f = x - whole;
-  const float power = 1 + f * (0.69314718f + f * (0.24022651f + f * (0.05550411f +
-                          f * (0.00961813f + f * 0.00133336f))));
+  const float power =
+      1 + f * (0.69314718f +
+               f * (0.24022651f + f * (0.05550411f + f * (0.00961813f + f * 0.00133336f))));
   const int32_t bits = (static_cast<int32_t>(whole) + 127) << 23;
   float scale;
   memcpy(&scale, &bits, 4);
@@ -108,7 +109,8 @@ struct Texels {
 
 constexpr int kMaxTaps = 5;
 
-// Anisotropic: taps along the long axis of the pixel's footprint, each of the size of the short one.
+// Anisotropic: taps along the long axis of the pixel's footprint, each of the size of the short
+// one.
 Texels sample(const Texture &texture, const Surface &surface, float u, float v, Vec along,
               float minor_m, float stretch) {
   const Vec u_axis = vec(surface.along_u), v_axis = vec(surface.along_v);
@@ -116,10 +118,12 @@ Texels sample(const Texture &texture, const Surface &surface, float u, float v, 
   taps = taps < 1 ? 1 : taps > kMaxTaps ? kMaxTaps : taps;
   const float major_m = minor_m * stretch, step_m = major_m / static_cast<float>(taps);
   const float u_per_m2 = dot(u_axis, u_axis), v_per_m2 = dot(v_axis, v_axis);
-  const float width = static_cast<float>(texture.widths[0]), height = static_cast<float>(texture.heights[0]);
+  const float width = static_cast<float>(texture.widths[0]),
+              height = static_cast<float>(texture.heights[0]);
   const float u_texels2 = u_per_m2 * width * width, v_texels2 = v_per_m2 * height * height;
   const float per_m = sqrtf(u_texels2 > v_texels2 ? u_texels2 : v_texels2);
-  const float size = (step_m > minor_m ? step_m : minor_m) * per_m;
+  // A quarter more than a pixel: sharper, the grid of texels beats with that of pixels.
+  const float size = 1.25f * (step_m > minor_m ? step_m : minor_m) * per_m;
   float level = size > 1 ? log2_of(size) : 0;
   const float top = static_cast<float>(texture.level_count - 1);
   level = level > top ? top : level;
@@ -158,36 +162,51 @@ inline float noise_at(const uint8_t *noise, float x, float y) {
 // Luminance of the sky towards a unit direction; a dark rim of far trees and hills below.
 float sky(const Surroundings &world, const Light &light, Vec d) {
   const float level = sqrtf(d.x * d.x + d.y * d.y) + 1e-6f;
-  const float rim = 0.012f + 0.07f * noise_at(world.noise, 128 + 90 * d.x / level, 128 + 90 * d.y / level);
+  const float rim =
+      0.012f + 0.07f * noise_at(world.noise, 128 + 90 * d.x / level, 128 + 90 * d.y / level);
   if (d.z < rim * level)
     return 0.28f * light.sky_power + 0.02f * light.sun_power;
   const float up = d.z > 0.02f ? d.z : 0.02f;
   const float towards_sun = dot(d, vec(light.sun));
   const float around = towards_sun > 0 ? towards_sun : 0;
   const float glow = power8(around), disc = power8(glow * glow);
-  float blue = light.sky_power * (1.15f - 0.5f * sqrtf(up)) +
-               light.sun_power * (0.12f * glow + 0.9f * disc);
+  float blue =
+      light.sky_power * (1.15f - 0.5f * sqrtf(up)) + light.sun_power * (0.12f * glow + 0.9f * disc);
   if (light.cloud <= 0.01f)
     return blue;
   const float x = d.x / (up + 0.12f) * 22 + light.cloud_shift[0];
   const float y = d.y / (up + 0.12f) * 22 + light.cloud_shift[1];
-  const float field = 0.62f * noise_at(world.noise, x, y) + 0.28f * noise_at(world.noise, 2.3f * x + 37, 2.3f * y + 11) +
+  const float field = 0.62f * noise_at(world.noise, x, y) +
+                      0.28f * noise_at(world.noise, 2.3f * x + 37, 2.3f * y + 11) +
                       0.1f * noise_at(world.noise, 6.1f * x + 5, 6.1f * y + 91);
   const float edge = 0.97f - 1.05f * light.cloud;
   const float cover = smooth(edge - 0.09f, edge + 0.09f, field);
-  const float lit = (0.62f + 0.45f * (1 - field) + 0.2f * up) * (light.sky_power + 0.09f * light.sun_power);
+  const float lit =
+      (0.62f + 0.45f * (1 - field) + 0.2f * up) * (light.sky_power + 0.09f * light.sun_power);
   return mix(blue, 1.15f * lit, cover);
 }
 
-// Share of the sun that reaches a point: a 3×3 tent over the map's texels, which is about as wide as
-// the sun's own penumbra ten metres behind an edge.
-float sunlit(const DepthMap &map, Vec p) {
+// Share of the sun that reaches a point: a 3×3 tent over the map's texels, which is about as wide
+// as the sun's own penumbra ten metres behind an edge. Each texel is compared with the height that
+// the receiving plane itself has there: a plane never shades itself, whatever its tilt, and shadows
+// stay attached with a small bias.
+float sunlit(const DepthMap &map, Vec p, Vec normal) {
   if (map.heights == nullptr)
     return 1;
   const double *axes = map.window.axes;
+  const Vec right = {static_cast<float>(axes[0]), static_cast<float>(axes[1]),
+                     static_cast<float>(axes[2])};
+  const Vec below = {static_cast<float>(axes[4]), static_cast<float>(axes[5]),
+                     static_cast<float>(axes[6])};
+  const Vec up = {static_cast<float>(axes[8]), static_cast<float>(axes[9]),
+                  static_cast<float>(axes[10])};
+  const float facing = dot(normal, up), steepest = 0.05f;
+  const float scale = -1 / (dot(right, right) * (facing > steepest ? facing : steepest));
+  const float slope_x = scale * dot(normal, right), slope_y = scale * dot(normal, below);
   const float x = static_cast<float>(axes[0] * p.x + axes[1] * p.y + axes[2] * p.z + axes[3]);
   const float y = static_cast<float>(axes[4] * p.x + axes[5] * p.y + axes[6] * p.z + axes[7]);
-  const float height = static_cast<float>(axes[8] * p.x + axes[9] * p.y + axes[10] * p.z + axes[11]);
+  const float height =
+      static_cast<float>(axes[8] * p.x + axes[9] * p.y + axes[10] * p.z + axes[11]);
   const float x_floor = floorf(x), y_floor = floorf(y);
   const int32_t i = static_cast<int32_t>(x_floor), j = static_cast<int32_t>(y_floor);
   if (i < 1 || j < 1 || i + 2 >= map.window.width || j + 2 >= map.window.height)
@@ -195,12 +214,15 @@ float sunlit(const DepthMap &map, Vec p) {
   const float a = x - x_floor, b = y - y_floor;
   const f32x4 across = {1 - a, 1, 1, a};
   const float down[4] = {1 - b, 1, 1, b};
+  const f32x4 columns = {-1 - a, -a, 1 - a, 2 - a};
   f32x4 shaded = {0, 0, 0, 0};
   for (int row = 0; row < 4; ++row) {
+    const f32x4 plane = columns * slope_x + (height + slope_y * (static_cast<float>(row - 1) - b));
     f32x4 heights;
-    memcpy(&heights, map.heights + static_cast<int64_t>(j - 1 + row) * map.window.width + i - 1, 16);
+    memcpy(&heights, map.heights + static_cast<int64_t>(j - 1 + row) * map.window.width + i - 1,
+           16);
     const f32x4 weights = across * down[row];
-    shaded += reinterpret_cast<f32x4>(reinterpret_cast<i32x4>(weights) & (heights > height));
+    shaded += reinterpret_cast<f32x4>(reinterpret_cast<i32x4>(weights) & (heights > plane));
   }
   const float sum = (shaded[0] + shaded[1]) + (shaded[2] + shaded[3]);
   return 1 - sum * (1 / 9.0f);
@@ -236,7 +258,8 @@ float lamplit(const Lamp &lamp, Vec from_lamp) {
     right = from_lamp.y > 0 ? from_lamp.x : -from_lamp.x, below = down;
   }
   constexpr float kHalf = 0.5f * kLampFace;
-  const float x = kHalf - 0.5f + kHalf * right / forward, y = kHalf - 0.5f + kHalf * below / forward;
+  const float x = kHalf - 0.5f + kHalf * right / forward,
+              y = kHalf - 0.5f + kHalf * below / forward;
   int32_t i = static_cast<int32_t>(floorf(x)), j = static_cast<int32_t>(floorf(y));
   i = i < 0 ? 0 : i > kLampFace - 2 ? kLampFace - 2 : i;
   j = j < 0 ? 0 : j > kLampFace - 2 ? kLampFace - 2 : j;
@@ -319,7 +342,7 @@ Shine headlights_at(const Light &light, const Point &point) {
     const float facing = dot(to_lamp, point.normal) * inverse;
     // Dipped: a cut-off a little above the horizontal.
     const float dipped = 1 - 0.85f * smooth(-0.02f, 0.05f, -to_lamp.z * inverse);
-    const float power = 9 * light.headlights * power8(inside * inside) * dipped / d2;
+    const float power = 6 * light.headlights * power8(inside) * dipped / (d2 + 6);
     shine.diffuse += facing > 0 ? power * facing : 0;
   }
   return shine;
@@ -361,7 +384,7 @@ float ambient(const Surroundings &world, const Light &light, const Point &point)
                                 point.at.y + out_m * point.flat_normal.y);
   const float height = point.at.z > 0 ? point.at.z : 0;
   const float open = 1 - (1 - ground) * exp_of(-0.22f * height);
-  const float from_sky = light.sky_power * open * (0.60f + 0.40f * point.normal.z);
+  const float from_sky = light.sky_power * open * (0.80f + 0.20f * point.normal.z);
   const float bounced = (0.12f * light.sky_power + 0.10f * light.sun_power) * (0.4f + 0.6f * open);
   return from_sky + bounced;
 }
@@ -377,11 +400,13 @@ float sunshine(const Surroundings &world, const Light &light, const Point &point
     return 0;
   if (facing <= 0)
     return 0;
-  const float off = point.flags & kTranslucent ? 0.12f : 0.03f + 0.0012f * point.distance_m;
+  const bool leaf = point.flags & kTranslucent;
+  const float off = leaf ? 0.12f : 0.02f + 0.0004f * point.distance_m;
   const Vec near = point.at + off * point.flat_normal + off * sun;
-  float lit = sunlit(world.sun_static, near);
+  const Vec plane = leaf ? sun : point.flat_normal; // leaves stand in each other's way at random
+  float lit = sunlit(world.sun_static, near, plane);
   if (lit > 0 && world.sun_moving.heights != nullptr)
-    lit *= sunlit(world.sun_moving, near);
+    lit *= sunlit(world.sun_moving, near, plane);
   return light.sun_power * facing * lit;
 }
 
@@ -395,7 +420,8 @@ float fogged(const Light &light, float luminance, float distance_m) {
 // Bends the normal by the texture's slopes.
 Vec bumped(const Surface &surface, Vec normal, float slope_u, float slope_v) {
   const Vec u = vec(surface.along_u), v = vec(surface.along_v);
-  const float u_scale = slope_u / sqrtf(dot(u, u) + 1e-12f), v_scale = slope_v / sqrtf(dot(v, v) + 1e-12f);
+  const float u_scale = slope_u / sqrtf(dot(u, u) + 1e-12f),
+              v_scale = slope_v / sqrtf(dot(v, v) + 1e-12f);
   const Vec bent = normal + u_scale * u + v_scale * v;
   return (1 / sqrtf(dot(bent, bent))) * bent;
 }
@@ -418,7 +444,7 @@ float shade_point(const Surroundings &world, const Light &light, const Surface &
   float luminance =
       albedo * (ambient(world, light, point) + sunshine(world, light, point) + shine.diffuse);
   if (surface.glow > 0)
-    luminance += surface.glow * light.windows * texels.special * (0.3f + 0.7f * texels.albedo);
+    luminance += surface.glow * light.windows * texels.special * (0.15f + 1.2f * texels.albedo);
   if ((surface.flags & kGlass) && texels.special > 0.02f)
     luminance += texels.special * (0.03f + mirror(point.cosine)) * reflected(world, light, point);
   if (point.wet > 0)

@@ -25,7 +25,7 @@ from engram.errors import ConfigError
 Progress = Callable[[str, int, int], None]
 
 # SciPy takes a quarter of a second for one window: fewer runs tell enough.
-_SLOW_STAGES = {"window_ba_512": 10}
+_SLOW_STAGES = {"render_pair_512": 10, "window_ba_512": 10}
 
 
 def run_bench(

@@ -13,6 +13,7 @@ import numpy as np
 from engram.bench.data import BenchData
 from engram.bench.plain import PlainPipeline
 from engram.bench.ranking import prepare_ranking
+from engram.bench.rendering import prepare_rendering
 from engram.bench.stage import Prepared, Run, Stage
 from engram.bench.window import prepare_window
 from engram.frontend import Frontend, MatcherConfig, StereoPair, match_frames
@@ -90,6 +91,7 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "frontend_odometry_full": partial(prepare_frontend_odometry, size="full"),
         "attempt_512": partial(prepare_attempt, size="512"),
         "attempt_full": partial(prepare_attempt, size="full"),
+        "render_pair_512": prepare_rendering,
         "window_ba_512": prepare_window,
         "rank_150_paths": partial(prepare_ranking, paths=150),
         "rank_10000_paths": partial(prepare_ranking, paths=10_000),

@@ -126,7 +126,7 @@ class Places:
     ) -> list[tuple[SE3, StereoPair]]:
         """True pose and images at each place, moved so far ahead and to the left."""
         conditions = Conditions(visit.start, visit.weather, visit.day)
-        today = Today(visit.day, conditions.hour, conditions.season, 0.6)
+        today = Today(visit.day, conditions.hour, conditions.season, 0.45)
         renderer = TownRenderer(self._town, today)
         camera, found = self.robot.camera, []
         for k, start_m in enumerate(self._starts_m):

@@ -15,9 +15,9 @@ from engram.simulation.robots import Robot
 Luminance = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
-_TARGET = 0.46  # exposed luminance that the metered highlights are brought to
+_TARGET = 0.4  # exposed luminance that the metered highlights are brought to
 _MOST_GAIN = 26.0
-_SHUTTER_BY_DAY_S = 0.002
+_SHUTTER_BY_DAY_S = 0.0007
 _LONGEST_SHUTTER_S = 0.012
 
 
@@ -69,7 +69,7 @@ class CameraModel:
         if self._lens.covered_from_m <= pose.driven_m < self._lens.covered_to_m:
             luminance = luminance * np.float32(0.002)
         gain = self._meter(luminance)
-        shutter_s = float(np.clip(_SHUTTER_BY_DAY_S * gain, 0.0005, _LONGEST_SHUTTER_S))
+        shutter_s = float(np.clip(_SHUTTER_BY_DAY_S * gain, 0.0002, _LONGEST_SHUTTER_S))
         pair = []
         for eye in range(2):
             light = self._blur(luminance[eye], inverse_depths[eye], pose.twist * shutter_s)
@@ -104,7 +104,7 @@ class CameraModel:
         camera = self._robot.camera
         # The nearest things, about 3 m away, move by this much at most.
         moved_px = camera.fx * (np.abs(twist[:3]).max() / 3 + np.abs(twist[3:]).max())
-        if moved_px < 0.4:
+        if moved_px < 0.5:
             return light
         blurred: Luminance = _core.smear(
             np.ascontiguousarray(light), np.ascontiguousarray(inverse_depths),

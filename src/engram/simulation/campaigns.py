@@ -85,7 +85,7 @@ class Campaign:
     traffic: float
     size: Size
     home: str
-    parked_share: float = 0.6
+    parked_share: float = 0.45
     spacing_m: float = 0.7
     place: Place = OXFORD
 
@@ -242,7 +242,7 @@ def _oxford(seed: int, size: Size) -> Campaign:
         "oxford", seed, starts, _drawn(rng, 10), ["wildcat"] * 10, [k % 2 == 1 for k in range(10)]
     )
     length = 7600 if size is Size.FULL else 3000
-    return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.75)
+    return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.65)
 
 
 CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {

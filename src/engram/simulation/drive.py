@@ -14,7 +14,7 @@ from engram.simulation.streets import Junction, Route, StreetPlan
 Array = NDArray[np.float64]
 
 _STEP_M = 0.25  # between points of the line
-_ROUND_M = 2.6  # standard deviation of the smoothing that rounds corners
+_ROUND_M = 5.5  # standard deviation of the smoothing that rounds corners: a radius of 4.9 m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,28 +59,41 @@ def driving_line(plan: StreetPlan, route: Route, reverse: bool) -> Line:
     pieces = []
     for k, start in enumerate(junctions):
         end = junctions[(k + 1) % len(junctions)]
-        centre = plan.centreline(start, end)
-        left = np.roll(np.gradient(centre, axis=0), 1, axis=1) * [-1, 1]
-        left /= np.linalg.norm(left, axis=1, keepdims=True)
+        centre = plan.centreline(start, end)[:-1]
         aside_m = min(1.7, 0.42 * plan.half_width_m(start, end))
-        pieces.append((centre + aside_m * left)[:-1])
-    return closed_line(np.concatenate(pieces), _ROUND_M)
+        # Across a junction one drives closer to the middle, or left turns would be too tight.
+        aside = np.array([0.35 * aside_m, *([aside_m] * (len(centre) - 1))])
+        pieces.append(np.column_stack([centre, aside]))
+    middle = closed_line(np.concatenate(pieces), _ROUND_M).points
+    along = np.roll(middle[:, :2], -1, axis=0) - np.roll(middle[:, :2], 1, axis=0)
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    even = _resampled(middle[:, :2] + middle[:, 2:] * left, _STEP_M)
+    return Line(even, _length_m(even))
 
 
 def closed_line(corners: Array, round_m: float) -> Line:
-    """The curve through corners (N, 2) and back to the first, smoothed over so many metres."""
+    """The curve through corners (N, 2) and back to the first, smoothed over so many metres.
+
+    Further columns are carried along.
+    """
     smooth = _rounded(_resampled(corners, _STEP_M), round_m / _STEP_M)
     even = _resampled(smooth, _STEP_M)
-    steps = np.linalg.norm(np.roll(even, -1, 0) - even, axis=1)
-    return Line(even, float(steps.sum()))
+    return Line(even, _length_m(even))
+
+
+def _length_m(closed: Array) -> float:
+    return float(np.linalg.norm((np.roll(closed, -1, 0) - closed)[:, :2], axis=1).sum())
 
 
 def _resampled(closed: Array, step_m: float) -> Array:
     looped = np.vstack([closed, closed[:1]])
-    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(looped, axis=0), axis=1))])
+    along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(looped[:, :2], axis=0), axis=1))])
     count = round(float(along[-1] / step_m))
     wanted = np.arange(count) * along[-1] / count
-    return np.stack([np.interp(wanted, along, looped[:, k]) for k in range(2)], axis=1)
+    return np.stack(
+        [np.interp(wanted, along, looped[:, k]) for k in range(closed.shape[1])], axis=1
+    )
 
 
 def _rounded(closed: Array, sigma: float) -> Array:
@@ -88,7 +101,9 @@ def _rounded(closed: Array, sigma: float) -> Array:
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     weights /= weights.sum()
     wrapped = np.vstack([closed[-reach:], closed, closed[:reach]])
-    return np.stack([np.convolve(wrapped[:, k], weights, "valid") for k in range(2)], axis=1)
+    return np.stack(
+        [np.convolve(wrapped[:, k], weights, "valid") for k in range(closed.shape[1])], axis=1
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ class NoiseFields:
     Attributes:
         rough: all scales, like weathered plaster.
         soft: only scales beyond about 12 texels, like stains.
-        grain: white noise.
+        grain: white noise, band-limited to about 4 texels so that it does not beat with pixels.
     """
 
     rough: Field
@@ -33,7 +33,7 @@ class NoiseFields:
         return NoiseFields(
             rough=_coloured(rng, exponent=1.15, low_pass=0.45),
             soft=_coloured(rng, exponent=1.6, low_pass=0.04),
-            grain=_coloured(rng, exponent=0.0, low_pass=0.5),
+            grain=_coloured(rng, exponent=0.0, low_pass=0.28),
         )
 
     def cut(self, field: Field, rng: np.random.Generator, shape: tuple[int, int]) -> Field:

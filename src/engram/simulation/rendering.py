@@ -15,7 +15,7 @@ from engram.simulation.town import Tile, Today, Town
 _AHEAD_M = 170.0  # how far tiles are kept around the camera
 _LAMP_POWER = 7.0
 _LAMP_RANGE_M = 22.0
-_WINDOW_LUMINANCE = 0.85
+_WINDOW_LUMINANCE = 0.3
 
 
 class TownRenderer:

@@ -28,8 +28,8 @@ class Robot:
     camera: StereoCamera
     height_m: float = 1.55
     pitch_rad: float = 0.0
-    read_noise: float = 0.004
-    shot_noise: float = 1.2e-4
+    read_noise: float = 0.0022
+    shot_noise: float = 5e-5
     vignette: float = 0.12
     shake: float = 1.0
     on_handlebars: bool = False

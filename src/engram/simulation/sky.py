@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from datetime import datetime
+from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
+
+_J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 
 
 def sun_direction(when: datetime, latitude_deg: float, longitude_deg: float) -> NDArray[np.float64]:
@@ -17,19 +19,21 @@ def sun_direction(when: datetime, latitude_deg: float, longitude_deg: float) -> 
         latitude_deg: north is positive.
         longitude_deg: east is positive.
 
-    Source: Spencer (1971), declination and equation of time as Fourier series; within 0.2°.
+    Source: the Astronomical Almanac's low-precision formulae, within 0.01° from 1950 to 2050.
     """
+    days = (when - _J2000).total_seconds() / 86400
+    mean_longitude = math.radians((280.460 + 0.9856474 * days) % 360)
+    anomaly = math.radians((357.528 + 0.9856003 * days) % 360)
+    ecliptic = mean_longitude + math.radians(
+        1.915 * math.sin(anomaly) + 0.020 * math.sin(2 * anomaly)
+    )
+    obliquity = math.radians(23.439 - 4e-7 * days)
+    declination = math.asin(math.sin(obliquity) * math.sin(ecliptic))
+    ascension = math.atan2(math.cos(obliquity) * math.sin(ecliptic), math.cos(ecliptic))
+    # The equation of time: how far the true sun is ahead of the mean one, as an angle.
+    ahead = math.remainder(mean_longitude - ascension, 2 * math.pi)
     hour_utc = when.hour + when.minute / 60 + when.second / 3600
-    day = 2 * math.pi * (when.timetuple().tm_yday - 1 + (hour_utc - 12) / 24) / 365
-    declination = (
-        0.006918 - 0.399912 * math.cos(day) + 0.070257 * math.sin(day)
-        - 0.006758 * math.cos(2 * day) + 0.000907 * math.sin(2 * day)
-    )  # fmt: skip
-    equation_min = 229.18 * (
-        0.000075 + 0.001868 * math.cos(day) - 0.032077 * math.sin(day)
-        - 0.014615 * math.cos(2 * day) - 0.040849 * math.sin(2 * day)
-    )  # fmt: skip
-    solar_hour = hour_utc + longitude_deg / 15 + equation_min / 60
+    solar_hour = hour_utc + longitude_deg / 15 + math.degrees(ahead) / 15
     angle = math.radians(15 * (solar_hour - 12))
     latitude = math.radians(latitude_deg)
     east = -math.cos(declination) * math.sin(angle)
@@ -56,5 +60,5 @@ def clear_sky_power(elevation_sine: float) -> float:
     """Mean luminance of a clear sky; falls by about a factor ten for every 3° below −2°."""
     elevation_deg = math.degrees(math.asin(max(-1.0, min(1.0, elevation_sine))))
     if elevation_deg >= 0:
-        return 0.16 + 0.62 * math.sqrt(elevation_sine)
-    return max(0.0035, 0.16 * 10 ** (elevation_deg / 3.6))
+        return 0.14 + 0.53 * math.sqrt(elevation_sine)
+    return max(0.0035, 0.14 * 10 ** (elevation_deg / 3.6))

@@ -542,8 +542,8 @@ class _TileBuilder:
             length = float(np.linalg.norm(b - a))
             outwards = np.array([side.along[1], -side.along[0]])
             for k in range(int((length - 3) // 5.6)):
-                rng = np.random.default_rng(self.daily.integers(2**32))
-                if rng.random() > self.today.parked_share:
+                rng = self._who_parks()
+                if rng is None:
                     continue
                 at = a + side.along * (3.6 + 5.6 * k + rng.uniform(-0.4, 0.4))
                 at = at + outwards * (1.0 + rng.uniform(-0.08, 0.15))
@@ -551,3 +551,16 @@ class _TileBuilder:
                 heading = float(np.arctan2(side.along[1], side.along[0])) + turned
                 heading += float(rng.normal(0, 0.02))
                 self.parts.append(car(self.materials, rng).moved(_level(at, 0.0), heading))
+
+    def _who_parks(self) -> np.random.Generator | None:
+        """What draws the car in the next bay; None while it is free.
+
+        Most bays have a neighbour's car, always the same, on four days of five; the others, and
+        those that the neighbour left, are sometimes taken by anyone. About `parked_share` of all
+        are taken.
+        """
+        home = np.random.default_rng(self.rng.integers(2**32))
+        guest = np.random.default_rng(self.daily.integers(2**32))
+        if home.random() < self.today.parked_share and guest.random() < 0.8:
+            return home
+        return guest if guest.random() < 0.5 * self.today.parked_share else None

@@ -1,0 +1,146 @@
+"""The rasteriser and the shading against rays cast one by one."""
+
+import numpy as np
+import pytest
+
+from engram import _core
+from engram.simulation.mesh import Kind, Mesh, MeshBuilder, SurfaceFlag
+from engram.simulation.noise import NoiseFields
+from engram.simulation.textures import sheet
+
+_CAMERA = _core.RenderCamera(60.0, 60.0, 31.5, 23.5, 64, 48, 0.3)
+# Looking north: columns right (east), down, forward (north).
+_NORTH = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+
+
+def _scene() -> tuple[_core.Scene, int]:
+    scene = _core.Scene(NoiseFields.of_seed(0).tile())
+    return scene, scene.add_texture(sheet(0.5))
+
+
+def _add(scene: _core.Scene, mesh: Mesh) -> int:
+    return scene.add_mesh(
+        mesh.vertices, mesh.uv, mesh.textures, mesh.flags, mesh.tint, mesh.glow, mesh.kinds
+    )
+
+
+def _random_quads(rng: np.random.Generator, count: int, texture: int) -> Mesh:
+    builder = MeshBuilder()
+    for _ in range(count):
+        right, up, _ = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        middle = rng.uniform([-6, -2, -4], [6, 14, 4])  # some behind, some across the near plane
+        a, b = rng.uniform(0.3, 4, 2)
+        corners = [
+            middle + s * a * right + t * b * up for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+        ]
+        flags = SurfaceFlag.TWO_SIDED if rng.random() < 0.5 else SurfaceFlag.PLAIN
+        builder.quad(
+            corners, [(0, 1), (1, 1), (1, 0), (0, 0)], texture, Kind(1 + rng.integers(7)), flags
+        )
+    return builder.build()
+
+
+def _cast(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and kind along the ray of every pixel centre, by testing every quad."""
+    columns, rows = np.meshgrid(np.arange(64), np.arange(48))
+    cam = np.stack([(columns - 31.5) / 60, (rows - 23.5) / 60, np.ones((48, 64))], -1)
+    rays = cam @ _NORTH.T
+    depth, kinds = np.full((48, 64), np.inf), np.full((48, 64), -1)
+    for corners, flags, kind in zip(
+        mesh.vertices.astype(float), mesh.flags, mesh.kinds, strict=True
+    ):
+        normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+        if corners[0] @ normal > 0 and not flags & SurfaceFlag.TWO_SIDED:
+            continue
+        with np.errstate(divide="ignore"):
+            t = (corners[0] @ normal) / (rays @ normal)
+        points = rays * t[..., None]
+        inside = t > 0
+        for k in range(4):
+            edge = corners[(k + 1) % 4] - corners[k]
+            inside &= (np.cross(edge, points - corners[k]) @ normal) >= 0
+        nearer = inside & (t < depth)
+        depth[nearer], kinds[nearer] = t[nearer], kind
+    return depth, kinds
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_depth_is_that_of_the_nearest_quad_along_each_ray(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene, texture = _scene()
+    mesh = _random_quads(rng, 40, texture)
+    _add(scene, mesh)
+    depth, kinds = scene.depth(_CAMERA, _NORTH, np.zeros(3))
+    expected, expected_kinds = _cast(mesh)
+    # Pixels whose centre lies on an edge to within rounding may go either way.
+    differ = (kinds != expected_kinds) | ~np.isclose(depth, expected, rtol=1e-4)
+    assert differ.mean() < 0.002
+
+
+def _light(**changes: object) -> _core.Light:
+    values = {
+        "sun": np.array([0, 0, 1], np.float32), "vehicle": np.zeros((3, 3), np.float32),
+        "sun_power": 0.0, "sky_power": 1.0, "cloud": 0.0, "cloud_x": 0.0, "cloud_y": 0.0,
+        "fog_per_m": 0.0, "haze": 1.0, "wet": 0.0, "snow": 0.0, "headlights": 0.0, "windows": 0.0,
+    }  # fmt: skip
+    return _core.Light.of(**{**values, **changes})
+
+
+def _floor_and_roof(texture: int, roof: bool) -> Mesh:
+    builder = MeshBuilder()
+    square = [(0, 1), (1, 1), (1, 0), (0, 0)]
+    builder.quad(
+        [(-30, -30, 0), (30, -30, 0), (30, 30, 0), (-30, 30, 0)], square, texture, Kind.GROUND
+    )
+    if roof:
+        corners = [(2, 6, 3), (6, 6, 3), (6, 10, 3), (2, 10, 3)]
+        builder.quad(corners, square, texture, Kind.BUILDING, SurfaceFlag.TWO_SIDED)
+    return builder.build()
+
+
+def test_a_roof_throws_its_shadow_where_the_sun_sends_it() -> None:
+    sun = np.array([0.6, 0.0, 0.8], np.float32)  # from the east: shadows lie 0.75 h to the west
+    eye = np.array([0.0, -4.0, 1.7])
+    found = []
+    for roof in (False, True):
+        scene, texture = _scene()
+        _add(scene, _floor_and_roof(texture, roof))
+        found.append(scene.render(_CAMERA, _NORTH, eye, _light(sun=sun, sun_power=3.0))[0][0])
+    lit, shaded = found
+
+    def ratio_at(x: float, y: float) -> float:
+        forward, down = y - eye[1], eye[2]
+        column = round(31.5 + 60 * (x - eye[0]) / forward)
+        row = round(23.5 + 60 * down / forward)
+        return float(shaded[row, column] / lit[row, column])
+
+    assert ratio_at(4 - 2.25, 8.0) < 0.4  # under the sun's ray through the roof's middle
+    assert ratio_at(-2.5, 8.0) > 0.95
+    assert ratio_at(-1.5, 4.0) > 0.95
+
+
+def test_the_right_eye_sees_things_further_left() -> None:
+    scene, texture = _scene()
+    builder = MeshBuilder()
+    corners = [(-0.5, 6, -0.5), (0.5, 6, -0.5), (0.5, 6, 0.5), (-0.5, 6, 0.5)]
+    builder.quad(corners, [(0, 1), (1, 1), (1, 0), (0, 0)], texture, Kind.BUILDING)
+    _add(scene, builder.build())
+    _, inverse_depths = scene.render(_CAMERA, _NORTH, np.zeros(3), _light())
+    middles = [np.mean(np.nonzero(inverse_depth > 0.1)[1]) for inverse_depth in inverse_depths]
+    assert middles[0] - middles[1] == pytest.approx(60 * 0.3 / 6, abs=0.6)  # whole pixels
+
+
+def test_bad_meshes_are_refused() -> None:
+    scene, texture = _scene()
+    good = _random_quads(np.random.default_rng(1), 3, texture)
+    for name, value, words in (
+        ("textures", good.textures + 99, "texture number"),
+        ("uv", good.uv[:2], "uv must"),
+        ("tint", good.tint[:1], "length N"),
+        ("vertices", good.vertices * np.float32(np.nan), "not finite"),
+    ):
+        fields = {key: getattr(good, key) for key in Mesh.__slots__}
+        with pytest.raises(ValueError, match=words):
+            _add(scene, Mesh(**{**fields, name: value}))
+    with pytest.raises(ValueError, match="no such mesh"):
+        scene.remove_mesh(0)
