@@ -1,5 +1,7 @@
 #include "place_index.hpp"
 
+#include <algorithm>
+
 namespace engram {
 
 int64_t PlaceIndex::add(const int32_t *words, int64_t count) {
@@ -14,10 +16,10 @@ int64_t PlaceIndex::add(const int32_t *words, int64_t count) {
   for (int64_t i = 0; i < count; ++i) {
     const auto word = static_cast<size_t>(words[i]);
     std::vector<uint8_t> &list = blocks_.back()[word];
-    int32_t gap = here - last_[word] - 1;
-    for (; gap >= skip; gap -= skip)
-      list.push_back(skip);
-    list.push_back(static_cast<uint8_t>(gap));
+    int32_t step = here - last_[word];
+    for (; step > skipped; step -= skipped)
+      list.push_back(0);
+    list.push_back(static_cast<uint8_t>(step));
     last_[word] = here;
   }
   return places_++;
@@ -31,6 +33,25 @@ int64_t PlaceIndex::bytes() const {
       total += list.capacity();
   }
   return static_cast<int64_t>(total);
+}
+
+std::vector<int64_t> best_scores(const double *scores, int64_t count, int64_t most) {
+  const auto better = [scores](int64_t a, int64_t b) {
+    return scores[a] > scores[b] || (scores[a] == scores[b] && a < b);
+  };
+  std::vector<int64_t> best; // a heap whose front is the worst
+  for (int64_t i = 0; i < count && most > 0; ++i) {
+    if (static_cast<int64_t>(best.size()) == most) {
+      if (!(scores[i] > scores[best.front()])) // an equal one that comes later is worse
+        continue;
+      std::pop_heap(best.begin(), best.end(), better);
+      best.pop_back();
+    }
+    best.push_back(i);
+    std::push_heap(best.begin(), best.end(), better);
+  }
+  std::sort_heap(best.begin(), best.end(), better);
+  return best;
 }
 
 } // namespace engram

@@ -8,12 +8,13 @@
 namespace engram {
 
 // Places come in blocks, so that the sums of a block stay in the second-level cache while the
-// postings of all words run over them. A gap of up to 255 takes one byte: a place that shows 500
-// of 10,000 words takes about 500 bytes.
+// postings of all words run over them. A posting is the step from the last place that shows the
+// word, 1 to 255, in one byte; 0 skips 255 places. A place that shows 500 of 10,000 words takes
+// about 500 bytes.
 class PlaceIndex {
 public:
   static constexpr int64_t block_size = 1 << 16;
-  static constexpr uint8_t skip = 255; // 255 places without the word
+  static constexpr int32_t skipped = 255;
 
   explicit PlaceIndex(int64_t words) : words_(words) {}
 
@@ -34,5 +35,8 @@ private:
   std::vector<std::vector<std::vector<uint8_t>>> blocks_;
   std::vector<int32_t> last_; // within the open block, the last place of each word; -1 before it
 };
+
+// Numbers of the `most` greatest scores, greatest first, of equal ones the first.
+std::vector<int64_t> best_scores(const double *scores, int64_t count, int64_t most);
 
 } // namespace engram

@@ -7,12 +7,14 @@ import pytest
 
 from engram.bench import STAGES, BenchReport, run_bench, runner
 from engram.bench.data import BenchData, load_bench_data, scale_and_crop, synthetic_drive
+from engram.bench.places import DenseTable, made_up_vocabulary
 from engram.bench.plain import load_plain_pipeline
 from engram.bench.report import Machine, Side, StageResult
 from engram.bench.stages import prepare_attempt, prepare_frontend_odometry
 from engram.errors import ConfigError
 from engram.frontend import Frontend
 from engram.odometry import Odometry
+from engram.places import FabMap
 
 STEP_M = 0.8
 
@@ -76,6 +78,27 @@ def test_ranking_needs_no_reference(drive: BenchData, plain) -> None:
     prepared = STAGES["rank_150_paths"](drive, plain)
     assert prepared.reference is None
     assert prepared.ours(0) == {"paths": 150, "candidates": 200, "observed": 1000}
+
+
+def test_the_dense_table_finds_the_same_places() -> None:
+    rng = np.random.default_rng(0)
+    vocabulary = made_up_vocabulary(rng)
+    recogniser, looks = FabMap(vocabulary), list(vocabulary.samples)
+    table = DenseTable(vocabulary, recogniser.config, len(looks))
+    for words in looks:
+        recogniser.add(words)
+        table.add(words)
+    for words in looks[:5]:
+        query = words[::2].copy()
+        found = recogniser.recognise(query, 10)
+        # float32 may swap what lies within its rounding, about 0.01 nats in sums of thousands.
+        assert len(set(found.places) & set(table.best(query, 10))) >= 9
+        assert found.places[0] in table.best(query, 2)
+
+
+def test_training_is_timed_on_what_it_says(drive: BenchData, plain) -> None:
+    prepared = STAGES["vocabulary_train"](drive, plain)
+    assert prepared.ours(0) == {"words": 1000, "descriptors": 50_000}
 
 
 def test_report_has_the_agreed_shape(drive: BenchData) -> None:

@@ -23,6 +23,14 @@ def test_sums_are_those_of_the_dense_table(seed: int, count: int) -> None:
     assert np.allclose(sums, shown @ weights, rtol=0, atol=1e-12)
 
 
+@given(st.lists(st.integers(-5, 5), max_size=60), st.integers(0, 70))
+@settings(deadline=None)
+def test_the_best_come_in_order_and_ties_by_number(scores: list[int], most: int) -> None:
+    found = _core.best_scores(np.array(scores, float), most)
+    order = sorted(range(len(scores)), key=lambda i: (-scores[i], i))
+    assert found.tolist() == order[:most]
+
+
 def test_places_beyond_the_first_block_are_found() -> None:
     index = _core.PlaceIndex(2)
     count = (1 << 16) + 300

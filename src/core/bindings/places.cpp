@@ -109,6 +109,16 @@ void add_weights(const PlaceIndex &index, const Input<int32_t, 1> &words,
               static_cast<int64_t>(words.shape(0)), sums.data());
 }
 
+auto best_scores(const Input<double, 1> &scores, int64_t most) {
+  std::vector<int64_t> best;
+  {
+    nb::gil_scoped_release unlocked;
+    best = engram::best_scores(scores.data(), static_cast<int64_t>(scores.shape(0)), most);
+  }
+  const size_t count = best.size();
+  return engram::to_numpy(std::move(best), {count});
+}
+
 } // namespace
 
 void bind_places(nb::module_ &module) {
@@ -118,6 +128,8 @@ void bind_places(nb::module_ &module) {
            "Word (N,) int32 of each descriptor (N, 32) uint8.");
   module.def("k_majority", &k_majority, "descriptors"_a, "k"_a, "iterations"_a, "seed"_a,
              "Centres (K, 4) uint64, K <= k, and the cluster (N,) int32 of each descriptor.");
+  module.def("best_scores", &best_scores, "scores"_a, "most"_a,
+             "Numbers (K,) int64 of the greatest scores, greatest first, ties by number.");
   nb::class_<PlaceIndex>(module, "PlaceIndex", "For each word the places that show it.")
       .def("__init__",
            [](PlaceIndex *place, int64_t words) {

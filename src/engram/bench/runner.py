@@ -24,8 +24,14 @@ from engram.errors import ConfigError
 
 Progress = Callable[[str, int, int], None]
 
-# SciPy takes a quarter of a second for one window: fewer runs tell enough.
-_SLOW_STAGES = {"render_pair_512": 10, "window_ba_512": 10}
+# A quarter of a second or so for one run of either side: fewer runs tell enough.
+_SLOW_STAGES = {
+    "render_pair_512": 10,
+    "window_ba_512": 10,
+    "places_query_20000": 40,
+    "places_query_1000000": 20,
+    "vocabulary_train": 5,
+}
 
 
 def run_bench(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from engram.bench.data import BenchData
+from engram.bench.places import prepare_places_query, prepare_vocabulary_train
 from engram.bench.plain import PlainPipeline
 from engram.bench.ranking import prepare_ranking
 from engram.bench.rendering import prepare_rendering
@@ -93,6 +94,9 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "attempt_full": partial(prepare_attempt, size="full"),
         "render_pair_512": prepare_rendering,
         "window_ba_512": prepare_window,
+        "places_query_20000": partial(prepare_places_query, places=20_000, dense=True),
+        "places_query_1000000": partial(prepare_places_query, places=1_000_000, dense=False),
+        "vocabulary_train": prepare_vocabulary_train,
         "rank_150_paths": partial(prepare_ranking, paths=150),
         "rank_10000_paths": partial(prepare_ranking, paths=10_000),
     }

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.places.recogniser import Recognition, best_places
+from engram.places.recogniser import Recognition
 from engram.places.vocabulary import Vocabulary
 
 
@@ -47,7 +47,7 @@ class BagOfWords:
         self._index.add_weights(words, self._idf[words] ** 2, sums)
         norms = self._norms[: len(self)] * self._norm(words)
         cosines = np.divide(sums, norms, out=np.zeros_like(sums), where=norms > 0)
-        best = best_places(cosines, count)
+        best = _core.best_scores(cosines, count)
         return Recognition(best, cosines[best], None)
 
     def _norm(self, words: NDArray[np.int32]) -> float:

@@ -15,12 +15,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from engram import _core
 from engram.errors import ConfigError
 from engram.places.observation import DetectorModel, ObservationModel
-from engram.places.recogniser import Recognition, best_places
+from engram.places.recogniser import Recognition
 from engram.places.vocabulary import Vocabulary
 
 
@@ -86,7 +85,7 @@ class FabMap:
     def log_likelihood_elsewhere(self, words: NDArray[np.int32]) -> float:
         """Log p(Z | none of the places): the mean likelihood over sampled places."""
         sampled = self._elsewhere.of(self._query.weigh(words))
-        return float(logsumexp(sampled)) - float(np.log(max(len(sampled), 1)))
+        return _log_sum(sampled) - float(np.log(max(len(sampled), 1)))
 
     def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
         """See `PlaceRecogniser`. Before looking, all places are equally likely."""
@@ -97,15 +96,23 @@ class FabMap:
         scores = self._places.of(weights)
         scores += np.log((1 - prior) / len(self))
         sampled = self._elsewhere.of(weights)
-        elsewhere = float(logsumexp(sampled)) + float(np.log(prior / max(len(sampled), 1)))
+        elsewhere = _log_sum(sampled) + float(np.log(prior / max(len(sampled), 1)))
         greatest = max(float(scores.max()), elsewhere)
         # What is e^-40 of the most likely is lost in the rounding of the sum.
         near = scores[scores > greatest - 40.0]
         evidence = greatest + np.log(np.exp(near - greatest).sum() + np.exp(elsewhere - greatest))
-        best = best_places(scores, count)
+        best = _core.best_scores(scores, count)
         return Recognition(
             best, np.exp(scores[best] - evidence), float(np.exp(elsewhere - evidence))
         )
+
+
+def _log_sum(logs: NDArray[np.float64]) -> float:
+    """Log Σ exp; that of nothing is −∞."""
+    if len(logs) == 0:
+        return -np.inf
+    greatest = float(logs.max())
+    return greatest + float(np.log(np.exp(logs - greatest).sum()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -57,15 +57,3 @@ class PlaceRecogniser(Protocol):
             count: how many places are wanted at most.
         """
         ...
-
-
-def best_places(scores: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Numbers of the `count` greatest scores, greatest first, ties by number."""
-    count = min(count, len(scores))
-    if count == 0:
-        return np.zeros(0, np.int64)
-    least = np.partition(scores, len(scores) - count)[len(scores) - count]
-    above = np.flatnonzero(scores > least)
-    tied = np.flatnonzero(scores == least)[: count - len(above)]
-    kept = np.concatenate([above, tied])
-    return kept[np.lexsort((kept, -scores[kept]))]
