@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from typing import Self
 
 from engram.drive.live import LiveFrame, live_frames
 from engram.drive.opened_map import open_map
@@ -64,15 +64,10 @@ class LocaliseRun:
             live=session_of_drive(sequence).id,
         )
 
-    def __enter__(self) -> LocaliseRun:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.localiser.close()
         self.opened.close()
 

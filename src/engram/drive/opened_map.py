@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import cached_property
 from pathlib import Path
-from types import TracebackType
+from typing import Self
 
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
@@ -56,15 +56,10 @@ class OpenMap:
             tried = [self.graph.index(attempt.node) for attempt in made]
             self.attempts += count_attempts(made, self.graph.experiences[tried])
 
-    def __enter__(self) -> OpenMap:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -193,15 +188,10 @@ class LiveRobot:
             relocaliser=relocaliser,
         )
 
-    def __enter__(self) -> LiveRobot:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

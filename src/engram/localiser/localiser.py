@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from types import TracebackType
+from typing import Self
 from uuid import uuid5
 
 import numpy as np
@@ -121,15 +121,10 @@ class Localiser:
         self._attempts: list[Attempt] = []
         self._outcomes: list[Outcome] = []
 
-    def __enter__(self) -> Localiser:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
