@@ -175,6 +175,18 @@ def attempt(
     covariance: NDArray[np.float64] | None = None,
 ) -> PoseAndInliers | None: ...
 
+# --- ordering
+
+def order_rows(
+    nodes: NDArray[np.int32], uuid_words: NDArray[np.uint64], *keys: NDArray[np.float64]
+) -> NDArray[np.int64]: ...
+def success_rates(
+    rates: NDArray[np.float64],
+    bin_m: float,
+    along_m: NDArray[np.float64],
+    across_m: NDArray[np.float64],
+) -> NDArray[np.float64]: ...
+
 # --- path memory
 
 def co_occurrence(

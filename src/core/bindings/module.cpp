@@ -10,6 +10,7 @@ void bind_extraction(nb::module_ &module);
 void bind_graph_search(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
 void bind_matching(nb::module_ &module);
+void bind_ordering(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
 void bind_places(nb::module_ &module);
 void bind_render(nb::module_ &module);
@@ -22,6 +23,7 @@ NB_MODULE(_core, module) {
   bind_graph_search(module);
   bind_hamming(module);
   bind_matching(module);
+  bind_ordering(module);
   bind_path_scores(module);
   bind_places(module);
   bind_render(module);

@@ -48,24 +48,35 @@ uint64_t sum_of(u64x8 x) {
   return x[0] + x[1];
 }
 
-// Swaps the off-diagonal blocks of all 2 width x 2 width blocks on the diagonal.
-template <int width> void swap_blocks(u64x8 *rows, uint64_t mask) {
-  for (int top = 0; top < 64; top += 2 * width)
-    for (int k = top; k < top + width; ++k) {
-      const u64x8 swapped = ((rows[k] >> width) ^ rows[k + width]) & mask;
-      rows[k] ^= swapped << width;
-      rows[k + width] ^= swapped;
-    }
+// Swaps the off-diagonal blocks of the 2 width x 2 width blocks that two rows are part of.
+template <int width> void swap_blocks(u64x8 &above, u64x8 &below, uint64_t mask) {
+  const u64x8 swapped = ((above >> width) ^ below) & mask;
+  above ^= swapped << width;
+  below ^= swapped;
+}
+
+// Three rounds of it among eight rows a stride apart, which stay in registers meanwhile.
+template <int stride>
+void swap_blocks_of_eight(u64x8 *rows, uint64_t widest, uint64_t middle, uint64_t narrowest) {
+  u64x8 row[8];
+  for (int k = 0; k < 8; ++k)
+    row[k] = rows[k * stride];
+  for (int k = 0; k < 4; ++k)
+    swap_blocks<4 * stride>(row[k], row[k + 4], widest);
+  for (const int k : {0, 1, 4, 5})
+    swap_blocks<2 * stride>(row[k], row[k + 2], middle);
+  for (int k = 0; k < 8; k += 2)
+    swap_blocks<stride>(row[k], row[k + 1], narrowest);
+  for (int k = 0; k < 8; ++k)
+    rows[k * stride] = row[k];
 }
 
 // Eight 64x64 bit matrices at once, one per lane: bit c of row r goes to bit r of row c.
 void transpose(u64x8 *rows) {
-  swap_blocks<32>(rows, 0x00000000FFFFFFFF);
-  swap_blocks<16>(rows, 0x0000FFFF0000FFFF);
-  swap_blocks<8>(rows, 0x00FF00FF00FF00FF);
-  swap_blocks<4>(rows, 0x0F0F0F0F0F0F0F0F);
-  swap_blocks<2>(rows, 0x3333333333333333);
-  swap_blocks<1>(rows, 0x5555555555555555);
+  for (int k = 0; k < 8; ++k)
+    swap_blocks_of_eight<8>(rows + k, 0x00000000FFFFFFFF, 0x0000FFFF0000FFFF, 0x00FF00FF00FF00FF);
+  for (int k = 0; k < 64; k += 8)
+    swap_blocks_of_eight<1>(rows + k, 0x0F0F0F0F0F0F0F0F, 0x3333333333333333, 0x5555555555555555);
 }
 
 // Lane g of row l goes to lane l of row g.
@@ -260,15 +271,15 @@ private:
 
   void tally_octet(const Counters &counters, size_t number, u64x8 mask, u64x8 successes) {
     Octet &tally = octets_[number];
-    if (!seen_[number])
-      tally = Octet{};
+    const bool first = !seen_[number];
     seen_[number] = 1;
     for (size_t k = 0; k < octet; ++k) {
       u64x8 equal = mask;
       for (size_t level = 0; level < 3; ++level)
         equal &= (k >> level) & 1 ? counters.planes[level] : ~counters.planes[level];
-      tally.all[k] += popcount(equal);
-      tally.successes[k] += popcount(equal & successes);
+      const u64x8 all = popcount(equal), succeeded = popcount(equal & successes);
+      tally.all[k] = first ? all : tally.all[k] + all;
+      tally.successes[k] = first ? succeeded : tally.successes[k] + succeeded;
     }
   }
 
@@ -289,7 +300,9 @@ public:
     }
   }
   double log() const {
-    return std::log(value_) + static_cast<double>(exponent_) * 0.6931471805599453094;
+    return value_ == 1 && exponent_ == 0
+               ? 0
+               : std::log(value_) + static_cast<double>(exponent_) * 0.6931471805599453094;
   }
 
 private:
@@ -297,28 +310,63 @@ private:
   int64_t exponent_ = 0;
 };
 
-// log of the product over j of theta_ij where it succeeded, 1 - theta_ij where it failed:
-// theta_ij = (Z_ij + alpha) / total, so the numerators multiply up and the total is taken out.
-// Equal tallies give equal bits, whichever nodes they come from.
-double log_likelihood(const std::vector<Tally::Entry> &tally, double observed, double alpha,
-                      const std::vector<double> &log_of_success) {
-  uint64_t all = 0;
-  for (const Tally::Entry &entry : tally)
-    all += entry.value * (entry.successes + entry.failures);
-  const double total = static_cast<double>(all) + observed * alpha;
-  double score = -observed * std::log(total);
-  Product product;
-  for (const Tally::Entry &entry : tally) {
-    score += static_cast<double>(entry.successes) * log_of_success[entry.value];
-    const double factor = (total - alpha) - static_cast<double>(entry.value);
-    if (entry.failures > 8) // a logarithm costs as much as some multiplications
-      score += static_cast<double>(entry.failures) * std::log(factor);
-    else
-      for (uint64_t i = 0; i < entry.failures; ++i)
-        product.multiply(factor);
+// Logarithms of n + offset for whole n: candidates with a short history have most of them in
+// common.
+class Logarithms {
+public:
+  explicit Logarithms(double offset) : offset_(offset), known_(kKept, 0) {}
+
+  bool keeps(uint64_t n) const { return n < kKept; }
+  double argument(uint64_t n) const { return static_cast<double>(n) + offset_; }
+
+  double operator()(uint64_t n) {
+    if (!keeps(n))
+      return std::log(argument(n));
+    double &known = known_[n];
+    if (known == 0)
+      known = std::log(argument(n));
+    return known;
   }
-  return score + product.log();
-}
+
+private:
+  static constexpr size_t kKept = 512;
+  double offset_;
+  std::vector<double> known_;
+};
+
+// log of the product over j of theta_ij where it succeeded, 1 - theta_ij where it failed:
+// theta_ij = (Z_ij + alpha) / total, so the logarithms of the numerators add up and the total is
+// taken out. Equal tallies give equal bits, whichever nodes they come from.
+class Likelihood {
+public:
+  Likelihood(double observed, double alpha)
+      : observed_(observed), of_success_(alpha), of_total_(observed * alpha),
+        of_failure_((observed - 1) * alpha) {}
+
+  double log(const std::vector<Tally::Entry> &tally) {
+    uint64_t all = 0;
+    for (const Tally::Entry &entry : tally)
+      all += entry.value * (entry.successes + entry.failures);
+    double score = -observed_ * of_total_(all);
+    Product product;
+    for (const Tally::Entry &entry : tally) {
+      if (entry.successes > 0)
+        score += static_cast<double>(entry.successes) * of_success_(entry.value);
+      const uint64_t rest = all - entry.value;
+      // A logarithm that is not at hand costs as much as some multiplications.
+      if (entry.failures > 8 || (entry.failures > 0 && of_failure_.keeps(rest)))
+        score += static_cast<double>(entry.failures) * of_failure_(rest);
+      else
+        for (uint64_t i = 0; i < entry.failures; ++i)
+          product.multiply(of_failure_.argument(rest));
+    }
+    return score + product.log();
+  }
+
+private:
+  double observed_;
+  Logarithms of_success_, of_total_, of_failure_;
+};
 
 // One bit per observed node: whether it succeeded, and whether it failed.
 void outcome_masks(const PathEvidence &evidence, std::vector<u64x8> &successes,
@@ -386,17 +434,15 @@ void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count
   if (observed > 0)
     outcome_masks(evidence, successes, failures);
   const int64_t most = most_paths(paths, candidates, count);
-  std::vector<double> log_of_success(static_cast<size_t>(most + octet));
-  for (size_t z = 0; z < log_of_success.size(); ++z)
-    log_of_success[z] = std::log(static_cast<double>(z) + evidence.alpha);
+  Likelihood likelihood(static_cast<double>(observed), evidence.alpha);
+  Logarithms prior(evidence.gamma);
   std::vector<int32_t> list(static_cast<size_t>(most + 4));
   Tally tally(most);
   for (int64_t i = 0; i < count; ++i) {
     scores[i] = 0;
     if (evidence.reference >= 0) {
       const auto reference = static_cast<int32_t>(evidence.reference);
-      const auto shared = static_cast<double>(shared_paths(paths, candidates[i], reference));
-      scores[i] += std::log(shared + evidence.gamma);
+      scores[i] += prior(shared_paths(paths, candidates[i], reference));
     }
     if (observed == 0)
       continue;
@@ -405,8 +451,7 @@ void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count
     for (int64_t v = 0; v < others.vectors(); ++v)
       tally.count(Counters(list.data(), length, others.rows(v), others.empty()),
                   successes[static_cast<size_t>(v)], failures[static_cast<size_t>(v)]);
-    scores[i] += log_likelihood(tally.entries(), static_cast<double>(observed),
-                                evidence.alpha, log_of_success);
+    scores[i] += likelihood.log(tally.entries());
   }
 }
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
+from engram import _core
 from engram.errors import InputError
 from engram.experience.model import Attempt
 
@@ -112,12 +113,10 @@ class MatchBasin:
 
         The two directions are taken as independent: ``g_along · g_across / g(0)``.
         """
-        along, across = (
-            np.interp(np.abs(offset), _BIN_CENTRES_M, rates)
-            for offset, rates in zip((along_m, across_m), self.rates, strict=True)
-        )
-        at_zero = max(float(self.rates[:, 0].max()), 1e-9)
-        return np.asarray(np.minimum(along * across / at_zero, 1.0))
+        along = np.ascontiguousarray(along_m, dtype=np.float64)
+        across = np.ascontiguousarray(across_m, dtype=np.float64)
+        rates = _core.success_rates(self.rates, BIN_M, along.reshape(-1), across.reshape(-1))
+        return rates.reshape(along.shape)
 
     @property
     def basin_m(self) -> float:

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.experience.basin import MatchBasin
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import PathId
@@ -60,6 +61,6 @@ class RankingPolicy(Protocol):
 def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
     """Rows by the keys, (Y,) each, smallest first; ties by distance, then by UUID (SPEC §4)."""
     neighbourhood = context.neighbourhood
-    words = context.graph.uuid_words[neighbourhood.nodes]
-    ties = (words[:, 1], words[:, 0], neighbourhood.distance_m)
-    return np.lexsort((*ties, *reversed(keys)))
+    values = (np.ascontiguousarray(key, dtype=np.float64) for key in keys)
+    uuid_words = context.graph.uuid_words
+    return _core.order_rows(neighbourhood.nodes, uuid_words, *values, neighbourhood.distance_m)

@@ -28,6 +28,8 @@ class PathPolicy:
         neighbourhood = context.neighbourhood
         rates = context.basin.success_rate(neighbourhood.along_m, neighbourhood.across_m)
         within = rates >= BASIN_LEVEL
+        if within.all():
+            return self._formula.rank(context)
         scores = np.zeros(len(neighbourhood))
         scores[within] = self._formula.scores(context, neighbourhood.nodes[within])
         return order_by(context, ~within, -scores)
