@@ -12,6 +12,7 @@ from engram.cli.extraction import extract
 from engram.cli.inspection import check, info, log, seal
 from engram.cli.localisation import localise
 from engram.cli.mapping import map_
+from engram.cli.places import places, relocalise, vocabulary
 from engram.cli.simulation import simulate
 
 VERBS: dict[str, Callable[..., None]] = {
@@ -24,6 +25,9 @@ VERBS: dict[str, Callable[..., None]] = {
     "check": check,
     "seal": seal,
     "simulate": simulate,
+    "vocabulary": vocabulary,
+    "relocalise": relocalise,
+    "places": places,
     "bench": bench,
 }
 

@@ -21,6 +21,7 @@ from engram.localiser import (
     Budget,
     Localisation,
     Localiser,
+    Relocaliser,
     Searched,
 )
 from engram.odometry import Odometry
@@ -81,9 +82,28 @@ class OpenMap:
         body = self.store.vocabulary()
         return None if body is None else decode_vocabulary(body)
 
-    def _vocabulary_or_default(self, descriptor: DescriptorKind) -> Vocabulary:
+    def vocabulary_or_default(self, descriptor: DescriptorKind) -> Vocabulary:
         """The map's vocabulary, or the default one; `descriptor` counts while it is empty."""
         return self.vocabulary or default_vocabulary(self.descriptor or descriptor)
+
+    def relocaliser(self, name: str, descriptor: DescriptorKind) -> Relocaliser:
+        """What finds a lost robot in this map.
+
+        Args:
+            name: key of `RELOCALISERS`.
+            descriptor: kind of the live frames' descriptors; counts while the map is empty.
+
+        Raises:
+            ConfigError: there is no such relocaliser.
+            MapCorruptError: the vocabulary or a node's landmarks are damaged.
+        """
+        if name not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}, none"
+            )
+        return RELOCALISERS[name](
+            Searched(self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor))
+        )
 
     def localiser(
         self,
@@ -112,22 +132,15 @@ class OpenMap:
         """
         if policy not in POLICIES:
             raise ConfigError(f"policy {policy!r} is unknown; known: {', '.join(POLICIES)}")
-        if relocaliser is not None and relocaliser not in RELOCALISERS:
-            raise ConfigError(
-                f"relocaliser {relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}, none"
-            )
-        searched = Searched(
-            self.graph,
-            self.store.frames,
-            lambda: self._vocabulary_or_default(settings.frontend.descriptor),
-        )
         return Localiser(
             self.graph,
             self.path_memory,
             self.store.frames,
             policy=POLICIES[policy](),
             budget=budget or Budget(),
-            relocaliser=None if relocaliser is None else RELOCALISERS[relocaliser](searched),
+            relocaliser=None
+            if relocaliser is None
+            else self.relocaliser(relocaliser, settings.frontend.descriptor),
             basin=MatchBasin.of(camera.fx, self.attempts),
             live=live,
             saves=saves,

@@ -101,6 +101,8 @@ class Localisation:
         open_loop_m: distance driven on odometry alone since the last match.
         position: the best estimate, measured or carried on by odometry; None while `LOST` with
             no estimate.
+        new_place: probability, before matching, that the frame shows nothing of the map; None
+            where no relocaliser was asked, or it cannot tell. What a match says counts more.
         stage_ms: time of each stage of this call.
     """
 
@@ -115,6 +117,7 @@ class Localisation:
     covariance: NDArray[np.float64] | None = None
     inliers: int = 0
     position: Position | None = None
+    new_place: float | None = None
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -120,6 +120,7 @@ class Localiser:
         self._adrift = False
         self._attempts: list[Attempt] = []
         self._outcomes: list[Outcome] = []
+        self._new_place: float | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -183,6 +184,7 @@ class Localiser:
         if deadline is None and self._budget.deadline_ms is not None:
             deadline = clock.started + self._budget.deadline_ms / 1e3
         self._carry_on(odometry)
+        self._new_place = None
         self._recent.begin_frame(self._driven_m)
         outcomes: list[Outcome] = []
         neighbourhood: Neighbourhood | None = None
@@ -296,7 +298,10 @@ class Localiser:
     def _proposals(self, live: Frame, count: int) -> list[int]:
         """The relocaliser's nodes, without this session's own recent ones (SPEC §3.1)."""
         assert self._relocaliser is not None
-        return self._relocaliser.propose(live, count, lambda index: not self._is_recent_own(index))
+        relocaliser = self._relocaliser
+        proposed = relocaliser.propose(live, count, lambda index: not self._is_recent_own(index))
+        self._new_place = relocaliser.new_place
+        return proposed
 
     def _is_recent_own(self, index: int) -> bool:
         node = self._graph.node(index)
@@ -372,6 +377,7 @@ class Localiser:
             candidates=0 if neighbourhood is None else len(neighbourhood),
             open_loop_m=self._open_loop_m,
             position=self.position,
+            new_place=self._new_place,
             stage_ms=stage_ms,
         )
         if success is None:

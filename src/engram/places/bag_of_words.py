@@ -41,12 +41,16 @@ class BagOfWords:
         self._norms[number] = self._norm(words)
         return number
 
-    def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
-        """See `PlaceRecogniser`."""
+    def similarities(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Cosine (P,), 0…1, of an image with these words and each place."""
         sums = np.zeros(len(self))
         self._index.add_weights(words, self._idf[words] ** 2, sums)
         norms = self._norms[: len(self)] * self._norm(words)
-        cosines = np.divide(sums, norms, out=np.zeros_like(sums), where=norms > 0)
+        return np.divide(sums, norms, out=np.zeros_like(sums), where=norms > 0)
+
+    def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
+        """See `PlaceRecogniser`."""
+        cosines = self.similarities(words)
         best = _core.best_scores(cosines, count)
         return Recognition(best, cosines[best], None)
 

@@ -1,0 +1,139 @@
+"""Every frame of a drive as a cold start: which places look like it, and which one it was."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from engram.drive.live import live_frames
+from engram.drive.opened_map import OpenMap, open_map
+from engram.drive.session import DriveSequence
+from engram.drive.settings import Settings
+from engram.experience.model import NodeId, node_id
+from engram.frontend import Frame, FrameStatus
+from engram.localiser import UNNAMED_LIVE_SESSION, Budget, Relocaliser
+from engram.localiser.attempts import Attempter, Candidate, best_success
+
+
+class PlaceStatus(StrEnum):
+    """What a cold start came to."""
+
+    FOUND = "found"
+    NEW_PLACE = "new_place"
+    UNKNOWN = "unknown"
+    UNUSABLE_FRAME = "unusable_frame"
+
+
+@dataclass(frozen=True, slots=True)
+class ColdStart:
+    """One frame that knew nothing of the frames before it.
+
+    Attributes:
+        stamp_ns: of the frame.
+        status: found by matching; or not found, and the recogniser thinks it is new, or does not
+            know; or the frame was of no use.
+        node: the node that it was matched with; None unless found.
+        inliers: of that match; 0 unless found.
+        attempts: match attempts made.
+        new_place: probability of a new place before matching; None where the relocaliser cannot
+            tell.
+    """
+
+    stamp_ns: int
+    status: PlaceStatus
+    node: NodeId | None
+    inliers: int
+    attempts: int
+    new_place: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "stamp_ns": self.stamp_ns,
+            "status": self.status.value,
+            "node": None if self.node is None else str(self.node),
+            "inliers": self.inliers,
+            "attempts": self.attempts,
+            "new_place": self.new_place,
+        }
+
+
+def relocalise_drive(
+    map_path: Path,
+    sequence: DriveSequence,
+    settings: Settings,
+    *,
+    relocaliser: str = "fabmap",
+    budget: Budget | None = None,
+    at: int | None = None,
+    advance: Callable[[str], None],
+) -> list[ColdStart]:
+    """Finds every frame of a drive in a map as if the robot had just been switched on.
+
+    Args:
+        map_path: the map, which stays as it is.
+        sequence: the drive.
+        settings: the resolved configuration.
+        relocaliser: key of `RELOCALISERS`.
+        budget: of each frame; 2 lanes × 2 rounds by default.
+        at: number of the map's revision; None for the newest.
+        advance: called once per frame with a word on how it went.
+
+    Raises:
+        ConfigError: there is no such relocaliser.
+        MapError: the map cannot be read.
+    """
+    budget = budget or Budget()
+    with open_map(map_path, at) as opened:
+        settings = settings.for_descriptor(opened.descriptor)
+        finder = opened.relocaliser(relocaliser, settings.frontend.descriptor)
+        matching = (settings.localiser.matcher, settings.localiser.acceptance)
+        with Attempter(opened.store.frames, budget, *matching) as attempter:
+            found = []
+            for live in live_frames(sequence, settings):
+                finder.forget_failures()
+                found.append(_cold_start(opened, live.frame, finder, attempter, budget))
+                advance(found[-1].status.value)
+    return found
+
+
+def summarise_cold_starts(starts: list[ColdStart]) -> dict[str, Any]:
+    """How many frames came to what, and the attempts made."""
+    counts = Counter(start.status for start in starts)
+    return {
+        "frames": len(starts),
+        **{status.value: counts[status] for status in PlaceStatus},
+        "attempts": sum(start.attempts for start in starts),
+    }
+
+
+def _cold_start(
+    opened: OpenMap, frame: Frame, finder: Relocaliser, attempter: Attempter, budget: Budget
+) -> ColdStart:
+    if frame.status is not FrameStatus.OK:
+        return ColdStart(frame.stamp_ns, PlaceStatus.UNUSABLE_FRAME, None, 0, 0, None)
+    proposed = finder.propose(frame, budget.attempts, lambda _: True)
+    candidates = [
+        Candidate(index, opened.graph.node(index).id, None, guided=False, row=None)
+        for index in proposed
+    ]
+    live_id = node_id(UNNAMED_LIVE_SESSION, frame.stamp_ns)
+    outcomes = attempter.run(frame, live_id, candidates, None)
+    success = best_success(outcomes)
+    if success is None:
+        # Even odds: the recogniser holds new places as likely as all known ones before it looks.
+        new = finder.new_place is not None and finder.new_place > 0.5
+        status = PlaceStatus.NEW_PLACE if new else PlaceStatus.UNKNOWN
+        return ColdStart(frame.stamp_ns, status, None, 0, len(outcomes), finder.new_place)
+    return ColdStart(
+        frame.stamp_ns,
+        PlaceStatus.FOUND,
+        success.candidate.node,
+        success.match.inliers,
+        len(outcomes),
+        finder.new_place,
+    )
