@@ -3,7 +3,10 @@
 import os
 from pathlib import Path
 
+import cv2
 import pytest
+
+from engram.bench.data import synthetic_drive
 
 
 @pytest.fixture(scope="session")
@@ -18,4 +21,24 @@ def data_dir() -> Path:
     folder = Path(named)
     if not folder.is_dir():
         pytest.skip(f"ENGRAM_DATA names {folder}, which is no folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve pairs of a rendered street in the plain layout."""
+    folder = tmp_path_factory.mktemp("drives") / "street"
+    pairs = synthetic_drive(frames=12, step_m=0.8)
+    camera = pairs[0].camera
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        for number, pair in enumerate(pairs):
+            cv2.imwrite(str(folder / side / f"{number:06d}.png"), getattr(pair, side))
+    stamps = "".join(f"{number / 10:.6f}\n" for number in range(len(pairs)))
+    (folder / "times.txt").write_text(stamps)
+    values = [
+        f"{name} = {getattr(camera, name)}"
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
+    ]
+    (folder / "calibration.toml").write_text("\n".join(["[rectified]", *values]) + "\n")
     return folder
