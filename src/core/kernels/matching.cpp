@@ -246,27 +246,36 @@ int32_t distinct_column(const Distances &distances, int16_t least, const MatchSe
   return best;
 }
 
-// Landmarks of a frame in cells of its image.
-class Grid {
+Floats magnitude(Floats lanes) { return lanes < 0.0f ? -lanes : lanes; }
+
+// Landmarks of a frame in strips across its image, from top to bottom. A window is as wide as the
+// prediction is vague, up to most of the image, so that sixteen landmarks are tested at once.
+class Strips {
 public:
-  explicit Grid(const FrameView &frame) : frame_(frame) {
-    float right = 0, bottom = 0;
+  Strips(const FrameView &frame, double gate_sigmas) {
     for (int64_t row = 0; row < frame.count; ++row) {
-      right = std::max(right, frame.pixels[2 * row]);
-      bottom = std::max(bottom, frame.pixels[2 * row + 1]);
+      right_ = std::max(right_, frame.pixels[2 * row]);
+      bottom_ = std::max(bottom_, frame.pixels[2 * row + 1]);
     }
-    right_ = right, bottom_ = bottom;
-    columns_ = static_cast<int>(std::min(right, kExtent) / kCell) + 1;
-    rows_ = static_cast<int>(std::min(bottom, kExtent) / kCell) + 1;
-    starts_.assign(columns_ * rows_ + 1, 0);
+    count_ = static_cast<int>(std::min(bottom_, kExtent) / kHeight) + 1;
+    starts_.assign(count_ + 1, 0);
     for (int64_t row = 0; row < frame.count; ++row)
-      ++starts_[cell_of(row) + 1];
-    for (size_t cell = 1; cell < starts_.size(); ++cell)
-      starts_[cell] += starts_[cell - 1];
-    members_.resize(frame.count);
+      ++starts_[strip(frame.pixels[2 * row + 1]) + 1];
+    for (int k = 0; k < count_; ++k)
+      starts_[k + 1] += starts_[k];
     std::vector<int32_t> next(starts_.begin(), starts_.end() - 1);
+    rows_.resize(frame.count);
     for (int64_t row = 0; row < frame.count; ++row)
-      members_[next[cell_of(row)]++] = static_cast<int32_t>(row);
+      rows_[next[strip(frame.pixels[2 * row + 1])]++] = static_cast<int32_t>(row);
+    constexpr float kNowhere = 1e30f; // in the padding
+    for (auto *values : {&u_, &v_, &disparity_, &reach_})
+      values->assign(frame.count + kLanes, kNowhere);
+    for (int64_t place = 0; place < frame.count; ++place) {
+      const int32_t row = rows_[place];
+      u_[place] = frame.pixels[2 * row], v_[place] = frame.pixels[2 * row + 1];
+      disparity_[place] = frame.disparity_px[row];
+      reach_[place] = static_cast<float>(gate_sigmas * frame.disparity_sigma_px[row]);
+    }
   }
 
   // Whether a place is closer than the margin to the image's landmarks.
@@ -274,34 +283,40 @@ public:
     return u >= -margin && v >= -margin && u <= right_ + margin && v <= bottom_ + margin;
   }
 
+  // Calls visit(row) for the landmarks whose (u, v, disparity) lie within the radius; that of the
+  // disparity is widened by their own doubt.
   template <class Visit>
-  void visit(double u, double v, double radius_u, double radius_v, Visit visit) const {
-    const int left = cell(u - radius_u, columns_), right = cell(u + radius_u, columns_);
-    const int top = cell(v - radius_v, rows_), bottom = cell(v + radius_v, rows_);
-    for (int y = top; y <= bottom; ++y)
-      for (int32_t k = starts_[y * columns_ + left]; k < starts_[y * columns_ + right + 1]; ++k) {
-        const int32_t row = members_[k];
-        if (std::abs(frame_.pixels[2 * row] - u) <= radius_u &&
-            std::abs(frame_.pixels[2 * row + 1] - v) <= radius_v)
-          visit(row);
-      }
+  void visit(const std::array<float, 3> &centre, const std::array<float, 3> &radius,
+             Visit visit) const {
+    const int32_t begin = starts_[strip(centre[1] - radius[1])];
+    const int32_t end = starts_[strip(centre[1] + radius[1]) + 1];
+    // A block may reach into the strips below, which are too far away, and into the padding.
+    for (int32_t k = begin; k < end; k += kLanes) {
+      const Ints near = (magnitude(load(&u_[k]) - centre[0]) <= radius[0]) &
+                        (magnitude(load(&v_[k]) - centre[1]) <= radius[1]) &
+                        (magnitude(load(&disparity_[k]) - centre[2]) <=
+                         radius[2] + load(&reach_[k]));
+      for (uint32_t bits = bits_of(near); bits != 0; bits &= bits - 1)
+        if (const int32_t place = k + __builtin_ctz(bits); place < end)
+          visit(rows_[place]);
+    }
   }
 
 private:
-  static constexpr float kCell = 16;
+  static constexpr float kHeight = 8;
   static constexpr float kExtent = 16384;
-  static int cell(double value, int count) {
-    return static_cast<int>(std::clamp(value / kCell, 0.0, count - 1.0));
-  }
-  int cell_of(int64_t row) const {
-    return cell(frame_.pixels[2 * row + 1], rows_) * columns_ +
-           cell(frame_.pixels[2 * row], columns_);
+
+  int strip(float v) const {
+    const float number = v / kHeight;
+    return number >= static_cast<float>(count_ - 1) ? count_ - 1
+           : number > 0                             ? static_cast<int>(number)
+                                                    : 0;
   }
 
-  const FrameView &frame_;
-  double right_, bottom_;
-  int columns_, rows_;
-  std::vector<int32_t> starts_, members_;
+  float right_ = 0, bottom_ = 0;
+  int count_;
+  std::vector<int32_t> starts_, rows_;
+  std::vector<float> u_, v_, disparity_, reach_;
 };
 
 // Where reference landmarks should be seen, how far from there to look, and whether to look at all.
@@ -434,9 +449,10 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
   pairs.clear();
   if (reference.count == 0 || live.count == 0)
     return;
-  const Grid grid(live);
+  const Strips strips(live, settings.gate_sigmas);
   std::vector<int32_t> nearest_distance(live.count, kFar), nearest_row(live.count, -1);
   std::vector<std::pair<int32_t, int32_t>> candidates; // distance, live row
+  candidates.reserve(live.count);
   const Predictor predictor(reference, live.camera, prediction, settings);
   Windows windows;
   for (int64_t i = 0; i < reference.count; ++i) {
@@ -444,29 +460,27 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
     if (lane == 0)
       windows = predictor.windows(i);
     const double u = windows.stereo[0][lane], v = windows.stereo[1][lane];
-    if (!windows.worth[lane] || !grid.within(u, v, settings.max_radius_px))
+    if (!windows.worth[lane] || !strips.within(u, v, settings.max_radius_px))
       continue;
     uint64_t descriptor[4];
     std::memcpy(descriptor, reference.descriptors + 4 * i, sizeof descriptor);
+    std::array<float, 3> centre, radius;
+    for (int k = 0; k < 3; ++k) {
+      centre[k] = static_cast<float>(windows.stereo[k][lane]);
+      radius[k] = static_cast<float>(windows.radius[k][lane]);
+    }
     candidates.clear();
-    grid.visit(u, v, windows.radius[0][lane], windows.radius[1][lane],
-               [&](int32_t j) {
-                 const double reach = windows.radius[2][lane] +
-                                      settings.gate_sigmas * live.disparity_sigma_px[j];
-                 if (std::abs(live.disparity_px[j] - windows.stereo[2][lane]) > reach)
-                   return;
-                 uint64_t other[4];
-                 std::memcpy(other, live.descriptors + 4 * j, sizeof other);
-                 candidates.emplace_back(hamming(descriptor, other), j);
-               });
-    if (candidates.empty())
-      continue;
-    for (const auto &[distance, j] : candidates)
-      if (distance < nearest_distance[j]) {
-        nearest_distance[j] = distance;
-        nearest_row[j] = static_cast<int32_t>(i);
-      }
-    const auto best = *std::min_element(candidates.begin(), candidates.end());
+    std::pair<int32_t, int32_t> best{kFar, -1};
+    strips.visit(centre, radius, [&](int32_t j) {
+      uint64_t other[4];
+      std::memcpy(other, live.descriptors + 4 * j, sizeof other);
+      const int32_t distance = hamming(descriptor, other);
+      candidates.emplace_back(distance, j);
+      best = std::min(best, candidates.back());
+      const bool closer = distance < nearest_distance[j];
+      nearest_distance[j] = closer ? distance : nearest_distance[j];
+      nearest_row[j] = closer ? static_cast<int32_t>(i) : nearest_row[j];
+    });
     if (best.first > settings.max_guided_distance)
       continue;
     const float *corner = live.pixels + 2 * best.second;

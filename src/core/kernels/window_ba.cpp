@@ -134,11 +134,28 @@ void add_to_block(const Vector &x, const Matrix &n, BlockLanes &block) {
   }
 }
 
+// Of eight landmarks: their own block, inverted, and right-hand sides.
+struct Solved {
+  Symmetric inverse;
+  Vector gradient, by_offset;
+};
+
+// A megabyte, kept between calls: fresh pages would cost a tenth of the work.
+struct Scratch {
+  // By group of landmarks and frame.
+  std::vector<uint8_t> present;
+  std::vector<Measured> measured;
+  std::vector<Share> shares;
+  std::vector<Matrix> carried; // M H⁻¹
+  std::vector<Solved> solved;  // by group
+};
+
 class Window {
 public:
   Window(const Camera &camera, const std::vector<RigidTransform> &world_from_cam,
-         const WindowObservations &observations, const WindowSettings &settings)
-      : camera_(camera), settings_(settings), poses_(world_from_cam),
+         const WindowObservations &observations, const WindowSettings &settings, Scratch &scratch)
+      : present_(scratch.present), measured_(scratch.measured), shares_(scratch.shares),
+        carried_(scratch.carried), solved_(scratch.solved), camera_(camera), settings_(settings), poses_(world_from_cam),
         frames_(static_cast<int>(world_from_cam.size())), free_(frames_ - settings.fixed),
         tracks_(observations.tracks), offset_(settings.offset_px) {
     group_by_landmark(observations);
@@ -524,24 +541,17 @@ private:
             result.points[3 * track + i] = group.points[i][lane];
   }
 
-  // Of eight landmarks: their own block, inverted, and right-hand sides.
-  struct Solved {
-    Symmetric inverse;
-    Vector gradient, by_offset;
-  };
-
+  std::vector<uint8_t> &present_;
+  std::vector<Measured> &measured_;
+  std::vector<Share> &shares_;
+  std::vector<Matrix> &carried_;
+  std::vector<Solved> &solved_;
   Camera camera_;
   WindowSettings settings_;
   std::vector<Pose> poses_;
   int frames_, free_, tracks_;
   double offset_, offset_hessian_ = 0, offset_gradient_ = 0;
   std::vector<Landmarks> groups_;
-  // By group and frame.
-  std::vector<uint8_t> present_;
-  std::vector<Measured> measured_;
-  std::vector<Share> shares_;
-  std::vector<Matrix> carried_; // M H⁻¹
-  std::vector<Solved> solved_;  // by group
   std::vector<double> system_, right_;
   std::vector<int32_t> seen_in_;
 };
@@ -551,7 +561,8 @@ private:
 WindowResult adjust_window(const Camera &camera, const std::vector<RigidTransform> &world_from_cam,
                            const WindowObservations &observations,
                            const WindowSettings &settings) {
-  return Window(camera, world_from_cam, observations, settings).run();
+  static thread_local Scratch kept;
+  return Window(camera, world_from_cam, observations, settings, kept).run();
 }
 
 } // namespace engram::ENGRAM_ISA

@@ -22,7 +22,7 @@ from engram.frontend.frame import Frame
 from engram.geometry import SE3
 
 # Goes into `matcher_hash`: raise it whenever the kernels give other results for equal settings.
-_VERSION = 2
+_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -190,7 +190,9 @@ def _number_longest(track: NDArray[np.int32], most: int) -> NDArray[np.int32]:
         return track
     track = track - track.min()
     length = np.bincount(track)
-    kept = np.argsort(-length, kind="stable")[:most]
+    # Lengths are at most the frames of the window; 16 bits are sorted by radix, 64 by merging.
+    shortness = (length.max() - length).astype(np.uint16)
+    kept = np.argsort(shortness, kind="stable")[:most]
     kept = kept[length[kept] >= 2]
     number = np.full(len(length), _UNSEEN, dtype=np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
