@@ -44,14 +44,14 @@ def _tell(report: DemoReport) -> None:
     from rich.table import Table
 
     console = Console()
-    grown = Table(title="The map grows only where a drive does not recognise the place")
+    grown = Table(title="The map grows where a drive does not know the place")
     for column in ("drive", "localised", "new nodes"):
         grown.add_column(column, justify="left" if column == "drive" else "right")
     for condition, mapped in zip(report.conditions, report.mapped, strict=False):
         share = mapped.to_dict()["share_localised"]
         grown.add_row(condition, f"{share:.0%}", str(mapped.saved))
     console.print(grown)
-    found = Table(title=f"Then: {report.conditions[-1]}, one match attempt a frame")
+    found = Table(title=f"Then: {report.conditions[-1]}, up to four attempts a frame")
     for column in ("policy", "localised", "attempts a frame", "longest gap, m"):
         found.add_column(column, justify="left" if column == "policy" else "right")
     for policy, summary in report.localised.items():
@@ -65,7 +65,7 @@ def _tell(report: DemoReport) -> None:
     console.print(
         f"In {report.out}: one_place.png, the same place in six conditions; matches_path/, live "
         "image and node side by side with their inliers joined; map_from_above.png, experiences "
-        "in colour; attempts.png, what each frame cost. With one attempt a frame it matters which "
-        "experience is tried: `distance` takes the nearest node, `path` one that went together "
-        "with those that matched just now in earlier drives."
+        "in colour; attempts.png, what each frame cost until it matched. `distance` tries the "
+        "nearest node first, `path` one that went together in earlier drives with those that "
+        "matched just now: the more experiences a place has, the more that saves."
     )

@@ -34,8 +34,8 @@ from engram.viewing import Track, draw_attempts, draw_from_above
 
 _CAMPAIGN = "hamlet"
 _POLICIES = ("distance", "path")
-# One attempt a frame: what is left is which experience to try.
-_LANES, _ROUNDS = 1, 1
+# One attempt after another, up to four: what counts is which experience is tried first.
+_LANES, _ROUNDS = 1, 4
 # The place that is shown in every condition, as a share of the drive.
 _SHOWN_AT = 0.35
 
@@ -166,16 +166,20 @@ def _experience_tracks(
         graph = opened.graph
         tree = graph.chains_from(0)
         tracks = []
-        sessions = [session.start_ns for session in store.load().sessions]
-        for number, start_ns in enumerate(sessions):
+        for session in store.load().sessions:
+            number = graph.session_number(session.id)
+            if number is None:  # it localised everywhere, and saved nothing
+                continue
             nodes = [i for i in np.flatnonzero(graph.sessions == number) if int(i) in tree.row_of]
             points = [tree.pose(int(i)).translation[[0, 2]] for i in nodes]
             label = next(
                 text
                 for drive, text in zip(drives, conditions, strict=True)
-                if drive.stamp_ns(0) == start_ns
+                if drive.stamp_ns(0) == session.start_ns
             )
-            tracks.append(Track(f"{label}: {len(points)} nodes", np.array(points).reshape(-1, 2)))
+            apart = int((graph.sessions == number).sum()) - len(points)
+            label += f": {len(points)} nodes" + (f", {apart} more unconnected" if apart else "")
+            tracks.append(Track(label, np.array(points).reshape(-1, 2)))
     return tracks
 
 
