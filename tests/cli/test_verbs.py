@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from engram.cli.verbs import VERBS
+from engram.localiser import Localiser
 
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
@@ -273,3 +274,56 @@ def test_bench_gives_the_documented_json(engram) -> None:
         assert math.isfinite(stage["ms"])
     assert ran.json["machine"]
     json.dumps(ran.json)
+
+
+@pytest.mark.parametrize("frames", [0, 3])
+def test_ctrl_c_keeps_what_was_localised_and_ends_with_130(
+    engram, street: Path, town: Path, monkeypatch: pytest.MonkeyPatch, frames: int
+) -> None:
+    localise = Localiser.localise
+    seen = 0
+
+    def interrupted(*arguments, **options):
+        nonlocal seen
+        seen += 1
+        if seen > frames:
+            raise KeyboardInterrupt
+        return localise(*arguments, **options)
+
+    monkeypatch.setattr(Localiser, "localise", interrupted)
+    ran = engram("localise", town, street, "--json")
+    assert ran.status == 130
+    assert ran.json["summary"]["interrupted"]
+    assert ran.json["summary"]["frames"] == len(ran.json["frames"]) == frames
+
+
+def test_ctrl_c_before_there_is_a_result_is_said_in_json_too(
+    engram, town: Path, street: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("engram.drive.open_drive", interrupted)
+    ran = engram("localise", town, street, "--json")
+    assert ran.status == 130
+    assert "interrupted" in ran.json["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    ("table", "setting"),
+    [
+        ("mapper", "checkpoint_every = 0"),
+        ("mapper", "save_every_m = nan"),
+        ("localiser", "search_radius_m = -1.0"),
+        ("localiser.acceptance", "min_inliers = -5"),
+    ],
+)
+def test_settings_out_of_range_are_refused(
+    engram, street: Path, tmp_path: Path, table: str, setting: str
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(f"[{table}]\n{setting}\n")
+    ran = engram("map", tmp_path / "a.engram", street, "--config", settings)
+    assert ran.status == 2
+    assert setting.split(maxsplit=1)[0] in ran.err
+    assert not (tmp_path / "a.engram").exists()

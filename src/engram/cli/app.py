@@ -23,6 +23,10 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
 
+class VerbInterruptedError(Exception):
+    """A verb was stopped by Ctrl-C before it had a result."""
+
+
 def main() -> None:
     """Runs the program; an error that Engram foresaw is one line, never a traceback."""
     from engram.cli import verbs  # registers the verbs on `app`
@@ -33,12 +37,12 @@ def main() -> None:
     except EngramError as error:
         _complain(error)
         sys.exit(EXIT_BAD_INPUT)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
+    except VerbInterruptedError as error:
+        _complain(error)
         sys.exit(EXIT_INTERRUPTED)
 
 
-def _complain(error: EngramError) -> None:
+def _complain(error: Exception) -> None:
     kind = type(error).__name__
     if "--json" in sys.argv:
         print(json.dumps({"error": {"kind": kind, "message": str(error)}}))

@@ -103,6 +103,7 @@ def localise(
         preload=preload,
     )
     results: list[FrameResult] = []
+    interrupted = False
     with LocaliseRun(map_path, sequence, load_settings(config), asked) as run:
         writer = (
             PictureWriter(pictures, every, run.localiser, run.opened.store.frames)
@@ -117,14 +118,21 @@ def localise(
                     if writer is not None:
                         writer.offer(live, result)
             except KeyboardInterrupt:
+                interrupted = True
                 typer.echo("interrupted: what follows is of the frames so far", err=True)
         if trajectory is not None:
             write_trajectory(trajectory, run.opened.graph, results)
-    summary = {**summarise(results), "skipped_pairs": sequence.skipped}
+    summary = {
+        **summarise(results),
+        "skipped_pairs": sequence.skipped,
+        "interrupted": interrupted,
+    }
     if as_json:
         print(json.dumps({"summary": summary, "frames": [r.to_dict() for r in results]}))
     else:
         _print(summary)
+    if interrupted:
+        raise typer.Exit(130)
 
 
 def _print(summary: dict[str, Any]) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
+from typing import Any
 
 import typer
 
+from engram.cli.app import VerbInterruptedError
 from engram.cli.benchmark import bench
 from engram.cli.demonstration import demo
 from engram.cli.extraction import extract
@@ -35,4 +38,17 @@ VERBS: dict[str, Callable[..., None]] = {
 def register(app: typer.Typer) -> None:
     """Gives the program its verbs."""
     for name, verb in VERBS.items():
-        app.command(name)(verb)
+        app.command(name)(_tells_of_interruption(verb))
+
+
+def _tells_of_interruption(verb: Callable[..., None]) -> Callable[..., None]:
+    """Ctrl-C where the verb itself has nothing to save: said like any other end without result."""
+
+    @functools.wraps(verb)
+    def run(*arguments: Any, **options: Any) -> None:
+        try:
+            verb(*arguments, **options)
+        except KeyboardInterrupt:
+            raise VerbInterruptedError("interrupted before there was anything to save") from None
+
+    return run

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -91,21 +92,22 @@ def extract_log(
     header: FrameLogHeader | None = None
     writer: FrameLogWriter | None = None
     try:
-        for live in live_frames(sequence, settings):
-            if live.pair is None:
-                raise SequenceError(f"{sequence.info.name}: is a frame log already")
-            if writer is None:
-                header = _header(sequence, live.frame, settings)
-                writer = FrameLogWriter(out, header)
-            _count(report, live.frame.status, live.odometry.status)
-            pair_hash = first_pair_hash(live.pair)
-            if writer.holds(live.frame.stamp_ns, pair_hash):
-                report.already_recorded += 1
-                advance("recorded already")
-                continue
-            writer.append(LoggedFrame(live.frame, live.odometry), pair_hash)
-            report.frames += 1
-            advance(live.odometry.status.value)
+        with closing(live_frames(sequence, settings)) as frames:
+            for live in frames:
+                if live.pair is None:
+                    raise SequenceError(f"{sequence.info.name}: is a frame log already")
+                if writer is None:
+                    header = _header(sequence, live.frame, settings)
+                    writer = FrameLogWriter(out, header)
+                _count(report, live.frame.status, live.odometry.status)
+                pair_hash = first_pair_hash(live.pair)
+                if writer.holds(live.frame.stamp_ns, pair_hash):
+                    report.already_recorded += 1
+                    advance("recorded already")
+                    continue
+                writer.append(LoggedFrame(live.frame, live.odometry), pair_hash)
+                report.frames += 1
+                advance(live.odometry.status.value)
         if writer is None:
             raise SequenceError(f"{sequence.info.name}: no frame can be read")
         writer.close(complete=True)

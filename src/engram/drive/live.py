@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from queue import Queue
 from threading import Event, Thread
 from typing import TypeVar
 
+from engram.drive.interruption import deferred_interrupt
 from engram.drive.settings import Settings
 from engram.frontend import Frame, Frontend, StereoPair
 from engram.odometry import Odometry, OdometryStep
@@ -44,7 +46,7 @@ def live_frames(
     settings: Settings,
     rate_hz: float | None = None,
     preload: bool = False,
-) -> Iterator[LiveFrame]:
+) -> Generator[LiveFrame]:
     """Runs a drive's images through front-end and odometry; a frame log brings both along.
 
     Args:
@@ -52,25 +54,44 @@ def live_frames(
         settings: of front-end and odometry.
         rate_hz: replay in real time at this rate; None for as fast as it goes.
         preload: decode everything before the first frame.
+
+    Close the generator where it is left early: that ends the thread that reads ahead. While it is
+    open, Ctrl-C waits for the end of the frame (`deferred_interrupt`).
+
+    Raises:
+        KeyboardInterrupt: between two frames.
     """
-    entries: Iterable[StereoPair | LoggedFrame] = (
-        list(sequence) if preload else read_ahead(sequence, _READ_AHEAD)
-    )
     frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
-    for arrived, entry in paced(entries, rate_hz):
-        if isinstance(entry, LoggedFrame):
-            yield LiveFrame(entry.frame, entry.odometry, arrived, None, {})
-            continue
-        started = time.perf_counter()
-        frame = frontend.extract(entry)
-        extracted = time.perf_counter()
-        step = odometry.step(frame)
-        finished = time.perf_counter()
-        stage_ms = {
-            "frontend": (extracted - started) * 1e3,
-            "odometry": (finished - extracted) * 1e3,
-        }
-        yield LiveFrame(frame, step, arrived, entry, stage_ms)
+    # Closed by hand: after an error its traceback would keep the reading thread alive to the end
+    # of the process, and a thread that is in the midst of C++ then takes the process down with it.
+    with closing(_entries(sequence, preload)) as entries, deferred_interrupt() as raise_if_asked:
+        for arrived, entry in paced(entries, rate_hz):
+            raise_if_asked()
+            if isinstance(entry, LoggedFrame):
+                yield LiveFrame(entry.frame, entry.odometry, arrived, None, {})
+            else:
+                yield _run(frontend, odometry, entry, arrived)
+            raise_if_asked()
+
+
+def _entries(
+    sequence: StereoSequence | FrameSequence, preload: bool
+) -> Generator[StereoPair | LoggedFrame]:
+    entries: Iterable[StereoPair | LoggedFrame] = sequence
+    yield from list(entries) if preload else read_ahead(entries, _READ_AHEAD)
+
+
+def _run(frontend: Frontend, odometry: Odometry, pair: StereoPair, arrived: float) -> LiveFrame:
+    started = time.perf_counter()
+    frame = frontend.extract(pair)
+    extracted = time.perf_counter()
+    step = odometry.step(frame)
+    finished = time.perf_counter()
+    stage_ms = {
+        "frontend": (extracted - started) * 1e3,
+        "odometry": (finished - extracted) * 1e3,
+    }
+    return LiveFrame(frame, step, arrived, pair, stage_ms)
 
 
 def ignore(word: str) -> None:
@@ -97,7 +118,7 @@ def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]
         yield due, item
 
 
-def read_ahead(items: Iterable[T], depth: int) -> Iterator[T]:
+def read_ahead(items: Iterable[T], depth: int) -> Generator[T]:
     """Iterates on a thread of its own, up to `depth` items ahead of the consumer.
 
     An error of the iteration is raised where the item would have come.

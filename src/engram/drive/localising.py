@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -13,6 +13,7 @@ from engram.drive.opened_map import open_map
 from engram.drive.results import FrameResult
 from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
+from engram.errors import ConfigError
 from engram.localiser import Budget, Localiser
 
 
@@ -39,6 +40,10 @@ class LocaliseOptions:
     rate_hz: float | None = None
     preload: bool = False
 
+    def __post_init__(self) -> None:
+        if self.rate_hz is not None and not self.rate_hz > 0:
+            raise ConfigError(f"rate is {self.rate_hz} Hz, must be > 0")
+
 
 class LocaliseRun:
     """A drive being localised: iterate for each live frame and its result. A context manager.
@@ -55,11 +60,12 @@ class LocaliseRun:
         self._sequence = sequence
         self._settings = settings.for_descriptor(self.opened.descriptor)
         self._options = options
+        self._frames: Generator[LiveFrame] | None = None
         self.localiser: Localiser = self.opened.localiser(
             sequence.camera,
             self._settings,
             policy=options.policy,
-            budget=Budget(options.lanes, options.rounds),
+            budget=Budget(options.lanes, options.rounds, options.deadline_ms),
             relocaliser=options.relocaliser,
             live=session_of_drive(sequence).id,
         )
@@ -68,13 +74,15 @@ class LocaliseRun:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self._frames is not None:
+            self._frames.close()
         self.localiser.close()
         self.opened.close()
 
     def __iter__(self) -> Iterator[tuple[LiveFrame, FrameResult]]:
         options = self._options
-        frames = live_frames(self._sequence, self._settings, options.rate_hz, options.preload)
-        for live in frames:
+        self._frames = live_frames(self._sequence, self._settings, options.rate_hz, options.preload)
+        for live in self._frames:
             deadline = (
                 None if options.deadline_ms is None else live.arrived + options.deadline_ms / 1e3
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 
-from engram.errors import SequenceError
+from engram.errors import ConfigError, SequenceError
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
 from engram.sequences import SequenceInfo, StereoSequence
@@ -24,6 +24,8 @@ class ThereAndBack:
     """
 
     def __init__(self, sequence: StereoSequence, count: int, rate_hz: float = 20.0) -> None:
+        if count < 1:
+            raise ConfigError(f"there and back for {count} frames: must be 1 or more")
         self._pairs = list(sequence)
         if len(self._pairs) < 2:
             raise SequenceError(
