@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,19 @@ from engram.drive.opened_map import OpenMap
 from engram.drive.results import FrameResult, summarise
 from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
-from engram.experience.model import Session
+from engram.experience.model import PathEntryKind, Session
 from engram.frontend import Frontend
 from engram.geometry import StereoCamera
 from engram.localiser import Budget
 from engram.mapper import Mapper, Saver
 from engram.sequences import FrameLog
-from engram.store import MapStore, SessionState, SessionWriter, WritableMapStore
+from engram.store import (
+    MapStore,
+    SessionState,
+    SessionWriter,
+    StoredSession,
+    WritableMapStore,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +146,8 @@ def map_drive(
             writer = store.resume_session(session.id)
             report.resumed = True
         opened = OpenMap(store)
-        frames = live_frames(sequence, settings, options.rate_hz)
-        _map_frames(opened, writer, sequence.camera, frames, settings, options, report, advance)
+        with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
+            _map_frames(opened, writer, sequence.camera, frames, settings, options, report, advance)
     report.skipped = sequence.skipped
     return report
 
@@ -198,16 +205,23 @@ def _map_frames(
         camera,
         settings,
         policy=options.policy,
-        budget=Budget(options.lanes, options.rounds),
+        budget=Budget(options.lanes, options.rounds, options.deadline_ms),
         relocaliser=options.relocaliser,
         live=writer.session.id,
         saves=True,
     )
+    stored = writer.stored
+    if stored.last_entry is not None:
+        localiser.resume_walk(stored.last_entry.node, stored.next_sequence, stored.next_iteration)
     with localiser:
         mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper)
         try:
-            for live in _from_where_it_stopped(frames, writer, mapper, advance):
-                deadline = options.deadline_ms and live.arrived + options.deadline_ms / 1e3
+            for live in _from_where_it_stopped(frames, stored, mapper, advance):
+                deadline = (
+                    None
+                    if options.deadline_ms is None
+                    else live.arrived + options.deadline_ms / 1e3
+                )
                 step = mapper.process(live.frame, live.odometry, deadline)
                 report.saved += step.saved is not None
                 report.results.append(
@@ -229,22 +243,24 @@ def _map_frames(
 
 def _from_where_it_stopped(
     frames: Iterable[LiveFrame],
-    writer: SessionWriter,
+    stored: StoredSession,
     mapper: Mapper,
     advance: Callable[[str], None],
 ) -> Iterable[LiveFrame]:
-    """All frames of a new session; of a resumed one those from its last saved node on.
+    """All frames of a new session; of a resumed one those after the last that it remembers.
 
-    The robot is in the node that it saved by construction, so the drive goes on from that very
-    frame; frames before it went into odometry only.
+    That is the frame of its last saved node or of its last match, whichever is later; frames up
+    to there went into the map already, and give odometry only.
     """
-    last = writer.stored.nodes[-1] if writer.stored.nodes else None
-    reached = last is None
     for live in frames:
-        if reached:
+        stamp_ns = live.frame.stamp_ns
+        if stored.last_stamp_ns is None or stamp_ns > stored.last_stamp_ns:
             yield live
             continue
         advance("resuming")
-        if last is not None and live.frame.stamp_ns == last.stamp_ns:
-            mapper.resume(last, writer.stored.next_sequence)
-            reached = True
+        mapper.follow(live.odometry)
+        if stored.nodes and stamp_ns == stored.nodes[-1].stamp_ns:
+            mapper.resume_in(stored.nodes[-1].id)
+        entry = stored.last_entry
+        if entry and stamp_ns == entry.stamp_ns and entry.kind is PathEntryKind.MATCHED:
+            mapper.resume_near(entry.node)

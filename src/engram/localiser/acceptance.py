@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from engram.errors import ConfigError
 from engram.frontend import Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
@@ -36,6 +37,12 @@ class AcceptanceConfig:
     reach_m: float = 8.0
     slack_m: float = 1.0
     slack_rad: float = float(np.deg2rad(10.0))
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if not 0 <= value < np.inf:
+                raise ConfigError(f"acceptance: {one.name} is {value}, must be finite and >= 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Self
 from uuid import uuid5
@@ -10,13 +10,13 @@ from uuid import uuid5
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.errors import ConfigError
 from engram.experience.basin import MatchBasin
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import (
     ENGRAM_NAMESPACE,
     Attempt,
     LandmarkSource,
-    Node,
     NodeId,
     PathEntryKind,
     SessionId,
@@ -37,6 +37,9 @@ from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import RankingContext, RankingPolicy, RecentAttempts
 
 _PREFETCH = 16
+# A resumed robot was matched with a node from somewhere within a wide match basin.
+_RESUMED_SIGMA_M = 3.0
+_RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
 # Stands for a drive that is not identified: equal input gives equal results there too.
 UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
 
@@ -64,6 +67,12 @@ class LocaliserConfig:
     guide_below_rad: float = float(np.deg2rad(3.0))
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if isinstance(value, float) and not 0 <= value < np.inf:
+                raise ConfigError(f"localiser: {one.name} is {value}, must be finite and >= 0")
 
 
 class Localiser:
@@ -153,11 +162,21 @@ class Localiser:
         self._open_loop_m = 0.0
         self._adrift = False
 
-    def resume_in(self, node: Node, next_sequence: int) -> None:
-        """Goes on in the last node that this session had saved before it was interrupted."""
-        self.position = Position.at(node.id)
-        self._driven_m = node.driven_m
-        self.walk = Walk(self.walk.path, next_sequence)
+    def resume_walk(self, node: NodeId, next_sequence: int, next_iteration: int) -> None:
+        """Goes on with the path and the attempts of a session that was interrupted in `node`."""
+        self.walk = Walk(self.walk.path, next_sequence, node)
+        self._recent = RecentAttempts(first_iteration=next_iteration)
+
+    def resume_in(self, node: NodeId) -> None:
+        """The live frame had been saved as `node`."""
+        self.position = Position.at(node)
+        self._adrift = False
+
+    def resume_near(self, node: NodeId) -> None:
+        """The live frame had been matched with `node`, nobody knows from where exactly."""
+        spread = np.diag([_RESUMED_SIGMA_M**2] * 3 + [_RESUMED_SIGMA_RAD**2] * 3)
+        self.start_at(Position(node, SE3.identity(), spread))
+        self._adrift = True
 
     def settle_in(self, node: NodeId, stamp_ns: int) -> None:
         """The live frame was saved as `node`: the robot is in it by construction (SPEC §4)."""
@@ -183,7 +202,7 @@ class Localiser:
         clock = _StageClock()
         if deadline is None and self._budget.deadline_ms is not None:
             deadline = clock.started + self._budget.deadline_ms / 1e3
-        self._carry_on(odometry)
+        self.carry_on(odometry)
         self._new_place = None
         self._recent.begin_frame(self._driven_m)
         outcomes: list[Outcome] = []
@@ -206,7 +225,7 @@ class Localiser:
         clock.lap("remember")
         return self._result(live, odometry, success, neighbourhood, clock.stage_ms)
 
-    def _carry_on(self, odometry: OdometryStep) -> None:
+    def carry_on(self, odometry: OdometryStep) -> None:
         """Propagates the position by odometry (SPEC §3).
 
         A frame that odometry could not use changes nothing: the next usable one brings the motion

@@ -8,10 +8,10 @@ from engram.experience.model import NodeId, PathEntry, PathEntryKind, PathId
 class Walk:
     """Collects the entries of one session's path: one whenever its node changes."""
 
-    def __init__(self, path: PathId, first_sequence: int = 0) -> None:
+    def __init__(self, path: PathId, first_sequence: int = 0, node: NodeId | None = None) -> None:
         self.path = path
         self._sequence = first_sequence
-        self._node: NodeId | None = None
+        self._node = node
         self._new: list[PathEntry] = []
 
     def visit(self, node: NodeId, kind: PathEntryKind, stamp_ns: int) -> None:

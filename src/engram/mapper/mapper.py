@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from engram.errors import ConfigError
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import Edge, EdgeKind, Node, NodeId, Session, node_id
 from engram.experience.proximity import lay_proximity_edges, tighten_chain
@@ -31,6 +32,14 @@ class MapperConfig:
     save_every_rad: float = float(np.deg2rad(15.0))
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
+
+    def __post_init__(self) -> None:
+        for name in ("save_every_m", "save_every_rad", "tie_within_m"):
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise ConfigError(f"mapper: {name} is {value}, must be finite and >= 0")
+        if self.checkpoint_every < 1:
+            raise ConfigError(f"mapper: checkpoint_every is {self.checkpoint_every}, must be >= 1")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,14 +112,22 @@ class Mapper:
             self._saver.put(records)
         return MappingStep(localisation, saved.id if saved else None)
 
-    def resume(self, last: Node, next_sequence: int) -> None:
-        """Goes on behind the last saved node of an interrupted session.
+    def follow(self, odometry: OdometryStep) -> None:
+        """Carries on over a frame that an interrupted run of this session had mapped already."""
+        self._localiser.carry_on(odometry)
+        if self._since_saved is not None:
+            self._since_saved = _carried_on(self._since_saved, odometry)
 
-        To be called when its frame is the live one, before the next is processed.
-        """
-        self._experience = [last.id]
-        self._since_saved = Position.at(last.id)
-        self._localiser.resume_in(last, next_sequence)
+    def resume_in(self, saved: NodeId) -> None:
+        """The frame just followed is the last that this session had saved as a node."""
+        self._experience = [saved]
+        self._since_saved = Position.at(saved)
+        self._localiser.resume_in(saved)
+
+    def resume_near(self, matched: NodeId) -> None:
+        """The frame just followed is the last whose match with another node is remembered."""
+        self._experience = []
+        self._localiser.resume_near(matched)
 
     def _worth_saving(self, live: Frame) -> bool:
         """A usable frame, far enough from the last saved one (SPEC §5)."""

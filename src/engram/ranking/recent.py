@@ -74,16 +74,16 @@ class RecentAttempts:
     frames of the running iteration see T iterations before it and what it attempted so far.
     """
 
-    def __init__(self, config: RecentConfig | None = None) -> None:
+    def __init__(self, config: RecentConfig | None = None, first_iteration: int = 0) -> None:
         self._config = RecentConfig() if config is None else config
         self._iterations: deque[dict[int, bool]] = deque(maxlen=self._config.T)
         self._current: dict[int, bool] = {}
         self._began_m: float | None = None
-        self._number = -1
+        self._number = first_iteration - 1
 
     @property
     def iteration(self) -> int:
-        """Number of the running iteration, from 0; -1 before the first frame."""
+        """Number of the running iteration; one less than the first before the first frame."""
         return self._number
 
     def begin_frame(self, driven_m: float) -> int:
@@ -95,7 +95,7 @@ class RecentAttempts:
             and driven_m - self._began_m < self._config.iteration_m
         ):
             return self._number
-        if self._number >= 0:
+        if self._began_m is not None:
             self._iterations.append(self._current)
         self._current, self._began_m = {}, driven_m
         self._number += 1

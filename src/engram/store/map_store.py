@@ -6,12 +6,20 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Self
+from uuid import UUID
 
 from sqlalchemy import Connection, func, insert, select
 
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
-from engram.experience.model import Session, SessionId, path_id
+from engram.experience.model import (
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    Session,
+    SessionId,
+    path_id,
+)
 from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.store import reading
@@ -277,7 +285,7 @@ class WritableMapStore(MapStore):
             camera_key = self._keys.ensure_camera(connection, camera)
             frontend_key = self._keys.ensure_frontend(connection, descriptor, frontend)
             self._insert_session(connection, session, opened["key"], camera_key, frontend_key)
-        return self._writer(session.id, StoredSession((), None, 0, 0))
+        return self._writer(session.id, StoredSession())
 
     def resume_session(self, session: SessionId) -> SessionWriter:
         """Go on with an interrupted session; `SessionWriter.stored` says where.
@@ -503,19 +511,38 @@ def _stored_session(connection: Connection, view: View, session: Row) -> StoredS
         node_from_row(row, session_id, cameras[row["camera"]].id)
         for row in verified(nodes, connection.execute(query))
     )
-    steps = (
-        select(func.max(path_entries.c.sequence), func.max(path_entries.c.stamp_ns))
-        .select_from(path_entries.join(paths, paths.c.key == path_entries.c.path))
-        .where(paths.c.session == session["key"])
-    )
-    last_sequence, last_entry_ns = connection.execute(steps).one()
+    last_entry = _last_path_entry(connection, session["key"], session_id)
     made = reading.attempt_tables(connection, view).get(session["key"])
-    stamps = [node.stamp_ns for node in saved]
     return StoredSession(
         nodes=saved,
-        last_stamp_ns=max(
-            [*stamps, *([] if last_entry_ns is None else [last_entry_ns])], default=None
-        ),
-        next_sequence=0 if last_sequence is None else last_sequence + 1,
+        last_entry=last_entry,
+        next_sequence=0 if last_entry is None else last_entry.sequence + 1,
         next_iteration=0 if made is None else int(made.columns["iteration"].max()) + 1,
+    )
+
+
+def _last_path_entry(
+    connection: Connection, session_key: int, session: SessionId
+) -> PathEntry | None:
+    query = (
+        select(*path_entries.columns, nodes.c.uuid.label("node_uuid"))
+        .select_from(
+            path_entries.join(paths, paths.c.key == path_entries.c.path).join(
+                nodes, nodes.c.key == path_entries.c.node
+            )
+        )
+        .where(paths.c.session == session_key)
+        .order_by(path_entries.c.sequence.desc())
+        .limit(1)
+    )
+    found = connection.execute(query).first()
+    if found is None:
+        return None
+    row = next(verified(path_entries, [found]))
+    return PathEntry(
+        path_id(session),
+        row["sequence"],
+        NodeId(UUID(bytes=found[-1])),
+        PathEntryKind(row["kind"]),
+        row["stamp_ns"],
     )

@@ -87,15 +87,23 @@ class StoredSession:
 
     Attributes:
         nodes: its nodes in order of saving.
-        last_stamp_ns: newest stamp among nodes and path entries; None if there are none.
+        last_entry: the newest entry of its path; None if it has none.
         next_sequence: sequence number of its next path entry.
         next_iteration: one past the newest iteration among its attempts.
     """
 
-    nodes: tuple[Node, ...]
-    last_stamp_ns: int | None
-    next_sequence: int
-    next_iteration: int
+    nodes: tuple[Node, ...] = ()
+    last_entry: PathEntry | None = None
+    next_sequence: int = 0
+    next_iteration: int = 0
+
+    @property
+    def last_stamp_ns(self) -> int | None:
+        """Newest stamp among nodes and path entries; None if there are none."""
+        stamps_ns = [node.stamp_ns for node in self.nodes[-1:]]
+        if self.last_entry is not None:
+            stamps_ns.append(self.last_entry.stamp_ns)
+        return max(stamps_ns, default=None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
