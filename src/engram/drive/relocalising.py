@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -92,9 +93,12 @@ def relocalise_drive(
         settings = settings.for_descriptor(opened.descriptor)
         finder = opened.relocaliser(relocaliser, settings.frontend.descriptor)
         matching = (settings.localiser.matcher, settings.localiser.acceptance)
-        with Attempter(opened.store.frames, budget, *matching) as attempter:
+        with (
+            Attempter(opened.store.frames, budget, *matching) as attempter,
+            closing(live_frames(sequence, settings)) as frames,
+        ):
             found = []
-            for live in live_frames(sequence, settings):
+            for live in frames:
                 finder.forget_failures()
                 found.append(_cold_start(opened, live.frame, finder, attempter, budget))
                 advance(found[-1].status.value)

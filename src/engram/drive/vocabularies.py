@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -149,5 +150,5 @@ def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
             return [store.frames.frame(node.id) for node in store.load().nodes]
     sequence: DriveSequence = open_drive(source)
     settings = Settings().for_descriptor(kind)
-    live = (one.frame for one in live_frames(sequence, settings))
-    return [frame for frame in live if frame.status is FrameStatus.OK]
+    with closing(live_frames(sequence, settings)) as live:
+        return [one.frame for one in live if one.frame.status is FrameStatus.OK]
