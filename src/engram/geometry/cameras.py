@@ -15,6 +15,9 @@ from engram.geometry.se3 import SE3
 
 CameraId = NewType("CameraId", str)
 
+# Longer than any robot; a baseline given in millimetres exceeds it.
+LONGEST_BASELINE_M = 20.0
+
 # Landmarks are stored with 16 bits for a pixel.
 _MAX_SIDE_PX = 65535
 
@@ -35,8 +38,8 @@ class StereoCamera:
         id: 32 hexadecimal digits, equal for equal cameras.
 
     Raises:
-        CalibrationError: a value is not finite or not positive, or the principal point lies
-            outside the image by more than its size.
+        CalibrationError: a value is not finite or not positive, the principal point lies outside
+            the image, or the baseline is longer than any robot.
     """
 
     fx: float
@@ -61,8 +64,16 @@ class StereoCamera:
                 raise CalibrationError(f"camera: {name} is {value}, must be finite and > 0")
         for name, size in (("cx", self.width), ("cy", self.height)):
             value = getattr(self, name)
-            if not (np.isfinite(value) and -size <= value <= 2 * size):
-                raise CalibrationError(f"camera: {name} is {value}, image size is {size} px")
+            if not 0 <= value <= size:
+                raise CalibrationError(
+                    f"camera: {name} is {value}, outside the image of {self.width}×{self.height} "
+                    "px: is this the calibration of these images?"
+                )
+        if self.baseline_m > LONGEST_BASELINE_M:
+            raise CalibrationError(
+                f"camera: baseline_m is {self.baseline_m}, must be at most {LONGEST_BASELINE_M} m: "
+                "is it in millimetres?"
+            )
         object.__setattr__(self, "id", _content_hash(self))
 
     def __eq__(self, other: object) -> bool:
