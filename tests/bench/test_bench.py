@@ -69,7 +69,9 @@ def test_both_sides_get_as_many_features(prepare, drive: BenchData, plain) -> No
         assert reference["features"] == pytest.approx(ours["landmarks"], rel=0.1)
 
 
-def test_window_solutions_agree(drive: BenchData, plain) -> None:
+def test_both_sides_of_the_window_stage_solve_a_problem_of_one_size(
+    drive: BenchData, plain
+) -> None:
     prepared = STAGES["window_ba_512"](drive, plain)
     assert prepared.ours(0) == prepared.reference(0)
 

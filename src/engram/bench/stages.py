@@ -27,15 +27,18 @@ _FRAME_INTERVAL_NS = 100_000_000
 
 
 def prepare_frontend_odometry(
-    data: BenchData, plain: PlainPipeline | None, *, size: str
+    data: BenchData, plain: PlainPipeline | None, *, size: str, windowed: bool = False
 ) -> Prepared:
-    """One stereo pair in, one motion out; without the window, which is a stage of its own.
+    """One stereo pair in, one motion out.
 
-    The drive is played to and fro without end, so every step is a real motion.
+    The window is a stage of its own; `windowed` adds it to our side as the product runs it, while
+    the reference has none. The drive is played to and fro without end, so every step is a real
+    motion.
     """
     pairs = data.at(size)
     frontend = Frontend()
-    odometry = Odometry(OdometryConfig(window=WindowConfig(iterations=0)))
+    window = WindowConfig() if windowed else WindowConfig(iterations=0)
+    odometry = Odometry(OdometryConfig(window=window))
 
     def ours(i: int) -> dict[str, int]:
         pair = pairs[_to_and_fro(i, len(pairs))]
@@ -90,6 +93,12 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
     {
         "frontend_odometry_512": partial(prepare_frontend_odometry, size="512"),
         "frontend_odometry_full": partial(prepare_frontend_odometry, size="full"),
+        "frontend_odometry_windowed_512": partial(
+            prepare_frontend_odometry, size="512", windowed=True
+        ),
+        "frontend_odometry_windowed_full": partial(
+            prepare_frontend_odometry, size="full", windowed=True
+        ),
         "attempt_512": partial(prepare_attempt, size="512"),
         "attempt_full": partial(prepare_attempt, size="full"),
         "render_pair_512": prepare_rendering,

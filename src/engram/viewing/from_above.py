@@ -19,12 +19,10 @@ class Track:
     Attributes:
         label: for the legend.
         points_m: (N, 2) float64, x to the right and z forward in the picture's frame, metres.
-        weak: drawn thin and grey, as a background.
     """
 
     label: str
     points_m: NDArray[np.float64]
-    weak: bool = False
 
 
 def draw_from_above(tracks: Sequence[Track], path: Path, title: str) -> None:
@@ -36,9 +34,6 @@ def draw_from_above(tracks: Sequence[Track], path: Path, title: str) -> None:
     figure, axes = _axes()
     for number, track in enumerate(tracks):
         x, z = track.points_m[:, 0], track.points_m[:, 1]
-        if track.weak:
-            axes.plot(x, z, "-", color="0.8", linewidth=1, label=track.label)
-            continue
         colour = f"C{number % 10}"
         axes.plot(x, z, ".", color=colour, markersize=5, label=track.label)
     axes.set_aspect("equal")
