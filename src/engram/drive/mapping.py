@@ -19,7 +19,7 @@ from engram.drive.settings import Settings
 from engram.experience.model import PathEntryKind, Session
 from engram.frontend import Frontend
 from engram.geometry import StereoCamera
-from engram.localiser import Budget
+from engram.localiser import Budget, Position
 from engram.mapper import Mapper, Saver
 from engram.sequences import FrameLog
 from engram.store import (
@@ -115,6 +115,7 @@ def map_drive(
     settings: Settings,
     options: MapOptions,
     advance: Callable[[str], None] = ignore,
+    start: Position | None = None,
 ) -> MapReport:
     """Adds a drive to a map, which is made if there is none.
 
@@ -127,6 +128,7 @@ def map_drive(
         settings: the resolved configuration, kept with the revision.
         options: how it is mapped.
         advance: called once per frame with a word on how it went.
+        start: where the robot stands before its first frame, if that is known.
 
     Raises:
         MapError: the map cannot be read or written; what was checkpointed is intact.
@@ -147,7 +149,10 @@ def map_drive(
             report.resumed = True
         opened = OpenMap(store)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
-            _map_frames(opened, writer, sequence.camera, frames, settings, options, report, advance)
+            if report.resumed:
+                start = None
+            camera = sequence.camera
+            _map_frames(opened, writer, camera, frames, settings, options, report, advance, start)
     report.skipped = sequence.skipped
     return report
 
@@ -198,6 +203,7 @@ def _map_frames(
     options: MapOptions,
     report: MapReport,
     advance: Callable[[str], None],
+    start: Position | None,
 ) -> None:
     """Feeds the mapper; commits at the end, or leaves the session to be resumed."""
     saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every)
@@ -210,6 +216,8 @@ def _map_frames(
         live=writer.session.id,
         saves=True,
     )
+    if start is not None:
+        localiser.start_at(start)
     stored = writer.stored
     if stored.last_entry is not None:
         localiser.resume_walk(stored.last_entry.node, stored.next_sequence, stored.next_iteration)

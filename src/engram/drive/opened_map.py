@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Self
@@ -12,6 +13,7 @@ from engram.errors import ConfigError
 from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import SessionId
+from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
 from engram.frontend import DescriptorKind, Frontend, StereoPair
 from engram.geometry import StereoCamera
@@ -21,6 +23,7 @@ from engram.localiser import (
     Budget,
     Localisation,
     Localiser,
+    Matcher,
     Relocaliser,
     Searched,
 )
@@ -115,6 +118,8 @@ class OpenMap:
         relocaliser: str | None = "fabmap",
         live: SessionId = UNNAMED_LIVE_SESSION,
         saves: bool = False,
+        matcher: Matcher | None = None,
+        search: Callable[..., Neighbourhood] | None = None,
     ) -> Localiser:
         """A localiser for one session in this map.
 
@@ -126,6 +131,7 @@ class OpenMap:
             relocaliser: key of `RELOCALISERS`; None for none.
             live: the live session.
             saves: whether it is being mapped.
+            matcher, search: in place of the map's own; see `Localiser`.
 
         Raises:
             ConfigError: there is no such policy or relocaliser.
@@ -145,6 +151,8 @@ class OpenMap:
             live=live,
             saves=saves,
             config=settings.localiser,
+            matcher=matcher,
+            search=search,
         )
 
     def robot(

@@ -16,7 +16,7 @@ from engram.drive.session import DriveSequence
 from engram.drive.settings import Settings
 from engram.experience.model import NodeId, node_id
 from engram.frontend import Frame, FrameStatus
-from engram.localiser import UNNAMED_LIVE_SESSION, Budget, Relocaliser
+from engram.localiser import UNNAMED_LIVE_SESSION, Budget, FrameMatcher, Relocaliser
 from engram.localiser.attempts import Attempter, Candidate, best_success
 
 
@@ -92,9 +92,9 @@ def relocalise_drive(
     with open_map(map_path, at) as opened:
         settings = settings.for_descriptor(opened.descriptor)
         finder = opened.relocaliser(relocaliser, settings.frontend.descriptor)
-        matching = (settings.localiser.matcher, settings.localiser.acceptance)
+        matcher = FrameMatcher(opened.store.frames, settings.localiser.matcher)
         with (
-            Attempter(opened.store.frames, budget, *matching) as attempter,
+            Attempter(matcher, budget, settings.localiser.acceptance) as attempter,
             closing(live_frames(sequence, settings)) as frames,
         ):
             found = []

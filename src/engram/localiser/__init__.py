@@ -1,6 +1,7 @@
 """Live frame + neighbourhood + policy + budget → localisation; lost and found again."""
 
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
+from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
 from engram.localiser.relocalisation import RELOCALISERS, Exhaustive, Relocaliser, Searched
@@ -12,10 +13,12 @@ __all__ = [
     "AcceptanceConfig",
     "Budget",
     "Exhaustive",
+    "FrameMatcher",
     "Localisation",
     "LocalisationStatus",
     "Localiser",
     "LocaliserConfig",
+    "Matcher",
     "Position",
     "Prediction",
     "Relocaliser",

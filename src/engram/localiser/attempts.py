@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Self
-from uuid import UUID
+from typing import Protocol, Self
 
 import numpy as np
 
@@ -47,23 +46,62 @@ class Outcome:
     accepted: bool
 
 
+class Matcher(Protocol):
+    """The first half of an attempt, a pure function of two frames (SPEC §3.2)."""
+
+    @property
+    def threads(self) -> bool:
+        """Whether attempts gain by running on threads of their own."""
+        ...
+
+    def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
+        """The match of a live frame with a node; `guide` is given for a guided attempt only."""
+        ...
+
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> float:
+        """`inlier_spread` of such a match."""
+        ...
+
+
+class FrameMatcher:
+    """Matches with the landmarks that a source holds: what runs on a robot."""
+
+    threads = True
+
+    def __init__(self, frames: LandmarkSource, config: MatcherConfig) -> None:
+        self._frames = frames
+        self._config = config
+
+    def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
+        """See `Matcher`; seeded by both UUIDs."""
+        covariance = None
+        if guide is not None:
+            covariance = np.diag([guide.sigma_m**2] * 3 + [guide.sigma_yaw_rad**2] * 3)
+        return match_frames(
+            self._frames.frame(node),
+            live,
+            self._config,
+            seed=pair_seed(live_id, node),
+            predicted=None if guide is None else guide.node_from_live,
+            predicted_covariance=covariance,
+        )
+
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> float:
+        """See `Matcher`."""
+        del live_id
+        return inlier_spread(match, self._frames.frame(node), live)
+
+
 class Attempter:
     """Runs attempts on threads of its own; the core releases the GIL, so they are parallel."""
 
-    def __init__(
-        self,
-        frames: LandmarkSource,
-        budget: Budget,
-        matcher: MatcherConfig,
-        acceptance: AcceptanceConfig,
-    ) -> None:
-        self._frames = frames
-        self._budget = budget
+    def __init__(self, matcher: Matcher, budget: Budget, acceptance: AcceptanceConfig) -> None:
         self._matcher = matcher
+        self._budget = budget
         self._acceptance = acceptance
         self._pool = (
             ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")
-            if budget.lanes > 1
+            if budget.lanes > 1 and matcher.threads
             else None
         )
 
@@ -81,7 +119,7 @@ class Attempter:
     def run(
         self,
         live: Frame,
-        live_id: UUID,
+        live_id: NodeId,
         candidates: Sequence[Candidate],
         deadline: float | None,
     ) -> list[Outcome]:
@@ -108,7 +146,7 @@ class Attempter:
         return outcomes
 
     def _round(
-        self, live: Frame, live_id: UUID, candidates: Sequence[Candidate], ranks: range
+        self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate], ranks: range
     ) -> list[Outcome]:
         def attempt(rank: int) -> Outcome:
             return self._attempt(live, live_id, candidates[rank], rank)
@@ -117,25 +155,25 @@ class Attempter:
             return [attempt(rank) for rank in ranks]
         return list(self._pool.map(attempt, ranks))
 
-    def _attempt(self, live: Frame, live_id: UUID, candidate: Candidate, rank: int) -> Outcome:
+    def _attempt(self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int) -> Outcome:
         prediction = candidate.prediction
-        covariance = None
-        if candidate.guided and prediction is not None:
-            covariance = np.diag([prediction.sigma_m**2] * 3 + [prediction.sigma_yaw_rad**2] * 3)
-        node = self._frames.frame(candidate.node)
-        match = match_frames(
-            node,
-            live,
-            self._matcher,
-            seed=pair_seed(live_id, candidate.node),
-            predicted=prediction.node_from_live
-            if candidate.guided and prediction is not None
-            else None,
-            predicted_covariance=covariance,
+        match = self._matcher.match(
+            live, live_id, candidate.node, prediction if candidate.guided else None
         )
-        spread = inlier_spread(match, node, live) if prediction is None else 1.0
+        spread = 1.0
+        if prediction is None:
+            spread = self._matcher.spread(live, live_id, candidate.node, match)
         accepted = accept(match, prediction, self._acceptance, spread)
         return Outcome(candidate, rank, match, accepted)
+
+    def foresee(
+        self, live: Frame, live_id: NodeId, candidates: Iterable[Candidate]
+    ) -> list[Outcome]:
+        """What would become of these attempts; for the policy that knows it all (SPEC §4)."""
+        return [
+            self._attempt(live, live_id, candidate, rank)
+            for rank, candidate in enumerate(candidates)
+        ]
 
 
 def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Self
@@ -29,12 +30,19 @@ from engram.frontend import Frame, FrameStatus
 from engram.frontend.matching import MatcherConfig
 from engram.geometry import SE3
 from engram.localiser.acceptance import AcceptanceConfig, Prediction
-from engram.localiser.attempts import Attempter, Candidate, Outcome, best_success
+from engram.localiser.attempts import (
+    Attempter,
+    Candidate,
+    FrameMatcher,
+    Matcher,
+    Outcome,
+    best_success,
+)
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.walk import Walk
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.ranking import RankingContext, RankingPolicy, RecentAttempts
+from engram.ranking import Foreseen, RankingContext, RankingPolicy, RecentAttempts, RecentConfig
 
 _PREFETCH = 16
 # A resumed robot was matched with a node from somewhere within a wide match basin.
@@ -56,6 +64,7 @@ class LocaliserConfig:
         lost_after_m: open loop distance past which the robot is lost. Source: SPEC §3.4, 10 m.
         guide_below_m, guide_below_rad: an attempt is guided by the prediction where its standard
             deviations lie below both; 0 turns guidance off.
+        recent: what the ranking remembers of this session's attempts.
         matcher, acceptance: settings of the two halves of an attempt.
     """
 
@@ -65,6 +74,7 @@ class LocaliserConfig:
     lost_after_m: float = 10.0
     guide_below_m: float = 0.3
     guide_below_rad: float = float(np.deg2rad(3.0))
+    recent: RecentConfig = field(default_factory=RecentConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
 
@@ -93,6 +103,9 @@ class Localiser:
             results.
         saves: whether the session is being mapped: then its own recent nodes are no candidates.
         config: settings.
+        matcher: the first half of an attempt; None matches with the landmarks of `frames`.
+        search: finds the candidates; None for the graph's own `neighbourhood`. Localisers in step
+            with each other, in a graph that does not grow, may share one that remembers.
     """
 
     def __init__(
@@ -108,6 +121,8 @@ class Localiser:
         live: SessionId = UNNAMED_LIVE_SESSION,
         saves: bool = False,
         config: LocaliserConfig | None = None,
+        matcher: Matcher | None = None,
+        search: Callable[..., Neighbourhood] | None = None,
     ) -> None:
         self.config = config or LocaliserConfig()
         self.live = live
@@ -119,8 +134,11 @@ class Localiser:
         self._budget = budget
         self._relocaliser = relocaliser
         self._basin = basin
-        self._attempter = Attempter(frames, budget, self.config.matcher, self.config.acceptance)
-        self._recent = RecentAttempts()
+        self._search = search or graph.neighbourhood
+        self._attempter = Attempter(
+            matcher or FrameMatcher(frames, self.config.matcher), budget, self.config.acceptance
+        )
+        self._recent = RecentAttempts(self.config.recent)
         self.walk = Walk(path_id(self.live))
         self.position: Position | None = None
         self._open_loop_m = 0.0
@@ -165,7 +183,7 @@ class Localiser:
     def resume_walk(self, node: NodeId, next_sequence: int, next_iteration: int) -> None:
         """Goes on with the path and the attempts of a session that was interrupted in `node`."""
         self.walk = Walk(self.walk.path, next_sequence, node)
-        self._recent = RecentAttempts(first_iteration=next_iteration)
+        self._recent = RecentAttempts(self.config.recent, next_iteration)
 
     def resume_in(self, node: NodeId) -> None:
         """The live frame had been saved as `node`."""
@@ -262,7 +280,7 @@ class Localiser:
         if position is None:
             return None
         radius_m = self._basin.search_radius_m(position.sigma_m, self.config.search_radius_m)
-        return self._graph.neighbourhood(
+        return self._search(
             self._graph.index(position.node),
             position.node_from_live,
             position.covariance,
@@ -286,8 +304,18 @@ class Localiser:
             own_path=self.walk.path,
             stamp_ns=live.stamp_ns,
             seed=live.stamp_ns,
+            foresee=lambda: self._foresee(live, neighbourhood),
         )
         return self._policy.rank(context)
+
+    def _foresee(self, live: Frame, neighbourhood: Neighbourhood) -> Foreseen:
+        """The outcome of attempting each candidate, without attempting it for the record."""
+        candidates = (self._predicted(neighbourhood, row) for row in range(len(neighbourhood)))
+        outcomes = self._attempter.foresee(live, node_id(self.live, live.stamp_ns), candidates)
+        return Foreseen(
+            np.array([outcome.accepted for outcome in outcomes], dtype=np.bool_),
+            np.array([outcome.match.inliers for outcome in outcomes], dtype=np.int64),
+        )
 
     def _candidates(
         self, live: Frame, neighbourhood: Neighbourhood | None, order: NDArray[np.int64]

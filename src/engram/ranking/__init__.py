@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from engram.errors import ConfigError
-from engram.ranking.context import RankingContext, RankingPolicy
+from engram.ranking.context import Foreseen, RankingContext, RankingPolicy
 from engram.ranking.distance import DistancePolicy
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_literal import PathLiteralPolicy
@@ -39,6 +39,7 @@ def policy_named(name: str) -> RankingPolicy:
 
 __all__ = [
     "POLICIES",
+    "Foreseen",
     "IterationUnit",
     "Observations",
     "RankingContext",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,6 +16,19 @@ from engram.experience.model import PathId
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
 from engram.ranking.recent import Observations
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Foreseen:
+    """What attempting each candidate would come to.
+
+    Attributes:
+        accepted: (Y,) bool, whether it would be a success.
+        inliers: (Y,) int64, inliers of the match, 0 if there were none.
+    """
+
+    accepted: NDArray[np.bool_]
+    inliers: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +46,8 @@ class RankingContext:
         own_path: the live session's path, which counts neither in Z nor in N; None if it has none.
         stamp_ns: the live frame's stamp, ns.
         seed: of policies that draw at random.
+        foresee: makes every attempt to see how it ends; only the oracle, the bound of all
+            policies, asks (SPEC §4). None where it cannot be known.
     """
 
     neighbourhood: Neighbourhood
@@ -43,6 +59,7 @@ class RankingContext:
     own_path: PathId | None
     stamp_ns: int
     seed: int = 0
+    foresee: Callable[[], Foreseen] | None = None
 
 
 class RankingPolicy(Protocol):

@@ -1,0 +1,97 @@
+"""The seams of the localiser: who matches, who searches, what the oracle foresees."""
+
+from pathlib import Path
+
+import numpy as np
+
+from engram.drive import OpenMap, Settings
+from engram.localiser import Budget, FrameMatcher, Position
+from engram.ranking import POLICIES
+from engram.store import MapStore
+from mapping_rig import map_simulated
+from synthetic_world import World, drive
+
+WORLD = World(30.0)
+ROAD = np.arange(0.0, 25.0, 0.7)
+
+
+class _Counting(FrameMatcher):
+    """Matches as a robot does, and counts."""
+
+    threads = False
+    calls = 0
+
+    def match(self, live, live_id, node, guide):
+        self.calls += 1
+        return super().match(live, live_id, node, guide)
+
+
+class _Foreseeing:
+    """Ranks by distance and keeps what it could foresee."""
+
+    name = "foreseeing"
+
+    def __init__(self) -> None:
+        self.seen = []
+
+    def rank(self, context):
+        order = POLICIES["distance"]().rank(context)
+        self.seen.append((context.foresee(), order, len(context.neighbourhood)))
+        return order
+
+
+def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candidates(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
+    with OpenMap(MapStore.open(path)) as opened:
+        matcher = _Counting(opened.store.frames, Settings().localiser.matcher)
+        searched = []
+
+        def search(*args, **options):
+            searched.append(args)
+            return opened.graph.neighbourhood(*args, **options)
+
+        with opened.localiser(
+            live[0].frame.camera,
+            Settings(),
+            policy="distance",
+            budget=Budget(3, 1),
+            relocaliser=None,
+            matcher=matcher,
+            search=search,
+        ) as localiser:
+            localiser.start_at(Position.at(opened.graph.node(0).id))
+            found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+    assert all(one.node is not None for one in found)
+    assert matcher.calls == sum(one.attempts for one in found) > 0
+    assert len(searched) == len(live)
+
+
+def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)[:10]
+    policy = _Foreseeing()
+    monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
+    with (
+        OpenMap(MapStore.open(path)) as opened,
+        opened.localiser(
+            live[0].frame.camera,
+            Settings(),
+            policy=policy.name,
+            budget=Budget(1000, 1),
+            relocaliser=None,
+        ) as localiser,
+    ):
+        localiser.start_at(Position.at(opened.graph.node(0).id))
+        for seen in live:
+            localiser.localise(seen.frame, seen.odometry)
+            foreseen, order, count = policy.seen[-1]
+            assert foreseen.accepted.shape == foreseen.inliers.shape == (count,)
+            made = localiser.outcomes
+            assert [one.accepted for one in made] == foreseen.accepted[order].tolist()
+            assert [one.match.inliers for one in made] == foreseen.inliers[order].tolist()
+    assert policy.seen[-1][0].accepted.any()
