@@ -94,7 +94,7 @@ def graph_chains(
     a_from_b: NDArray[np.float64],
     errors: NDArray[np.float64],
     root: int,
-    goal: int = -1,
+    goals: NDArray[np.int32],
     usable: NDArray[np.uint8] | None = None,
 ) -> tuple[
     NDArray[np.int32],

@@ -93,6 +93,17 @@ def test_chains_equal_plain_python(seed) -> None:
         )
 
 
+@given(st.integers(0, 2**31), st.lists(st.integers(0, 29), min_size=1, max_size=6))
+@settings(max_examples=30, deadline=None)
+def test_a_search_with_goals_is_the_beginning_of_the_whole_search(seed, goals) -> None:
+    graph = random_graph(seed, nodes=30, extra=20)
+    whole, cut = graph.chains_from(3), graph.chains_from(3, goals=goals)
+    reached = [whole.row_of[goal] for goal in goals if goal in whole.row_of]
+    rows = len(whole.nodes) if len(reached) < len(goals) else max(reached) + 1
+    assert cut.nodes.tolist() == whole.nodes[:rows].tolist()
+    np.testing.assert_array_equal(cut.root_from_node, whole.root_from_node[:rows])
+
+
 def test_shortest_chain_prefers_many_tight_edges_to_one_loose_edge() -> None:
     graph, nodes = chain_graph(10)
     loose = make_edge(nodes[0].id, nodes[9].id, forward(8.0), EdgeKind.PROXIMITY, (2.0, 0.1))

@@ -4,6 +4,7 @@
 
 #include <nanobind/stl/optional.h>
 
+#include <algorithm>
 #include <optional>
 #include <stdexcept>
 
@@ -84,14 +85,18 @@ auto graph_candidates(const Input<int32_t, 1> &first_half, const Input<int32_t, 
 
 auto graph_chains(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
                   const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
-                  const Input<double, 2> &errors, int64_t root, int64_t goal,
+                  const Input<double, 2> &errors, int64_t root, const Input<int32_t, 1> &goals,
                   std::optional<Input<uint8_t, 1>> usable) {
   const engram::GraphView graph = view_of(first_half, next_half, target, a_from_b, errors);
   check_node(graph, root, "root");
   if (usable && usable->shape(0) != a_from_b.shape(0))
     throw std::invalid_argument("graph_chains: expected usable (E,)");
-  const engram::SearchLimits limits{nullptr, 0, 0, 0, usable ? usable->data() : nullptr,
-                                    static_cast<int32_t>(goal)};
+  // The search counts each goal once, and finds it by halving.
+  std::vector<int32_t> ascending(goals.data(), goals.data() + goals.shape(0));
+  std::sort(ascending.begin(), ascending.end());
+  ascending.erase(std::unique(ascending.begin(), ascending.end()), ascending.end());
+  const engram::SearchLimits limits{nullptr,          0, 0, 0, usable ? usable->data() : nullptr,
+                                    ascending.data(), static_cast<int32_t>(ascending.size())};
   std::vector<int32_t> nodes, parents, halves;
   std::vector<double> poses, errors_out;
   {
@@ -134,7 +139,7 @@ void bind_graph_search(nb::module_ &module) {
              "driven_m"_a, "own_session"_a, "own_driven_m"_a, "own_exclusion_m"_a,
              "Columns of a Neighbourhood: the nodes near the live camera.");
   module.def("graph_chains", &graph_chains, "first_half"_a, "next_half"_a, "target"_a,
-             "a_from_b"_a, "errors"_a, "root"_a, "goal"_a = -1, "usable"_a = nb::none(),
+             "a_from_b"_a, "errors"_a, "root"_a, "goals"_a, "usable"_a = nb::none(),
              "Least uncertain chains from a root: nodes (N,), parent rows (N,), half edges (N,), "
              "root_from_node (N, 12), errors (N, 6: tau, s0, s1, s2).");
 }

@@ -97,6 +97,7 @@ public:
   // Rows of `seen` in the order in which they were settled.
   std::vector<int32_t> run(int32_t root) {
     std::vector<int32_t> order;
+    int32_t goals_left = limits_.goal_count;
     start(root);
     while (!scratch.heap.empty()) {
       std::pop_heap(scratch.heap.begin(), scratch.heap.end());
@@ -107,7 +108,7 @@ public:
         continue;
       settle(row);
       order.push_back(row);
-      if (node == limits_.goal)
+      if (is_goal(node) && --goals_left == 0)
         break;
       if (within_reach(row))
         expand(row);
@@ -116,6 +117,10 @@ public:
   }
 
 private:
+  bool is_goal(int32_t node) const {
+    return std::binary_search(limits_.goals, limits_.goals + limits_.goal_count, node);
+  }
+
   void start(int32_t root) {
     Reached row{};
     row.node = root;
@@ -369,7 +374,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
   // The reference may lie behind, after a while on odometry alone: reach at least as far as it.
   const double *live = query.reference_from_live + 9;
   const double reach = std::max(query.radius_m, std::sqrt(dot(live, live))) + query.margin_m;
-  const SearchLimits limits{live, reach, query.slack_sigmas, query.slack_m, nullptr, -1};
+  const SearchLimits limits{live, reach, query.slack_sigmas, query.slack_m, nullptr, nullptr, 0};
   static thread_local std::vector<Reached> seen;
   std::vector<int32_t> order;
   {

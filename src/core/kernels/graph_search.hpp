@@ -44,7 +44,8 @@ struct SearchLimits {
   double slack_sigmas;   // plus so many standard deviations of where they are,
   double slack_m;        // but no more than this
   const uint8_t *usable; // (edges) 0 for edges to leave out; or null
-  int32_t goal;          // stop once this node is reached; -1 for none
+  const int32_t *goals;  // (goal_count) ascending, each once: stop when all are reached
+  int32_t goal_count;    // 0 to go on to the end
 };
 
 struct Candidates {

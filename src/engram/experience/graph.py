@@ -246,17 +246,26 @@ class ExperienceGraph:
 
     def components(self) -> NDArray[np.int32]:
         """(N,) int32: the connected component of each node, numbered from 0 by first node."""
-        ends = self._target.rows.reshape(-1, 2)
+        ends = self.edge_ends
         links = coo_matrix((np.ones(len(ends)), (ends[:, 1], ends[:, 0])), shape=(len(self),) * 2)
         labels = connected_components(links, directed=False)[1]
         return np.asarray(labels, dtype=np.int32)
 
+    @property
+    def edge_ends(self) -> NDArray[np.int32]:
+        """(E, 2) int32: dense indices of the ends b and a of each of `edges`. A view."""
+        return self._target.rows.reshape(-1, 2)
+
     def edges_of(self, node: int) -> list[Edge]:
         """The edges at a node, newest key first."""
+        return [edge for edge, _ in self.numbered_edges_of(node)]
+
+    def numbered_edges_of(self, node: int) -> list[tuple[Edge, int]]:
+        """The edges at a node, newest key first, each with its place in `edges`."""
         edges = []
         half = int(self._first_half.rows[node])
         while half != -1:
-            edges.append(self._edges[half // 2])
+            edges.append((self._edges[half // 2], half // 2))
             half = int(self._next_half.rows[half])
         return edges
 
@@ -325,22 +334,22 @@ class ExperienceGraph:
         return Neighbourhood(*columns)
 
     def chains_from(
-        self, root: int, *, goal: int = -1, usable: NDArray[np.uint8] | None = None
+        self, root: int, *, goals: Sequence[int] = (), usable: NDArray[np.uint8] | None = None
     ) -> ChainTree:
-        """Least uncertain chains from a node to all others, or until `goal` is reached.
+        """Least uncertain chains from a node to all others, or until all goals are reached.
 
         Args:
             root: dense index.
-            goal: dense index of the node to stop at; -1 to go on to the end.
+            goals: dense indices of the nodes to stop at; none to go on to the end.
             usable: (E,) uint8, 0 for edges (by their place in `edges`) to leave out.
         """
-        columns = _core.graph_chains(*self._arrays(), root, goal, usable)
+        columns = _core.graph_chains(*self._arrays(), root, np.array(goals, dtype=np.int32), usable)
         row_of = {int(node): row for row, node in enumerate(columns[0])}
         return ChainTree(root, row_of, *columns)
 
     def shortest_chain(self, a: int, b: int) -> Chain | None:
         """The least uncertain chain from node a to node b; None if they are not connected."""
-        tree = self.chains_from(a, goal=b)
+        tree = self.chains_from(a, goals=[b])
         if b not in tree.row_of:
             return None
         rows = [tree.row_of[b]]

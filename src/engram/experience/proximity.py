@@ -186,8 +186,9 @@ def _sharpened(graph: ExperienceGraph, chain: Sequence[int]) -> Iterator[Edge]:
     # What was saved before the first of them is on the known side, if the chain met itself.
     first = min(chain.index(node) for _, _, node in laid)
     newer = set(chain[first:])
-    near_end = _views_from_end(graph, chain[first], newer)
-    far_end = _views_from_end(graph, chain[-1], newer)
+    known = [a for _, a, _ in laid]
+    near_end = _view_from_end(graph, chain[first], newer, known)
+    far_end = _view_from_end(graph, chain[-1], newer, known)
     for edge, a, b in laid:
         if a in newer or not far_end.sees(a, b):
             continue
@@ -215,19 +216,29 @@ class _EndView:
         return a_from_end @ end_from_b, error.seen_from(a_from_end).covariance()
 
 
-def _views_from_end(graph: ExperienceGraph, end: int, chain: set[int]) -> _EndView:
-    outer, inner = (np.zeros(len(graph.edges), np.uint8) for _ in range(2))
-    for number, edge in enumerate(graph.edges):
-        a, b = graph.index(edge.a), graph.index(edge.b)
-        inside = (a in chain) + (b in chain)
-        if inside == 0:
+def _view_from_end(
+    graph: ExperienceGraph, end: int, chain: set[int], known: Sequence[int]
+) -> _EndView:
+    """The view to the known nodes, no further: the cost follows the chain, not the map."""
+    members = np.array(sorted(chain), dtype=np.int32)
+    in_chain = np.zeros(len(graph), dtype=bool)
+    in_chain[members] = True
+    inside = in_chain[graph.edge_ends].sum(axis=1)
+    outer = (inside == 0).astype(np.uint8)
+    inner = np.zeros_like(outer)
+    # An odometry edge at the end joins it to the older part of the same chain.
+    for edge, number in graph.numbered_edges_of(end):
+        if inside[number] == 1 and edge.kind is not EdgeKind.PROXIMITY:
             outer[number] = 1
-        elif inside == 1:
-            # An odometry edge joins it to the older part of the same chain.
-            outer[number] = end in (a, b) and edge.kind is not EdgeKind.PROXIMITY
-        else:
-            inner[number] = edge.kind is EdgeKind.ODOMETRY
-    return _EndView(graph.chains_from(end, usable=outer), graph.chains_from(end, usable=inner))
+    for node in chain:
+        for edge, number in graph.numbered_edges_of(node):
+            if inside[number] == 2 and edge.kind is EdgeKind.ODOMETRY:
+                inner[number] = 1
+    outward = [node for node in known if not in_chain[node]]
+    return _EndView(
+        graph.chains_from(end, goals=outward or [end], usable=outer),
+        graph.chains_from(end, usable=inner),
+    )
 
 
 def _fused_at_junction(edge: Edge, a: int, b: int, near: _EndView, far: _EndView) -> Edge:
