@@ -99,6 +99,21 @@ class Edge:
     covariance: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Omission:
+    """A node that a merge did not take, since the map shows the same place alike (SPEC §7).
+
+    Attributes:
+        omitted: the node that was handed in.
+        node: its equivalent in the map.
+        node_from_omitted: the omitted node's camera in the equivalent's camera frame.
+    """
+
+    omitted: NodeId
+    node: NodeId
+    node_from_omitted: SE3
+
+
 class PathEntryKind(StrEnum):
     """Why a node is on a path."""
 

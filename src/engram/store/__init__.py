@@ -1,6 +1,7 @@
 """A map on disk: revisions, transactions, integrity; and the bytes that stand for a frame."""
 
 from engram.store.blob import decode_landmarks, decode_thumbnail, encode_landmarks, encode_thumbnail
+from engram.store.bulk_writer import BulkWriter
 from engram.store.map_store import MapStore, WritableMapStore
 from engram.store.records import (
     AttemptArrays,
@@ -11,12 +12,14 @@ from engram.store.records import (
     Problem,
     Revision,
     SessionState,
+    StoredNode,
     StoredSession,
 )
 from engram.store.session_writer import SessionWriter
 
 __all__ = [
     "AttemptArrays",
+    "BulkWriter",
     "CheckReport",
     "InterruptedSession",
     "MapContents",
@@ -26,6 +29,7 @@ __all__ = [
     "Revision",
     "SessionState",
     "SessionWriter",
+    "StoredNode",
     "StoredSession",
     "WritableMapStore",
     "decode_landmarks",

@@ -113,6 +113,11 @@ def blob_hash(blob: bytes) -> bytes:
     return blob[:HASH_BYTES]
 
 
+def is_intact(blob: bytes) -> bool:
+    """Whether a landmark blob is what its hash says, without decoding it."""
+    return content_digest(blob[HASH_BYTES:]) == blob[:HASH_BYTES]
+
+
 def encode_thumbnail(thumbnail: NDArray[np.uint8]) -> bytes:
     """A (h, w) uint8 grey picture as JPEG: for people to look at, so small beats exact.
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import bindparam, select
 
 from engram.errors import InputError, MapCorruptError, MapError
-from engram.experience.model import NodeId
+from engram.experience.model import Node, NodeId
 from engram.frontend import DescriptorKind, Frame, FrameStatus
 from engram.geometry import StereoCamera
-from engram.store.blob import blob_hash, decode_landmarks, decode_thumbnail
+from engram.store.blob import blob_hash, decode_landmarks, decode_thumbnail, is_intact
 from engram.store.database import Database
 from engram.store.reading import load_cameras, load_frontends
+from engram.store.records import StoredNode
 from engram.store.rows import Row, verified
 from engram.store.schema import frames, nodes
 from engram.store.view import View
@@ -24,6 +28,8 @@ DEFAULT_CACHE_BYTES = 256 * 2**20
 # Of a landmark in memory: 2 + 1 + 1 + 3 floats, descriptor, octave.
 _BYTES_PER_LANDMARK = 61
 _BYTES_PER_FRAME = 1500
+# Stored nodes read at a time: about 2 MB.
+_STORED_BATCH = 64
 
 
 class FrameReader:
@@ -85,6 +91,47 @@ class FrameReader:
         if row is None:
             raise MapCorruptError(f"node {node}: its frame is missing")
         return None if row["thumbnail"] is None else decode_thumbnail(row["thumbnail"])
+
+    def stored(self, wanted: Iterable[Node]) -> Iterator[StoredNode]:
+        """Nodes with their landmarks as bytes, in the order given, a few at a time in memory.
+
+        The bytes are held against their hash and not decoded.
+
+        Raises:
+            InputError: the map has no such node, or not yet in this revision.
+            MapCorruptError: the bytes do not match their hash.
+        """
+        remaining = iter(wanted)
+        while batch := list(islice(remaining, _STORED_BATCH)):
+            with self._database.reading() as connection:
+                query = _WHOLE_NODES.where(nodes.c.uuid.in_([one.id.bytes for one in batch]))
+                found = {row[_NODE_UUID]: row for row in connection.execute(query)}
+            for one in batch:
+                if one.id.bytes not in found:
+                    raise InputError(f"the map has no node {one.id}")
+                yield self._stored_node(one, found[one.id.bytes])
+
+    def decode(self, stored: StoredNode) -> Frame:
+        """The frame of a stored node.
+
+        Raises:
+            MapCorruptError: the blob is malformed.
+        """
+        camera = next((c for c in self._cameras.values() if c.id == stored.node.camera), None)
+        if camera is None:
+            raise MapCorruptError(f"node {stored.node.id}: its camera is missing")
+        try:
+            landmarks = decode_landmarks(stored.landmarks, camera)
+        except MapCorruptError as error:
+            raise MapCorruptError(f"node {stored.node.id}: {error}") from error
+        return Frame(
+            stored.node.stamp_ns,
+            camera,
+            landmarks,
+            stored.descriptor,
+            stored.frontend,
+            stored.status,
+        )
 
     def prefetch(self, nodes: list[NodeId]) -> None:
         """Read these ahead; a newer call takes the place of what an older one still had to do."""
@@ -160,6 +207,27 @@ class FrameReader:
             raise InputError(f"node {node} is not part of the map at this revision")
         return row, found[-1]
 
+    def _stored_node(self, node: Node, found: Sequence[Any]) -> StoredNode:
+        row = next(verified(nodes, [found]))
+        frame = next(verified(frames, [found[len(nodes.columns) :]]), None)
+        if row["revision"] not in self._revisions or row["key"] in self._hidden:
+            raise InputError(f"node {node.id} is not part of the map at this revision")
+        frontend = self._frontends.get(row["frontend"])
+        if frontend is None or frame is None:
+            raise MapCorruptError(f"node {node.id}: its front-end or frame is missing")
+        blob = frame["landmarks"]
+        if blob_hash(blob) != row["landmark_hash"] or not is_intact(blob):
+            raise MapCorruptError(f"node {node.id}: its landmarks are not those that were saved")
+        return StoredNode(
+            node=node,
+            descriptor=frontend[0],
+            frontend=frontend[1],
+            status=FrameStatus(row["status"]),
+            landmark_hash=row["landmark_hash"],
+            landmarks=blob,
+            thumbnail=frame["thumbnail"],
+        )
+
     def _remember(self, node: NodeId, frame: Frame) -> None:
         with self._lock:
             if node in self._cache:
@@ -191,6 +259,13 @@ _NODE_WITH_LANDMARKS = (
     .where(nodes.c.uuid == bindparam("uuid"))
     .order_by(nodes.c.key)
 )
+
+_WHOLE_NODES = (
+    select(*nodes.columns, *frames.columns)
+    .select_from(nodes.join(frames, frames.c.node == nodes.c.key))
+    .order_by(nodes.c.key)
+)
+_NODE_UUID = nodes.columns.keys().index("uuid")
 
 
 def _size_bytes(frame: Frame) -> int:

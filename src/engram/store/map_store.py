@@ -14,8 +14,10 @@ from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
 from engram.experience.model import (
     NodeId,
+    Omission,
     PathEntry,
     PathEntryKind,
+    PathId,
     Session,
     SessionId,
     path_id,
@@ -24,8 +26,10 @@ from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.store import reading
 from engram.store.blob import content_digest
+from engram.store.bulk_writer import BulkWriter
 from engram.store.checking import check
 from engram.store.collecting import collect_abandoned
+from engram.store.committing import change_revision, commit_revision
 from engram.store.content import content_hash
 from engram.store.database import Database, Lock
 from engram.store.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
@@ -38,6 +42,7 @@ from engram.store.records import (
     MapInfo,
     Problem,
     Revision,
+    RevisionStatus,
     SessionState,
     StoredSession,
 )
@@ -52,7 +57,7 @@ from engram.store.rows import (
     verified,
 )
 from engram.store.schema import nodes, path_entries, paths, revisions, sessions, vocabularies
-from engram.store.session_writer import SessionWriter, change_revision, commit_revision
+from engram.store.session_writer import SessionWriter
 from engram.store.sqlite import SqliteDatabase
 from engram.store.view import View, head
 
@@ -173,6 +178,30 @@ class MapStore:
         with self._database.reading() as connection:
             return reading.load_vocabulary(connection, self._view)
 
+    def omissions(self) -> dict[NodeId, Omission]:
+        """The nodes that merges did not take, by their ids; equivalents that are hidden left out.
+
+        Raises:
+            MapCorruptError: a row does not match its checksum.
+        """
+        with self._database.reading() as connection:
+            return reading.load_omissions(connection, self._view)
+
+    def frontends(self) -> dict[SessionId, tuple[DescriptorKind, str]]:
+        """Descriptor kind and hash of the front-end of each session."""
+        with self._database.reading() as connection:
+            return reading.frontends_of_sessions(connection, self._view)
+
+    def landmark_hashes(self) -> dict[NodeId, bytes]:
+        """The 16 bytes that stand for each node's landmarks."""
+        with self._database.reading() as connection:
+            return reading.landmark_hashes(connection, self._view)
+
+    def partial_paths(self) -> frozenset[PathId]:
+        """Paths of which some entries stayed elsewhere."""
+        with self._database.reading() as connection:
+            return reading.partial_paths(connection, self._view)
+
     def session_state(self, session: SessionId) -> SessionState:
         """What the map knows of a session: ask before handing one in."""
         with self._database.reading() as connection:
@@ -243,6 +272,7 @@ class WritableMapStore(MapStore):
             self._lock.release()
             raise
         self._open_session: SessionWriter | None = None
+        self._bulk: BulkWriter | None = None
         self._holder = self._lock.holder
 
     def begin_session(
@@ -316,6 +346,39 @@ class WritableMapStore(MapStore):
         """
         return self.resume_session(session).commit()
 
+    def begin_revision(
+        self, *, author: str, message: str, configuration: Mapping[str, Any]
+    ) -> BulkWriter:
+        """Begin to write one revision that brings records of many sessions at once.
+
+        Args:
+            author: who, or which robot.
+            message: what `log` shows.
+            configuration: the resolved settings, plain JSON data.
+
+        Raises:
+            RevisionError: a session or another such revision is being written.
+            InputError: the configuration is no JSON data.
+        """
+        self._check_none_open()
+        row = self._revision_row(author, message, to_json(configuration))
+        row["status"] = str(RevisionStatus.ABANDONED)
+        with self._database.writing() as connection:
+            collect_abandoned(connection)  # whose UUIDs may come again
+            connection.execute(insert(revisions), [sealed(revisions, row)])
+        own = View(self._view.at, row["key"])
+        self._see(own)
+        self._bulk = BulkWriter(
+            self._database,
+            self._keys,
+            self.frames,
+            revision_key=row["key"],
+            view=own,
+            on_cameras=lambda: self.frames.set_view(own),
+            on_end=self._writing_ended,
+        )
+        return self._bulk
+
     def put_vocabulary(
         self, body: bytes, *, author: str, message: str, configuration: Mapping[str, Any]
     ) -> Revision:
@@ -342,7 +405,7 @@ class WritableMapStore(MapStore):
         with self._database.writing() as connection:
             connection.execute(insert(revisions), [sealed(revisions, opened)])
             connection.execute(insert(vocabularies), [sealed(vocabularies, row)])
-            revision = commit_revision(connection, self._keys, opened["key"])
+            revision = commit_revision(connection, opened["key"])
         self._see(View(revision.number))
         return revision
 
@@ -414,12 +477,12 @@ class WritableMapStore(MapStore):
             camera_key=row["camera"],
             frontend=(row["frontend"], *frontend),
             stored=stored,
-            on_end=self._session_ended,
+            on_end=self._writing_ended,
         )
         return self._open_session
 
-    def _session_ended(self) -> None:
-        self._open_session = None
+    def _writing_ended(self) -> None:
+        self._open_session = self._bulk = None
         with self._database.reading() as connection:
             newest = head(connection)
         self._see(View(newest))
@@ -434,6 +497,8 @@ class WritableMapStore(MapStore):
             raise RevisionError(
                 f"session {self._open_session.session.id} is being written; commit or abandon it"
             )
+        if self._bulk is not None:
+            raise RevisionError("a revision is being written; commit or abandon it")
 
     def _check_new(self, session: Session) -> None:
         state = self.session_state(session.id)

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Select, func, select, union
 
 from engram.errors import MapCorruptError
-from engram.experience.model import Edge, EdgeKind, Node, NodeId, PathEntry, PathId, SessionId
+from engram.experience.model import (
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    Omission,
+    PathEntry,
+    PathId,
+    SessionId,
+)
 from engram.frontend import DescriptorKind
 from engram.geometry import CameraId, StereoCamera
 from engram.store.attempts import AttemptTable, concatenate, unpack
@@ -34,6 +44,7 @@ from engram.store.schema import (
     edges,
     frontends,
     nodes,
+    omissions,
     path_entries,
     paths,
     revisions,
@@ -174,6 +185,48 @@ def load_vocabulary(connection: Connection, view: View) -> bytes | None:
     if content_digest(body) != kept[-1]["hash"]:
         raise MapCorruptError("the vocabulary does not match its hash; run engram check")
     return body
+
+
+def load_omissions(connection: Connection, view: View) -> dict[NodeId, Omission]:
+    """Nodes that were not taken, each with its newest equivalent that is seen."""
+    query = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
+    node_ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
+    found = {}
+    for row in view.rows(connection, omissions):
+        omitted = NodeId(uuid_from_bytes(row["uuid"], f"omission {row['key']}"))
+        if row["node"] in node_ids:
+            transform = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")
+            found[omitted] = Omission(omitted, node_ids[row["node"]], transform)
+    return found
+
+
+def frontends_of_sessions(
+    connection: Connection, view: View
+) -> dict[SessionId, tuple[DescriptorKind, str]]:
+    """Descriptor kind and hash of each session's front-end."""
+    known = load_frontends(connection)
+    found = {}
+    for row in view.rows(connection, sessions):
+        session = SessionId(uuid_from_bytes(row["uuid"], f"session {row['key']}"))
+        if row["frontend"] not in known:
+            raise MapCorruptError(f"session {session}: its front-end is missing")
+        found[session] = known[row["frontend"]]
+    return found
+
+
+def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
+    """The hash of each node's landmarks."""
+    query = view.select(nodes).with_only_columns(nodes.c.uuid, nodes.c.landmark_hash)
+    return {NodeId(UUID(bytes=row[0])): row[1] for row in connection.execute(query)}
+
+
+def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:
+    """Paths of which some entries stayed elsewhere."""
+    return frozenset(
+        PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}"))
+        for row in view.rows(connection, paths)
+        if row["partial"]
+    )
 
 
 def attempt_tables(connection: Connection, view: View) -> dict[int, AttemptTable]:

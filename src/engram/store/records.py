@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.experience.model import Attempt, Edge, Node, PathEntry, Session, SessionId
-from engram.frontend import DescriptorKind
+from engram.frontend import DescriptorKind, FrameStatus
 from engram.geometry import CameraId, StereoCamera
 
 
@@ -139,6 +139,38 @@ class AttemptArrays:
 
     def __len__(self) -> int:
         return len(self.node)
+
+    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> AttemptArrays:
+        """Some of the attempts: a mask, or their places in the order wanted."""
+        columns = {
+            field.name: getattr(self, field.name)[rows]
+            for field in fields(self)
+            if field.name != "policies"
+        }
+        return AttemptArrays(**columns, policies=self.policies)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredNode:
+    """A node with its landmarks as they lie in the map: to be copied, not to be looked at.
+
+    Attributes:
+        node: the record.
+        descriptor: kind of its descriptors.
+        frontend: hash of the front-end that made its frame.
+        status: of its frame.
+        landmark_hash: the 16 bytes that stand for its landmarks.
+        landmarks: the blob.
+        thumbnail: JPEG; None if none was saved.
+    """
+
+    node: Node
+    descriptor: DescriptorKind
+    frontend: str
+    status: FrameStatus
+    landmark_hash: bytes
+    landmarks: bytes
+    thumbnail: bytes | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Table, delete, func, insert, select, update
+from sqlalchemy import Connection, Table, insert
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.experience.model import (
     Attempt,
     Edge,
-    EdgeKind,
     Node,
     NodeId,
     PathEntry,
@@ -23,12 +21,14 @@ from engram.experience.model import (
     path_id,
 )
 from engram.frontend import DescriptorKind, Frame
-from engram.store.attempts import COLUMNS, AttemptTable, concatenate, pack, unpack
+from engram.store.attempt_rows import attempt_table, repack_attempts, write_attempts
+from engram.store.attempts import AttemptTable, concatenate
 from engram.store.blob import blob_hash, encode_landmarks, encode_thumbnail
+from engram.store.committing import change_revision, commit_revision
 from engram.store.database import Database
+from engram.store.edge_checks import check_edge
 from engram.store.frame_reader import FrameReader
 from engram.store.keys import KeyBook
-from engram.store.reading import log
 from engram.store.records import Revision, StoredSession
 from engram.store.rows import (
     Row,
@@ -37,23 +37,8 @@ from engram.store.rows import (
     edge_row,
     sealed,
     to_json,
-    transform_from_bytes,
-    verified,
 )
-from engram.store.schema import (
-    VERSIONED,
-    attempts,
-    edges,
-    frames,
-    nodes,
-    path_entries,
-    revisions,
-    statistics,
-)
-from engram.store.view import View, head
-
-# Covariances come from products with their own transposes: what is left of asymmetry is rounding.
-_ASYMMETRY_LIMIT = 1e-6
+from engram.store.schema import edges, frames, nodes, path_entries, statistics
 
 
 class SessionWriter:
@@ -147,7 +132,7 @@ class SessionWriter:
         Raises:
             InputError: an end is not in the map, both are the same, or a number is not finite.
         """
-        _check_edge(edge)
+        check_edge(edge)
         with self._lock:
             self._check_open()
             a, b = self._node_key(edge.a, "edge"), self._node_key(edge.b, "edge")
@@ -198,7 +183,7 @@ class SessionWriter:
                 for one in made
             ]
             if made:
-                self._attempts.append(_attempt_table(made, keys))
+                self._attempts.append(attempt_table(made, keys))
 
     def put_statistics(self, name: str, values: Mapping[str, Any]) -> None:
         """Keep a statistic of the map under a name; the newest counts.
@@ -241,7 +226,8 @@ class SessionWriter:
         with self._lock:
             self.checkpoint()
             with self._database.writing() as connection:
-                revision = commit_revision(connection, self._keys, self._revision_key)
+                repack_attempts(connection, self._keys, self._revision_key)
+                revision = commit_revision(connection, self._revision_key)
             self._end()
             return revision
 
@@ -313,109 +299,4 @@ class SessionWriter:
             connection.execute(statement, list(self._statistics.values()))
         if self._attempts:
             made = concatenate(self._attempts)
-            _write_attempts(connection, self._keys, self._revision_key, self._session_key, made)
-
-
-def commit_revision(connection: Connection, keys: KeyBook, revision_key: int) -> Revision:
-    """Flip an open revision to committed and give it its number."""
-    _repack_attempts(connection, keys, revision_key)
-    parent = head(connection)
-    change_revision(
-        connection,
-        revision_key,
-        status="committed",
-        number=parent + 1,
-        parent=parent or None,
-        committed_ns=time.time_ns(),
-        contents=to_json(revision_contents(connection, revision_key)),
-    )
-    return log(connection, View(parent + 1))[-1]
-
-
-def change_revision(connection: Connection, key: int, **changes: Any) -> None:
-    """Change an open revision's row.
-
-    Raises:
-        RevisionError: it is not open.
-    """
-    found = connection.execute(select(revisions).where(revisions.c.key == key))
-    row = next(verified(revisions, found), None)
-    if row is None or row["status"] != "open":
-        raise RevisionError(f"revision row {key} is not open")
-    row = sealed(revisions, {**row, **changes})
-    connection.execute(update(revisions).where(revisions.c.key == key).values(row))
-
-
-def revision_contents(connection: Connection, revision_key: int) -> dict[str, float]:
-    """How many rows of each table a revision brought, and metres of odometry edges."""
-    contents: dict[str, float] = {}
-    for table in VERSIONED:
-        rows = select(func.count()).select_from(table).where(table.c.revision == revision_key)
-        contents[table.name] = connection.execute(rows).scalar_one()
-    packed = select(func.sum(attempts.c.count)).where(attempts.c.revision == revision_key)
-    contents["attempts"] = int(connection.execute(packed).scalar() or 0)
-    steps = (
-        select(edges.c.a_from_b)
-        .where(edges.c.revision == revision_key, edges.c.kind == str(EdgeKind.ODOMETRY))
-        .order_by(edges.c.key)
-    )
-    contents["mapped_m"] = sum(
-        transform_from_bytes(step, "odometry edge").distance_m
-        for step in connection.execute(steps).scalars()
-    )
-    return contents
-
-
-def _repack_attempts(connection: Connection, keys: KeyBook, revision_key: int) -> None:
-    """Pack the attempts of all checkpoints together: the file does not tell when they were made."""
-    query = select(attempts).where(attempts.c.revision == revision_key).order_by(attempts.c.key)
-    by_session: dict[int, list[AttemptTable]] = {}
-    for row in verified(attempts, connection.execute(query)):
-        by_session.setdefault(row["session"], []).append(unpack(row["body"], row["count"]))
-    if by_session:
-        connection.execute(delete(attempts).where(attempts.c.revision == revision_key))
-    for session_key, tables in by_session.items():
-        _write_attempts(connection, keys, revision_key, session_key, concatenate(tables))
-
-
-def _write_attempts(
-    connection: Connection, keys: KeyBook, revision_key: int, session_key: int, table: AttemptTable
-) -> None:
-    rows = [
-        sealed(
-            attempts,
-            {
-                "key": keys.next(attempts),
-                "revision": revision_key,
-                "session": session_key,
-                "count": count,
-                "body": body,
-            },
-        )
-        for count, body in pack(table)
-    ]
-    connection.execute(insert(attempts), rows)
-
-
-def _attempt_table(made: list[Attempt], keys: list[tuple[int, int]]) -> AttemptTable:
-    policies = tuple(dict.fromkeys(one.policy for one in made))
-    index = {name: at for at, name in enumerate(policies)}
-    ends = dict(zip(("reference", "node"), zip(*keys, strict=True), strict=True))
-    columns = {
-        name: np.array(ends[name] if name in ends else [getattr(one, name) for one in made], kind)
-        for name, kind in COLUMNS
-    }
-    policy = np.array([index[one.policy] for one in made], np.int32)
-    return AttemptTable(columns, policy, policies)
-
-
-def _check_edge(edge: Edge) -> None:
-    what = f"edge {edge.a} → {edge.b} ({edge.kind})"
-    if edge.a == edge.b:
-        raise InputError(f"{what} joins a node with itself")
-    transform = np.concatenate([edge.a_from_b.rotation.ravel(), edge.a_from_b.translation])
-    if not np.isfinite(transform).all() or edge.covariance.shape != (6, 6):
-        raise InputError(f"{what}: a transform is finite, its covariance (6, 6)")
-    asymmetry = np.abs(edge.covariance - edge.covariance.T).max()
-    if not asymmetry <= _ASYMMETRY_LIMIT * max(1.0, np.abs(edge.covariance).max()):
-        raise InputError(f"{what}: its covariance is not finite and symmetric")
+            write_attempts(connection, self._keys, self._revision_key, self._session_key, made)
