@@ -367,6 +367,7 @@ class WritableMapStore(MapStore):
             collect_abandoned(connection)  # whose UUIDs may come again
             connection.execute(insert(revisions), [sealed(revisions, row)])
         own = View(self._view.at, row["key"])
+        self._keys.forget_nodes()  # some may have been hidden since they were learnt
         self._see(own)
         self._bulk = BulkWriter(
             self._database,
