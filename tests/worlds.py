@@ -7,6 +7,7 @@ import numpy as np
 from engram.experience.basin import MatchBasin
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import (
+    Clock,
     Edge,
     EdgeKind,
     Node,
@@ -14,13 +15,14 @@ from engram.experience.model import (
     PathEntry,
     PathEntryKind,
     PathId,
+    Session,
     SessionId,
     node_id,
 )
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import ALL_KINDS, PathMemory
 from engram.geometry import SE3, CameraId
-from engram.ranking import Observations, RankingContext
+from engram.ranking import Background, Observations, RankingContext, RunAttempts, SessionTimes
 
 CAMERA = CameraId("0" * 32)
 
@@ -55,12 +57,48 @@ def forward(metres: float, across_m: float = 0.0, yaw_rad: float = 0.0) -> SE3:
     return SE3(turn.rotation, np.array([across_m, 0.0, metres]))
 
 
-def flat_graph(count: int) -> ExperienceGraph:
-    """Nodes without edges."""
+def flat_graph(count: int, sessions: int = 1) -> ExperienceGraph:
+    """Nodes without edges; sessions take turns in saving them."""
     graph = ExperienceGraph()
     for index in range(count):
-        graph.add_node(make_node(0, index))
+        graph.add_node(make_node(index % sessions, index))
     return graph
+
+
+def session_record(number: int, hour: float | None = None, day: int = 0) -> Session:
+    """A drive on a day after 1970, at an hour by the sun; no clock without an hour."""
+    start_ns = int(((hour or 0.0) + 24 * day) * 3_600_000_000_000)
+    clock = Clock.UNKNOWN if hour is None else Clock.UTC
+    return Session(session_uuid(number), "robot", CAMERA, start_ns, clock, longitude_deg=0.0)
+
+
+class MadeUpWords:
+    """Words of nodes and frames as a test says; nodes that it leaves out show none."""
+
+    def __init__(self, of_nodes: dict[int, list[int]], count: int = 50) -> None:
+        self.idf = np.linspace(1.0, 2.0, count)
+        self._of_nodes = of_nodes
+
+    def of_frame(self, frame: object) -> np.ndarray:
+        raise NotImplementedError("contexts hold the live words themselves")
+
+    def of_node(self, node: int) -> np.ndarray:
+        return np.array(self._of_nodes.get(node, []), np.int32)
+
+
+def run_of(attempts, driven_m: float = 0.0) -> RunAttempts:
+    """This run's attempts: (at_m, node, rate, accepted) each, with 100 of 200 landmarks matched."""
+    at_m, nodes, rates, accepted = zip(*attempts, strict=True) if attempts else ([], [], [], [])
+    accepted = np.array(accepted, np.bool_)
+    return RunAttempts(
+        driven_m,
+        np.array(at_m, np.float64),
+        np.array(nodes, np.int32),
+        np.array(rates, np.float64),
+        accepted,
+        np.where(accepted, 100, 0),
+        np.full(len(accepted), 200),
+    )
 
 
 def memory_of(graph: ExperienceGraph, paths, kinds=ALL_KINDS) -> PathMemory:
@@ -99,12 +137,24 @@ def make_context(
     focal_px=256.0,
     stamp_ns=0,
     seed=0,
+    sessions=1,
+    run=(),
+    hour=None,
+    hours=None,
+    words=None,
+    live_words=None,
 ) -> RankingContext:
-    """A context over dense indices; candidates stand 0.1 m apart unless told."""
+    """A context over dense indices; candidates stand 0.1 m apart unless told.
+
+    Sessions take turns in saving nodes; `hours` is their hour of day, `words` what nodes show.
+    """
     along = 0.1 * np.arange(len(candidates)) if along_m is None else along_m
     if graph is None:
-        used = [*candidates, *observed, *(n for path in paths for n in path), reference or 0]
-        graph = flat_graph(max(used, default=0) + 1)
+        attempted = [attempt[1] for attempt in run]
+        on_paths = (node for path in paths for node in path)
+        used = [*candidates, *observed, *on_paths, *attempted, reference or 0]
+        graph = flat_graph(max(used, default=0) + 1, sessions)
+    records = [session_record(number, one) for number, one in enumerate(hours or [])]
     return RankingContext(
         neighbourhood=neighbourhood_of(candidates, along),
         graph=graph,
@@ -115,4 +165,8 @@ def make_context(
         own_path=own_path,
         stamp_ns=stamp_ns,
         seed=seed,
+        run=run_of(run),
+        hour=hour,
+        background=Background(SessionTimes(records), None if words is None else MadeUpWords(words)),
+        live_words=None if live_words is None else lambda: np.array(sorted(live_words), np.int32),
     )

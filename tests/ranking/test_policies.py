@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.worlds import make_context, neighbourhood_of, path_uuid
 
 from engram.errors import ConfigError
-from engram.ranking import POLICIES, RankingContext, policy_named
+from engram.ranking import POLICIES, Foreseen, RankingContext, policy_named
 
 
 @st.composite
@@ -18,7 +18,15 @@ def contexts(draw) -> RankingContext:
     some = st.lists(st.integers(0, nodes - 1), max_size=nodes, unique=True)
     candidates = draw(some)
     observed = draw(some)
-    return make_context(
+    hours = st.none() | st.floats(0, 23.99)
+    words = st.lists(st.integers(0, 9), max_size=5, unique=True).map(sorted)
+    run = st.tuples(
+        st.floats(-50, 0),
+        st.integers(0, nodes - 1),
+        st.sampled_from([0.0, 0.3, 0.9, np.nan]),
+        st.booleans(),
+    )
+    context = make_context(
         paths=draw(st.lists(some, max_size=8)),
         candidates=candidates,
         # Few values, so that ties in distance are common.
@@ -28,7 +36,26 @@ def contexts(draw) -> RankingContext:
         reference=draw(st.none() | st.integers(0, nodes - 1)),
         own_path=draw(st.none() | st.just(path_uuid(0))),
         stamp_ns=draw(st.integers(0, 2**62)),
+        sessions=draw(st.integers(1, 5)),
+        run=sorted(draw(st.lists(run, max_size=12)), key=lambda attempt: attempt[0]),
+        hour=draw(hours),
+        hours=draw(st.lists(hours, max_size=5)),
+        words=draw(st.none() | st.dictionaries(st.integers(0, nodes - 1), words)),
+        live_words=draw(st.none() | words),
     )
+    return foreknown(context, draw(st.integers(0, 2**32)))
+
+
+def foreknown(context: RankingContext, seed: int = 0) -> RankingContext:
+    """The context with made-up foresight, a property of the node and not of the row."""
+    nodes = context.neighbourhood.nodes
+
+    def tell() -> Foreseen:
+        rng = np.random.default_rng(seed)
+        inliers = rng.integers(0, 4, len(context.graph)) * 10
+        return Foreseen(inliers[nodes] >= 20, inliers[nodes])
+
+    return dataclasses.replace(context, foresee=tell)
 
 
 @pytest.mark.parametrize("name", sorted(POLICIES))
@@ -50,10 +77,13 @@ class TestContract:
     ) -> None:
         shuffle = np.random.default_rng(seed).permutation(len(context.neighbourhood))
         near = context.neighbourhood
-        shuffled = dataclasses.replace(
-            context,
-            neighbourhood=neighbourhood_of(near.nodes[shuffle], near.along_m[shuffle]),
+        shuffled = foreknown(
+            dataclasses.replace(
+                context,
+                neighbourhood=neighbourhood_of(near.nodes[shuffle], near.along_m[shuffle]),
+            )
         )
+        context = foreknown(context)
         nodes = near.nodes[policy_named(name).rank(context)]
         again = shuffled.neighbourhood.nodes[policy_named(name).rank(shuffled)]
         np.testing.assert_array_equal(nodes, again)
@@ -63,11 +93,11 @@ class TestContract:
     def test_one_policy_serves_again_and_gives_the_same(self, name: str, context) -> None:
         policy = policy_named(name)
         first = policy.rank(context)
-        policy.rank(make_context(candidates=[0, 1, 2], paths=[[0, 1]], reference=1))
+        policy.rank(foreknown(make_context(candidates=[0, 1, 2], paths=[[0, 1]], reference=1)))
         np.testing.assert_array_equal(first, policy.rank(context))
 
     def test_no_candidates_give_an_empty_order(self, name: str) -> None:
-        assert policy_named(name).rank(make_context()).shape == (0,)
+        assert policy_named(name).rank(foreknown(make_context())).shape == (0,)
 
     def test_the_live_path_does_not_count(self, name: str) -> None:
         situation = {
@@ -82,12 +112,24 @@ class TestContract:
             paths=[*past, [4, 3, 5], [4, 3, 5]][:3], own_path=path_uuid(2), **situation
         )
         policy = policy_named(name)
-        np.testing.assert_array_equal(policy.rank(without), policy.rank(with_live))
+        np.testing.assert_array_equal(
+            policy.rank(foreknown(without)), policy.rank(foreknown(with_live))
+        )
+
+    def test_a_robot_on_its_first_day_gets_an_order(self, name: str) -> None:
+        """No history, clock, words or position: all candidates, and the nearest first."""
+        context = foreknown(make_context(candidates=[4, 2, 7], along_m=[2.0, 0.5, 1.0], sessions=3))
+        order = policy_named(name).rank(context)
+        assert sorted(order.tolist()) == [0, 1, 2]
+        if name not in {"random", "oracle"}:
+            assert order.tolist() == [1, 2, 0]
 
 
-@pytest.mark.parametrize("name", ["distance", "path", "path-literal"])
+@pytest.mark.parametrize("name", sorted(POLICIES.keys() - {"random"}))
 def test_equal_candidates_stand_by_distance_then_by_uuid(name: str) -> None:
     context = make_context(candidates=[0, 1, 2, 3, 4], along_m=[1.0, 0.5, -0.5, 0.5, -1.0])
+    nothing = Foreseen(np.zeros(5, np.bool_), np.zeros(5, np.int64))
+    context = dataclasses.replace(context, foresee=lambda: nothing)
     ids = [context.graph.node(i).id for i in range(5)]
     expected = sorted(range(5), key=lambda i: (context.neighbourhood.distance_m[i], ids[i]))
     assert policy_named(name).rank(context).tolist() == expected
@@ -148,5 +190,5 @@ def test_random_depends_on_seed_and_stamp() -> None:
 
 
 def test_unknown_policy_is_refused_with_the_known_ones_named() -> None:
-    with pytest.raises(ConfigError, match=r"'nearest'.*distance, path, path-literal, random"):
+    with pytest.raises(ConfigError, match=r"'nearest'.*distance.*path, path-literal, random"):
         policy_named("nearest")

@@ -57,7 +57,12 @@ Deadline: TypeAlias = Annotated[
     typer.Option("--deadline", metavar="MS", help="No attempt starts later after its frame."),
 ]
 Policy: TypeAlias = Annotated[
-    str, typer.Option("--policy", help="Ranking: distance, path, path-literal or random.")
+    str,
+    typer.Option(
+        "--policy",
+        help="Ranking: path, distance, bandit, bag-of-words, time-of-day, collaborative, "
+        "nearest-of-each, path-literal or random.",
+    ),
 ]
 ThereAndBack: TypeAlias = Annotated[
     int | None,

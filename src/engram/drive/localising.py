@@ -15,6 +15,7 @@ from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
 from engram.localiser import Budget, Localiser
+from engram.ranking import check_for_robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +42,7 @@ class LocaliseOptions:
     preload: bool = False
 
     def __post_init__(self) -> None:
+        check_for_robot(self.policy)
         if self.rate_hz is not None and not self.rate_hz > 0:
             raise ConfigError(f"rate is {self.rate_hz} Hz, must be > 0")
 
@@ -68,6 +70,7 @@ class LocaliseRun:
             budget=Budget(options.lanes, options.rounds, options.deadline_ms),
             relocaliser=options.relocaliser,
             live=session_of_drive(sequence).id,
+            clock=sequence.info,
         )
 
     def __enter__(self) -> Self:

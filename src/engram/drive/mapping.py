@@ -21,6 +21,7 @@ from engram.frontend import Frontend
 from engram.geometry import StereoCamera
 from engram.localiser import Budget, Position
 from engram.mapper import Mapper, Saver
+from engram.ranking import check_for_robot
 from engram.sequences import FrameLog
 from engram.store import (
     MapStore,
@@ -131,9 +132,11 @@ def map_drive(
         start: where the robot stands before its first frame, if that is known.
 
     Raises:
+        ConfigError: the policy is unknown, or looks ahead.
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; what came before is saved.
     """
+    check_for_robot(options.policy)
     session = session_of_drive(sequence)
     report = MapReport(session)
     with _open_or_create(map_path) as store:
@@ -148,6 +151,7 @@ def map_drive(
             writer = store.resume_session(session.id)
             report.resumed = True
         opened = OpenMap(store)
+        opened.times.add(session)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             if report.resumed:
                 start = None
@@ -215,6 +219,7 @@ def _map_frames(
         relocaliser=options.relocaliser,
         live=writer.session.id,
         saves=True,
+        clock=writer.session,
     )
     if start is not None:
         localiser.start_at(start)

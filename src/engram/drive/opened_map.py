@@ -11,6 +11,7 @@ from typing import Self
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
 from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
+from engram.experience.clock import Clocked
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import SessionId
 from engram.experience.neighbourhood import Neighbourhood
@@ -29,7 +30,13 @@ from engram.localiser import (
 )
 from engram.odometry import Odometry
 from engram.places import Vocabulary, decode_vocabulary, default_vocabulary
-from engram.ranking import POLICIES
+from engram.ranking import (
+    Background,
+    QuantisedWords,
+    SessionTimes,
+    check_for_robot,
+    policy_named,
+)
 from engram.store import MapStore
 
 
@@ -41,6 +48,7 @@ class OpenMap:
         graph: its experience graph.
         path_memory: its paths.
         attempts: counts of remembered attempts, from which match basins are learnt.
+        times: when its sessions were driven.
     """
 
     def __init__(self, store: MapStore) -> None:
@@ -54,6 +62,7 @@ class OpenMap:
             self.graph.add_edge(edge)
         for entry in contents.path_entries:
             self.path_memory.add(entry)
+        self.times = SessionTimes(contents.sessions)
         self.attempts = BasinCounts.empty()
         for session in contents.sessions:
             made = contents.attempts_of(session.id)
@@ -120,6 +129,7 @@ class OpenMap:
         saves: bool = False,
         matcher: Matcher | None = None,
         search: Callable[..., Neighbourhood] | None = None,
+        clock: Clocked | None = None,
     ) -> Localiser:
         """A localiser for one session in this map.
 
@@ -132,17 +142,16 @@ class OpenMap:
             live: the live session.
             saves: whether it is being mapped.
             matcher, search: in place of the map's own; see `Localiser`.
+            clock: what its stamps mean, and where it is; None if unknown.
 
         Raises:
             ConfigError: there is no such policy or relocaliser.
         """
-        if policy not in POLICIES:
-            raise ConfigError(f"policy {policy!r} is unknown; known: {', '.join(POLICIES)}")
         return Localiser(
             self.graph,
             self.path_memory,
             self.store.frames,
-            policy=POLICIES[policy](),
+            policy=policy_named(policy),
             budget=budget or Budget(),
             relocaliser=None
             if relocaliser is None
@@ -153,7 +162,15 @@ class OpenMap:
             config=settings.localiser,
             matcher=matcher,
             search=search,
+            background=self._background(settings.frontend.descriptor),
+            clock=clock,
         )
+
+    def _background(self, descriptor: DescriptorKind) -> Background:
+        words = QuantisedWords(
+            self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor)
+        )
+        return Background(self.times, words)
 
     def robot(
         self,
@@ -198,6 +215,7 @@ class LiveRobot:
         budget: Budget,
         relocaliser: str | None,
     ) -> None:
+        check_for_robot(policy)
         self.camera = camera
         self._frontend = Frontend(settings.for_descriptor(opened.descriptor).frontend)
         self._odometry = Odometry(settings.odometry)

@@ -67,6 +67,19 @@ class PathMemory:
             self._make_room()
             self._bits[node, number // 64] |= np.uint64(1 << (number % 64))
 
+    def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """(P, N) bool: whether each path holds each node; unknown paths hold none.
+
+        Args:
+            paths: (P,) any paths.
+            nodes: (N,) int32, dense node indices.
+        """
+        self._make_room()
+        numbers = np.array([self._number.get(path, -1) for path in paths], np.int64)
+        words = self._bits[nodes][:, numbers // 64].T
+        held = (words >> (numbers % 64).astype(np.uint64)[:, None]) & np.uint64(1)
+        return np.asarray((held != 0) & (numbers >= 0)[:, None])
+
     def co_occurrence(
         self, a: NDArray[np.int32], b: NDArray[np.int32], *, excluded: PathId | None = None
     ) -> NDArray[np.int32]:

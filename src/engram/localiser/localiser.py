@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from time import perf_counter
 from typing import Self
 from uuid import uuid5
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from engram.errors import ConfigError
 from engram.experience.basin import MatchBasin
+from engram.experience.clock import Clocked, hour_of_day
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import (
     ENGRAM_NAMESPACE,
@@ -42,7 +44,15 @@ from engram.localiser.localisation import Budget, Localisation, LocalisationStat
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.walk import Walk
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.ranking import Foreseen, RankingContext, RankingPolicy, RecentAttempts, RecentConfig
+from engram.ranking import (
+    Background,
+    Foreseen,
+    RankingContext,
+    RankingPolicy,
+    RecentAttempts,
+    RecentConfig,
+    RunLog,
+)
 
 _PREFETCH = 16
 # A resumed robot was matched with a node from somewhere within a wide match basin.
@@ -106,6 +116,8 @@ class Localiser:
         matcher: the first half of an attempt; None matches with the landmarks of `frames`.
         search: finds the candidates; None for the graph's own `neighbourhood`. Localisers in step
             with each other, in a graph that does not grow, may share one that remembers.
+        background: what policies may know of the map beyond its graph and paths.
+        clock: what the live frames' stamps mean, and where the robot is; None if unknown.
     """
 
     def __init__(
@@ -123,9 +135,13 @@ class Localiser:
         config: LocaliserConfig | None = None,
         matcher: Matcher | None = None,
         search: Callable[..., Neighbourhood] | None = None,
+        background: Background | None = None,
+        clock: Clocked | None = None,
     ) -> None:
         self.config = config or LocaliserConfig()
         self.live = live
+        self._background = background or Background()
+        self._clock = clock
         self._own_session = live if saves else None
         self._graph = graph
         self._paths = paths
@@ -139,6 +155,7 @@ class Localiser:
             matcher or FrameMatcher(frames, self.config.matcher), budget, self.config.acceptance
         )
         self._recent = RecentAttempts(self.config.recent)
+        self._run = RunLog()
         self.walk = Walk(path_id(self.live))
         self.position: Position | None = None
         self._open_loop_m = 0.0
@@ -235,7 +252,7 @@ class Localiser:
                 live, node_id(self.live, live.stamp_ns), candidates, deadline
             )
             clock.lap("attempts")
-            self._remember(neighbourhood, outcomes)
+            self._remember(live, neighbourhood, outcomes)
         self._outcomes = outcomes
         success = best_success(outcomes)
         if success is not None:
@@ -305,6 +322,10 @@ class Localiser:
             stamp_ns=live.stamp_ns,
             seed=live.stamp_ns,
             foresee=lambda: self._foresee(live, neighbourhood),
+            run=self._run.attempts(self._driven_m),
+            hour=None if self._clock is None else hour_of_day(self._clock, live.stamp_ns),
+            background=self._background,
+            live_words=self._words_of(live),
         )
         return self._policy.rank(context)
 
@@ -316,6 +337,10 @@ class Localiser:
             np.array([outcome.accepted for outcome in outcomes], dtype=np.bool_),
             np.array([outcome.match.inliers for outcome in outcomes], dtype=np.int64),
         )
+
+    def _words_of(self, live: Frame) -> Callable[[], NDArray[np.int32]] | None:
+        words = self._background.words
+        return None if words is None else partial(words.of_frame, live)
 
     def _candidates(
         self, live: Frame, neighbourhood: Neighbourhood | None, order: NDArray[np.int64]
@@ -371,12 +396,15 @@ class Localiser:
         )
         return Candidate(index, self._graph.node(index).id, prediction, guided, row)
 
-    def _remember(self, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]) -> None:
+    def _remember(
+        self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
+    ) -> None:
         """Keeps the outcome of every attempt that had a prediction (SPEC §3.5)."""
         self._recent.add(
             [outcome.candidate.index for outcome in outcomes],
             [outcome.accepted for outcome in outcomes],
         )
+        self._log(live, neighbourhood, outcomes)
         for outcome in outcomes:
             row = outcome.candidate.row
             if neighbourhood is None or row is None or self.position is None:
@@ -396,6 +424,24 @@ class Localiser:
                 policy=self._policy.name,
             )
             self._attempts.append(attempt)
+
+    def _log(
+        self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
+    ) -> None:
+        """What policies learn from while driving."""
+        for outcome in outcomes:
+            row, rate = outcome.candidate.row, np.nan
+            if neighbourhood is not None and row is not None:
+                offset = neighbourhood.along_m[row : row + 1], neighbourhood.across_m[row : row + 1]
+                rate = float(self._basin.success_rate(*offset)[0])
+            self._run.add(
+                self._driven_m,
+                outcome.candidate.index,
+                rate,
+                accepted=outcome.accepted,
+                inliers=outcome.match.inliers,
+                landmarks=len(live.landmarks),
+            )
 
     def _settle(self, success: Outcome, stamp_ns: int) -> None:
         """The position becomes (n, ``T_n_q``), the open loop 0 (SPEC §3.3)."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
+from engram.places.chow_liu import WordStatistics
 from engram.places.recogniser import Recognition
 from engram.places.vocabulary import Vocabulary
 
@@ -25,8 +26,7 @@ class BagOfWords:
     name = "bag-of-words"
 
     def __init__(self, vocabulary: Vocabulary) -> None:
-        statistics = vocabulary.statistics
-        self._idf = np.log((statistics.images + 1) / (statistics.seen + 0.5))
+        self._idf = inverse_frequencies(vocabulary.statistics)
         self._index = _core.PlaceIndex(len(vocabulary))
         self._norms = np.zeros(16)
 
@@ -56,3 +56,8 @@ class BagOfWords:
 
     def _norm(self, words: NDArray[np.int32]) -> float:
         return float(np.linalg.norm(self._idf[words]))
+
+
+def inverse_frequencies(statistics: WordStatistics) -> NDArray[np.float64]:
+    """Inverse document frequency (W,) of each word: how much it tells about a place."""
+    return np.asarray(np.log((statistics.images + 1) / (statistics.seen + 0.5)))

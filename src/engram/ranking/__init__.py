@@ -8,18 +8,34 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from engram.errors import ConfigError
+from engram.ranking.background import Background
+from engram.ranking.bag_of_words import BagOfWordsPolicy
+from engram.ranking.bandit import BanditPolicy
+from engram.ranking.collaborative import CollaborativePolicy
 from engram.ranking.context import Foreseen, RankingContext, RankingPolicy
 from engram.ranking.distance import DistancePolicy
+from engram.ranking.nearest_of_each import NearestOfEachPolicy
+from engram.ranking.oracle import OraclePolicy
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_literal import PathLiteralPolicy
 from engram.ranking.random import RandomPolicy
 from engram.ranking.recent import IterationUnit, Observations, RecentAttempts, RecentConfig
+from engram.ranking.run import RunAttempts, RunLog
+from engram.ranking.time_of_day import TimeOfDayPolicy
+from engram.ranking.times import SessionTimes
+from engram.ranking.words import QuantisedWords, WordSource
 
 POLICIES: dict[str, Callable[[], RankingPolicy]] = {
     "distance": DistancePolicy,
     "path": PathPolicy,
     "path-literal": PathLiteralPolicy,
     "random": RandomPolicy,
+    "oracle": OraclePolicy,
+    "time-of-day": TimeOfDayPolicy,
+    "bag-of-words": BagOfWordsPolicy,
+    "collaborative": CollaborativePolicy,
+    "nearest-of-each": NearestOfEachPolicy,
+    "bandit": BanditPolicy,
 }
 
 
@@ -37,14 +53,34 @@ def policy_named(name: str) -> RankingPolicy:
         ) from None
 
 
+def check_for_robot(name: str) -> None:
+    """Refuses a policy that looks ahead: a robot would attempt every candidate to rank them.
+
+    Raises:
+        ConfigError: only an evaluation may use this policy.
+    """
+    if name == OraclePolicy.name:
+        raise ConfigError(
+            "the policy oracle knows what will match, which only an evaluation can tell; use it in "
+            "engram evaluate, and another policy for a drive"
+        )
+
+
 __all__ = [
     "POLICIES",
+    "Background",
     "Foreseen",
     "IterationUnit",
     "Observations",
+    "QuantisedWords",
     "RankingContext",
     "RankingPolicy",
     "RecentAttempts",
     "RecentConfig",
+    "RunAttempts",
+    "RunLog",
+    "SessionTimes",
+    "WordSource",
+    "check_for_robot",
     "policy_named",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,9 @@ from engram.experience.graph import ExperienceGraph
 from engram.experience.model import PathId
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
+from engram.ranking.background import Background
 from engram.ranking.recent import Observations
+from engram.ranking.run import RunAttempts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +50,11 @@ class RankingContext:
         seed: of policies that draw at random.
         foresee: makes every attempt to see how it ends; only the oracle, the bound of all
             policies, asks (SPEC §4). None where it cannot be known.
+        run: this run's attempts, with where they were made and how likely they were.
+        hour: hour of day of the live frame in [0, 24); None where it is not known.
+        background: what is known of the map's sessions and nodes.
+        live_words: gives the distinct words (n,) int32 of the live frame, rising; None where
+            there is no vocabulary. Costs time only when called.
     """
 
     neighbourhood: Neighbourhood
@@ -60,6 +67,20 @@ class RankingContext:
     stamp_ns: int
     seed: int = 0
     foresee: Callable[[], Foreseen] | None = None
+    run: RunAttempts = field(default_factory=RunAttempts.none)
+    hour: float | None = None
+    background: Background = field(default_factory=Background)
+    live_words: Callable[[], NDArray[np.int32]] | None = None
+
+    @property
+    def sessions(self) -> NDArray[np.int32]:
+        """(Y,) int32: for each candidate the number of the session that saved it."""
+        return self.graph.sessions[self.neighbourhood.nodes]
+
+    def success_rates(self) -> NDArray[np.float64]:
+        """(Y,) float64: g(d) of each candidate, appearance being compatible (SPEC §3.1)."""
+        near = self.neighbourhood
+        return self.basin.success_rate(near.along_m, near.across_m)
 
 
 class RankingPolicy(Protocol):
@@ -71,7 +92,11 @@ class RankingPolicy(Protocol):
         ...
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
-        """(Y,) int64: the rows of the neighbourhood, most promising first; each row once."""
+        """(Y,) int64: the rows of the neighbourhood, most promising first; each row once.
+
+        Raises:
+            ConfigError: the policy needs to know what the context cannot tell.
+        """
         ...
 
 
@@ -81,3 +106,22 @@ def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.
     values = (np.ascontiguousarray(key, dtype=np.float64) for key in keys)
     uuid_words = context.graph.uuid_words
     return _core.order_rows(neighbourhood.nodes, uuid_words, *values, neighbourhood.distance_m)
+
+
+def round_robin(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
+    """The sessions of the candidates in turn, each with its nearest node first (SPEC §4).
+
+    In each round sessions stand by the keys, (Y,) each and equal for all nodes of one session;
+    ties by distance, then by UUID. A policy that knows which experience is best, but not which
+    node of it, would otherwise spend its budget on one experience's nodes from near to far.
+    """
+    nearest_first = order_by(context)
+    groups = context.sessions[nearest_first]
+    by_group = np.argsort(groups, kind="stable")
+    grouped = groups[by_group]
+    place = np.arange(len(groups))
+    is_first = np.diff(grouped, prepend=-1) != 0
+    first = np.maximum.accumulate(np.where(is_first, place, 0))
+    turn = np.empty(len(groups))
+    turn[nearest_first[by_group]] = place - first
+    return order_by(context, turn, *keys)

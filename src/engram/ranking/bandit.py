@@ -1,0 +1,60 @@
+"""Γ(bandit): learns from this run alone; has no path memory at all."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.ranking.context import RankingContext, order_by
+
+# Source of all four: SPEC §4.
+_MEMORY_M = 8.0
+_PRIOR_SUCCESSES = 0.3
+_PRIOR_ATTEMPTS = 1.0
+_REDUNDANCY = 0.8
+
+
+class BanditPolicy:
+    """p = (a + 0.3) / (a + b + 1) · g(d), picked greedily and diversely (SPEC §4).
+
+    a and b are this run's successes and failures on the session that saved the candidate, decayed
+    by exp(−Δs / 8 m), failures weighted by g of their distance. After each pick the other nodes
+    of its session count 1 − 0.8 p, where p is what the pick itself counted then.
+    """
+
+    name = "bandit"
+
+    def rank(self, context: RankingContext) -> NDArray[np.int64]:
+        """See `RankingPolicy`."""
+        successes, failures = session_tallies(context, _MEMORY_M)
+        sessions = context.sessions
+        a, b = successes[sessions], failures[sessions]
+        level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
+        return _pick_diversely(context, level * context.success_rates())
+
+
+def session_tallies(
+    context: RankingContext, memory_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """This run's decayed successes and failures (S,) on each session of the graph."""
+    run = context.run
+    sessions = context.graph.sessions
+    count = int(sessions.max()) + 1 if len(sessions) else 0
+    weights = run.decay(memory_m)
+    attempted = sessions[run.nodes]
+    successes = np.bincount(attempted, weights * run.accepted, count).astype(np.float64)
+    failures = np.bincount(attempted, weights * run.failure_weights(), count).astype(np.float64)
+    return successes, failures
+
+
+def _pick_diversely(context: RankingContext, p: NDArray[np.float64]) -> NDArray[np.int64]:
+    canonical = order_by(context)  # the first of equals is the nearest, then by UUID
+    left = p[canonical]
+    sessions = context.sessions[canonical]
+    picked = np.empty(len(left), np.int64)
+    for place in range(len(left)):
+        best = int(np.argmax(left))
+        picked[place] = canonical[best]
+        left[sessions == sessions[best]] *= 1 - _REDUNDANCY * left[best]
+        left[best] = -np.inf
+    return picked

@@ -1,0 +1,53 @@
+"""Γ(collaborative): experiences that recent matches lead to first [MacTavish 2018]."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.experience.model import path_id
+from engram.ranking.context import RankingContext, round_robin
+
+# "Decayed with distance" (SPEC §4), by as much as the bandit's memory.
+_DECAY_M = 8.0
+
+
+class CollaborativePolicy:
+    """Experience r scores P_r / √(Q_r · Q_live), experiences round robin.
+
+    P_r counts the recent live landmarks whose chain of matches reaches r, Q_r the landmarks that
+    r saw here. Our nodes keep no links between landmarks, so both are counted in frames: a live
+    frame matched with a node by a share of its landmarks, and r saved that node or matched it on
+    its own drive (path memory); and nodes here that r saved or matched. Q_live is the same for
+    all, and left out.
+
+    Source: SPEC §4; MacTavish, Paton, Barfoot, Selective memory: recalling relevant experience
+    for long-term visual localization, Journal of Field Robotics 2018.
+    """
+
+    name = "collaborative"
+
+    def rank(self, context: RankingContext) -> NDArray[np.int64]:
+        """See `RankingPolicy`."""
+        run, near = context.run, context.neighbourhood
+        numbers, group = np.unique(context.sessions, return_inverse=True)
+        share = run.inliers / np.maximum(run.landmarks, 1)
+        reached = _reached(context, numbers, run.nodes) @ (
+            run.decay(_DECAY_M) * run.accepted * share
+        )
+        seen = _reached(context, numbers, near.nodes) @ np.exp(-near.distance_m / _DECAY_M)
+        scores = reached / np.sqrt(np.maximum(seen, 1e-12))
+        return round_robin(context, -scores[group])
+
+
+def _reached(
+    context: RankingContext, sessions: NDArray[np.int32], nodes: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """(S, N) 1 where the session saved the node or matched it on its way, else 0."""
+    graph = context.graph
+    paths = [path_id(graph.session(number)) for number in sessions]
+    saved = graph.sessions[nodes] == sessions[:, None]
+    matched = context.path_memory.on_paths(paths, nodes)
+    if context.own_path in paths:
+        matched[paths.index(context.own_path)] = False
+    return np.asarray((saved | matched).astype(np.float64))

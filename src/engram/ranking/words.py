@@ -1,0 +1,88 @@
+"""The visual words of nodes and live frames, for policies that compare appearances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import LandmarkSource
+from engram.frontend import Frame
+from engram.places import Vocabulary
+from engram.places.bag_of_words import inverse_frequencies
+
+
+class WordSource(Protocol):
+    """Words of frames and of nodes, and how much each word tells."""
+
+    @property
+    def idf(self) -> NDArray[np.float64]:
+        """(W,) inverse document frequency of each word of the vocabulary."""
+        ...
+
+    def of_frame(self, frame: Frame) -> NDArray[np.int32]:
+        """The distinct words (n,) int32 of a live frame, rising."""
+        ...
+
+    def of_node(self, node: int) -> NDArray[np.int32]:
+        """The distinct words (n,) int32 of a node, by its dense index, rising."""
+        ...
+
+
+class QuantisedWords:
+    """A `WordSource` that looks words up when they are first asked for, and keeps nodes' words.
+
+    Args:
+        graph: the nodes.
+        frames: their landmarks.
+        vocabulary: gives the vocabulary; called once, at first use.
+    """
+
+    def __init__(
+        self,
+        graph: ExperienceGraph,
+        frames: LandmarkSource,
+        vocabulary: Callable[[], Vocabulary],
+    ) -> None:
+        self._graph = graph
+        self._frames = frames
+        self._make_vocabulary = vocabulary
+        self._vocabulary: Vocabulary | None = None
+        self._idf: NDArray[np.float64] | None = None
+        self._of_node: dict[int, NDArray[np.int32]] = {}
+
+    @property
+    def idf(self) -> NDArray[np.float64]:
+        """See `WordSource`."""
+        if self._idf is None:
+            self._idf = inverse_frequencies(self._loaded.statistics)
+        return self._idf
+
+    def of_frame(self, frame: Frame) -> NDArray[np.int32]:
+        """See `WordSource`.
+
+        Raises:
+            IncompatibleError: its descriptors are of another kind than the vocabulary's.
+        """
+        return self._loaded.words_of(frame.landmarks.descriptors, frame.descriptor)
+
+    def of_node(self, node: int) -> NDArray[np.int32]:
+        """See `WordSource`.
+
+        Raises:
+            MapCorruptError: the node's landmarks do not match their hash.
+        """
+        words = self._of_node.get(node)
+        if words is None:
+            words = self.of_frame(self._frames.frame(self._graph.node(node).id))
+            self._of_node[node] = words
+        return words
+
+    @property
+    def _loaded(self) -> Vocabulary:
+        if self._vocabulary is None:
+            self._vocabulary = self._make_vocabulary()
+        return self._vocabulary
