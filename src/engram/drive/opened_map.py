@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 from typing import Self
@@ -13,7 +14,7 @@ from engram.errors import ConfigError
 from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
 from engram.experience.clock import Clocked
 from engram.experience.graph import ExperienceGraph
-from engram.experience.model import SessionId
+from engram.experience.model import PathEntryKind, SessionId
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
 from engram.frontend import DescriptorKind, Frontend, StereoPair
@@ -78,6 +79,20 @@ class OpenMap:
     def close(self) -> None:
         """Closes the file."""
         self.store.close()
+
+    def counting(self, kinds: Collection[PathEntryKind]) -> OpenMap:
+        """This map with a path memory in which only these kinds of entry count.
+
+        It shares the file and the graph with this one, and is closed with it.
+        """
+        if frozenset(kinds) == self.path_memory.kinds:
+            return self
+        other = copy(self)
+        other.path_memory = PathMemory(self.graph, kinds)
+        for path in self.path_memory.paths:
+            for entry in self.path_memory.entries(path):
+                other.path_memory.add(entry)
+        return other
 
     @property
     def descriptor(self) -> DescriptorKind | None:

@@ -1,11 +1,25 @@
 """How good is a map: pure functions of results (SPEC §8)."""
 
+from engram.measures.accuracy import PoseErrors, pose_errors
+from engram.measures.bootstrap import (
+    Interval,
+    Resamples,
+    SessionSums,
+    difference,
+    excess_ratio,
+    ratio,
+)
+from engram.measures.comparison import beats
 from engram.measures.failure import (
+    FORMULAS,
     Drive,
+    Estimator,
     Gaps,
+    failure_curve,
     failure_gap,
     failure_lost,
     failure_route,
+    failure_sums,
     gaps,
     longest_gap_m,
     route_m,
@@ -13,13 +27,26 @@ from engram.measures.failure import (
 )
 
 __all__ = [
+    "FORMULAS",
     "Drive",
+    "Estimator",
     "Gaps",
+    "Interval",
+    "PoseErrors",
+    "Resamples",
+    "SessionSums",
+    "beats",
+    "difference",
+    "excess_ratio",
+    "failure_curve",
     "failure_gap",
     "failure_lost",
     "failure_route",
+    "failure_sums",
     "gaps",
     "longest_gap_m",
+    "pose_errors",
+    "ratio",
     "route_m",
     "route_not_localised",
 ]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,48 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
         rows = np.concatenate([[-1], ends, [len(positions)]])
         failed.extend(np.diff(rows) > 1)
     return Gaps(np.array(lengths, dtype=np.float64), np.array(failed, dtype=bool))
+
+
+class Estimator(StrEnum):
+    """How P(X >= x) is taken from the gaps g. Source: SPEC §8; the formulas stand in `FORMULAS`."""
+
+    ROUTE = "route"
+    GAP = "gap"
+    LOST = "lost"
+
+
+# What is printed beside every figure.
+FORMULAS = {
+    Estimator.ROUTE: "(1/L) Σ max(0, g − x)",
+    Estimator.GAP: "#{g ≥ x} / #{g}",
+    Estimator.LOST: "#{g ≥ x} / #{g}, gaps with a failed frame",
+}
+
+
+def failure_sums(
+    drive: Drive, at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
+) -> tuple[NDArray[np.float64], float]:
+    """One session's part of a failure curve: numerators (X,) at distances (X,), and denominator.
+
+    The curve over several sessions is the sum of the numerators ÷ the sum of the denominators.
+    """
+    found = gaps([drive])
+    lengths = found.length_m[found.failed] if estimator is Estimator.LOST else found.length_m
+    beyond = lengths[None, :] - at_m[:, None]
+    if estimator is Estimator.ROUTE:
+        return np.maximum(beyond, 0.0).sum(axis=1), float(drive.step_m.sum())
+    return (beyond >= 0).sum(axis=1).astype(np.float64), float(len(lengths))
+
+
+def failure_curve(
+    drives: Sequence[Drive], at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
+) -> NDArray[np.float64]:
+    """P(X >= x) at distances (X,), metres; 0 where there is nothing to count. Source: SPEC §8."""
+    above, below = np.zeros(len(at_m)), 0.0
+    for drive in drives:
+        numerators, denominator = failure_sums(drive, at_m, estimator)
+        above, below = above + numerators, below + denominator
+    return above / below if below else above
 
 
 def failure_route(drives: Sequence[Drive], at_m: float) -> float:

@@ -1,0 +1,22 @@
+"""The papers' experiments: cross-validation, sweeps, figures and tables (SPEC §8)."""
+
+from engram.evaluation.configurations import UNLIMITED, Configuration
+from engram.evaluation.drives import DriveSet, EvaluatedDrive, drives_of, open_campaign
+from engram.evaluation.folds import Fold, split
+from engram.evaluation.running import Plan, RankingOptions, make_plan, run, task_count
+
+__all__ = [
+    "UNLIMITED",
+    "Configuration",
+    "DriveSet",
+    "EvaluatedDrive",
+    "Fold",
+    "Plan",
+    "RankingOptions",
+    "drives_of",
+    "make_plan",
+    "open_campaign",
+    "run",
+    "split",
+    "task_count",
+]

@@ -1,0 +1,157 @@
+"""One map per fold, from its training sessions in the order of time (SPEC §8)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from engram.config import to_dict
+from engram.drive import MapOptions, OpenMap, Settings, map_drive, open_map
+from engram.drive.live import ignore
+from engram.evaluation.drives import EvaluatedDrive
+from engram.evaluation.starting import TrueNodes
+from engram.localiser import Position
+from engram.sequences import FrameLog
+
+# Enough for every candidate that matters; counts only, so that the same drives give the same map.
+GENEROUS = MapOptions(policy="path", lanes=4, rounds=8, relocaliser="fabmap")
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltSession:
+    """What adding one training session came to.
+
+    Attributes:
+        name: of the drive.
+        revision: of the map with it.
+        nodes: of the map with it.
+        share_localised: of its frames.
+        seconds: it took.
+    """
+
+    name: str
+    revision: int
+    nodes: int
+    share_localised: float
+    seconds: float
+
+
+@dataclass(slots=True)
+class BuiltMap:
+    """A fold's map.
+
+    Attributes:
+        path: the file.
+        sessions: as they were added, in the order of time.
+    """
+
+    path: Path
+    sessions: list[BuiltSession] = field(default_factory=list)
+
+    def revision_after(self, sessions: int) -> int:
+        """The revision that holds the first so many training sessions."""
+        return self.sessions[sessions - 1].revision
+
+
+def build_map(
+    path: Path, drives: Sequence[EvaluatedDrive], settings: Settings, options: MapOptions
+) -> BuiltMap:
+    """Maps the drives one after another; goes on where an earlier run stopped.
+
+    A session is mapped in a copy that takes the map's place when it is whole, so that a map that
+    was built with interruptions is the same as one that was not.
+
+    Args:
+        path: NAME.engram; NAME.json beside it tells how far it is.
+        drives: the training sessions, in the order of time.
+        settings: the resolved configuration.
+        options: the budget of the build.
+
+    Raises:
+        MapError: the map cannot be written.
+        SequenceError: a drive cannot be read.
+    """
+    built = read_built_map(path)
+    for drive in drives[len(built.sessions) :]:
+        started = time.perf_counter()
+        draft = path.with_name(f"{path.stem}.draft{path.suffix}")
+        _remove(draft)
+        if built.sessions:
+            shutil.copyfile(path, draft)
+        log = FrameLog(drive.path)
+        try:
+            report = map_drive(draft, log, settings, options, ignore, _start(draft, drive, drives))
+        finally:
+            log.close()
+        if report.interrupted or report.revision is None:
+            raise KeyboardInterrupt
+        summary = report.to_dict()
+        with open_map(draft) as opened:
+            nodes = len(opened.graph)
+        built.sessions.append(
+            BuiltSession(
+                drive.name,
+                report.revision,
+                nodes,
+                summary["share_localised"],
+                round(time.perf_counter() - started, 3),
+            )
+        )
+        # The record first: where a run is killed between the two it is ahead of the map, and what
+        # it is ahead by is done again.
+        write_json(path.with_suffix(".json"), {"sessions": to_dict(built.sessions)})
+        draft.replace(path)
+        _remove(draft)
+    return built
+
+
+def read_built_map(path: Path) -> BuiltMap:
+    """How far a fold's map is; nothing where it was not begun."""
+    record = path.with_suffix(".json")
+    if not (record.exists() and path.exists()):
+        return BuiltMap(path)
+    known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
+    with open_map(path) as opened:
+        newest = opened.store.info().revision
+    return BuiltMap(path, [BuiltSession(**one) for one in known if one["revision"] <= newest])
+
+
+def _start(draft: Path, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> Position | None:
+    """Where the drive begins, by truth; None in an empty map, or where truth is not known."""
+    truth = drive.truth()
+    if truth is None or not draft.exists():
+        return None
+    log = FrameLog(drive.path)
+    try:
+        first = truth.at(int(log.stamps_ns[0]))
+    finally:
+        log.close()
+    if first is None:
+        return None
+    with open_map(draft) as opened:
+        return true_nodes(opened, drives).start(first)
+
+
+def true_nodes(opened: OpenMap, drives: Sequence[EvaluatedDrive]) -> TrueNodes:
+    """True poses of a map's nodes; `drives` are at least those that it was built from."""
+    sessions = {node.session for node in opened.graph.nodes}
+    truths = {one.session.id: one.truth() for one in drives if one.session.id in sessions}
+    return TrueNodes(opened, truths)
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Writes a file in one step."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    draft.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def _remove(path: Path) -> None:
+    for one in path.parent.glob(f"{path.name}*"):
+        one.unlink()

@@ -1,0 +1,176 @@
+"""The drives that an evaluation runs on: a campaign's frame logs, or a user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from engram.config import config_hash
+from engram.drive import campaign_folder, session_of_drive
+from engram.errors import ConfigError, SequenceError
+from engram.experience.model import Session
+from engram.frontend import DescriptorKind
+from engram.geometry import SE3, StereoCamera
+from engram.sequences import FrameLog, LoggedFrame
+from engram.sequences.trajectories import Trajectory, read_truth
+from engram.simulation import Campaign, Size, campaign_named
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedDrive:
+    """One drive, recorded as a frame log.
+
+    Attributes:
+        path: NAME.framelog.
+        session: its session.
+        camera: its camera.
+        descriptor: kind of its descriptors.
+        frontend: hash of the front-end that made it.
+        has_truth: whether its true poses stand beside it; those of all drives of an evaluation
+            are in one world frame.
+    """
+
+    path: Path
+    session: Session
+    camera: StereoCamera
+    descriptor: DescriptorKind
+    frontend: str
+    has_truth: bool
+
+    @property
+    def name(self) -> str:
+        """For people and files."""
+        return self.path.stem
+
+    def frames(self) -> list[LoggedFrame]:
+        """All its frames, in memory."""
+        log = FrameLog(self.path)
+        try:
+            return list(log)
+        finally:
+            log.close()
+
+    def truth(self) -> Truth | None:
+        """Its true poses; None where they are not known."""
+        return _truth(self.path) if self.has_truth else None
+
+
+class Truth:
+    """True poses of one drive's frames, by stamp."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        self._poses = dict(
+            zip(trajectory.stamps_ns.tolist(), trajectory.world_from_cam, strict=True)
+        )
+
+    def at(self, stamp_ns: int) -> SE3 | None:
+        """``world_from_cam`` of the frame with this very stamp; None if it has none."""
+        return self._poses.get(stamp_ns)
+
+
+@lru_cache(maxsize=256)
+def _truth(path: Path) -> Truth | None:
+    trajectory = read_truth(path)
+    return None if trajectory is None else Truth(trajectory)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSet:
+    """What is evaluated together.
+
+    Attributes:
+        name: of the campaign; for figures, tables and folders.
+        drives: in the order of time.
+    """
+
+    name: str
+    drives: tuple[EvaluatedDrive, ...]
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether all drives have their truth beside them."""
+        return all(drive.has_truth for drive in self.drives)
+
+    @property
+    def hash(self) -> str:
+        """Changes with any drive and with the front-end that made it: what caches are kept by."""
+        return config_hash({str(one.session.id): one.frontend for one in self.drives})
+
+
+def open_campaign(text: str, campaigns: Path, size: Size = Size.STANDARD) -> DriveSet:
+    """A rendered campaign, by ``NAME`` or ``NAME@SEED`` of its town.
+
+    Args:
+        text: such as ``begbroke`` or ``village@2``.
+        campaigns: folder below which campaigns were rendered.
+        size: of the campaign.
+
+    Raises:
+        ConfigError: there is no such campaign.
+        SequenceError: some of its sessions are not rendered.
+    """
+    name, _, seed = text.partition("@")
+    try:
+        campaign = campaign_named(name, int(seed or 1), size)
+    except ValueError:
+        raise ConfigError(f"campaign {text!r}: the seed after @ must be a whole number") from None
+    paths = campaign_logs(campaign, campaigns)
+    missing = [path for path in paths if not path.exists()]
+    if missing:
+        raise SequenceError(
+            f"campaign {text!r}: {len(missing)} of {len(paths)} sessions are not rendered (the "
+            f"first is {missing[0]}); run: engram simulate {campaign.home} --seed "
+            f"{campaign.seed} --size {size.value}"
+        )
+    return DriveSet(text, drives_of(paths))
+
+
+def campaign_logs(campaign: Campaign, campaigns: Path) -> list[Path]:
+    """Where the frame logs of a campaign's sessions stand, rendered or not."""
+    folder = campaign_folder(campaigns, campaign)
+    return [folder / f"{plan.name}.framelog" for plan in campaign.sessions]
+
+
+def drives_of(paths: Sequence[Path]) -> tuple[EvaluatedDrive, ...]:
+    """Frame logs as drives, in the order of time.
+
+    Raises:
+        SequenceError: one is no frame log, was not recorded to its end, or is there twice.
+        IncompatibleError: they have different kinds of descriptors.
+    """
+    drives = sorted((_drive(path) for path in paths), key=lambda d: (d.session.start_ns, d.name))
+    by_id: dict[object, EvaluatedDrive] = {}
+    for drive in drives:
+        other = by_id.setdefault(drive.session.id, drive)
+        if other is not drive:
+            raise SequenceError(f"{drive.path} and {other.path} are the same drive; give it once")
+    kinds = {drive.descriptor for drive in drives}
+    if len(kinds) > 1:
+        raise SequenceError(
+            f"the logs have descriptors of several kinds ({', '.join(sorted(kinds))}), which "
+            "cannot be matched; extract them with one front-end"
+        )
+    return tuple(drives)
+
+
+def _drive(path: Path) -> EvaluatedDrive:
+    if path.suffix != ".framelog":
+        raise SequenceError(f"{path}: is no frame log; make one with: engram extract {path}")
+    log = FrameLog(path)
+    try:
+        if not log.complete:
+            raise SequenceError(
+                f"{path}: was not recorded to its end; give the same extract or simulate again"
+            )
+        return EvaluatedDrive(
+            path,
+            session_of_drive(log),
+            log.camera,
+            log.header.descriptor,
+            log.header.frontend,
+            path.with_suffix(".truth.txt").exists(),
+        )
+    finally:
+        log.close()

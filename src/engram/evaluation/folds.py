@@ -1,0 +1,44 @@
+"""Cross-validation over sessions (SPEC §8)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from engram.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """One division of the sessions; numbers are places in the order of time.
+
+    Attributes:
+        number: 0, 1, ….
+        training: sessions that the map is built from, in the order of time.
+        held_out: sessions that are localised in it.
+    """
+
+    number: int
+    training: tuple[int, ...]
+    held_out: tuple[int, ...]
+
+
+def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
+    """Every session is held out once; seeded shuffle, sizes within one. Source: SPEC §8.
+
+    Raises:
+        ConfigError: fewer than two folds, or fewer sessions than folds.
+    """
+    if not 2 <= folds <= sessions:
+        raise ConfigError(
+            f"cannot split {sessions} sessions into {folds} folds; there must be at least 2 folds "
+            "and as many sessions as folds"
+        )
+    shuffled = np.random.default_rng(seed).permutation(sessions)
+    parts = [tuple(sorted(part.tolist())) for part in np.array_split(shuffled, folds)]
+    everyone = range(sessions)
+    return tuple(
+        Fold(number, tuple(one for one in everyone if one not in part), part)
+        for number, part in enumerate(parts)
+    )

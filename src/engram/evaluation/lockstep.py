@@ -1,0 +1,247 @@
+"""Many localisers over one drive in step: what does not depend on the policy is done once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.drive import OpenMap, Settings
+from engram.evaluation.configurations import Configuration, PathKinds, Radius
+from engram.evaluation.drives import EvaluatedDrive, Truth
+from engram.evaluation.starting import TrueNodes
+from engram.experience.model import NodeId
+from engram.experience.neighbourhood import Neighbourhood
+from engram.frontend import Frame
+from engram.geometry import SE3
+from engram.localiser import Localiser, Matcher, Position
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.sequences import LoggedFrame
+
+
+class SharedSearch:
+    """A graph's neighbourhood search that remembers this frame's answers.
+
+    Localisers that matched the same node stand at the same position to the bit, whatever their
+    policies: they ask the same.
+    """
+
+    def __init__(self, search: Callable[..., Neighbourhood]) -> None:
+        self._search = search
+        self._known: dict[tuple[object, ...], Neighbourhood] = {}
+
+    def next_frame(self) -> None:
+        """Forgets: another frame, other positions."""
+        self._known.clear()
+
+    def __call__(
+        self,
+        reference: int,
+        reference_from_live: SE3,
+        covariance: NDArray[np.float64],
+        **options: Any,
+    ) -> Neighbourhood:
+        """See `ExperienceGraph.neighbourhood`."""
+        key = (
+            reference,
+            reference_from_live.translation.tobytes(),
+            reference_from_live.rotation.tobytes(),
+            covariance.tobytes(),
+            *options.values(),
+        )
+        found = self._known.get(key)
+        if found is None:
+            found = self._search(reference, reference_from_live, covariance, **options)
+            self._known[key] = found
+        return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runs:
+    """How one drive was localised by C configurations, F frames each.
+
+    Attributes:
+        configurations: the C configurations.
+        step_m: (F,) float64, odometry distance of the step that ends in the frame.
+        matched: (C, F) bool, whether the frame was localised.
+        attempts: (C, F) int32, match attempts.
+        candidates: (C, F) int32, |Y|.
+        succeeded: (C, F) int32, attempts that were accepted.
+        offset_m, turn_rad: (C, F) float32, error of the pose of a success; NaN without one, or
+            without truth.
+        step_ms: (C,) float64, mean time of a frame without the making of new matches.
+    """
+
+    configurations: tuple[Configuration, ...]
+    step_m: NDArray[np.float64]
+    matched: NDArray[np.bool_]
+    attempts: NDArray[np.int32]
+    candidates: NDArray[np.int32]
+    succeeded: NDArray[np.int32]
+    offset_m: NDArray[np.float32]
+    turn_rad: NDArray[np.float32]
+    step_ms: NDArray[np.float64]
+
+    @staticmethod
+    def empty(configurations: Sequence[Configuration], step_m: NDArray[np.float64]) -> Runs:
+        """Nothing run yet."""
+        shape = (len(configurations), len(step_m))
+        return Runs(
+            configurations=tuple(configurations),
+            step_m=step_m,
+            matched=np.zeros(shape, np.bool_),
+            attempts=np.zeros(shape, np.int32),
+            candidates=np.zeros(shape, np.int32),
+            succeeded=np.zeros(shape, np.int32),
+            offset_m=np.full(shape, np.nan, np.float32),
+            turn_rad=np.full(shape, np.nan, np.float32),
+            step_ms=np.zeros(shape[0]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Situation:
+    """One held-out drive and the map that it is localised in.
+
+    Attributes:
+        opened: the map, which stays as it is.
+        drive: the drive.
+        frames: its frames.
+        start: number of the first frame that is localised, and the position there; None where
+            no start is known.
+        nodes: true poses of the map's nodes.
+        truth: true poses of the drive; None where they are not known.
+    """
+
+    opened: OpenMap
+    drive: EvaluatedDrive
+    frames: Sequence[LoggedFrame]
+    start: tuple[int, Position] | None
+    nodes: TrueNodes
+    truth: Truth | None
+
+
+def run_in_step(
+    situation: Situation,
+    configurations: Sequence[Configuration],
+    settings: Settings,
+    matcher: Matcher | None,
+    relocaliser: str | None = None,
+    cost_so_far: Callable[[], float] = lambda: 0.0,
+) -> Runs:
+    """Localises the drive with every configuration, frame by frame.
+
+    Args:
+        situation: drive and map.
+        configurations: what to run.
+        settings: the resolved configuration.
+        matcher: makes the matches, unguided; None for the localiser's own, guided ones.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost dead-reckoning.
+        cost_so_far: seconds spent in making matches; left out of `step_ms`.
+    """
+    frames = situation.frames
+    runs = Runs.empty(configurations, np.array([_step_m(one.odometry) for one in frames]))
+    search = SharedSearch(situation.opened.graph.neighbourhood)
+    with _localisers(
+        situation, configurations, settings, matcher, search, relocaliser
+    ) as localisers:
+        for number, logged in enumerate(frames):
+            odometry = logged.odometry
+            if situation.start is None or number < situation.start[0]:
+                for localiser in localisers:
+                    localiser.carry_on(odometry)
+                continue
+            if number == situation.start[0]:
+                for localiser in localisers:
+                    localiser.carry_on(odometry)
+                    localiser.start_at(situation.start[1])
+                odometry = OdometryStep(OdometryStatus.FIRST)
+            search.next_frame()
+            judge = _Judge(situation, logged.frame)
+            for row, localiser in enumerate(localisers):
+                started, made = perf_counter(), cost_so_far()
+                found = localiser.localise(logged.frame, odometry)
+                seconds = perf_counter() - started - (cost_so_far() - made)
+                localiser.take_attempts()
+                runs.step_ms[row] += 1e3 * seconds
+                runs.matched[row, number] = found.node is not None
+                runs.attempts[row, number] = found.attempts
+                runs.candidates[row, number] = found.candidates
+                runs.succeeded[row, number] = sum(one.accepted for one in localiser.outcomes)
+                if found.node is not None and found.node_from_live is not None:
+                    error = judge.error(found.node, found.node_from_live)
+                    runs.offset_m[row, number], runs.turn_rad[row, number] = error
+    runs.step_ms[:] /= max(len(frames), 1)
+    return runs
+
+
+class _Judge:
+    """Errors of one frame's poses; several configurations often have the same."""
+
+    def __init__(self, situation: Situation, live: Frame) -> None:
+        self._nodes = situation.nodes
+        truth = situation.truth
+        self._world_from_live = None if truth is None else truth.at(live.stamp_ns)
+        self._known: dict[tuple[NodeId, bytes], tuple[float, float]] = {}
+
+    def error(self, node: NodeId, node_from_live: SE3) -> tuple[float, float]:
+        """Metres and radians; NaN where truth is not known."""
+        world_from_node = self._nodes.pose(node)
+        if self._world_from_live is None or world_from_node is None:
+            return np.nan, np.nan
+        key = (node, node_from_live.translation.tobytes())
+        if key not in self._known:
+            true = world_from_node.inverse() @ self._world_from_live
+            offset_m = float(np.linalg.norm(node_from_live.translation - true.translation))
+            self._known[key] = offset_m, (true.inverse() @ node_from_live).angle_rad
+        return self._known[key]
+
+
+@contextmanager
+def _localisers(
+    situation: Situation,
+    configurations: Iterable[Configuration],
+    settings: Settings,
+    matcher: Matcher | None,
+    search: SharedSearch,
+    relocaliser: str | None,
+) -> Iterator[list[Localiser]]:
+    """One per configuration; in one map they share what is known of it."""
+    views: dict[PathKinds, OpenMap] = {}
+    with ExitStack() as stack:
+        localisers = []
+        for one in configurations:
+            view = views.get(one.paths)
+            if view is None:
+                view = views[one.paths] = situation.opened.counting(one.paths.kinds)
+            localiser = view.localiser(
+                situation.drive.camera,
+                _settings_for(settings, one, guided=matcher is None),
+                policy=one.policy,
+                budget=one.budget,
+                relocaliser=relocaliser,
+                live=situation.drive.session.id,
+                matcher=matcher,
+                search=search,
+            )
+            localisers.append(stack.enter_context(localiser))
+        yield localisers
+
+
+def _settings_for(settings: Settings, configuration: Configuration, *, guided: bool) -> Settings:
+    localiser = settings.localiser
+    changed = replace(localiser, recent=replace(localiser.recent, T=configuration.T))
+    if configuration.radius is Radius.BASIN:
+        changed = replace(changed, search_radius_m=0.0)
+    if not guided:
+        changed = replace(changed, guide_below_m=0.0)
+    return replace(settings, localiser=changed)
+
+
+def _step_m(odometry: OdometryStep) -> float:
+    return 0.0 if odometry.prev_from_curr is None else odometry.prev_from_curr.distance_m

@@ -1,0 +1,326 @@
+"""Builds the maps of all folds and runs every configuration on every held-out session."""
+
+from __future__ import annotations
+
+import multiprocessing
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from engram import __version__
+from engram.config import config_hash, to_dict
+from engram.drive import MapOptions, OpenMap, Settings, open_map
+from engram.drive.live import ignore
+from engram.errors import ConfigError
+from engram.evaluation.building import (
+    GENEROUS,
+    BuiltMap,
+    build_map,
+    read_built_map,
+    true_nodes,
+    write_json,
+)
+from engram.evaluation.configurations import (
+    DEFAULT_LANES,
+    FEW_LANES,
+    Configuration,
+    map_sizes,
+    sweep,
+)
+from engram.evaluation.drives import DriveSet
+from engram.evaluation.folds import Fold, split
+from engram.evaluation.lockstep import Runs, Situation, run_in_step
+from engram.evaluation.memo import MatchMemo
+from engram.evaluation.starting import start_by_matching
+from engram.evaluation.store import joined, missing, read_runs, write_runs
+from engram.frontend.matching import matcher_hash
+from engram.localiser import FrameMatcher, Matcher
+from engram.ranking import POLICIES
+
+# Policies that cannot run without knowing the outcomes.
+_BOUNDS = ("oracle",)
+
+
+@dataclass(frozen=True, slots=True)
+class RankingOptions:
+    """What an evaluation of ranking policies runs.
+
+    Attributes:
+        policies: keys of `POLICIES`.
+        lanes, rounds: Np and Nr.
+        folds: of the cross-validation.
+        seed: of the shuffle of sessions and of the bootstrap.
+        map_sizes: whether earlier revisions are run too ([L15] Fig. 9).
+        live_folds: folds whose sessions are also run guided and without memo, at Np = 2: that
+            confirms the order of policies and gives milliseconds per frame.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost dead-reckoning (SPEC §8).
+        build: how the maps are built.
+    """
+
+    policies: tuple[str, ...] = tuple(POLICIES)
+    lanes: tuple[int, ...] = DEFAULT_LANES
+    rounds: tuple[int, ...] = (1, 2)
+    folds: int = 5
+    seed: int = 0
+    map_sizes: bool = True
+    live_folds: int = 1
+    relocaliser: str | None = None
+    build: MapOptions = field(default_factory=lambda: GENEROUS)
+
+    def __post_init__(self) -> None:
+        for policy in self.policies:
+            if policy not in POLICIES:
+                raise ConfigError(
+                    f"no ranking policy '{policy}'; there are: {', '.join(sorted(POLICIES))}"
+                )
+        for name, values in (("lanes", self.lanes), ("rounds", self.rounds)):
+            if not values or min(values) < 1:
+                raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")
+
+    @property
+    def few_lanes(self) -> int:
+        """Np of the figures that show one budget: 2 where that is run."""
+        return FEW_LANES if FEW_LANES in self.lanes else self.lanes[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All that a worker needs to know.
+
+    Attributes:
+        drives: what is evaluated.
+        settings: the resolved configuration.
+        options: what is run.
+        work: folder of maps, memos and results.
+    """
+
+    drives: DriveSet
+    settings: Settings
+    options: RankingOptions
+    work: Path
+
+    @property
+    def folds(self) -> tuple[Fold, ...]:
+        """The divisions of the drives."""
+        return split(len(self.drives.drives), self.options.folds, self.options.seed)
+
+    def map_path(self, fold: Fold) -> Path:
+        """The map built from a fold's training sessions."""
+        return self.work / f"fold{fold.number}.engram"
+
+    def runs_path(self, session: int, mode: str) -> Path:
+        """Results of one held-out session; `mode` is "memo" or "live"."""
+        return self.work / f"{mode}-{self.drives.drives[session].name}.npz"
+
+    def configuration(self) -> dict[str, Any]:
+        """The resolved configuration, kept with the results."""
+        return {
+            "campaign": self.drives.name,
+            "drives": [one.name for one in self.drives.drives],
+            "drives_hash": self.drives.hash,
+            "with_truth": self.drives.has_truth,
+            "folds": [to_dict(one) for one in self.folds],
+            "settings": to_dict(self.settings),
+            "options": to_dict(self.options),
+            "matcher": matcher_hash(self.settings.localiser.matcher),
+            "machine": platform.machine(),
+            "engram": __version__,
+        }
+
+
+def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, work: Path) -> Plan:
+    """A plan; its folder below `work` depends on all that its maps and results depend on.
+
+    More policies or lanes may be run later, and find there what was done.
+    """
+    settings = settings.for_descriptor(drives.drives[0].descriptor)
+    depends = (
+        drives.hash,
+        to_dict(settings),
+        to_dict(options.build),
+        options.folds,
+        options.seed,
+        options.relocaliser,
+        matcher_hash(settings.localiser.matcher),
+        __version__,
+    )
+    folder = work / f"{_file_name(drives.name)}-{config_hash(depends)}"
+    folder.mkdir(parents=True, exist_ok=True)
+    plan = Plan(drives, settings, options, folder)
+    write_json(folder / "configuration.json", plan.configuration())
+    return plan
+
+
+def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -> None:
+    """Builds, runs, and leaves the results in the plan's folder; what is there is kept.
+
+    Fold by fold: sessions are run as soon as their map is built. Results do not depend on the
+    number of workers. Killed or interrupted, the same call goes on.
+
+    Args:
+        plan: what to run.
+        workers: processes.
+        advance: called once per task with a word; see `task_count`.
+
+    Raises:
+        MapError: a map cannot be written.
+        SequenceError: a drive cannot be read.
+    """
+    if workers < 1:
+        raise ConfigError(f"workers is {workers}, must be >= 1")
+    with _executor(workers) as executor:
+        pending: dict[Future[None], Fold | None] = {
+            executor.submit(_build, plan, fold): fold for fold in plan.folds
+        }
+        try:
+            while pending:
+                done, _ = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    fold = pending.pop(future)
+                    future.result()
+                    advance("run" if fold is None else "built")
+                    if fold is not None:
+                        for session in fold.held_out:
+                            pending[executor.submit(_run_session, plan, fold, session)] = None
+        except BaseException:
+            executor.shutdown(wait=False, cancel_futures=True)
+            raise
+    # Alone on the machine, and in order: these runs are timed.
+    for fold in plan.folds[: plan.options.live_folds]:
+        for session in fold.held_out:
+            _run_live(plan, fold, session)
+            advance("timed")
+
+
+def task_count(plan: Plan) -> int:
+    """How often `run` will call `advance`."""
+    timed = sum(len(fold.held_out) for fold in plan.folds[: plan.options.live_folds])
+    return len(plan.folds) + len(plan.drives.drives) + timed
+
+
+class _Here(Executor):
+    """Runs everything at once, in this process."""
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@contextmanager
+def _executor(workers: int) -> Iterator[Executor]:
+    if workers == 1:
+        yield _Here()
+        return
+    # Started afresh: a forked child would share the parent's threads half way through.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, partial(cv2.setNumThreads, 1)) as pool:
+        yield pool
+
+
+def _build(plan: Plan, fold: Fold) -> None:
+    drives = [plan.drives.drives[number] for number in fold.training]
+    build_map(plan.map_path(fold), drives, plan.settings, plan.options.build)
+
+
+def _run_session(plan: Plan, fold: Fold, session: int) -> None:
+    """All that is missing of one held-out session."""
+    drive = plan.drives.drives[session]
+    path = plan.runs_path(session, "memo")
+    done = read_runs(path)
+    options = plan.options
+    whole = missing(done, sweep(options.policies, options.lanes, options.rounds))
+    earlier: list[Configuration] = []
+    if options.map_sizes:
+        wanted = map_sizes(options.policies, options.few_lanes, len(fold.training))
+        earlier = missing(done, wanted)
+    if not (whole or earlier):
+        return
+    built = read_built_map(plan.map_path(fold))
+    # The newest map's landmarks: earlier revisions have no others.
+    with open_map(built.path) as newest:
+        config = plan.settings.localiser.matcher
+        memo = MatchMemo(
+            FrameMatcher(newest.store.frames, config),
+            plan.work / f"memo-{drive.name}.matches.npz",
+            matcher_hash(config),
+        )
+        frames = drive.frames()
+        run_one = partial(_run_in, plan, fold, session, frames, memo)
+        if whole:
+            done = joined(done, run_one(newest, whole))
+            memo.save()
+            write_runs(path, done)
+        for count in sorted({one.sessions for one in earlier if one.sessions is not None}):
+            some = [one for one in earlier if one.sessions == count]
+            with open_map(built.path, built.revision_after(count)) as opened:
+                done = joined(done, run_one(opened, some))
+        if earlier and done is not None:
+            memo.save()
+            write_runs(path, done)
+
+
+def _run_live(plan: Plan, fold: Fold, session: int) -> None:
+    """Guided, with every match made as on a robot."""
+    path = plan.runs_path(session, "live")
+    done = read_runs(path)
+    policies = [one for one in plan.options.policies if one not in _BOUNDS]
+    wanted = missing(done, [Configuration(one, plan.options.few_lanes) for one in policies])
+    if not wanted:
+        return
+    frames = plan.drives.drives[session].frames()
+    for configuration in wanted:  # one after another: each has the machine for itself
+        with open_map(read_built_map(plan.map_path(fold)).path) as opened:
+            runs = _run_in(plan, fold, session, frames, None, opened, [configuration])
+            done = joined(done, runs)
+    assert done is not None
+    write_runs(path, done)
+
+
+def _run_in(
+    plan: Plan,
+    fold: Fold,
+    session: int,
+    frames: Sequence[Any],
+    matcher: Matcher | None,
+    opened: OpenMap,
+    configurations: Sequence[Configuration],
+) -> Runs:
+    """One session in one map."""
+    drive = plan.drives.drives[session]
+    training = [plan.drives.drives[number] for number in fold.training]
+    nodes, truth = true_nodes(opened, training), drive.truth()
+    first = None if truth is None else truth.at(frames[0].frame.stamp_ns)
+    if first is not None:
+        position = nodes.start(first)
+        start = None if position is None else (0, position)
+    else:
+        config = plan.settings.localiser
+        start = start_by_matching(
+            opened,
+            frames,
+            drive.session.id,
+            matcher or FrameMatcher(opened.store.frames, config.matcher),
+            config.acceptance,
+        )
+    situation = Situation(opened, drive, frames, start, nodes, truth)
+    cost = (lambda: matcher.seconds) if isinstance(matcher, MatchMemo) else (lambda: 0.0)
+    return run_in_step(
+        situation, configurations, plan.settings, matcher, plan.options.relocaliser, cost
+    )
+
+
+def _file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
+
+
+def built_map(plan: Plan, fold: Fold) -> BuiltMap:
+    """A fold's map, as far as it is built."""
+    return read_built_map(plan.map_path(fold))

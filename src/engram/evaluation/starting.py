@@ -1,0 +1,92 @@
+"""Where a drive starts in a map: by truth, or found by matching (SPEC §8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from engram.drive import OpenMap
+from engram.evaluation.drives import Truth
+from engram.experience.model import NodeId, SessionId, node_id
+from engram.frontend import FrameStatus
+from engram.geometry import SE3
+from engram.localiser import AcceptanceConfig, Matcher, Position, accept
+from engram.sequences import LoggedFrame
+
+# What an operator who sets a robot down knows of its place.
+_SIGMA_M = 0.25
+_SIGMA_RAD = float(np.deg2rad(1.0))
+_VIEW_GATE_RAD = float(np.deg2rad(60.0))  # as for candidates, SPEC §3.1
+
+
+class TrueNodes:
+    """True poses of a map's nodes.
+
+    Args:
+        opened: the map.
+        truths: of the sessions that it was built from; may lack some.
+    """
+
+    def __init__(self, opened: OpenMap, truths: Mapping[SessionId, Truth | None]) -> None:
+        self._poses: dict[NodeId, SE3] = {}
+        for node in opened.graph.nodes:
+            truth = truths.get(node.session)
+            pose = None if truth is None else truth.at(node.stamp_ns)
+            if pose is not None:
+                self._poses[node.id] = pose
+        self._ids = list(self._poses)
+        poses = list(self._poses.values())
+        self._positions = np.array([pose.translation for pose in poses]).reshape(-1, 3)
+        self._headings = np.array([pose.rotation[:, 2] for pose in poses]).reshape(-1, 3)
+
+    def pose(self, node: NodeId) -> SE3 | None:
+        """``world_from_node``; None where it is not known."""
+        return self._poses.get(node)
+
+    def start(self, world_from_live: SE3) -> Position | None:
+        """The position seen from the nearest node that looks the same way; None without nodes."""
+        if not self._ids:
+            return None
+        distance_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
+        away = self._headings @ world_from_live.rotation[:, 2] < np.cos(_VIEW_GATE_RAD)
+        # Nodes that look another way only where there are no others.
+        node = self._ids[int(np.lexsort((distance_m, away))[0])]
+        covariance = np.diag([_SIGMA_M**2] * 3 + [_SIGMA_RAD**2] * 3)
+        return Position(node, self._poses[node].inverse() @ world_from_live, covariance)
+
+
+def start_by_matching(
+    opened: OpenMap,
+    frames: Sequence[LoggedFrame],
+    live: SessionId,
+    matcher: Matcher,
+    acceptance: AcceptanceConfig,
+) -> tuple[int, Position] | None:
+    """The first frame that matches a node of the map, and its position there.
+
+    Every node is matched, so that where a drive starts does not depend on any policy. It is held
+    to what a lost robot must show. Where the first 200 frames match nothing, nothing will.
+
+    Returns:
+        Number of the frame and the position; None where there is none.
+    """
+    for number, logged in enumerate(frames[:200]):
+        frame = logged.frame
+        if frame.status is not FrameStatus.OK:
+            continue
+        live_id = node_id(live, frame.stamp_ns)
+        found = []
+        for node in opened.graph.nodes:
+            match = matcher.match(frame, live_id, node.id, None)
+            if match.inliers < acceptance.min_inliers_lost:
+                continue
+            spread = matcher.spread(frame, live_id, node.id, match)
+            if accept(match, None, acceptance, spread):
+                found.append((match, node.id))
+        if found:
+            match, best = max(found, key=lambda one: (one[0].inliers, one[1].int))
+            assert match.reference_from_live is not None
+            assert match.covariance is not None
+            return number, Position(best, match.reference_from_live, match.covariance)
+    return None
