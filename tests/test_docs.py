@@ -34,7 +34,15 @@ def test_every_command_shown_is_a_verb_with_these_options(page: str, words: list
     register(app)
     verbs = typer.main.get_command(app).commands
     assert words[1] in verbs, f"{page}: engram {words[1]}"
-    known = {option for parameter in verbs[words[1]].params for option in parameter.opts}
+    verb = verbs[words[1]]
+    if hasattr(verb, "commands"):
+        assert words[2] in verb.commands, f"{page}: engram {words[1]} {words[2]}"
+        verb = verb.commands[words[2]]
+    known = {
+        option
+        for parameter in verb.params
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
     assert {word for word in words if word.startswith("--")} <= known
 
 

@@ -51,13 +51,13 @@ def simulate(
     from engram.drive import simulate as render
     from engram.simulation import SimulatedDrive, campaign_named
 
-    chosen = campaign_named(campaign, seed, _size(size))
+    chosen = campaign_named(campaign, seed, size_named(size))
     numbers = _numbers(sessions) if sessions else list(range(len(chosen.sessions)))
     total = sum(len(SimulatedDrive(chosen, number)) for number in numbers)
     with progress(f"simulate {campaign}", total) as advance:
         report = render(
             chosen,
-            out or _campaigns_folder(),
+            out or campaigns_folder(),
             images=images,
             sessions=numbers,
             workers=workers,
@@ -70,7 +70,7 @@ def simulate(
         typer.echo(report.text())
 
 
-def _campaigns_folder() -> Path:
+def campaigns_folder() -> Path:
     """$ENGRAM_CAMPAIGNS, or a folder in the user's cache: rendered once, read often."""
     named = os.environ.get("ENGRAM_CAMPAIGNS")
     if named:
@@ -80,7 +80,8 @@ def _campaigns_folder() -> Path:
     return user_cache_path("engram") / "campaigns"
 
 
-def _size(text: str) -> Size:
+def size_named(text: str) -> Size:
+    """A campaign's size, by the name given on the command line."""
     from engram.errors import ConfigError
     from engram.simulation import Size
 

@@ -11,6 +11,7 @@ import typer
 from engram.cli.app import VerbInterruptedError
 from engram.cli.benchmark import bench
 from engram.cli.demonstration import demo
+from engram.cli.evaluation import evaluate
 from engram.cli.extraction import extract
 from engram.cli.inspection import check, info, log, seal
 from engram.cli.localisation import localise
@@ -34,11 +35,19 @@ VERBS: dict[str, Callable[..., None]] = {
     "bench": bench,
 }
 
+# Verbs that have verbs below them.
+GROUPS: tuple[typer.Typer, ...] = (evaluate,)
+
 
 def register(app: typer.Typer) -> None:
     """Gives the program its verbs."""
     for name, verb in VERBS.items():
         app.command(name)(_tells_of_interruption(verb))
+    for group in GROUPS:
+        for command in group.registered_commands:
+            assert command.callback is not None
+            command.callback = _tells_of_interruption(command.callback)
+        app.add_typer(group)
 
 
 def _tells_of_interruption(verb: Callable[..., None]) -> Callable[..., None]:

@@ -64,6 +64,7 @@ class OpenMap:
         for entry in contents.path_entries:
             self.path_memory.add(entry)
         self.times = SessionTimes(contents.sessions)
+        self._backgrounds: dict[DescriptorKind, Background] = {}
         self.attempts = BasinCounts.empty()
         for session in contents.sessions:
             made = contents.attempts_of(session.id)
@@ -182,10 +183,14 @@ class OpenMap:
         )
 
     def _background(self, descriptor: DescriptorKind) -> Background:
-        words = QuantisedWords(
-            self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor)
-        )
-        return Background(self.times, words)
+        """Made once: the words of nodes serve all localisers of this map."""
+        known = self._backgrounds.get(descriptor)
+        if known is None:
+            words = QuantisedWords(
+                self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor)
+            )
+            known = self._backgrounds[descriptor] = Background(self.times, words)
+        return known
 
     def robot(
         self,

@@ -62,6 +62,10 @@ class Matcher(Protocol):
         """`inlier_spread` of such a match."""
         ...
 
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        """Hint that these are likely to be matched next. Returns at once."""
+        ...
+
 
 class FrameMatcher:
     """Matches with the landmarks that a source holds: what runs on a robot."""
@@ -91,6 +95,10 @@ class FrameMatcher:
         del live_id
         return inlier_spread(match, self._frames.frame(node), live)
 
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        """See `Matcher`."""
+        self._frames.prefetch(nodes)
+
 
 class Attempter:
     """Runs attempts on threads of its own; the core releases the GIL, so they are parallel."""
@@ -115,6 +123,10 @@ class Attempter:
         """Ends the threads."""
         if self._pool is not None:
             self._pool.shutdown()
+
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        """Hint that these are likely to be attempted next."""
+        self._matcher.prefetch(nodes)
 
     def run(
         self,

@@ -145,7 +145,6 @@ class Localiser:
         self._own_session = live if saves else None
         self._graph = graph
         self._paths = paths
-        self._frames = frames
         self._policy = policy
         self._budget = budget
         self._relocaliser = relocaliser
@@ -353,7 +352,7 @@ class Localiser:
         budget = self._budget.attempts
         ranked = []
         if neighbourhood is not None:
-            self._frames.prefetch(
+            self._attempter.prefetch(
                 [self._graph.node(int(i)).id for i in neighbourhood.nodes[order[:_PREFETCH]]]
             )
             ranked = [self._predicted(neighbourhood, int(row)) for row in order[:budget]]

@@ -53,6 +53,8 @@ class QuantisedWords:
         self._vocabulary: Vocabulary | None = None
         self._idf: NDArray[np.float64] | None = None
         self._of_node: dict[int, NDArray[np.int32]] = {}
+        # The live frame's words: several localisers in step ask for them one after another.
+        self._last: tuple[Frame, NDArray[np.int32]] | None = None
 
     @property
     def idf(self) -> NDArray[np.float64]:
@@ -67,7 +69,11 @@ class QuantisedWords:
         Raises:
             IncompatibleError: its descriptors are of another kind than the vocabulary's.
         """
-        return self._loaded.words_of(frame.landmarks.descriptors, frame.descriptor)
+        last = self._last
+        if last is None or last[0] is not frame:
+            words = self._loaded.words_of(frame.landmarks.descriptors, frame.descriptor)
+            last = self._last = (frame, words)
+        return last[1]
 
     def of_node(self, node: int) -> NDArray[np.int32]:
         """See `WordSource`.
@@ -77,7 +83,8 @@ class QuantisedWords:
         """
         words = self._of_node.get(node)
         if words is None:
-            words = self.of_frame(self._frames.frame(self._graph.node(node).id))
+            frame = self._frames.frame(self._graph.node(node).id)
+            words = self._loaded.words_of(frame.landmarks.descriptors, frame.descriptor)
             self._of_node[node] = words
         return words
 

@@ -1,0 +1,168 @@
+"""`engram evaluate …`: the papers' experiments."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from engram.cli import options
+
+if TYPE_CHECKING:
+    from engram.evaluation import DriveSet
+
+evaluate = typer.Typer(
+    name="evaluate",
+    help="Redo the papers' experiments on simulated campaigns or your own frame logs.",
+    no_args_is_help=True,
+)
+
+
+@evaluate.command("ranking")
+def ranking(
+    drives: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="CAMPAIGN|LOG…",
+            help="Rendered campaigns (begbroke, or village@2 for another town seed), or frame "
+            "logs of your own, which form one campaign.",
+        ),
+    ],
+    *,
+    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard",
+    policies: Annotated[
+        str | None,
+        typer.Option("--policies", metavar="NAME,NAME…", help="Only these [default: all]."),
+    ] = None,
+    lanes: Annotated[
+        str | None,
+        typer.Option(
+            "--lanes",
+            metavar="N,N…",
+            help="Np; 0 for as many as there are candidates [default: 1,2,3,4,6,8,12,16,0].",
+        ),
+    ] = None,
+    rounds: Annotated[
+        str, typer.Option("--rounds", metavar="N,N…", help="Nr; the first for all policies.")
+    ] = "1,2",
+    folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
+    ] = 0,
+    map_sizes: Annotated[
+        bool,
+        typer.Option("--map-sizes/--no-map-sizes", help="Run earlier revisions too (Fig. 9)."),
+    ] = True,
+    live_folds: Annotated[
+        int,
+        typer.Option(
+            "--live-folds", min=0, help="Folds that are also run guided and without memo, timed."
+        ),
+    ] = 1,
+    relocaliser: Annotated[
+        str, typer.Option("--relocaliser", help="What finds the lost; none leaves them.")
+    ] = "none",
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
+    campaigns: Annotated[
+        Path | None,
+        typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
+    ] = None,
+    work: Annotated[
+        Path | None,
+        typer.Option(
+            "--work", metavar="DIR", help="Maps, memos, results [default: the user's cache]."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
+        "results/ranking"
+    ),
+    config: options.Settings = None,
+    as_json: options.Json = False,
+) -> None:
+    """Measure ranking policies by cross-validation over sessions.
+
+    A run that was stopped goes on when it is given again; more policies or lanes later cost only
+    what is new.
+
+    \b
+    Examples:
+      engram evaluate ranking hamlet --policies distance,path --lanes 1,2 --folds 3
+      engram evaluate ranking begbroke keble oxford --out results/ranking
+      engram evaluate ranking monday.framelog tuesday.framelog … --out results/mine
+    """
+    from engram.cli.progress import progress
+    from engram.drive import load_settings
+    from engram.evaluation import (
+        DEFAULT_LANES,
+        RankingOptions,
+        make_plan,
+        run,
+        task_count,
+        write_report,
+    )
+    from engram.ranking import POLICIES
+
+    asked = RankingOptions(
+        policies=tuple(policies.split(",") if policies else POLICIES),
+        lanes=_lanes(lanes) if lanes else DEFAULT_LANES,
+        rounds=_numbers(rounds, "--rounds"),
+        folds=folds,
+        seed=seed,
+        map_sizes=map_sizes,
+        live_folds=live_folds,
+        relocaliser=None if relocaliser == "none" else relocaliser,
+    )
+    started = time.perf_counter()
+    settings = load_settings(config)
+    plans = [
+        make_plan(one, settings, asked, work or _work_folder())
+        for one in _drive_sets(drives, size, campaigns)
+    ]
+    for plan in plans:
+        with progress(f"evaluate {plan.drives.name}", task_count(plan)) as advance:
+            run(plan, workers, advance)
+    files = write_report(out, plans)
+    seconds = time.perf_counter() - started
+    if as_json:
+        print(json.dumps({"files": [str(one) for one in files], "seconds": round(seconds, 1)}))
+    else:
+        typer.echo("\n".join(str(one) for one in files))
+        typer.echo(f"{seconds:.0f} s")
+
+
+def _drive_sets(drives: list[str], size: str, campaigns: Path | None) -> list[DriveSet]:
+    """Each name of a campaign is one; all frame logs together are one."""
+    from engram.cli.simulation import campaigns_folder, size_named
+    from engram.evaluation import DriveSet, drives_of, open_campaign
+
+    logs = [Path(one) for one in drives if one.endswith(".framelog") or Path(one).exists()]
+    names = [one for one in drives if Path(one) not in logs]
+    folder = campaigns or campaigns_folder()
+    sets = [open_campaign(name, folder, size_named(size)) for name in names]
+    if logs:
+        sets.append(DriveSet(logs[0].resolve().parent.name or "logs", drives_of(logs)))
+    return sets
+
+
+def _lanes(text: str) -> tuple[int, ...]:
+    from engram.evaluation import UNLIMITED
+
+    return tuple(one or UNLIMITED for one in _numbers(text, "--lanes"))
+
+
+def _numbers(text: str, option: str) -> tuple[int, ...]:
+    from engram.errors import ConfigError
+
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"{option} {text!r}: expected numbers joined by commas") from None
+
+
+def _work_folder() -> Path:
+    from platformdirs import user_cache_path
+
+    return user_cache_path("engram") / "evaluation"

@@ -1,0 +1,268 @@
+"""From per-frame results to tables: one row per configuration and fold, one per session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.evaluation.configurations import UNLIMITED, Configuration
+from engram.evaluation.lockstep import Runs
+from engram.evaluation.running import Plan, built_map
+from engram.evaluation.store import read_runs
+from engram.measures import (
+    Drive,
+    Estimator,
+    PoseErrors,
+    Resamples,
+    SessionSums,
+    failure_sums,
+    longest_gap_m,
+)
+
+Array = NDArray[np.float64]
+
+# Where failure curves are drawn.
+CURVE_AT_M = np.arange(0.0, 50.5, 0.5)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionResult:
+    """One held-out session under one configuration.
+
+    Attributes:
+        session: its number in the order of time.
+        fold: in which it was held out.
+        nodes: of the map that it was localised in.
+        drive: steps and matches, from which every measure of failure follows.
+        attempts: match attempts made.
+        candidates, succeeded: means over frames of |Y| and of the attempts that were accepted.
+        errors: of the poses of its successes, where truth is known.
+        step_ms: mean time of a frame.
+    """
+
+    session: int
+    fold: int
+    nodes: int
+    drive: Drive
+    attempts: int
+    candidates: float
+    succeeded: float
+    errors: PoseErrors
+    step_ms: float
+
+    @property
+    def frames(self) -> int:
+        """Live frames."""
+        return len(self.drive.matched)
+
+
+class ConfigurationResult:
+    """All held-out sessions under one configuration, in the order of time."""
+
+    def __init__(self, configuration: Configuration, sessions: Sequence[SessionResult]) -> None:
+        self.configuration = configuration
+        self.sessions = tuple(sorted(sessions, key=lambda one: one.session))
+
+    @property
+    def drives(self) -> list[Drive]:
+        """For the measures."""
+        return [one.drive for one in self.sessions]
+
+    @cached_property
+    def not_localised(self) -> SessionSums:
+        """Route not localised: metres of steps without a match ÷ metres (SPEC §8)."""
+        missed = [float(one.step_m[~one.matched].sum()) for one in self.drives]
+        return SessionSums(np.array(missed), self.driven_m)
+
+    @cached_property
+    def driven_m(self) -> Array:
+        """(S,) odometry distance of each session."""
+        return np.array([float(one.step_m.sum()) for one in self.drives])
+
+    def failure(self, at_m: float, estimator: Estimator = Estimator.ROUTE) -> SessionSums:
+        """P(X ≥ x) at one distance."""
+        parts = [failure_sums(one, np.array([at_m]), estimator) for one in self.drives]
+        return SessionSums(np.array([p[0][0] for p in parts]), np.array([p[1] for p in parts]))
+
+    def curve(
+        self, resamples: Resamples, estimator: Estimator = Estimator.ROUTE
+    ) -> tuple[Array, Array, Array]:
+        """P(X ≥ x) at `CURVE_AT_M` with the ends of its interval, (X,) each."""
+        parts = [failure_sums(one, CURVE_AT_M, estimator) for one in self.drives]
+        below = np.array([part[1] for part in parts])
+        bands = [
+            resamples.interval(SessionSums(np.array([part[0][k] for part in parts]), below))
+            for k in range(len(CURVE_AT_M))
+        ]
+        return (
+            np.array([band.estimate for band in bands]),
+            np.array([band.low for band in bands]),
+            np.array([band.high for band in bands]),
+        )
+
+    @property
+    def attempts_per_frame(self) -> float:
+        """Match attempts ÷ frames."""
+        return _over(sum(one.attempts for one in self.sessions), self.frames)
+
+    @property
+    def frames(self) -> int:
+        """Of all sessions."""
+        return sum(one.frames for one in self.sessions)
+
+    @property
+    def successes(self) -> int:
+        """Frames that were localised."""
+        return sum(int(one.drive.matched.sum()) for one in self.sessions)
+
+    @property
+    def errors(self) -> PoseErrors:
+        """Of all successes with known truth."""
+        return PoseErrors(
+            np.concatenate([one.errors.offset_m for one in self.sessions]),
+            np.concatenate([one.errors.turn_rad for one in self.sessions]),
+        )
+
+    @property
+    def false_successes(self) -> int | None:
+        """Successes more than 1 m or 5° off; None where truth is not known."""
+        errors = self.errors
+        return int(errors.false.sum()) if len(errors.offset_m) else None
+
+    @property
+    def step_ms(self) -> float:
+        """Mean time of a frame."""
+        return _over(sum(one.step_ms * one.frames for one in self.sessions), self.frames)
+
+    @property
+    def longest_gap_m(self) -> float:
+        """The longest distance without a match."""
+        return longest_gap_m(self.drives)
+
+    def of_fold(self, fold: int) -> ConfigurationResult:
+        """Only the sessions held out in one fold."""
+        return ConfigurationResult(
+            self.configuration, [one for one in self.sessions if one.fold == fold]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CampaignResult:
+    """All results of one campaign.
+
+    Attributes:
+        name: of the campaign.
+        memo: unguided, by configuration.
+        live: guided and unmemoised, of fewer sessions, by configuration.
+        with_truth: whether pose errors are known.
+        seed: of the bootstrap.
+        few_lanes: Np of the figures that show one budget.
+        lap: per-frame candidates and possible successes of one session ([L15] Fig. 10); None
+            where that was not run.
+    """
+
+    name: str
+    memo: Mapping[Configuration, ConfigurationResult]
+    live: Mapping[Configuration, ConfigurationResult]
+    with_truth: bool
+    seed: int
+    few_lanes: int
+    lap: Lap | None
+
+    @cached_property
+    def resamples(self) -> Resamples:
+        """The same draws of sessions for everything, so that comparisons are paired."""
+        sessions = max((len(one.sessions) for one in self.memo.values()), default=1)
+        return Resamples.of(max(sessions, 1), seed=self.seed)
+
+    def get(
+        self, policy: str, lanes: int | None = None, **other: Any
+    ) -> ConfigurationResult | None:
+        """The result of a configuration; None where it was not run."""
+        return self.memo.get(Configuration(policy, lanes or self.few_lanes, **other))
+
+    @property
+    def policies(self) -> list[str]:
+        """Those run, in the order of the table."""
+        return list(dict.fromkeys(one.policy for one in self.memo))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lap:
+    """One session along its way.
+
+    Attributes:
+        name: of the session.
+        driven_m: (F,) from its start.
+        candidates: (F,) |Y|.
+        succeeded: (F,) candidates that match.
+    """
+
+    name: str
+    driven_m: Array
+    candidates: NDArray[np.int32]
+    succeeded: NDArray[np.int32]
+
+
+def collect(plan: Plan) -> CampaignResult:
+    """Reads all that was run of a plan."""
+    by_mode: dict[str, dict[Configuration, list[SessionResult]]] = {"memo": {}, "live": {}}
+    lap: Lap | None = None
+    for fold in plan.folds:
+        built = built_map(plan, fold)
+        for session in fold.held_out:
+            for mode, found in by_mode.items():
+                runs = read_runs(plan.runs_path(session, mode))
+                if runs is None:
+                    continue
+                for row, one in enumerate(runs.configurations):
+                    count = len(fold.training) if one.sessions is None else one.sessions
+                    nodes = built.sessions[count - 1].nodes
+                    result = _session_result(runs, row, session, fold.number, nodes)
+                    found.setdefault(one, []).append(result)
+                if lap is None and mode == "memo":
+                    lap = _lap(runs, plan.drives.drives[session].name)
+    memo, live = (
+        {one: ConfigurationResult(one, sessions) for one, sessions in found.items()}
+        for found in by_mode.values()
+    )
+    options = plan.options
+    return CampaignResult(
+        plan.drives.name, memo, live, plan.drives.has_truth, options.seed, options.few_lanes, lap
+    )
+
+
+def _session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) -> SessionResult:
+    known = np.isfinite(runs.offset_m[row])
+    return SessionResult(
+        session=session,
+        fold=fold,
+        nodes=nodes,
+        drive=Drive(runs.step_m, runs.matched[row].copy()),
+        attempts=int(runs.attempts[row].sum()),
+        candidates=float(runs.candidates[row].mean()),
+        succeeded=float(runs.succeeded[row].mean()),
+        errors=PoseErrors(
+            runs.offset_m[row][known].astype(np.float64),
+            runs.turn_rad[row][known].astype(np.float64),
+        ),
+        step_ms=float(runs.step_ms[row]),
+    )
+
+
+def _lap(runs: Runs, name: str) -> Lap | None:
+    """From the run that attempted every candidate."""
+    everything = Configuration("distance", UNLIMITED)
+    if everything not in runs.configurations:
+        return None
+    row = runs.configurations.index(everything)
+    return Lap(name, np.cumsum(runs.step_m), runs.candidates[row], runs.succeeded[row])
+
+
+def _over(above: float, below: float) -> float:
+    return above / below if below else 0.0
