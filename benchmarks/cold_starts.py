@@ -195,7 +195,7 @@ def cold_start(
     town: Town, drive: LiveDrive, first: int, relocaliser: Relocaliser, budget: Budget
 ) -> Start:
     """Switches a robot on at one frame and drives until it is found, 10 m at most."""
-    relocaliser.forget_failures()
+    relocaliser.forget()
     opened = town.opened
     attempts, driven_m, at = 0, 0.0, first
     with Localiser(

@@ -99,7 +99,7 @@ def relocalise_drive(
         ):
             found = []
             for live in frames:
-                finder.forget_failures()
+                finder.forget()
                 found.append(_cold_start(opened, live.frame, finder, attempter, budget))
                 advance(found[-1].status.value)
     return found

@@ -76,6 +76,29 @@ class ChainTree:
         return ChainError(self.moments[self.row_of[node]])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class HalfEdges:
+    """Every edge both ways, a struct of arrays.
+
+    Attributes:
+        sources, targets: (H,) int32, dense indices.
+        target_in_source: (H, 3) float64, metres: where the target's camera is, seen from the
+            source.
+        of_edges: edges of the graph when these were taken.
+    """
+
+    sources: NDArray[np.int32]
+    targets: NDArray[np.int32]
+    target_in_source: NDArray[np.float64]
+    of_edges: int
+
+    def rows(self, rows: NDArray[np.bool_]) -> HalfEdges:
+        """Some of them."""
+        return HalfEdges(
+            self.sources[rows], self.targets[rows], self.target_in_source[rows], self.of_edges
+        )
+
+
 class ExperienceGraph:
     """All nodes and edges of a map; metric over short distances, topological over long ones.
 
@@ -270,6 +293,31 @@ class ExperienceGraph:
         return edges
 
     # -- searching
+
+    def half_edges(self, reach_m: float) -> HalfEdges:
+        """All edges both ways, between nodes no further apart than `reach_m`."""
+        poses = self._a_from_b.rows
+        b_in_a = poses[:, 9:]
+        a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
+        targets = self._target.rows  # of half 2e an edge's b, of half 2e + 1 its a
+        short = np.linalg.norm(b_in_a, axis=1) <= reach_m
+        b, a = targets[0::2][short], targets[1::2][short]
+        return HalfEdges(
+            np.concatenate([a, b]),
+            np.concatenate([b, a]),
+            np.concatenate([b_in_a[short], a_in_b[short]]),
+            len(self._edges),
+        )
+
+    def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
+        """The nodes that an edge no longer than `reach_m` joins to a node."""
+        found: set[int] = set()
+        half = int(self._first_half.rows[node])
+        while half >= 0:
+            if np.linalg.norm(self._a_from_b.rows[half // 2, 9:]) <= reach_m:
+                found.add(int(self._target.rows[half]))
+            half = int(self._next_half.rows[half])
+        return np.array(sorted(found), np.int32)
 
     def neighbourhood(
         self,

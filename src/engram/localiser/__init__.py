@@ -2,16 +2,25 @@
 
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
 from engram.localiser.attempts import FrameMatcher, Matcher
+from engram.localiser.belief import BeliefConfig, PlaceBelief
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
-from engram.localiser.relocalisation import RELOCALISERS, Exhaustive, Relocaliser, Searched
+from engram.localiser.place_book import PlaceBook, Searched
+from engram.localiser.relocalisation import (
+    RELOCALISERS,
+    ByAppearance,
+    Exhaustive,
+    Relocaliser,
+)
 from engram.localiser.walk import Walk
 
 __all__ = [
     "RELOCALISERS",
     "UNNAMED_LIVE_SESSION",
     "AcceptanceConfig",
+    "BeliefConfig",
     "Budget",
+    "ByAppearance",
     "Exhaustive",
     "FrameMatcher",
     "Localisation",
@@ -19,6 +28,8 @@ __all__ = [
     "Localiser",
     "LocaliserConfig",
     "Matcher",
+    "PlaceBelief",
+    "PlaceBook",
     "Position",
     "Prediction",
     "Relocaliser",

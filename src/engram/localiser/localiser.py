@@ -256,6 +256,9 @@ class Localiser:
         success = best_success(outcomes)
         if success is not None:
             self._settle(success, live.stamp_ns)
+        elif self._relocaliser is not None:
+            unpredicted = [one.candidate for one in outcomes if one.candidate.prediction is None]
+            self._relocaliser.failed([candidate.index for candidate in unpredicted])
         clock.lap("remember")
         return self._result(live, odometry, success, neighbourhood, clock.stage_ms)
 
@@ -268,6 +271,8 @@ class Localiser:
         """
         if odometry.status in {OdometryStatus.FIRST, OdometryStatus.UNUSABLE_FRAME}:
             return
+        if self._relocaliser is not None:
+            self._relocaliser.carry_on(odometry.prev_from_curr)
         if odometry.prev_from_curr is None or odometry.covariance is None:
             self._open_loop_m += self._last_step_m
             self._adrift = True
@@ -451,7 +456,7 @@ class Localiser:
         self._open_loop_m = 0.0
         self._adrift = False
         if self._relocaliser is not None:
-            self._relocaliser.forget_failures()
+            self._relocaliser.forget()
         self.walk.visit(success.candidate.node, PathEntryKind.MATCHED, stamp_ns)
 
     def _result(

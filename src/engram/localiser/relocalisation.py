@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Protocol
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import LandmarkSource
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
 from engram.frontend import Frame
+from engram.geometry import SE3
+from engram.localiser.belief import PlaceBelief
+from engram.localiser.place_book import PlaceBook, Searched
 from engram.places import RECOGNISERS, PlaceRecogniser, Vocabulary
 
 # Neighbours in the order of saving show the same place: where one was not matched, others of that
@@ -18,7 +22,7 @@ _NEIGHBOURS = 3
 # A node that failed is not tried again for so many frames, unless nothing else is left.
 _PATIENCE = 10
 # Places of which those to attempt are chosen.
-_SHORTLIST = 64
+_SHORTLIST = 256
 
 
 class Relocaliser(Protocol):
@@ -51,24 +55,17 @@ class Relocaliser(Protocol):
         """
         ...
 
-    def forget_failures(self) -> None:
-        """The robot was found, or told where it is: what failed before says nothing any more."""
+    def carry_on(self, motion: SE3 | None) -> None:
+        """The robot moved on since the last frame; None if nobody knows how."""
         ...
 
+    def failed(self, nodes: Sequence[int]) -> None:
+        """Attempts to match the last frame with these nodes, by dense index, failed."""
+        ...
 
-@dataclass(frozen=True, slots=True)
-class Searched:
-    """What a relocaliser searches.
-
-    Attributes:
-        graph: the nodes; may grow.
-        frames: their landmarks.
-        vocabulary: gives the map's vocabulary; asked only by relocalisers that need one.
-    """
-
-    graph: ExperienceGraph
-    frames: LandmarkSource
-    vocabulary: Callable[[], Vocabulary]
+    def forget(self) -> None:
+        """The robot was found, or is another one: earlier frames say nothing any more."""
+        ...
 
 
 class Exhaustive:
@@ -96,19 +93,26 @@ class Exhaustive:
         self._next += len(proposed)
         return [index for index in proposed if allowed(index)]
 
-    def forget_failures(self) -> None:
+    def carry_on(self, motion: SE3 | None) -> None:
+        """See `Relocaliser`; of no interest to it."""
+
+    def failed(self, nodes: Sequence[int]) -> None:
+        """See `Relocaliser`; it does not come back to them before the next pass."""
+
+    def forget(self) -> None:
         """See `Relocaliser`; the pass over the map goes on where it was."""
 
 
 class ByAppearance:
-    """Asks a place recogniser which nodes look like the live frame (SPEC §6).
+    """Asks a place recogniser which nodes look like the live frames (SPEC §6).
 
-    All nodes are recognised from the first frame on, those that join the map later from the next.
-    A frame's attempts go to different places first, and over several frames to places further
-    down the list: a place that looks right and is not costs one attempt, not the whole budget.
+    The evidence of several frames is added up (`PlaceBelief`), so that one that could be of many
+    places does not decide. A frame's attempts go to different places first, and over several
+    frames to places further down the list: a place that looks right and is not costs an attempt,
+    not the whole budget.
 
     Args:
-        searched: the map; its landmarks are read when this is made.
+        searched: the map; its words are read when this is made.
         name: key in `RELOCALISERS`.
         recogniser: makes the recogniser for a vocabulary.
     """
@@ -120,44 +124,49 @@ class ByAppearance:
         recogniser: Callable[[Vocabulary], PlaceRecogniser],
     ) -> None:
         self.name = name
-        self._graph = searched.graph
-        self._frames = searched.frames
-        self._vocabulary = searched.vocabulary()
-        self._recogniser = recogniser(self._vocabulary)
+        self.book = PlaceBook(searched, recogniser)
+        self.new_place: float | None = None
+        self._belief = PlaceBelief(searched.graph)
         self._frames_seen = 0
         self._tried: dict[int, int] = {}
-        self.new_place: float | None = None
-        self._learn_new_nodes()
 
     def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
         """See `Relocaliser`."""
-        self._learn_new_nodes()
-        words = self._vocabulary.words_of(live.landmarks.descriptors, live.descriptor)
-        found = self._recogniser.recognise(words, _SHORTLIST)
-        self.new_place = found.new_place
+        self.book.learn_new_nodes()
+        compared = self.book.compare(self.book.words_of(live))
+        self.new_place = compared.new_place
         self._frames_seen += 1
-        places = [int(place) for place in found.places if allowed(int(place))]
+        likely = self._belief.observe(compared.evidence)
+        places = [place for place in best_places(self.book, likely) if allowed(place)]
         fresh = [
             place
             for place in places
             if self._frames_seen - self._tried.get(place, -_PATIENCE) >= _PATIENCE
         ]
         proposed = spread(fresh, count)
-        proposed += [place for place in places if place not in proposed][: count - len(proposed)]
-        self._tried.update(dict.fromkeys(proposed, self._frames_seen))
-        return proposed
+        return (
+            proposed + [place for place in places if place not in proposed][: count - len(proposed)]
+        )
 
-    def forget_failures(self) -> None:
+    def carry_on(self, motion: SE3 | None) -> None:
         """See `Relocaliser`."""
+        self._belief.carry_on(motion)
+
+    def failed(self, nodes: Sequence[int]) -> None:
+        """See `Relocaliser`."""
+        self._belief.refute(nodes)
+        self._tried.update(dict.fromkeys(nodes, self._frames_seen))
+
+    def forget(self) -> None:
+        """See `Relocaliser`."""
+        self._belief.forget()
         self._tried.clear()
 
-    def _learn_new_nodes(self) -> None:
-        """Adds the nodes that the recogniser does not know: its places are the graph's nodes."""
-        for index in range(len(self._recogniser), len(self._graph)):
-            frame = self._frames.frame(self._graph.node(index).id)
-            self._recogniser.add(
-                self._vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
-            )
+
+def best_places(book: PlaceBook, likely: NDArray[np.float64]) -> list[int]:
+    """The most likely nodes, best first, without those whose words nobody could read."""
+    best = _core.best_scores(likely, _SHORTLIST)
+    return [int(place) for place in best if int(place) not in book.unreadable]
 
 
 def spread(places: list[int], count: int) -> list[int]:

@@ -8,7 +8,7 @@ from engram.places.bag_of_words import BagOfWords
 from engram.places.chow_liu import WordStatistics
 from engram.places.fabmap import FabMap, FabMapConfig
 from engram.places.observation import DetectorModel, ObservationModel
-from engram.places.recogniser import PlaceRecogniser, Recognition
+from engram.places.recogniser import Comparison, PlaceRecogniser, Recognition
 from engram.places.training import TrainingConfig, train_vocabulary
 from engram.places.tree import TreeArrays
 from engram.places.vocabulary import (
@@ -27,6 +27,7 @@ RECOGNISERS: dict[str, Callable[[Vocabulary], PlaceRecogniser]] = {
 __all__ = [
     "RECOGNISERS",
     "BagOfWords",
+    "Comparison",
     "DetectorModel",
     "FabMap",
     "FabMapConfig",

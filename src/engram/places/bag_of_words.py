@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.places.chow_liu import WordStatistics
-from engram.places.recogniser import Recognition
+from engram.places.recogniser import Comparison, Recognition
 from engram.places.vocabulary import Vocabulary
 
 
@@ -47,6 +47,10 @@ class BagOfWords:
         self._index.add_weights(words, self._idf[words] ** 2, sums)
         norms = self._norms[: len(self)] * self._norm(words)
         return np.divide(sums, norms, out=np.zeros_like(sums), where=norms > 0)
+
+    def compare(self, words: NDArray[np.int32]) -> Comparison:
+        """See `PlaceRecogniser`."""
+        return Comparison(self.similarities(words), None)
 
     def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
         """See `PlaceRecogniser`."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.errors import ConfigError
 from engram.places.observation import DetectorModel, ObservationModel
-from engram.places.recogniser import Recognition
+from engram.places.recogniser import Comparison, Recognition
 from engram.places.vocabulary import Vocabulary
 
 
@@ -84,35 +84,59 @@ class FabMap:
 
     def log_likelihood_elsewhere(self, words: NDArray[np.int32]) -> float:
         """Log p(Z | none of the places): the mean likelihood over sampled places."""
-        sampled = self._elsewhere.of(self._query.weigh(words))
-        return _log_sum(sampled) - float(np.log(max(len(sampled), 1)))
+        return self._judge(words)[1]
+
+    def compare(self, words: NDArray[np.int32]) -> Comparison:
+        """See `PlaceRecogniser`: log-likelihoods, and what the samples leave to new places."""
+        scores, elsewhere = self._judge(words)
+        if len(scores) == 0:
+            return Comparison(scores, 1.0)
+        evidence = self._evidence(scores, elsewhere)
+        return Comparison(scores, float(np.exp(self._prior_elsewhere + elsewhere - evidence)))
 
     def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
         """See `PlaceRecogniser`. Before looking, all places are equally likely."""
-        if len(self) == 0:
+        scores, elsewhere = self._judge(words)
+        if len(scores) == 0:
             return Recognition(np.zeros(0, np.int64), np.zeros(0), 1.0)
-        prior = self.config.new_place_prior
-        weights = self._query.weigh(words)
-        scores = self._places.of(weights)
-        scores += np.log((1 - prior) / len(self))
-        sampled = self._elsewhere.of(weights)
-        elsewhere = _log_sum(sampled) + float(np.log(prior / max(len(sampled), 1)))
-        greatest = max(float(scores.max()), elsewhere)
-        # What is e^-40 of the most likely is lost in the rounding of the sum.
-        near = scores[scores > greatest - 40.0]
-        evidence = greatest + np.log(np.exp(near - greatest).sum() + np.exp(elsewhere - greatest))
+        evidence = self._evidence(scores, elsewhere)
         best = _core.best_scores(scores, count)
         return Recognition(
-            best, np.exp(scores[best] - evidence), float(np.exp(elsewhere - evidence))
+            best,
+            np.exp(scores[best] + self._prior_here - evidence),
+            float(np.exp(elsewhere + self._prior_elsewhere - evidence)),
         )
 
+    @property
+    def _prior_elsewhere(self) -> float:
+        return float(np.log(self.config.new_place_prior))
 
-def _log_sum(logs: NDArray[np.float64]) -> float:
-    """Log Σ exp; that of nothing is −∞."""
+    @property
+    def _prior_here(self) -> float:
+        """Of each place."""
+        return float(np.log((1 - self.config.new_place_prior) / len(self)))
+
+    def _judge(self, words: NDArray[np.int32]) -> tuple[NDArray[np.float64], float]:
+        """Log-likelihood (P,) at each place, and elsewhere."""
+        weights = self._query.weigh(words)
+        sampled = self._elsewhere.of(weights)
+        return self._places.of(weights), _log_mean(sampled)
+
+    def _evidence(self, scores: NDArray[np.float64], elsewhere: float) -> float:
+        """Log of the sum of prior times likelihood, over all places and elsewhere."""
+        greatest = float(scores.max())
+        # What is e^-40 of the most likely is lost in the rounding of the sum.
+        near = scores[scores > greatest - 40.0]
+        here = self._prior_here + greatest + float(np.log(np.exp(near - greatest).sum()))
+        return float(np.logaddexp(here, self._prior_elsewhere + elsewhere))
+
+
+def _log_mean(logs: NDArray[np.float64]) -> float:
+    """Log of the mean of exp; that of nothing is −∞."""
     if len(logs) == 0:
         return -np.inf
     greatest = float(logs.max())
-    return greatest + float(np.log(np.exp(logs - greatest).sum()))
+    return greatest + float(np.log(np.exp(logs - greatest).mean()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,6 +26,20 @@ class Recognition:
     new_place: float | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """How well an image fits each place.
+
+    Attributes:
+        evidence: (P,) float64, log-likelihoods, or similarities of 0…1 where the recogniser knows
+            no probabilities. What one place is given does not depend on the others.
+        new_place: see `Recognition`.
+    """
+
+    evidence: NDArray[np.float64]
+    new_place: float | None
+
+
 class PlaceRecogniser(Protocol):
     """Places, each an image's set of words, and which of them another image may show."""
 
@@ -46,6 +60,14 @@ class PlaceRecogniser(Protocol):
 
         Returns:
             Its number: 0, 1, 2, ….
+        """
+        ...
+
+    def compare(self, words: NDArray[np.int32]) -> Comparison:
+        """How well an image fits each place.
+
+        Args:
+            words: (n,) the distinct words of the image, rising; possibly none.
         """
         ...
 

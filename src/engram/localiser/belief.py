@@ -1,0 +1,137 @@
+"""Where a lost robot may be, judged by several frames: a Bayes filter over the nodes of a graph.
+
+One frame may look like several places, several frames along a stretch of road seldom do. Each
+frame's evidence is added to what the frames before it said, carried along the edges of the graph by
+odometry; a failed match attempt speaks against its node and those beside it. The filter keeps the
+best explanation of each node (Viterbi), not the sum over all: a sum over paths would favour nodes
+with many edges. What it yields is an order for attempts: only a match is believed.
+
+Evidence is counted in standard deviations over all nodes. Likelihoods of FAB-MAP take neighbouring
+features as independent and differ by hundreds between places; taken as they are, the first frame
+would decide alone.
+
+Source: SPEC §6; Cummins & Newman, FAB-MAP, IJRR 27(6), 2008, §4.6 carries the belief by a motion
+model between neighbouring places in the same way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.experience.graph import ExperienceGraph, HalfEdges
+from engram.geometry import SE3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class BeliefConfig:
+    """Settings of `PlaceBelief`.
+
+    Attributes:
+        step_m: the belief is carried along once the robot has moved so far; frames in between
+            weigh by their distance, so that standing still is no new evidence. Source: nodes are
+            saved every metre.
+        slack_m: standard deviation of where a robot is matched with a node from.
+        reach_m: edges to nodes further away are no steps.
+        leap: a robot may be where no edge leads to; that costs so much.
+        refuted: what a failed attempt costs its node.
+        refuted_beside: and each node that an edge joins to it.
+    """
+
+    step_m: float = 1.0
+    slack_m: float = 1.0
+    reach_m: float = 5.0
+    leap: float = 8.0
+    refuted: float = 2.0
+    refuted_beside: float = 0.5
+
+
+class PlaceBelief:
+    """Adds up what live frames say of each node of a graph.
+
+    Args:
+        graph: may grow meanwhile.
+        config: settings.
+    """
+
+    def __init__(self, graph: ExperienceGraph, config: BeliefConfig | None = None) -> None:
+        self.config = config or BeliefConfig()
+        self._graph = graph
+        self._steps: HalfEdges | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """What was seen before says nothing any more."""
+        self._belief: Array = np.zeros(0)
+        self._moved_m: Array = np.zeros(3)
+        self._since_m = np.inf
+
+    def carry_on(self, motion: SE3 | None) -> None:
+        """The robot moved on; None if nobody knows how."""
+        if motion is None:
+            self.forget()
+        elif len(self._belief):
+            self._moved_m = self._moved_m + motion.translation
+            self._since_m += motion.distance_m
+            if np.linalg.norm(self._moved_m) >= self.config.step_m:
+                self._carry()
+
+    def observe(self, evidence: Array) -> Array:
+        """Takes in what one frame says.
+
+        Args:
+            evidence: (N,) float64, how well the frame fits each node, on any linear scale.
+
+        Returns:
+            (N,) float64, how likely each node is now: log-probabilities up to scale and constant.
+        """
+        spread = float(evidence.std()) if len(evidence) else 0.0
+        scaled = (evidence - evidence.mean()) / spread if spread > 0 else np.zeros_like(evidence)
+        self._belief = self._of_all(len(evidence))
+        weight = min(1.0, self._since_m / self.config.step_m)
+        now: Array = self._belief + scaled
+        self._belief = self._belief + weight * scaled
+        self._since_m = 0.0
+        return now
+
+    def refute(self, nodes: Sequence[int]) -> None:
+        """Attempts to match the last frame with these nodes failed."""
+        config = self.config
+        for node in nodes:
+            if node < len(self._belief):
+                self._belief[node] -= config.refuted
+                beside = self._graph.beside(node, config.reach_m)
+                self._belief[beside[beside < len(self._belief)]] -= config.refuted_beside
+
+    def _of_all(self, count: int) -> Array:
+        """The belief, with nodes that joined the graph meanwhile as unlikely as the least."""
+        new = count - len(self._belief)
+        least = self._belief.min(initial=0.0)
+        return np.concatenate([self._belief, np.full(new, least)]) if new else self._belief
+
+    def _carry(self) -> None:
+        """Moves the belief along the edges, in steps about as long as they are."""
+        steps = self._edges()
+        count = max(1, round(float(np.linalg.norm(self._moved_m)) / self.config.step_m))
+        motion = self._moved_m / count
+        off = ((steps.target_in_source - motion) ** 2).sum(axis=1)
+        cost = off / (2 * self.config.slack_m**2)
+        stay = float(motion @ motion) / (2 * self.config.slack_m**2)
+        for _ in range(count):
+            carried = self._belief - stay
+            np.maximum.at(carried, steps.targets, self._belief[steps.sources] - cost)
+            self._belief = np.maximum(carried, self._belief.max() - self.config.leap)
+        self._moved_m = np.zeros(3)
+
+    def _edges(self) -> HalfEdges:
+        """Those short enough to be steps, between nodes that the belief knows."""
+        if self._steps is None or self._steps.of_edges != len(self._graph.edges):
+            self._steps = self._graph.half_edges(self.config.reach_m)
+        known = len(self._belief)
+        rows = (self._steps.sources < known) & (self._steps.targets < known)
+        return self._steps if rows.all() else self._steps.rows(rows)
