@@ -3,14 +3,17 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import islice
 
+import cv2
 import numpy as np
 import pytest
 from tests.simulation.conftest import small
 
 from engram.errors import ConfigError
 from engram.simulation import Campaign, Kind, SimulatedDrive, campaign_named
+from engram.simulation.camera_model import Lens
 
 
 def test_pairs_have_the_camera_s_size_and_rising_stamps(drive: SimulatedDrive) -> None:
@@ -41,6 +44,15 @@ def test_threads_do_not_change_the_picture(hamlet: Campaign) -> None:
     three = next(iter(small(SimulatedDrive(hamlet, 0, threads=3))))
     np.testing.assert_array_equal(one.left, three.left)
     np.testing.assert_array_equal(one.right, three.right)
+
+
+def test_a_covered_lens_shows_nothing_and_what_was_seen_comes_back(hamlet: Campaign) -> None:
+    drive = small(SimulatedDrive(hamlet, 0))
+    covered = Lens(covered_from_m=drive.poses[3].driven_m, covered_to_m=drive.poses[5].driven_m)
+    drive.plan = replace(drive.plan, lens=covered)
+    contrast = [float(cv2.GaussianBlur(pair.left, (0, 0), 2).std()) for pair in islice(drive, 8)]
+    assert max(contrast[3:5]) < 0.15 * min(contrast[:3])
+    assert min(contrast[5:]) > 0.15 * min(contrast[:3])
 
 
 def test_another_seed_is_another_town(drive: SimulatedDrive) -> None:

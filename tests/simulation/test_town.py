@@ -16,6 +16,7 @@ from engram.simulation.noise import NoiseFields
 from engram.simulation.sky import sun_direction
 from engram.simulation.streets import crossing_loops, loop_of_length
 from engram.simulation.textures import Style, facade
+from engram.simulation.town import _Side, _slide_m
 
 
 @settings(deadline=None)
@@ -137,3 +138,19 @@ def test_what_was_changed_for_good_stays_changed() -> None:
     assert len(after) > len(before)
     assert any(a.kind is AlterationKind.SCAFFOLD for a in before - after)
     assert not alterations_on(1, 0)
+
+
+@pytest.mark.parametrize("block", [(0, 0), (1, 0), (2, 1), (5, 3)])
+def test_no_end_wall_stands_before_the_fronts_round_the_corner(block: tuple[int, int]) -> None:
+    plan, _ = loop_of_length(700, 2)
+    front = plan.block_outline(block, 2.4)
+    sides = [
+        _Side((0, 0), (0, 0), (a, b), (a, b))
+        for a, b in zip(front, np.roll(front, -1, axis=0), strict=True)
+    ]
+    for number, side in enumerate(sides):
+        before, after = sides[number - 1], sides[(number + 1) % 12]
+        for other, end in ((before, side.front[0]), (after, side.front[1])):
+            back = end - 8.5 * side.outwards + _slide_m(side, other, 8.5) * side.along
+            # A pane lies 0.16 m behind its wall: the end wall is farther back from 0.6 m on.
+            assert (back - end) @ other.outwards / 8.5 < -0.25

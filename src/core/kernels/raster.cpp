@@ -2,6 +2,8 @@
 
 #include <math.h>
 
+#include <vector>
+
 namespace engram::ENGRAM_ISA {
 namespace {
 
@@ -358,29 +360,42 @@ void raster_window(const Mesh *meshes, const Texture *textures, const int32_t *o
 }
 
 void openness_of(const float *heights, int32_t width, int32_t height, float cell_m, float *share) {
-  constexpr int kDirections = 8, kRings = 6;
-  const float across[kDirections] = {1, 0.7071f, 0, -0.7071f, -1, -0.7071f, 0, 0.7071f};
-  const float radius_m[kRings] = {0.4f, 0.9f, 1.8f, 3.6f, 7.0f, 13.0f};
-  for (int32_t y = 0; y < height; ++y)
-    for (int32_t x = 0; x < width; ++x) {
-      const float own = heights[static_cast<int64_t>(y) * width + x];
-      float open = 0;
-      for (int k = 0; k < kDirections; ++k) {
-        // Under something: only what light comes in from the side.
-        float steepest = own > 0.4f ? own / 1.2f : 0;
-        for (int ring = 0; ring < kRings; ++ring) {
-          const int32_t i = x + static_cast<int32_t>(radius_m[ring] * across[k] / cell_m);
-          const int32_t j = y + static_cast<int32_t>(radius_m[ring] * across[(k + 6) & 7] / cell_m);
-          if (i < 0 || j < 0 || i >= width || j >= height)
-            break;
-          const float slope =
-              (heights[static_cast<int64_t>(j) * width + i] - 0.15f) / radius_m[ring];
-          steepest = slope > steepest ? slope : steepest;
+  // Many directions and small steps: with few, the share jumps where a house ends.
+  constexpr int kDirections = 16, kRings = 8;
+  constexpr float kAcross[kDirections] = {1,  0.9239f,  0.7071f,  0.3827f,  0, -0.3827f, -0.7071f,
+                                          -0.9239f, -1, -0.9239f, -0.7071f, -0.3827f, 0, 0.3827f,
+                                          0.7071f,  0.9239f};
+  constexpr float kRadius_m[kRings] = {0.4f, 0.9f, 1.8f, 3.6f, 5.0f, 7.0f, 9.6f, 13.0f};
+  std::vector<float> row_buffer(2 * static_cast<size_t>(width));
+  float *steepest = row_buffer.data(), *open = steepest + width;
+  for (int32_t y = 0; y < height; ++y) {
+    const float *own = heights + static_cast<int64_t>(y) * width;
+    for (int32_t x = 0; x < width; ++x)
+      open[x] = 0;
+    for (int k = 0; k < kDirections; ++k) {
+      // Under something: only what light comes in from the side.
+      for (int32_t x = 0; x < width; ++x)
+        steepest[x] = own[x] > 0.4f ? own[x] / 1.2f : 0;
+      for (int ring = 0; ring < kRings; ++ring) {
+        const auto i = static_cast<int32_t>(kRadius_m[ring] * kAcross[k] / cell_m);
+        const auto j =
+            static_cast<int32_t>(kRadius_m[ring] * kAcross[(k + 12) % kDirections] / cell_m);
+        if (y + j < 0 || y + j >= height)
+          break;
+        const float *there = own + static_cast<int64_t>(j) * width + i;
+        const int32_t first = i < 0 ? -i : 0, last = i > 0 ? width - i : width;
+        const float per_m = 1 / kRadius_m[ring];
+        for (int32_t x = first; x < last; ++x) {
+          const float slope = (there[x] - 0.15f) * per_m;
+          steepest[x] = slope > steepest[x] ? slope : steepest[x];
         }
-        open += 1.0f / (1.0f + steepest * steepest); // the sky above that horizon, cosine-weighted
       }
-      share[static_cast<int64_t>(y) * width + x] = open / kDirections;
+      for (int32_t x = 0; x < width; ++x) // the sky above that horizon, cosine-weighted
+        open[x] += 1.0f / (1.0f + steepest[x] * steepest[x]);
     }
+    for (int32_t x = 0; x < width; ++x)
+      share[static_cast<int64_t>(y) * width + x] = open[x] * (1.0f / kDirections);
+  }
 }
 
 } // namespace engram::ENGRAM_ISA

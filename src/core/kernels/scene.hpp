@@ -14,7 +14,8 @@ enum SurfaceFlag : uint32_t {
   kTranslucent = 1u << 2, // light passes through: leaves are bright from behind
   kTwoSided = 1u << 3, // seen from both sides; others only from where they turn counter-clockwise
   kNoShadow = 1u << 4, // throws no shadow
-  kRoad = 1u << 5,     // ground that traffic drives on: wheel tracks in snow, puddles
+  kRoad = 1u << 5,     // ground that traffic drives on: wheel tracks in snow
+  kCrossroad = 1u << 6, // ground where it crosses: snow is worn all over
 };
 
 // One convex planar polygon of four vertices (a triangle repeats one). Texture coordinates are

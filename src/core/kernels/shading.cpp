@@ -353,6 +353,8 @@ float snow_cover(const Surroundings &world, const Light &light, const Point &poi
   const float patch = noise_at(world.noise, 1.9f * point.at.x, 1.9f * point.at.y) * 0.6f +
                       noise_at(world.noise, 7.7f * point.at.x, 7.7f * point.at.y) * 0.4f;
   float amount = light.snow;
+  if (point.flags & kCrossroad)
+    amount *= 0.88f;
   if (point.flags & kRoad) { // two tracks on each side, worn out and winding a little
     const float wind = 0.02f * noise_at(world.noise, 0.8f * point.at.x + 31, 0.8f * point.at.y);
     const float half = fabsf(point.across - 0.5f + wind);

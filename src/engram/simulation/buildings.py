@@ -196,8 +196,13 @@ def add_shell(
     depth_m: float,
     roof: int,
     rng: np.random.Generator,
+    slides_m: tuple[float, float] = (0.0, 0.0),
 ) -> None:
-    """Side and back walls, and a roof: flat, or with its ridge along the street."""
+    """Side and back walls, and a roof: flat, or with its ridge along the street.
+
+    `slides_m` moves the left and the right end of the back wall along the front, for houses round
+    whose corner the fronts of another street begin.
+    """
     out = front.outwards
 
     def wall(a: Vector, b: Vector, top_m: float) -> None:
@@ -207,7 +212,8 @@ def add_shell(
         builder.quad(corners, uv, front.stone, Kind.BUILDING, tint=front.tint)
 
     left, right = front.at(0, 0), front.at(width_m, 0)
-    back_left, back_right = left - out * depth_m, right - out * depth_m
+    back_left = left - out * depth_m + front.along * slides_m[0]
+    back_right = right - out * depth_m + front.along * slides_m[1]
     wall(right, back_right, height_m)
     wall(back_right, back_left, height_m)
     wall(back_left, left, height_m)

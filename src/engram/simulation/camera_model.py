@@ -19,6 +19,7 @@ _TARGET = 0.4  # exposed luminance that the metered highlights are brought to
 _MOST_GAIN = 26.0
 _SHUTTER_BY_DAY_S = 0.0007
 _LONGEST_SHUTTER_S = 0.012
+_CLOTH = 0.002  # share of the light that comes through what covers a lens
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class CameraModel:
             frame: number of the frame, seeds its noise.
         """
         if self._lens.covered_from_m <= pose.driven_m < self._lens.covered_to_m:
-            luminance = luminance * np.float32(0.002)
+            luminance = _covered(luminance)
         gain = self._meter(luminance)
         shutter_s = float(np.clip(_SHUTTER_BY_DAY_S * gain, 0.0002, _LONGEST_SHUTTER_S))
         pair = []
@@ -117,19 +118,11 @@ class CameraModel:
         camera = self._robot.camera
         rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD127, eye])
         mask = np.zeros((camera.height, camera.width), dtype=np.float32)
-        for _ in range(int(25 * self._lens.dirt) + 1):
+        for _ in range(int(40 * self._lens.dirt) + 1):
             centre = (int(rng.uniform(0, camera.width)), int(rng.uniform(0, camera.height)))
-            axes = (int(rng.uniform(3, 16)), int(rng.uniform(3, 12)))
-            cv2.ellipse(
-                mask,
-                centre,
-                axes,
-                float(rng.uniform(0, 180)),
-                0,
-                360,
-                float(rng.uniform(0.3, 0.9)),
-                -1,
-            )
+            axes = (int(rng.uniform(4, 22)), int(rng.uniform(4, 14)))
+            turned_deg, takes = float(rng.uniform(0, 180)), float(rng.uniform(0.3, 0.9))
+            cv2.ellipse(mask, centre, axes, turned_deg, 0, 360, takes, -1)
         return np.asarray(cv2.GaussianBlur(mask, (0, 0), 4.0), dtype=np.float32)
 
     def _wet(self, light: Luminance, rain: float, frame: int, eye: int) -> Luminance:
@@ -153,6 +146,14 @@ class CameraModel:
         return np.asarray(light * (1 - soft) + through * soft, dtype=np.float32)
 
 
+def _covered(luminance: Luminance) -> Luminance:
+    """What comes through a cloth over both lenses: next to nothing, and without any edges."""
+    height, width = luminance.shape[1:]
+    coarse = [cv2.resize(eye, (4, 3), interpolation=cv2.INTER_AREA) for eye in luminance]
+    dim = [cv2.resize(eye, (width, height), interpolation=cv2.INTER_LINEAR) for eye in coarse]
+    return np.asarray(dim, dtype=np.float32) * np.float32(_CLOTH)
+
+
 def _veil(light: Luminance, gain: float) -> Luminance:
     """Light that strays in the lens: a halo round what is far brighter than white."""
     if float(light.max()) * gain < 1.6:
@@ -169,5 +170,5 @@ def _veil(light: Luminance, gain: float) -> Luminance:
 def _smudge(light: Luminance, mask: Luminance) -> Luminance:
     blurred = cv2.GaussianBlur(light, (0, 0), 5.0)
     mean = float(light[::8, ::8].mean())
-    smeared = 0.75 * blurred + 0.12 * mean
+    smeared = 0.55 * blurred + 0.12 * mean  # dirt swallows a third and scatters
     return np.asarray(light * (1 - mask) + mask * smeared, dtype=np.float32)

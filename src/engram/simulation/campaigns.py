@@ -193,6 +193,9 @@ def _village(seed: int, size: Size) -> Campaign:
     sessions = _planned(
         "village", seed, starts, [d[2] for d in drives], robots, [k % 8 == 5 for k in range(24)]
     )
+    # On one drive something lies over the lenses for some metres.
+    hidden = replace(sessions[15], lens=Lens(covered_from_m=200.0, covered_to_m=208.0))
+    sessions = (*sessions[:15], hidden, *sessions[16:])
     return Campaign("village", seed, 700, False, sessions, 0.4, size, "village")
 
 

@@ -38,7 +38,8 @@ class Materials:
         foliage: (season, variant) → texture; seasons are 0 summer, 1 autumn, 2 bare.
         hedges: the same for hedges, which stay green.
         railing: bars.
-        signs, plates: traffic signs; number plates.
+        signs, sign_backs: traffic signs; their bare backs, in the same order.
+        plates: number plates.
     """
 
     stone: int
@@ -55,6 +56,7 @@ class Materials:
     hedges: tuple[int, ...]
     railing: int
     signs: tuple[int, ...]
+    sign_backs: tuple[int, ...]
     plates: tuple[int, ...]
 
 
@@ -84,6 +86,9 @@ def shared_materials(scene: _core.Scene, noise: NoiseFields, style: Style, seed:
         hedges=tuple(scene.add_texture(leaves(rng, 1.5, 0.11), coverage=True) for _ in range(2)),
         railing=scene.add_texture(railing(), coverage=True),
         signs=tuple(scene.add_texture(_traffic_sign(k), coverage=True) for k in range(6)),
+        sign_backs=tuple(
+            scene.add_texture(_bare(_traffic_sign(k)), coverage=True) for k in range(6)
+        ),
         plates=tuple(scene.add_texture(_number_plate(rng)) for _ in range(8)),
     )
 
@@ -131,6 +136,13 @@ def _traffic_sign(kind: int) -> Texels:
             cv2.rectangle(face, (18, 40), (78, 56), 230 if kind else 15, -1)
     texels[..., 0], texels[..., 3] = face, cover
     return texels
+
+
+def _bare(sign: Texels) -> Texels:
+    """The back of a sign: its outline in plain metal."""
+    back = sign.copy()
+    back[..., 0] = 90
+    return back
 
 
 def _up(z_m: float) -> Vector:
@@ -281,10 +293,10 @@ def add_sign(
     corners = [middle - half * right - up, middle + half * right - up]
     corners += [middle + half * right + up, middle - half * right + up]
     square = [(0, 1), (1, 1), (1, 0), (0, 0)]
-    texture = materials.signs[int(rng.integers(len(materials.signs)))]
-    builder.quad(corners, square, texture, Kind.FURNITURE, SurfaceFlag.CUTOUT)
+    which = int(rng.integers(len(materials.signs)))
+    builder.quad(corners, square, materials.signs[which], Kind.FURNITURE, SurfaceFlag.CUTOUT)
     back = [corners[1], corners[0], corners[3], corners[2]]
-    builder.quad(back, square, texture, Kind.FURNITURE, SurfaceFlag.CUTOUT, tint=0.5)
+    builder.quad(back, square, materials.sign_backs[which], Kind.FURNITURE, SurfaceFlag.CUTOUT)
 
 
 def add_bench(builder: MeshBuilder, materials: Materials, at: Vector, along: Vector) -> None:

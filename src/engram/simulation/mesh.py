@@ -20,6 +20,7 @@ class SurfaceFlag(IntFlag):
     TWO_SIDED = 8
     NO_SHADOW = 16
     ROAD = 32
+    CROSSROAD = 64
 
 
 class Kind(IntEnum):

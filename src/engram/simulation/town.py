@@ -45,6 +45,8 @@ KERB_M = 0.12
 _UP = np.array([0.0, 0.0, 1.0])
 _COARSE_PER_M = 20  # texels of fronts that are only seen from afar
 _POOL = 16  # distinct coarse fronts
+_DEPTH_M = 8.5  # of terraced houses
+_BEHIND = 0.3  # how fast an end wall falls back behind the fronts round the corner, metres a metre
 _SHARED_STREET_M = 24.0  # after which the tarmac of side streets repeats
 
 
@@ -98,6 +100,17 @@ class _Side:
     @property
     def length_m(self) -> float:
         return float(np.linalg.norm(self.front[1] - self.front[0]))
+
+
+def _slide_m(side: _Side, other: _Side, depth_m: float) -> float:
+    """How far along the front the back corner of a side's end house moves.
+
+    So that its end wall stays behind the other side's fronts, which begin at the same corner of
+    the block; else that wall would hide their windows and their balconies stick out of it.
+    """
+    across = float(side.along @ other.outwards)
+    over = _BEHIND - float(side.outwards @ other.outwards)
+    return -depth_m * over / across if abs(across) > 0.3 and over > 0 else 0.0
 
 
 def _level(point: Points, height_m: float = KERB_M) -> Points:
@@ -319,7 +332,8 @@ class _TileBuilder:
             texture, size = self.town._tarmac, 40.0
         origin = self.plan.junction((i, j))
         uv = [tuple((c - origin) / size + 0.5) for c in corners]
-        self.solid.quad([_level(c, 0.0) for c in corners], uv, texture, Kind.GROUND)
+        flat = [_level(c, 0.0) for c in corners]
+        self.solid.quad(flat, uv, texture, Kind.GROUND, SurfaceFlag.CROSSROAD)
 
     def _add_pavement(self, sides: list[_Side], width_m: float) -> None:
         noise, style = self.town.noise, self.town.style
@@ -359,14 +373,20 @@ class _TileBuilder:
 
     def _add_terrace(self, sides: list[_Side], front: Points) -> None:
         self._add_lawn(front, self.materials.grass, 0.2)
-        for side in sides:
+        for number, side in enumerate(sides):
+            before = _slide_m(side, sides[number - 1], _DEPTH_M)
+            after = _slide_m(side, sides[(number + 1) % len(sides)], _DEPTH_M)
             at = 0.0
             while side.length_m - at > 4.0:
                 width = min(float(self.rng.uniform(6.2, 10.0)), side.length_m - at)
                 if side.length_m - at - width < 4.0:
                     width = side.length_m - at
                 setback = float(self.rng.choice([0, 0, 0.2, 0.45]))
-                self._add_house(side, at, width, setback, depth_m=8.5)
+                first, last = at == 0, side.length_m - at - width < 2.3
+                slides = (before if first else 0.0, max(after, 0.5 - width) if last else 0.0)
+                if any(slides):
+                    setback = 0.0  # or the house round the corner would stand before this one
+                self._add_house(side, at, width, setback, _DEPTH_M, slides)
                 gap = float(self.rng.choice([0, 0, 0, 0, 2.2]))
                 at += width + gap
 
@@ -375,7 +395,7 @@ class _TileBuilder:
         for side in sides:
             if side.length_m > 10:
                 width = float(self.rng.uniform(7.0, min(9.5, side.length_m - 2)))
-                self._add_house(side, (side.length_m - width) / 2, width, 4.5, depth_m=7.5)
+                self._add_house(side, (side.length_m - width) / 2, width, 4.5, 7.5)
             self._edge_garden(side)
 
     def _edge_garden(self, side: _Side) -> None:
@@ -396,13 +416,14 @@ class _TileBuilder:
                 add_tree(self.solid, self.green, self.materials, foot, self.today.season, self.rng)
 
     def _add_house(
-        self, side: _Side, at_m: float, width_m: float, setback_m: float, depth_m: float
-    ) -> None:
+        self, side: _Side, at_m: float, width_m: float, setback_m: float, depth_m: float,
+        slides_m: tuple[float, float] = (0.0, 0.0),
+    ) -> None:  # fmt: skip
         corner = side.front[0] + side.along * at_m - side.outwards * setback_m
         roof = self.materials.roof
         if not self.town.is_driven(side.start, side.end):
             k = int(self.rng.integers(_POOL))
-            self._add_coarse_house(side, corner, width_m, depth_m, k)
+            self._add_coarse_house(side, corner, width_m, depth_m, k, slides_m)
             return
         storeys = int(self.rng.integers(1, 4))
         height = 3.6 + 3.1 * storeys + float(self.rng.uniform(0.6, 1.2))
@@ -414,13 +435,14 @@ class _TileBuilder:
             self.materials.stone, tint,
         )  # fmt: skip
         add_front(self.solid, plane, texels, self.rng)
-        add_shell(self.solid, plane, width_m, height, depth_m, roof, self.rng)
+        add_shell(self.solid, plane, width_m, height, depth_m, roof, self.rng, slides_m)
         if self._altered(house, AlterationKind.SCAFFOLD):
             self._add_scaffold(plane, texels)
 
     def _add_coarse_house(
-        self, side: _Side, corner: Points, width_m: float, depth_m: float, k: int
-    ) -> None:
+        self, side: _Side, corner: Points, width_m: float, depth_m: float, k: int,
+        slides_m: tuple[float, float],
+    ) -> None:  # fmt: skip
         front = self.town._pool[k]
         plane = Front(
             _level(corner), np.array([*side.along, 0.0]), self.town._pool_textures[k],
@@ -432,8 +454,9 @@ class _TileBuilder:
             SurfaceFlag.GLASS, plane.tint,
         )  # fmt: skip
         add_shell(
-            self.solid, plane, width_m, front.height_m, depth_m, self.materials.roof, self.rng
-        )
+            self.solid, plane, width_m, front.height_m, depth_m, self.materials.roof, self.rng,
+            slides_m,
+        )  # fmt: skip
 
     def _altered(self, house: tuple[Junction, int], kind: AlterationKind) -> bool:
         return any(a.kind is kind and a.chooses(*house) for a in self.today.alterations)
