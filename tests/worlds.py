@@ -18,11 +18,20 @@ from engram.experience.model import (
     Session,
     SessionId,
     node_id,
+    path_id,
 )
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import ALL_KINDS, PathMemory
 from engram.geometry import SE3, CameraId
-from engram.ranking import Background, Observations, RankingContext, RunAttempts, SessionTimes
+from engram.ranking import (
+    Background,
+    Lessons,
+    Observations,
+    PastAttempts,
+    RankingContext,
+    RunAttempts,
+    SessionTimes,
+)
 
 CAMERA = CameraId("0" * 32)
 
@@ -124,6 +133,29 @@ def neighbourhood_of(nodes, along_m) -> Neighbourhood:
     return Neighbourhood(nodes, poses, np.abs(along), along, zeros, zeros, zeros, zeros, pivots)
 
 
+def lessons_of(graph, attempts, hours=()) -> Lessons:
+    """What sessions learnt from attempts: (session, node, rate, accepted) each."""
+    if not len(graph):
+        return Lessons.none()
+    count = max([int(graph.sessions.max()), *(attempt[0] for attempt in attempts)]) + 1
+    viewers = [path_id(session_uuid(number)) for number in range(count)]
+    known = [np.nan if hour is None else hour for hour in hours][:count]
+    columns = zip(*attempts, strict=True) if attempts else ([], [], [], [])
+    drives, nodes, rates, accepted = columns
+    return Lessons.learnt(
+        graph,
+        PathMemory(graph),
+        viewers,
+        np.array(known + [np.nan] * (count - len(known))),
+        PastAttempts(
+            np.array(drives, np.int32),
+            np.array(nodes, np.int32),
+            np.array(rates, np.float64),
+            np.array(accepted, np.bool_),
+        ),
+    )
+
+
 def make_context(
     *,
     graph=None,
@@ -143,14 +175,16 @@ def make_context(
     hours=None,
     words=None,
     live_words=None,
+    lessons=(),
 ) -> RankingContext:
     """A context over dense indices; candidates stand 0.1 m apart unless told.
 
-    Sessions take turns in saving nodes; `hours` is their hour of day, `words` what nodes show.
+    Sessions take turns in saving nodes; `hours` is their hour of day, `words` what nodes show,
+    `lessons` what they attempted: (session, node, rate, accepted) each.
     """
     along = 0.1 * np.arange(len(candidates)) if along_m is None else along_m
     if graph is None:
-        attempted = [attempt[1] for attempt in run]
+        attempted = [attempt[1] for attempt in (*run, *lessons)]
         on_paths = (node for path in paths for node in path)
         used = [*candidates, *observed, *on_paths, *attempted, reference or 0]
         graph = flat_graph(max(used, default=0) + 1, sessions)
@@ -167,6 +201,10 @@ def make_context(
         seed=seed,
         run=run_of(run),
         hour=hour,
-        background=Background(SessionTimes(records), None if words is None else MadeUpWords(words)),
+        background=Background(
+            SessionTimes(records),
+            lessons_of(graph, lessons, hours or []),
+            None if words is None else MadeUpWords(words),
+        ),
         live_words=None if live_words is None else lambda: np.array(sorted(live_words), np.int32),
     )

@@ -187,6 +187,44 @@ def success_rates(
     across_m: NDArray[np.float64],
 ) -> NDArray[np.float64]: ...
 
+# --- recall
+
+class RecallLessons:
+    def __init__(
+        self,
+        starts: NDArray[np.int64],
+        viewers: NDArray[np.int32],
+        rates: NDArray[np.float32],
+        on_success: NDArray[np.float32],
+        on_failure: NDArray[np.float32],
+        base: NDArray[np.float64],
+        viewer_count: int,
+    ) -> None: ...
+
+def recall_order(
+    lessons: RecallLessons,
+    run_nodes: NDArray[np.int32],
+    run_successes: NDArray[np.float64],
+    run_failures: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    nodes: NDArray[np.int32],
+    groups: NDArray[np.int32],
+    rates: NDArray[np.float64],
+    fixed: NDArray[np.float64],
+    successes: NDArray[np.float64],
+    failures: NDArray[np.float64],
+    *,
+    trust: float,
+    nobody: float,
+    unknown_base: float,
+    company: float,
+    own: float,
+    pseudo: float,
+    regret: float,
+    picks: int,
+    shortlist: int,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
+
 # --- path memory
 
 def co_occurrence(

@@ -13,6 +13,7 @@ void bind_matching(nb::module_ &module);
 void bind_ordering(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
 void bind_places(nb::module_ &module);
+void bind_recall(nb::module_ &module);
 void bind_render(nb::module_ &module);
 void bind_window_ba(nb::module_ &module);
 
@@ -28,6 +29,7 @@ NB_MODULE(_core, module) {
   bind_ordering(module);
   bind_path_scores(module);
   bind_places(module);
+  bind_recall(module);
   bind_render(module);
   bind_window_ba(module);
 }

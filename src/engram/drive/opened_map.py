@@ -9,12 +9,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
 from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
-from engram.experience.clock import Clocked
+from engram.experience.clock import Clocked, hour_of_day
 from engram.experience.graph import ExperienceGraph
-from engram.experience.model import PathEntryKind, SessionId
+from engram.experience.model import PathEntryKind, SessionId, path_id
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
 from engram.frontend import DescriptorKind, Frontend, StereoPair
@@ -33,6 +35,8 @@ from engram.odometry import Odometry
 from engram.places import Vocabulary, decode_vocabulary, default_vocabulary
 from engram.ranking import (
     Background,
+    Lessons,
+    PastAttempts,
     QuantisedWords,
     SessionTimes,
     check_for_robot,
@@ -64,7 +68,10 @@ class OpenMap:
         for entry in contents.path_entries:
             self.path_memory.add(entry)
         self.times = SessionTimes(contents.sessions)
-        self._backgrounds: dict[DescriptorKind, Background] = {}
+        self._words: dict[DescriptorKind, QuantisedWords] = {}
+        self._sessions = contents.sessions
+        self._remembered = contents.attempts
+        self._lessons: dict[float, Lessons] = {}
         self.attempts = BasinCounts.empty()
         for session in contents.sessions:
             made = contents.attempts_of(session.id)
@@ -133,6 +140,24 @@ class OpenMap:
             Searched(self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor))
         )
 
+    def lessons(self, focal_px: float) -> Lessons:
+        """What the drives of this map learnt, for a live camera of this focal length, px."""
+        if focal_px not in self._lessons:
+            made, basin = self._remembered, MatchBasin.of(focal_px, self.attempts)
+            along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
+            attempts = PastAttempts(
+                made.session, made.node, basin.success_rate(along_m, across_m), made.accepted
+            )
+            hours = [hour_of_day(session, session.start_ns) for session in self._sessions]
+            self._lessons[focal_px] = Lessons.learnt(
+                self.graph,
+                self.path_memory,
+                [path_id(session.id) for session in self._sessions],
+                np.array([np.nan if hour is None else hour for hour in hours], np.float64),
+                attempts,
+            )
+        return self._lessons[focal_px]
+
     def localiser(
         self,
         camera: StereoCamera,
@@ -178,19 +203,17 @@ class OpenMap:
             config=settings.localiser,
             matcher=matcher,
             search=search,
-            background=self._background(settings.frontend.descriptor),
+            background=self._background(camera.fx, settings.frontend.descriptor),
             clock=clock,
         )
 
-    def _background(self, descriptor: DescriptorKind) -> Background:
-        """Made once: the words of nodes serve all localisers of this map."""
-        known = self._backgrounds.get(descriptor)
-        if known is None:
-            words = QuantisedWords(
+    def _background(self, focal_px: float, descriptor: DescriptorKind) -> Background:
+        """Made of parts that serve all localisers of this map."""
+        if descriptor not in self._words:
+            self._words[descriptor] = QuantisedWords(
                 self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor)
             )
-            known = self._backgrounds[descriptor] = Background(self.times, words)
-        return known
+        return Background(self.times, self.lessons(focal_px), self._words[descriptor])
 
     def robot(
         self,

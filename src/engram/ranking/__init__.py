@@ -6,6 +6,7 @@ Every policy is one file and stands in `POLICIES`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from engram.errors import ConfigError
 from engram.ranking.background import Background
@@ -14,11 +15,13 @@ from engram.ranking.bandit import BanditPolicy
 from engram.ranking.collaborative import CollaborativePolicy
 from engram.ranking.context import Foreseen, RankingContext, RankingPolicy
 from engram.ranking.distance import DistancePolicy
+from engram.ranking.lessons import Lessons, PastAttempts
 from engram.ranking.nearest_of_each import NearestOfEachPolicy
 from engram.ranking.oracle import OraclePolicy
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_literal import PathLiteralPolicy
 from engram.ranking.random import RandomPolicy
+from engram.ranking.recall import RecallPolicy
 from engram.ranking.recent import IterationUnit, Observations, RecentAttempts, RecentConfig
 from engram.ranking.run import RunAttempts, RunLog
 from engram.ranking.time_of_day import TimeOfDayPolicy
@@ -36,6 +39,8 @@ POLICIES: dict[str, Callable[[], RankingPolicy]] = {
     "collaborative": CollaborativePolicy,
     "nearest-of-each": NearestOfEachPolicy,
     "bandit": BanditPolicy,
+    "recall": RecallPolicy,
+    "recall-no-clock": partial(RecallPolicy, clock=False),
 }
 
 
@@ -71,7 +76,9 @@ __all__ = [
     "Background",
     "Foreseen",
     "IterationUnit",
+    "Lessons",
     "Observations",
+    "PastAttempts",
     "QuantisedWords",
     "RankingContext",
     "RankingPolicy",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from engram.ranking.lessons import Lessons
 from engram.ranking.times import SessionTimes
 from engram.ranking.words import WordSource
 
@@ -14,8 +15,10 @@ class Background:
 
     Attributes:
         times: when the sessions were driven.
+        lessons: what past drives matched and failed to match.
         words: the visual words of nodes and frames; None without a vocabulary.
     """
 
     times: SessionTimes = field(default_factory=SessionTimes)
+    lessons: Lessons = field(default_factory=Lessons.none)
     words: WordSource | None = None

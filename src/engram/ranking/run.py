@@ -51,6 +51,21 @@ class RunAttempts:
     def __len__(self) -> int:
         return len(self.nodes)
 
+    def newest(self, count: int) -> RunAttempts:
+        """The last `count` of them at most."""
+        if len(self) <= count:
+            return self
+        last = slice(len(self) - count, None)
+        return RunAttempts(
+            self.driven_m,
+            self.at_m[last],
+            self.nodes[last],
+            self.rates[last],
+            self.accepted[last],
+            self.inliers[last],
+            self.landmarks[last],
+        )
+
     def decay(self, length_m: float) -> NDArray[np.float64]:
         """(R,) exp(−Δs / length) of the distance driven since each attempt."""
         return np.asarray(np.exp((self.at_m - self.driven_m) / length_m))
