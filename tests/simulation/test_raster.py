@@ -114,7 +114,8 @@ def test_a_roof_throws_its_shadow_where_the_sun_sends_it() -> None:
         row = round(23.5 + 60 * down / forward)
         return float(shaded[row, column] / lit[row, column])
 
-    assert ratio_at(4 - 2.25, 8.0) < 0.4  # under the sun's ray through the roof's middle
+    # Under the sun's ray through the roof's middle; half of the light is haze's.
+    assert ratio_at(4 - 2.25, 8.0) < 0.65
     assert ratio_at(-2.5, 8.0) > 0.95
     assert ratio_at(-1.5, 4.0) > 0.95
 

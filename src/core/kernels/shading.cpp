@@ -386,10 +386,14 @@ float ambient(const Surroundings &world, const Light &light, const Point &point)
                                 point.at.y + out_m * point.flat_normal.y);
   const float height = point.at.z > 0 ? point.at.z : 0;
   const float open = 1 - (1 - ground) * exp_of(-0.22f * height);
-  const float from_sky = light.sky_power * open * (0.80f + 0.20f * point.normal.z);
+  const float from_sky = light.sky_power * open * (0.92f + 0.08f * point.normal.z);
   const float bounced = (0.12f * light.sky_power + 0.10f * light.sun_power) * (0.4f + 0.6f * open);
   return from_sky + bounced;
 }
+
+// Share of the sun's light that comes from the bright haze around it and from sunlit walls about: it
+// falls from the sun's side, so that relief shows in the shade too, and shadows do not take it.
+constexpr float kAureole = 0.5f;
 
 float sunshine(const Surroundings &world, const Light &light, const Point &point) {
   if (light.sun_power <= 0)
@@ -409,6 +413,7 @@ float sunshine(const Surroundings &world, const Light &light, const Point &point
   float lit = sunlit(world.sun_static, near, plane);
   if (lit > 0 && world.sun_moving.heights != nullptr)
     lit *= sunlit(world.sun_moving, near, plane);
+  lit += kAureole * (1 - lit);
   return light.sun_power * facing * lit;
 }
 

@@ -42,7 +42,7 @@ WEATHERS: dict[str, Weather] = {
     "rain": Weather(cloud=1.0, fog_per_m=0.006, rain=0.8, wet=1.0),
     "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.002, rain=0.5, wet=0.7),
     "damp": Weather(cloud=0.9, changes=0.2, fog_per_m=0.001, wet=0.7),
-    "snow": Weather(cloud=1.0, fog_per_m=0.004, snow=0.95),
+    "snow": Weather(cloud=1.0, fog_per_m=0.008, snow=0.95),
     "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.45),
 }
 

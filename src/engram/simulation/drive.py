@@ -137,8 +137,8 @@ class DrivingStyle:
     """
 
     seed: int
-    offset_m: float = 0.15
-    sway_m: float = 0.16
+    offset_m: float = 0.3
+    sway_m: float = 0.2
     speed_m_s: float = 5.5
 
 

@@ -34,8 +34,8 @@ class Style:
         relief: factor on the slopes that bend normals.
     """
 
-    paint_contrast: float = 0.26
-    relief: float = 1.8
+    paint_contrast: float = 0.21
+    relief: float = 2.2
 
 
 def pack(
