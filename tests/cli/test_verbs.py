@@ -189,7 +189,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
     [
         (("localise", "absent.engram", "STREET"), "absent.engram"),
         (("localise", "TOWN", "nowhere"), "nowhere"),
-        (("localise", "TOWN", "STREET", "--policy", "best"), "known: "),
+        (("localise", "TOWN", "STREET", "--policy", "best"), "there are: "),
         (("localise", "TOWN", "STREET", "--relocaliser", "gps"), "known: "),
         (("localise", "TOWN", "STREET", "--at", 7), "not 7"),
         (("localise", "TOWN", "STREET", "--frames", "1:x"), "1:x"),
@@ -327,3 +327,11 @@ def test_settings_out_of_range_are_refused(
     assert ran.status == 2
     assert setting.split(maxsplit=1)[0] in ran.err
     assert not (tmp_path / "a.engram").exists()
+
+
+@pytest.mark.parametrize("mistyped", [("info",), ("infos", "m"), ("info", "m", "--frames", "3")])
+def test_a_mistyped_command_line_is_json_for_machines_and_help_for_people(engram, mistyped) -> None:
+    ran = engram(*mistyped, "--json")
+    assert ran.status == 2
+    assert ran.json["error"]["message"] in ran.err
+    assert "Usage: engram" in ran.err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from typing import cast
 
 import typer
 
@@ -22,6 +23,9 @@ app = typer.Typer(
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
+# What Typer raises for any mistyped command line; of its kinds it exports only this one's child.
+_UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
+
 
 class VerbInterruptedError(Exception):
     """A verb was stopped by Ctrl-C before it had a result."""
@@ -33,17 +37,28 @@ def main() -> None:
 
     verbs.register(app)
     try:
-        app()
+        code = app(prog_name="engram", standalone_mode=False)
+    except _UsageError as error:  # a verb or option that is mistyped
+        _tell_machines(error.format_message(), type(error).__name__)
+        error.show()
+        sys.exit(error.exit_code)
+    except typer.Abort:
+        _complain(VerbInterruptedError("interrupted"))
+        sys.exit(EXIT_INTERRUPTED)
     except EngramError as error:
         _complain(error)
         sys.exit(EXIT_BAD_INPUT)
     except VerbInterruptedError as error:
         _complain(error)
         sys.exit(EXIT_INTERRUPTED)
+    sys.exit(code)
 
 
 def _complain(error: Exception) -> None:
-    kind = type(error).__name__
-    if "--json" in sys.argv:
-        print(json.dumps({"error": {"kind": kind, "message": str(error)}}))
+    _tell_machines(str(error), type(error).__name__)
     print(f"engram: {error}", file=sys.stderr)
+
+
+def _tell_machines(message: str, kind: str) -> None:
+    if "--json" in sys.argv:
+        print(json.dumps({"error": {"kind": kind, "message": message}}))
