@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from engram.drive import OpenMap, Settings
+from engram.drive.mapping import loop_search
 from engram.experience.model import Clock, NodeId, Session, session_id
 from engram.geometry import SE3
 from engram.localiser import Budget, Localisation
@@ -49,7 +51,13 @@ def session_for(drive: list[Seen], name: str) -> Session:
 
 
 def map_simulated(
-    path: Path, drive: list[Seen], name: str = "r1", policy: str = "path", **budget: int
+    path: Path,
+    drive: list[Seen],
+    name: str = "r1",
+    policy: str = "path",
+    *,
+    closes_loops: bool = False,
+    **budget: int,
 ) -> Mapped:
     first = drive[0].frame
     opening = MapStore.open_for_writing if path.exists() else MapStore.create
@@ -73,9 +81,13 @@ def map_simulated(
             live=session.id,
             saves=True,
         )
-        with localiser:
-            mapper = Mapper(opened.graph, localiser, saver, session)
+        searching = nullcontext()
+        if closes_loops:
+            searching = loop_search(opened, localiser, Settings())
+        with localiser, searching as loops:
+            mapper = Mapper(opened.graph, localiser, saver, session, loops=loops)
             steps = [mapper.process(seen.frame, seen.odometry) for seen in drive]
+            mapper.finish()
         saver.finish()
         writer.commit()
     return Mapped(steps, drive)

@@ -118,8 +118,12 @@ def drive(
     start_ns: int = 1_000_000_000_000,
     seed: int = 0,
     camera: StereoCamera = CAMERA,
+    drift: SE3 | None = None,
 ) -> list[Seen]:
-    """Drives past the places given, with odometry of 1 % and 0.1° of noise a step."""
+    """Drives past the places given, with odometry of 1 % and 0.1° of noise a step.
+
+    `drift` is added to every step; the covariance knows nothing of it.
+    """
     rng = np.random.default_rng([world.seed, seed])
     appearances = np.broadcast_to(appearance, len(places_m))
     steps: list[Seen] = []
@@ -132,7 +136,7 @@ def drive(
             motion = steps[-1].world_from_live.inverse() @ truth
             sigma_m = 0.003 + 0.01 * motion.distance_m
             sigma = np.array([sigma_m] * 3 + [np.deg2rad(0.1)] * 3)
-            noisy = SE3.exp(rng.normal(0, sigma)) @ motion
+            noisy = SE3.exp(rng.normal(0, sigma)) @ motion @ (drift or SE3.identity())
             odometry = OdometryStep(OdometryStatus.OK, noisy, np.diag(sigma**2), 100)
         steps.append(Seen(frame, odometry, truth))
     return steps

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from engram.drive.settings import Settings
 from engram.experience.model import PathEntryKind, Session
 from engram.frontend import Frontend
 from engram.geometry import StereoCamera
-from engram.localiser import Budget, Position
-from engram.mapper import Mapper, Saver
+from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Position
+from engram.mapper import LoopConfig, LoopSearch, Mapper, Saver
 from engram.ranking import check_for_robot
 from engram.sequences import FrameLog
 from engram.store import (
@@ -226,8 +226,8 @@ def _map_frames(
     stored = writer.stored
     if stored.last_entry is not None:
         localiser.resume_walk(stored.last_entry.node, stored.next_sequence, stored.next_iteration)
-    with localiser:
-        mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper)
+    with localiser, loop_search(opened, localiser, settings) as loops:
+        mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper, loops)
         try:
             for live in _from_where_it_stopped(frames, stored, mapper, advance):
                 deadline = (
@@ -246,12 +246,30 @@ def _map_frames(
                 )
                 word = "saved" if step.saved else step.localisation.status.value
                 advance(word)
+            mapper.finish()
         except KeyboardInterrupt:
             report.interrupted = True
         finally:
             saver.finish()
     if not report.interrupted:
         report.revision = writer.commit().number
+
+
+def loop_search(
+    opened: OpenMap, localiser: Localiser, settings: Settings
+) -> AbstractContextManager[LoopSearch | None]:
+    """Looks for loops by the words that the relocaliser knows; None where it knows none."""
+    finder = localiser.relocaliser
+    if not isinstance(finder, ByAppearance):
+        return nullcontext()
+    matching = settings.localiser
+    return LoopSearch(
+        opened.graph,
+        finder.book,
+        FrameMatcher(opened.store.frames, matching.matcher),
+        matching.acceptance,
+        LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
+    )
 
 
 def _from_where_it_stopped(

@@ -11,6 +11,8 @@ from engram.localiser.relocalisation import (
     ByAppearance,
     Exhaustive,
     Relocaliser,
+    best_places,
+    spread,
 )
 from engram.localiser.walk import Walk
 
@@ -36,4 +38,6 @@ __all__ = [
     "Searched",
     "Walk",
     "accept",
+    "best_places",
+    "spread",
 ]

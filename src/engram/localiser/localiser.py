@@ -156,6 +156,7 @@ class Localiser:
         self._recent = RecentAttempts(self.config.recent)
         self._run = RunLog()
         self.walk = Walk(path_id(self.live))
+        self.proposes_when_certain = True
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
@@ -170,6 +171,11 @@ class Localiser:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    @property
+    def relocaliser(self) -> Relocaliser | None:
+        """What finds a lost robot."""
+        return self._relocaliser
 
     def close(self) -> None:
         """Ends the threads of the lanes."""
@@ -361,7 +367,8 @@ class Localiser:
                 [self._graph.node(int(i)).id for i in neighbourhood.nodes[order[:_PREFETCH]]]
             )
             ranked = [self._predicted(neighbourhood, int(row)) for row in order[:budget]]
-        if (ranked and not self._lost) or self._relocaliser is None:
+        left_to_mapper = self.certain and not self.proposes_when_certain
+        if (ranked and not self._lost) or self._relocaliser is None or left_to_mapper:
             return ranked
         known = {candidate.index for candidate in ranked}
         proposed = [

@@ -1,6 +1,16 @@
 """The EBN loop: localise, else save an experience. Saving runs on a thread of its own."""
 
+from engram.mapper.loops import LoopConfig, LoopSearch
 from engram.mapper.mapper import Mapper, MapperConfig, MappingStep
 from engram.mapper.saver import Records, RecordWriter, Saver
 
-__all__ = ["Mapper", "MapperConfig", "MappingStep", "RecordWriter", "Records", "Saver"]
+__all__ = [
+    "LoopConfig",
+    "LoopSearch",
+    "Mapper",
+    "MapperConfig",
+    "MappingStep",
+    "RecordWriter",
+    "Records",
+    "Saver",
+]

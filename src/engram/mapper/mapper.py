@@ -12,6 +12,7 @@ from engram.experience.model import Edge, EdgeKind, Node, NodeId, Session, node_
 from engram.experience.proximity import lay_proximity_edges, tighten_chain
 from engram.frontend import Frame, FrameStatus
 from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
+from engram.mapper.loops import LoopSearch
 from engram.mapper.saver import Records, Saver
 from engram.odometry import OdometryStatus, OdometryStep
 
@@ -64,6 +65,8 @@ class Mapper:
         saver: writes what is added.
         session: the drive.
         config: settings.
+        loops: looks for the places of saved nodes beside the drive; None leaves that to the
+            localiser's relocaliser.
     """
 
     def __init__(
@@ -73,8 +76,12 @@ class Mapper:
         saver: Saver,
         session: Session,
         config: MapperConfig | None = None,
+        loops: LoopSearch | None = None,
     ) -> None:
         self.config = config or MapperConfig()
+        self._loops = loops
+        # Whether what is being saved hangs together with the rest of the map.
+        self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
         self._graph = graph
         self._localiser = localiser
         self._saver = saver
@@ -92,15 +99,20 @@ class Mapper:
         Raises:
             MapError: an earlier frame could not be written.
         """
+        edges = self._close_loops(self._loops.closed()) if self._loops else []
+        # A robot that hangs together with the map is not lost, however far it drifts: its loops
+        # are looked for beside the drive.
+        self._localiser.proposes_when_certain = self._loops is None or not self._joined
         localisation = self._localiser.localise(live, odometry, deadline)
         if self._since_saved is not None:
             self._since_saved = _carried_on(self._since_saved, odometry)
-        edges: list[Edge] = []
         saved: Node | None = None
         if localisation.status is LocalisationStatus.LOCALISED:
-            edges = self._end_experience(localisation) + self._match_edges()
+            self._joined = True
+            edges += self._end_experience(localisation) + self._match_edges()
         elif self._worth_saving(live):
-            saved, edges = self._save(live, localisation.position)
+            saved, laid = self._save(live, localisation.position)
+            edges += laid
         records = Records(
             node=saved,
             frame=live if saved else None,
@@ -110,7 +122,19 @@ class Mapper:
         )
         if records:
             self._saver.put(records)
+        if saved is not None and self._loops is not None:
+            self._loops.ask(saved, live)
         return MappingStep(localisation, saved.id if saved else None)
+
+    def finish(self) -> None:
+        """The drive is over: waits for the places of the nodes saved last.
+
+        Raises:
+            MapError: an earlier frame could not be written.
+        """
+        edges = self._close_loops(self._loops.finish()) if self._loops else []
+        if edges:
+            self._saver.put(Records(edges=edges))
 
     def follow(self, odometry: OdometryStep) -> None:
         """Carries on over a frame that an interrupted run of this session had mapped already."""
@@ -152,6 +176,8 @@ class Mapper:
         )
         self._graph.add_node(node)
         edges = []
+        if self._since_saved is None:
+            self._joined = len(self._graph) == 1  # nobody knows how the robot came here
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
         elif not self._experience and position is not None and self._localiser.certain:
@@ -163,6 +189,15 @@ class Mapper:
         self._since_saved = Position.at(node.id)
         self._localiser.settle_in(node.id, live.stamp_ns)
         return node, edges
+
+    def _close_loops(self, closures: list[Edge]) -> list[Edge]:
+        """Edges to places that were found again; from now on their surroundings are candidates."""
+        edges = list(closures)
+        self._add_to_graph(closures)
+        for closure in closures:
+            self._joined = True
+            edges += lay_proximity_edges(self._graph, self._graph.index(closure.b))
+        return edges
 
     def _add_to_graph(self, edges: list[Edge]) -> None:
         for edge in edges:

@@ -1,0 +1,175 @@
+"""Closing large loops: each saved node asks once whether the map knows its place (SPEC §5).
+
+Odometry drifts: after a long loop the nodes that truly stand beside the robot may lie outside of
+its search radius. So the frame of every saved node is looked up among all places, and the most
+likely ones are matched with it. That happens on a thread of its own, off the path of the live
+frames, and the answer is taken some frames later, always the same number: what comes of it depends
+on the drive alone, not on the speed of the machine.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import Edge, EdgeKind, Node, NodeId
+from engram.frontend import Frame
+from engram.geometry import SE3
+from engram.localiser import AcceptanceConfig, Matcher, PlaceBook, accept, best_places, spread
+
+
+@dataclass(frozen=True, slots=True)
+class LoopConfig:
+    """Settings of `LoopSearch`.
+
+    Attributes:
+        attempts: places matched with each saved node. Off the frames' path there is time for more
+            than a live frame has.
+        answer_after_frames: live frames after which an answer is taken. A query and its attempts
+            take a few milliseconds: at 20 frames a second it is there long before.
+        near_m: nodes within this distance are candidates of the localiser anyway. Source: SPEC §3,
+            the search radius.
+        own_exclusion_m: own nodes saved within the last so many metres close no loop. Source:
+            SPEC §3.1.
+    """
+
+    attempts: int = 8
+    answer_after_frames: int = 5
+    near_m: float = 8.0
+    own_exclusion_m: float = 30.0
+
+    def __post_init__(self) -> None:
+        for name in ("attempts", "answer_after_frames"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 1")
+        for name in ("near_m", "own_exclusion_m"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Question:
+    """A saved node, its frame, and (N,) bool: which nodes would be news."""
+
+    node: NodeId
+    frame: Frame
+    news: NDArray[np.bool_]
+
+
+class LoopSearch:
+    """Looks for the places of saved nodes, on a thread of its own. A context manager.
+
+    Args:
+        graph: the experience graph; searched by the calling thread only.
+        book: the words of its nodes.
+        matcher: the first half of an attempt.
+        acceptance: the second half, as for a lost robot: no prediction speaks for a match.
+        config: settings.
+    """
+
+    def __init__(
+        self,
+        graph: ExperienceGraph,
+        book: PlaceBook,
+        matcher: Matcher,
+        acceptance: AcceptanceConfig,
+        config: LoopConfig | None = None,
+    ) -> None:
+        self.config = config or LoopConfig()
+        self._graph = graph
+        self._book = book
+        self._matcher = matcher
+        self._acceptance = acceptance
+        self._frames = 0
+        self._asked: deque[tuple[int, Future[Edge | None]]] = deque()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="engram-loops")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the thread; questions that nobody waits for any more are dropped."""
+        self._thread.shutdown(cancel_futures=True)
+
+    def ask(self, node: Node, frame: Frame) -> None:
+        """Looks up a node that was just saved and added to the graph; returns at once."""
+        self._book.learn_new_nodes()
+        question = _Question(node.id, frame, self._news(node))
+        self._asked.append((self._frames, self._thread.submit(self._answer, question)))
+
+    def closed(self) -> list[Edge]:
+        """The loops that are closed by now, each from the known node to the new one.
+
+        Call it once per live frame.
+
+        Raises:
+            MapCorruptError: the landmarks of a likely place do not match their hash.
+        """
+        self._frames += 1
+        return self._answers_to(self._frames - self.config.answer_after_frames)
+
+    def finish(self) -> list[Edge]:
+        """Waits for all answers."""
+        return self._answers_to(self._frames)
+
+    def _answers_to(self, frame: int) -> list[Edge]:
+        edges = []
+        while self._asked and self._asked[0][0] <= frame:
+            edge = self._asked.popleft()[1].result()
+            if edge is not None:
+                edges.append(edge)
+        return edges
+
+    def _news(self, node: Node) -> NDArray[np.bool_]:
+        """Nodes that are neither near the node, by all that is known, nor just saved."""
+        graph = self._graph
+        index = graph.index(node.id)
+        own = graph.sessions == graph.sessions[index]
+        recent = graph.driven_m > node.driven_m - self.config.own_exclusion_m
+        news: NDArray[np.bool_] = ~(own & recent)
+        near = graph.neighbourhood(
+            index,
+            SE3.identity(),
+            np.zeros((6, 6)),
+            radius_m=self.config.near_m,
+            view_gate_rad=np.pi,
+        )
+        news[near.nodes] = False
+        return news
+
+    def _answer(self, question: _Question) -> Edge | None:
+        """The best match among the most likely places; None if none is believed."""
+        if not question.news.any():
+            return None
+        compared = self._book.compare(self._book.words_of(question.frame))
+        evidence = compared.evidence[: len(question.news)]
+        likely = np.where(question.news, evidence, -np.inf)
+        places = [place for place in best_places(self._book, likely) if question.news[place]]
+        matches = [self._matched(question, place) for place in spread(places, self.config.attempts)]
+        believed = [found for found in matches if found is not None]
+        best = max(believed, key=lambda found: found[0], default=None)
+        return None if best is None else best[1]
+
+    def _matched(self, question: _Question, place: int) -> tuple[int, Edge] | None:
+        """Inliers and the edge, if the place is matched."""
+        known = self._graph.node(place).id
+        match = self._matcher.match(question.frame, question.node, known, None)
+        if match.reference_from_live is None or match.covariance is None:
+            return None
+        seen = self._matcher.spread(question.frame, question.node, known, match)
+        if not accept(match, None, self._acceptance, seen):
+            return None
+        edge = Edge(
+            known, question.node, EdgeKind.MATCH, match.reference_from_live, match.covariance
+        )
+        return match.inliers, edge

@@ -1,0 +1,87 @@
+"""Large loops close although odometry has drifted beyond the search radius."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.drive import OpenMap
+from engram.experience.model import Edge, EdgeKind
+from engram.geometry import SE3
+from engram.store import MapStore
+from mapping_rig import Mapped, map_simulated
+from synthetic_world import World, drive
+
+# A lap of 151 m with a step every 0.7 m: 0.17° a step too much is 37° and 17 m at its end.
+LAP_M = 2 * np.pi * 24.0
+RING = World(LAP_M, radius_m=24.0, seed=5)
+DRIFT = SE3.exp([0.0, 0.0, 0.01, 0.0, -0.003, 0.0])
+LAP_AND_A_HALF = np.arange(0.0, 1.5 * LAP_M, 0.7)
+LAP_FRAMES = int(LAP_M / 0.7)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "ring.engram"
+
+
+def loop_edges(path: Path, mapped: Mapped) -> list[tuple[Edge, SE3]]:
+    """Measured edges between own nodes, each with its truth."""
+    with MapStore.open(path) as store:
+        edges = OpenMap(store).graph.edges
+    truth = mapped.saved
+    return [
+        (edge, truth[edge.a].inverse() @ truth[edge.b])
+        for edge in edges
+        if edge.kind is EdgeKind.MATCH
+    ]
+
+
+def test_a_drifted_lap_is_closed_and_then_localised_in(path: Path) -> None:
+    mapped = map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
+    dead_reckoned = SE3.identity()
+    for seen in mapped.drive[1 : LAP_FRAMES + 1]:
+        dead_reckoned = dead_reckoned @ seen.odometry.prev_from_curr
+    assert dead_reckoned.distance_m > 2 * 8.0  # twice the search radius
+    closures = loop_edges(path, mapped)
+    assert closures
+    for edge, truth in closures:
+        # Two looks with 0.3 px noise at landmarks 5 to 40 m away.
+        assert np.linalg.norm(edge.a_from_b.translation - truth.translation) < 0.3
+    second = np.array(mapped.statuses[LAP_FRAMES + 12 :])
+    assert (second == "localised").mean() > 0.9
+
+
+def test_a_robot_that_knows_its_chain_asks_beside_the_drive_only(path: Path) -> None:
+    mapped = map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
+    first_lap = [step.localisation for step in mapped.steps[1 : LAP_FRAMES - 5]]
+    # A relocaliser that is asked says how likely a new place is.
+    assert {one.new_place for one in first_lap} == {None}
+
+
+def test_a_robot_that_came_from_nowhere_asks_on_every_frame_until_it_is_found(path: Path) -> None:
+    map_simulated(path, drive(RING, np.arange(0.0, 60.0, 0.7)))
+    other_look = np.where(np.arange(40) < 20, 1, 0)
+    live = drive(RING, 10 + np.arange(40) * 0.7, other_look, start_ns=10**15, seed=1)
+    mapped = map_simulated(path, live, name="r2", closes_loops=True)
+    assert all(step.localisation.attempts > 0 for step in mapped.steps[:20])
+    assert mapped.statuses[20] == "localised"
+
+
+def test_the_same_drive_gives_the_same_map(tmp_path: Path) -> None:
+    hashes = set()
+    for name in ("one", "two"):
+        path = tmp_path / f"{name}.engram"
+        map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
+        with MapStore.open(path) as store:
+            hashes.add(store.content_hash())
+    assert len(hashes) == 1
+
+
+def test_a_loop_that_closes_at_the_very_end_is_kept(path: Path) -> None:
+    # The second lap looks different but for its last node.
+    places = np.arange(0.0, LAP_M + 20.0, 0.7)
+    look = np.where((places > LAP_M - 10) & (np.arange(len(places)) < len(places) - 2), 1, 0)
+    mapped = map_simulated(path, drive(RING, places, look, drift=DRIFT), closes_loops=True)
+    assert "localised" not in mapped.statuses
+    assert len(loop_edges(path, mapped)) == 1
