@@ -15,6 +15,7 @@
     │   ├── RevisionError        no such revision, or in a state that forbids the step
     │   └── StorageFullError     no space left: free some; nothing committed is lost
     ├── IncompatibleError        two things that are each fine do not fit together
+    ├── RefusedError             a result did not pass the gate that was asked for
     └── MissingExtraError        an optional dependency: the message names the pip command
 
 Not localising is never an error: it is a status of the result.
@@ -71,6 +72,10 @@ class StorageFullError(MapError):
 
 class IncompatibleError(EngramError):
     """Two things do not fit together, such as two kinds of descriptor."""
+
+
+class RefusedError(EngramError):
+    """A result is worse than what it would take the place of; nothing was changed."""
 
 
 class MissingExtraError(EngramError, ImportError):

@@ -16,6 +16,7 @@ from engram.cli.extraction import extract
 from engram.cli.inspection import check, info, log, seal
 from engram.cli.localisation import localise
 from engram.cli.mapping import map_
+from engram.cli.merging import merge
 from engram.cli.places import places, relocalise, vocabulary
 from engram.cli.simulation import simulate
 
@@ -27,6 +28,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "info": info,
     "log": log,
     "check": check,
+    "merge": merge,
     "seal": seal,
     "simulate": simulate,
     "vocabulary": vocabulary,

@@ -24,7 +24,6 @@ from engram.mapper import LoopConfig, LoopSearch, Mapper, Saver
 from engram.ranking import check_for_robot
 from engram.sequences import FrameLog
 from engram.store import (
-    MapStore,
     SessionState,
     SessionWriter,
     StoredSession,
@@ -139,7 +138,7 @@ def map_drive(
     check_for_robot(options.policy)
     session = session_of_drive(sequence)
     report = MapReport(session)
-    with _open_or_create(map_path) as store:
+    with WritableMapStore.opened_or_created(map_path) as store:
         state = store.session_state(session.id)
         if state is SessionState.COMMITTED:
             report.known = True
@@ -159,10 +158,6 @@ def map_drive(
             _map_frames(opened, writer, camera, frames, settings, options, report, advance, start)
     report.skipped = sequence.skipped
     return report
-
-
-def _open_or_create(path: Path) -> WritableMapStore:
-    return MapStore.open_for_writing(path) if path.exists() else MapStore.create(path)
 
 
 def _begin(

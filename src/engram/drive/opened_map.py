@@ -54,6 +54,8 @@ class OpenMap:
         path_memory: its paths.
         attempts: counts of remembered attempts, from which match basins are learnt.
         times: when its sessions were driven.
+        sessions: its sessions, by id.
+        last_iterations: number of the newest remembered iteration of each session that has any.
     """
 
     def __init__(self, store: MapStore) -> None:
@@ -69,12 +71,15 @@ class OpenMap:
             self.path_memory.add(entry)
         self.times = SessionTimes(contents.sessions)
         self._words: dict[DescriptorKind, QuantisedWords] = {}
-        self._sessions = contents.sessions
         self._remembered = contents.attempts
         self._lessons: dict[float, Lessons] = {}
+        self.sessions = {session.id: session for session in contents.sessions}
         self.attempts = BasinCounts.empty()
+        self.last_iterations: dict[SessionId, int] = {}
         for session in contents.sessions:
             made = contents.attempts_of(session.id)
+            if made:
+                self.last_iterations[session.id] = made[-1].iteration
             tried = [self.graph.index(attempt.node) for attempt in made]
             self.attempts += count_attempts(made, self.graph.experiences[tried])
 
@@ -148,11 +153,11 @@ class OpenMap:
             attempts = PastAttempts(
                 made.session, made.node, basin.success_rate(along_m, across_m), made.accepted
             )
-            hours = [hour_of_day(session, session.start_ns) for session in self._sessions]
+            hours = [hour_of_day(session, session.start_ns) for session in self.sessions.values()]
             self._lessons[focal_px] = Lessons.learnt(
                 self.graph,
                 self.path_memory,
-                [path_id(session.id) for session in self._sessions],
+                [path_id(session.id) for session in self.sessions.values()],
                 np.array([np.nan if hour is None else hour for hour in hours], np.float64),
                 attempts,
             )
@@ -165,7 +170,7 @@ class OpenMap:
         *,
         policy: str = "path",
         budget: Budget | None = None,
-        relocaliser: str | None = "fabmap",
+        relocaliser: str | Relocaliser | None = "fabmap",
         live: SessionId = UNNAMED_LIVE_SESSION,
         saves: bool = False,
         matcher: Matcher | None = None,
@@ -179,7 +184,7 @@ class OpenMap:
             settings: the resolved configuration.
             policy: key of `POLICIES`.
             budget: by default 2 lanes × 2 rounds.
-            relocaliser: key of `RELOCALISERS`; None for none.
+            relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
             live: the live session.
             saves: whether it is being mapped.
             matcher, search: in place of the map's own; see `Localiser`.
@@ -194,9 +199,9 @@ class OpenMap:
             self.store.frames,
             policy=policy_named(policy),
             budget=budget or Budget(),
-            relocaliser=None
-            if relocaliser is None
-            else self.relocaliser(relocaliser, settings.frontend.descriptor),
+            relocaliser=self.relocaliser(relocaliser, settings.frontend.descriptor)
+            if isinstance(relocaliser, str)
+            else relocaliser,
             basin=MatchBasin.of(camera.fx, self.attempts),
             live=live,
             saves=saves,

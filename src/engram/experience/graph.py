@@ -267,6 +267,13 @@ class ExperienceGraph:
         """
         return self._experiences.rows
 
+    def find_edge(self, a: NodeId, b: NodeId, kind: EdgeKind) -> Edge | None:
+        """The edge of this key; None if there is none, or an end is not in the graph."""
+        if a not in self._index or b not in self._index:
+            return None
+        number = self._edge_index.get((self._index[a], self._index[b], kind))
+        return None if number is None else self._edges[number]
+
     def components(self) -> NDArray[np.int32]:
         """(N,) int32: the connected component of each node, numbered from 0 by first node."""
         ends = self.edge_ends

@@ -207,6 +207,21 @@ class Localiser:
         self.walk = Walk(self.walk.path, next_sequence, node)
         self._recent = RecentAttempts(self.config.recent, next_iteration)
 
+    def replay_from(self, driven_m: float, next_iteration: int) -> None:
+        """The frames to come are nodes that the session saved from there on (SPEC §7 MERGE 3).
+
+        Args:
+            driven_m: odometry distance from the session's start to the first of them.
+            next_iteration: number of their first iteration.
+        """
+        self._driven_m = driven_m
+        self._recent = RecentAttempts(self.config.recent, next_iteration)
+
+    @property
+    def iteration(self) -> int:
+        """Number of the running iteration."""
+        return self._recent.iteration
+
     def resume_in(self, node: NodeId) -> None:
         """The live frame had been saved as `node`."""
         self.position = Position.at(node)

@@ -1,7 +1,7 @@
 """The EBN loop: localise, else save an experience. Saving runs on a thread of its own."""
 
 from engram.mapper.loops import LoopConfig, LoopSearch
-from engram.mapper.mapper import Mapper, MapperConfig, MappingStep
+from engram.mapper.mapper import Mapper, MapperConfig, MappingStep, edge_through_live, match_edges
 from engram.mapper.saver import Records, RecordWriter, Saver
 
 __all__ = [
@@ -13,4 +13,6 @@ __all__ = [
     "RecordWriter",
     "Records",
     "Saver",
+    "edge_through_live",
+    "match_edges",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from engram.experience.model import Edge, EdgeKind, Node, NodeId, Session, node_
 from engram.experience.proximity import lay_proximity_edges, tighten_chain
 from engram.frontend import Frame, FrameStatus
 from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
+from engram.localiser.attempts import Outcome
 from engram.mapper.loops import LoopSearch
 from engram.mapper.saver import Records, Saver
 from engram.odometry import OdometryStatus, OdometryStep
@@ -109,7 +111,10 @@ class Mapper:
         saved: Node | None = None
         if localisation.status is LocalisationStatus.LOCALISED:
             self._joined = True
-            edges += self._end_experience(localisation) + self._match_edges()
+            edges += self._end_experience(localisation)
+            matched = match_edges(self._localiser.outcomes)
+            self._add_to_graph(matched)
+            edges += matched
         elif self._worth_saving(live):
             saved, laid = self._save(live, localisation.position)
             edges += laid
@@ -227,18 +232,17 @@ class Mapper:
         chain = [self._graph.index(node) for node in experience]
         return [tie, *tighten_chain(self._graph, chain)]
 
-    def _match_edges(self) -> list[Edge]:
-        """Nodes matched by the same live frame: their relation was measured."""
-        seen_from = [
-            Position(outcome.candidate.node, pose, covariance)
-            for outcome in self._localiser.outcomes
-            if outcome.accepted
-            and (pose := outcome.match.reference_from_live) is not None
-            and (covariance := outcome.match.covariance) is not None
-        ]
-        edges = [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
-        self._add_to_graph(edges)
-        return edges
+
+def match_edges(outcomes: Sequence[Outcome]) -> list[Edge]:
+    """Edges between nodes that were matched by the same live frame: their relation was measured."""
+    seen_from = [
+        Position(outcome.candidate.node, pose, covariance)
+        for outcome in outcomes
+        if outcome.accepted
+        and (pose := outcome.match.reference_from_live) is not None
+        and (covariance := outcome.match.covariance) is not None
+    ]
+    return [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
 
 
 def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:

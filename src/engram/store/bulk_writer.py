@@ -247,11 +247,11 @@ class BulkWriter:
     def add_attempts(
         self, session: SessionId, made: AttemptArrays, node_ids: Sequence[NodeId]
     ) -> None:
-        """Remember attempts of one session. Call it once for each session and revision.
+        """Remember attempts of one session, in the order of their iterations.
 
         Args:
             session: whose they are.
-            made: in the order of their iterations; their column `session` is of no account.
+            made: the attempts; their column `session` is of no account.
             node_ids: what their `reference` and `node` are indices into.
 
         Raises:

@@ -228,6 +228,20 @@ class MapStore:
             return content_hash(connection, self._view.at)
 
     @staticmethod
+    def copy(source: Path, target: Path) -> None:
+        """Copies a map file as it is now, also while somebody writes to it.
+
+        Raises:
+            InputError: the target exists already, or its folder does not.
+            MapError: the source cannot be read, or the target not written.
+        """
+        database = SqliteDatabase(source)
+        try:
+            database.copy_to(target)
+        finally:
+            database.close()
+
+    @staticmethod
     def check(location: Path | str) -> CheckReport:
         """Verify a map file to the last byte, also one that is too damaged to open.
 
@@ -274,6 +288,13 @@ class WritableMapStore(MapStore):
         self._open_session: SessionWriter | None = None
         self._bulk: BulkWriter | None = None
         self._holder = self._lock.holder
+
+    @staticmethod
+    def opened_or_created(location: Path) -> WritableMapStore:
+        """A map file open for writing, made if there is none."""
+        if location.exists():
+            return MapStore.open_for_writing(location)
+        return MapStore.create(location)
 
     def begin_session(
         self,

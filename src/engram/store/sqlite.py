@@ -81,22 +81,8 @@ class SqliteDatabase:
             MapError: it cannot be written.
         """
         _check_version()
-        if path.exists() or path.is_symlink():
-            raise InputError(f"{path} exists already; open it, or choose another name")
-        if not path.parent.is_dir():
-            raise InputError(f"{path.parent} is no folder; make it first")
-        draft = path.with_name(f".{path.name}.{os.getpid()}.new")
-        try:
-            _remove(draft)
+        with _new_file(path) as draft:
             _write_empty(draft)
-            _publish(draft, path)
-            _sync_folder(path.parent)
-        except FileExistsError as error:
-            raise InputError(f"{path} exists already; open it, or choose another name") from error
-        except OSError as error:
-            raise MapError(f"{path} cannot be created: {error.strerror}") from error
-        finally:
-            _remove(draft)
 
     @property
     def name(self) -> str:
@@ -167,6 +153,23 @@ class SqliteDatabase:
         except MapCorruptError as error:
             return [str(error)]
         return [str(fact) for fact in found if fact != "ok"]
+
+    def copy_to(self, target: Path) -> None:
+        """Copies the map as it is now, whoever writes to it meanwhile; whole or not at all.
+
+        Raises:
+            InputError: something is there already, or the folder is not.
+            MapError: it cannot be written.
+        """
+        with _new_file(target) as draft, _translated(str(target)):
+            source = _connect(_reading_uri(self.path), _prepare_reader)
+            copy = _connect(_uri(draft, "mode=rwc"), _prepare_writer)
+            try:
+                source.backup(copy)
+                copy.execute("PRAGMA journal_mode=WAL")
+            finally:
+                copy.close()
+                source.close()
 
     def size_bytes(self) -> int:
         """The file and its write-ahead log."""
@@ -304,6 +307,27 @@ def _check_tables(connection: Connection, path: Path) -> None:
         ]
         if columns != [(column.name, 0) for column in table.columns]:
             raise MapCorruptError(f"{path}: table {table.name} has the columns {columns}")
+
+
+@contextmanager
+def _new_file(path: Path) -> Iterator[Path]:
+    """A draft to be filled, which then appears under its name whole or not at all."""
+    if path.exists() or path.is_symlink():
+        raise InputError(f"{path} exists already; open it, or choose another name")
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent} is no folder; make it first")
+    draft = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        _remove(draft)
+        yield draft
+        _publish(draft, path)
+        _sync_folder(path.parent)
+    except FileExistsError as error:
+        raise InputError(f"{path} exists already; open it, or choose another name") from error
+    except OSError as error:
+        raise MapError(f"{path} cannot be created: {error.strerror}") from error
+    finally:
+        _remove(draft)
 
 
 def _write_empty(path: Path) -> None:

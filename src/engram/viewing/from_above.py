@@ -31,17 +31,39 @@ def draw_from_above(tracks: Sequence[Track], path: Path, title: str) -> None:
     Raises:
         MissingExtraError: Matplotlib is not installed.
     """
-    figure, axes = _axes()
-    for number, track in enumerate(tracks):
-        x, z = track.points_m[:, 0], track.points_m[:, 1]
-        colour = f"C{number % 10}"
-        axes.plot(x, z, ".", color=colour, markersize=5, label=track.label)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, m")
-    axes.set_ylabel("z, m")
-    axes.set_title(title)
-    axes.legend(fontsize=8, loc="best")
+    draw_panels([(title, tracks)], path)
+
+
+def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> None:
+    """Draws tracks from above, side by side.
+
+    Args:
+        panels: title and tracks of each; a label has one colour in all of them.
+        path: image file.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    names = dict.fromkeys(_name(track) for _, tracks in panels for track in tracks)
+    colours = {name: f"C{number % 10}" for number, name in enumerate(names)}
+    figure, all_axes = _axes(columns=len(panels))
+    for axes, (title, tracks) in zip(all_axes, panels, strict=True):
+        for track in tracks:
+            x, z = track.points_m[:, 0], track.points_m[:, 1]
+            colour = colours[_name(track)]
+            axes.plot(x, z, ".", color=colour, markersize=5, label=track.label)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x, m")
+        axes.set_ylabel("z, m")
+        axes.set_title(title)
+        if tracks:
+            axes.legend(fontsize=8, loc="best")
     _save(figure, path)
+
+
+def _name(track: Track) -> str:
+    """What a track is of, without the count behind it."""
+    return track.label.split(" (")[0]
 
 
 def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: str) -> None:
@@ -55,7 +77,7 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
     Raises:
         MissingExtraError: Matplotlib is not installed.
     """
-    figure, axes = _axes(wide=True)
+    figure, (axes,) = _axes(wide=True)
     for policy, counts in attempts.items():
         axes.step(np.arange(len(counts)), counts, where="mid", label=policy, linewidth=1.2)
     axes.set_xlabel("live frame")
@@ -66,7 +88,7 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
     _save(figure, path)
 
 
-def _axes(wide: bool = False):  # type: ignore[no-untyped-def]  # noqa: ANN202, Matplotlib's types
+def _axes(wide: bool = False, columns: int = 1):  # type: ignore[no-untyped-def]  # noqa: ANN202, Matplotlib's types
     try:
         import matplotlib
     except ImportError as error:
@@ -76,7 +98,9 @@ def _axes(wide: bool = False):  # type: ignore[no-untyped-def]  # noqa: ANN202, 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    return pyplot.subplots(figsize=(9, 3.2) if wide else (7, 6), layout="constrained")
+    size = (9, 3.2) if wide else (7 * columns, 6)
+    figure, axes = pyplot.subplots(1, columns, figsize=size, layout="constrained", squeeze=False)
+    return figure, axes[0]
 
 
 def _save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001, as above

@@ -1,0 +1,89 @@
+"""`engram merge`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engram.cli import options
+
+
+def merge(
+    centre: Annotated[
+        Path, typer.Argument(metavar="CENTRE", help="The fleet's map, made if there is none.")
+    ],
+    robots: Annotated[
+        list[Path], typer.Argument(metavar="ROBOT...", help="Maps that robots hand in, in order.")
+    ],
+    *,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Merge into a copy and throw it away.")
+    ] = False,
+    require_better: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--require-better",
+            metavar="DRIVE",
+            help="Refuse a merge in which this held-out drive localises worse; may be repeated.",
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help="Draw the centre before and after."),
+    ] = None,
+    policy: options.Policy = "path",
+    lanes: options.Lanes = 2,
+    rounds: options.Rounds = 4,
+    relocaliser: Annotated[
+        str,
+        typer.Option(
+            "--relocaliser",
+            help="How segments without a known neighbour are placed: fabmap, bag-of-words, "
+            "exhaustive or none.",
+        ),
+    ] = "fabmap",
+    author: Annotated[
+        str | None, typer.Option("--author", help="Who merges [default: the robots].")
+    ] = None,
+    config: options.Settings = None,
+    as_json: options.Json = False,
+) -> None:
+    """Merge what robots have seen and the centre is lacking into the centre.
+
+    Every map handed in is one revision, whole or not at all. Nodes that the centre has are not
+    taken again; the others are replayed as if they were a live drive, and only those that do not
+    localise are taken. The same map handed in twice changes nothing.
+
+    \b
+    Examples:
+      engram merge centre.engram r1.engram r2.engram
+      engram merge centre.engram r1.engram --dry-run --picture merge.png
+      engram merge centre.engram r1.engram --require-better held-out.framelog
+    """
+    from engram.cli.progress import progress
+    from engram.drive import load_settings
+    from engram.fleet import MergeOptions, merge_maps
+
+    asked = MergeOptions(
+        policy, lanes, rounds, None if relocaliser == "none" else relocaliser, author
+    )
+    reports = merge_maps(
+        centre,
+        robots,
+        load_settings(config),
+        asked,
+        dry_run=dry_run,
+        require_better=require_better or (),
+        picture=picture,
+        progress=progress,
+    )
+    if as_json:
+        print(json.dumps({"merges": [report.to_dict() for report in reports]}))
+    else:
+        for report in reports:
+            typer.echo(report.text())
+    if any(report.interrupted for report in reports):
+        raise typer.Exit(130)

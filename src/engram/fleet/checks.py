@@ -1,0 +1,133 @@
+"""Whether a map may be merged at all, and what about it somebody should look at."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+from engram.errors import IncompatibleError
+from engram.experience.model import Clock, Node, Session, SessionId
+from engram.fleet.centre import Centre
+from engram.fleet.handed_in import HandedIn
+
+_NS_PER_S = 1_000_000_000
+# Stamps count as running backwards only where odometry says that the robot drove on by as much.
+_DRIVEN_SLACK_M = 0.5
+
+
+def check_fits(centre: Centre, robot: HandedIn) -> None:
+    """Refuse a map that would spoil the centre.
+
+    Raises:
+        IncompatibleError: it has another kind of descriptors; or it has a node or a session under
+            the UUID of one of the centre's, and another content.
+    """
+    kind, theirs = centre.opened.descriptor, robot.store.info().descriptor
+    if None not in {kind, theirs} and kind is not theirs:
+        raise IncompatibleError(
+            f"{robot.name} holds {theirs} descriptors, the centre {kind}; the two cannot be "
+            "matched: extract and map the drives again"
+        )
+    for session in robot.sessions:
+        ours = centre.opened.sessions.get(session.id)
+        if ours is not None and _drive(ours) != _drive(session):
+            raise IncompatibleError(
+                f"session {session.id} is a drive of {session.robot} in {robot.name} and another "
+                f"one, of {ours.robot}, in the centre: one of the two maps is not what it says"
+            )
+    hashes = centre.landmark_hashes
+    for node in robot.contents.nodes:
+        if node.id in centre.graph and _content(centre, node) != (
+            node.session,
+            node.stamp_ns,
+            node.camera,
+            robot.landmark_hashes[node.id],
+        ):
+            raise IncompatibleError(
+                f"node {node.id} (session {node.session}, stamp {node.stamp_ns}) has one content "
+                f"in {robot.name} and another in the centre, landmarks "
+                f"{robot.landmark_hashes[node.id].hex()} and {hashes[node.id].hex()}: a node never "
+                "changes, so one of the two maps is not what it says"
+            )
+
+
+def notes(centre: Centre, robot: HandedIn, now_ns: int) -> list[str]:
+    """What is odd about a map and does not stand in the way of a merge.
+
+    Args:
+        centre: before the merge.
+        robot: the map.
+        now_ns: the time, UTC.
+    """
+    told = [
+        f"session {one.session.id} of {one.session.robot} was interrupted in {robot.name}: it is "
+        "not handed in before it is resumed or sealed there"
+        for one in robot.store.interrupted()
+    ]
+    for session in robot.sessions:
+        told += _backwards(session, robot.nodes_of[session])
+        if session.clock is Clock.UTC and session.start_ns > now_ns:
+            told.append(
+                f"session {session.id} of {session.robot} begins "
+                f"{(session.start_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
+                "was wrong"
+            )
+    told += _overlaps(centre, robot)
+    return told
+
+
+def _drive(session: Session) -> tuple[str, str, int]:
+    """What a session's UUID is made of; clock, longitude and zone may be told later (SPEC §2.8)."""
+    return session.robot, session.camera, session.start_ns
+
+
+def _content(centre: Centre, node: Node) -> tuple[SessionId, int, str, bytes]:
+    ours = centre.graph.node(centre.graph.index(node.id))
+    return ours.session, ours.stamp_ns, ours.camera, centre.landmark_hashes[node.id]
+
+
+def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
+    """Stamps that fall while the distance driven rises."""
+    back = [
+        (before.driven_m - after.driven_m, before, after)
+        for before, after in pairwise(nodes)
+        if after.driven_m < before.driven_m - _DRIVEN_SLACK_M
+    ]
+    if back:
+        _, before, after = max(back, key=lambda one: one[0])
+        yield (
+            f"the clock of session {session.id} ({session.robot}) runs backwards {len(back)} "
+            f"times: {(after.stamp_ns - before.stamp_ns) / _NS_PER_S:.1f} s after "
+            f"{before.driven_m:.0f} m driven it stamped {after.driven_m:.0f} m; nodes are replayed "
+            "in the order of their stamps"
+        )
+
+
+def _overlaps(centre: Centre, robot: HandedIn) -> Iterator[str]:
+    """Drives of one robot at the same time: two robots of one name, or a clock that was wrong."""
+    spans = _spans(centre, robot)
+    for session in robot.sessions:
+        mine = spans.get(session)
+        if mine is None:
+            continue
+        for other, theirs in spans.items():
+            new = other.id not in {one.id for one in robot.sessions} or other.id > session.id
+            if other.robot != session.robot or other.id == session.id or not new:
+                continue
+            if mine[0] <= theirs[1] and theirs[0] <= mine[1]:
+                yield (
+                    f"sessions {session.id} and {other.id} are both of a robot named "
+                    f"{session.robot!r} and overlap in time: two robots have the same name, or a "
+                    "clock was wrong"
+                )
+
+
+def _spans(centre: Centre, robot: HandedIn) -> dict[Session, tuple[int, int]]:
+    """First and last stamp of every session whose clock is UTC."""
+    sessions = {**centre.opened.sessions, **{one.id: one for one in robot.sessions}}
+    last = {one.id: one.start_ns for one in sessions.values()}
+    for node in (*centre.graph.nodes, *robot.contents.nodes):
+        last[node.session] = max(last[node.session], node.stamp_ns)
+    return {
+        one: (one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC
+    }

@@ -1,0 +1,144 @@
+"""A gate before the centre: held-out drives must not localise worse in what a merge made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.drive import OpenMap, Settings, live_frames, open_drive, session_of_drive
+from engram.drive.session import DriveSequence
+from engram.errors import RefusedError
+from engram.localiser import Budget, LocalisationStatus
+from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
+from engram.store import MapStore
+
+# SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
+_JUDGED_M = np.arange(0.0, 20.5, 0.5)
+_LONGEST_GAP_RATIO = 1.5
+# Sums of the same gaps in another order differ by this much.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class GateOptions:
+    """How held-out drives are localised.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each frame.
+        relocaliser: key of `RELOCALISERS`; drives begin lost.
+    """
+
+    policy: str = "path"
+    lanes: int = 2
+    rounds: int = 2
+    relocaliser: str | None = "fabmap"
+
+
+class Gate:
+    """Compares how held-out drives localise in the centre before and after.
+
+    Args:
+        drives: folders of images or frame logs; no part of what is merged.
+        settings: of localiser and odometry.
+        options: policy and budget.
+
+    Raises:
+        SequenceError: a drive cannot be read.
+    """
+
+    def __init__(
+        self, drives: Sequence[Path], settings: Settings, options: GateOptions | None = None
+    ) -> None:
+        self._paths = list(drives)
+        self._sequences = [open_drive(path) for path in drives]
+        self._settings = settings
+        self._options = options or GateOptions()
+        self._before: list[Drive] | None = None
+
+    def look_at(self, store: MapStore) -> None:
+        """The centre as it is; once, before the first merge."""
+        self._before = self._localise(store)
+
+    def __call__(self, store: MapStore) -> None:
+        """The centre as it would become.
+
+        Raises:
+            RefusedError: the drives localise worse in it.
+        """
+        assert self._before is not None
+        after = self._localise(store)
+        worse = what_is_worse(after, self._before)
+        if worse:
+            raise RefusedError(
+                f"the merge is refused: {', '.join(path.name for path in self._paths)} localise "
+                f"worse in the result: {worse}; the centre is as it was"
+            )
+        self._before = after
+
+    def _localise(self, store: MapStore) -> list[Drive]:
+        opened = OpenMap(store)
+        return [
+            localise_drive(opened, one, self._settings, self._options) for one in self._sequences
+        ]
+
+
+def localise_drive(
+    opened: OpenMap,
+    sequence: DriveSequence,
+    settings: Settings,
+    options: GateOptions,
+    advance: Callable[[str], None] = lambda _: None,
+) -> Drive:
+    """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
+    settings = settings.for_descriptor(opened.descriptor)
+    localiser = opened.localiser(
+        sequence.camera,
+        settings,
+        policy=options.policy,
+        budget=Budget(options.lanes, options.rounds),
+        relocaliser=options.relocaliser,
+        live=session_of_drive(sequence).id,
+        clock=sequence.info,
+    )
+    step_m, matched = [], []
+    with localiser, closing(live_frames(sequence, settings)) as frames:
+        for live in frames:
+            found = localiser.localise(live.frame, live.odometry)
+            motion = live.odometry.prev_from_curr
+            step_m.append(0.0 if motion is None else motion.distance_m)
+            matched.append(found.status is LocalisationStatus.LOCALISED)
+            advance(found.status.value)
+    return Drive(np.array(step_m, np.float64), np.array(matched, np.bool_))
+
+
+def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
+    """Where one map is worse than another (SPEC §8, "A beats B"); "" if it is not.
+
+    Args:
+        after, before: the same drives in both maps.
+    """
+    facts = []
+    curves = [_curve(drives) for drives in (after, before)]
+    excess = curves[0] - curves[1]
+    at = int(np.argmax(excess))
+    if excess[at] > _ROUNDING:
+        facts.append(
+            f"P(no match within {_JUDGED_M[at]:.1f} m) {curves[0][at]:.2%}, was {curves[1][at]:.2%}"
+        )
+    longest = [longest_gap_m(drives) for drives in (after, before)]
+    if longest[0] > _LONGEST_GAP_RATIO * longest[1] + _ROUNDING:
+        facts.append(f"longest gap {longest[0]:.1f} m, was {longest[1]:.1f} m")
+    if facts:
+        shares = [route_not_localised(drives) for drives in (after, before)]
+        facts.append(f"route not localised {shares[0]:.2%}, was {shares[1]:.2%}")
+    return "; ".join(facts)
+
+
+def _curve(drives: Sequence[Drive]) -> NDArray[np.float64]:
+    return np.array([failure_route(drives, float(at)) for at in _JUDGED_M])

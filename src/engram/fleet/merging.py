@@ -1,0 +1,278 @@
+"""MERGE: what a robot has seen and the centre is lacking joins the centre (SPEC §7, [G16] §V-A)."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from engram import __version__
+from engram.config import to_dict
+from engram.drive import Settings
+from engram.experience.model import (
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    PathEntry,
+    Session,
+    SessionId,
+    path_id,
+)
+from engram.fleet.attempts import at_equivalents, from_records
+from engram.fleet.centre import Centre, LazyRelocaliser
+from engram.fleet.checks import check_fits, notes
+from engram.fleet.handed_in import HandedIn
+from engram.fleet.positions import recomposed, uncertainty_m2
+from engram.fleet.replay import MergeOptions, Replay
+from engram.fleet.report import MergeReport
+from engram.fleet.segments import Segment, string_segments
+from engram.localiser import Position
+from engram.store import BulkWriter, WritableMapStore
+
+Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
+Gate: TypeAlias = Callable[[WritableMapStore], None]
+
+
+def merge_map(
+    store: WritableMapStore,
+    robot: HandedIn,
+    settings: Settings,
+    options: MergeOptions,
+    progress: Progress,
+    gate: Gate | None = None,
+) -> MergeReport:
+    """Merges one robot's map into the centre: one revision, or none where nothing is new.
+
+    Args:
+        store: the centre.
+        robot: the map handed in.
+        settings: of localiser and mapper.
+        options: policy and budget.
+        progress: shows how it goes.
+        gate: is shown the result before it becomes part of the centre, and raises to refuse it.
+
+    Raises:
+        IncompatibleError: the map does not fit the centre.
+        MapError: a map cannot be read or written. The centre is as it was.
+    """
+    centre = Centre(store)
+    check_fits(centre, robot)
+    report = MergeReport(robot.name, robot.content_hash, robot.robots)
+    report.notes = notes(centre, robot, time.time_ns())
+    new = [node for node in robot.contents.nodes if not centre.knows(node.id)]
+    report.known_omissions = sum(centre.has_omitted(node) for node in robot.nodes)
+    report.known = len(robot.nodes) - len(new) - report.known_omissions
+    if new or _has_more(centre, robot):
+        with store.begin_revision(**_about(robot, settings, options)) as writer:
+            merging = _Merging(centre, robot, writer, settings, options, report)
+            merging.take_over(new, progress)
+            if gate is not None:
+                writer.flush()
+                gate(store)
+            report.revision = writer.commit().number
+    report.components = int(centre.graph.components().max(initial=-1)) + 1
+    report.content_hash = store.content_hash()
+    return report
+
+
+def _about(robot: HandedIn, settings: Settings, options: MergeOptions) -> dict[str, Any]:
+    """Who merged what and how: kept with the revision, and free of where it happened."""
+    names = ", ".join(robot.robots)
+    return {
+        "author": options.author or names or "nobody",
+        "message": f"merge {names or 'a map without drives'}",
+        "configuration": {
+            "merge": {"source": robot.content_hash, **to_dict(options)},
+            "settings": to_dict(settings),
+            "engram": __version__,
+        },
+    }
+
+
+def _has_more(centre: Centre, robot: HandedIn) -> bool:
+    """Whether a map without new nodes has anything else to say."""
+    return (
+        any(session.id not in centre.opened.sessions for session in robot.sessions)
+        or any(centre.new_entry(entry) for entry in robot.contents.path_entries)
+        or any(_is_new(centre, edge) for edge in robot.edges)
+        or any(_carries(centre, robot, omitted) for omitted in robot.omissions)
+    )
+
+
+class _Merging:
+    """One robot's map on its way into the centre."""
+
+    def __init__(
+        self,
+        centre: Centre,
+        robot: HandedIn,
+        writer: BulkWriter,
+        settings: Settings,
+        options: MergeOptions,
+        report: MergeReport,
+    ) -> None:
+        self._centre = centre
+        self._robot = robot
+        self._writer = writer
+        self._settings = settings
+        self._options = options
+        self._report = report
+
+    def take_over(self, new: list[Node], progress: Progress) -> None:
+        """The steps of SPEC §7 MERGE, in order."""
+        self._take_vocabulary()
+        with progress(f"merge {self._robot.name}", len(new)) as advance:
+            replay = self._replay(advance)
+            late: list[PathEntry] = []
+            segments: dict[SessionId, list[Segment]] = defaultdict(list)
+            for segment in string_segments(new, self._robot.edges):
+                segments[segment.nodes[0].session].append(segment)
+            for session in self._robot.sessions:
+                self._add_session(session)
+                for segment in segments[session.id]:
+                    self._report.segments.append(replay.segment(session, segment))
+                late += self._unite_path(session, replay)
+        self._add_entries(late)
+        self._take_known_edges()
+        self._join_components()
+        self._carry_omissions()
+        self._carry_attempts(replay)
+        self._report.taken = sum(one.taken for one in self._report.segments)
+        self._report.omitted += sum(one.omitted for one in self._report.segments)
+        self._report.edges += replay.edges
+        self._report.match_attempts = replay.match_attempts
+
+    def _replay(self, advance: Callable[[str], None]) -> Replay:
+        name, descriptor = self._options.relocaliser, self._settings.frontend.descriptor
+        opened = self._centre.opened
+        return Replay(
+            self._centre,
+            self._robot,
+            self._writer,
+            self._settings,
+            self._options,
+            None
+            if name is None
+            else LazyRelocaliser(name, lambda: opened.relocaliser(name, descriptor)),
+            advance,
+        )
+
+    def _take_vocabulary(self) -> None:
+        """A centre without a vocabulary of its own takes that of the robot."""
+        theirs = self._robot.store.vocabulary()
+        if theirs is not None and self._centre.store.vocabulary() is None:
+            self._writer.put_vocabulary(theirs)
+
+    def _add_session(self, session: Session) -> None:
+        descriptor, frontend = self._robot.frontends[session.id]
+        is_new = self._writer.add_session(
+            session,
+            self._robot.contents.cameras[session.camera],
+            descriptor=descriptor,
+            frontend=frontend,
+            partial=path_id(session.id) in self._robot.partial_paths,
+        )
+        self._centre.opened.times.add(session)
+        self._report.sessions += is_new
+
+    def _unite_path(self, session: Session, replay: Replay) -> list[PathEntry]:
+        """The drive's path as far as its nodes are known; returns the entries that are not yet."""
+        path = path_id(session.id)
+        entries = self._robot.entries_of.get(path, [])
+        known = [entry for entry in entries if self._centre.knows(entry.node)]
+        self._add_entries([*known, *replay.entries.get(session.id, [])])
+        return [entry for entry in entries if not self._centre.knows(entry.node)]
+
+    def _add_entries(self, entries: list[PathEntry]) -> None:
+        for entry in entries:
+            new = self._centre.new_entry(entry)
+            if new is not None:
+                self._centre.add_entry(new)
+                self._writer.add_path_entry(new)
+                self._report.path_entries += 1
+
+    def _take_known_edges(self) -> None:
+        """What the robot found out about nodes that the centre had: matches between them."""
+        for edge in self._robot.edges:
+            if _is_new(self._centre, edge):
+                self._add_edge(edge)
+
+    def _join_components(self) -> None:
+        """Where two parts of the centre are joined only by nodes that were not taken."""
+        labels = self._centre.graph.components()
+        index = self._centre.graph.index
+        edges = []
+        for edge in self._robot.edges:
+            a, b = self._centre.equivalent(edge.a), self._centre.equivalent(edge.b)
+            moved = None if a is None or b is None else recomposed(edge, a, b)
+            if moved is not None and labels[index(moved.a)] != labels[index(moved.b)]:
+                edges.append(moved)
+        edges.sort(key=lambda edge: (uncertainty_m2(edge.covariance), edge.a, edge.b))
+        joined: dict[int, int] = {}
+        for edge in edges:
+            ends = [_root(joined, int(labels[index(node)])) for node in (edge.a, edge.b)]
+            if ends[0] != ends[1]:
+                self._add_edge(edge)
+                joined[max(ends)] = min(ends)
+
+    def _add_edge(self, edge: Edge) -> None:
+        self._centre.graph.add_edge(edge)
+        self._writer.add_edge(edge)
+        self._report.edges += 1
+
+    def _carry_omissions(self) -> None:
+        """What the robot's map had omitted itself, when it was merged from others."""
+        for omitted in sorted(self._robot.omissions):
+            position = _carries(self._centre, self._robot, omitted)
+            if position is not None:
+                self._writer.add_omission(self._centre.omit(omitted, position))
+                self._report.omitted += 1
+
+    def _carry_attempts(self, replay: Replay) -> None:
+        """Remembered attempts go along (SPEC §7 MERGE 4), those of the replay too."""
+        contents = self._robot.contents
+        positions = [self._centre.equivalent(node.id) for node in contents.nodes]
+        ids = [
+            node.id if at is None else at.node
+            for node, at in zip(contents.nodes, positions, strict=True)
+        ]
+        place = {session.id: at for at, session in enumerate(contents.sessions)}
+        for session in self._robot.sessions:
+            if session.id not in self._centre.opened.sessions:
+                rows = np.flatnonzero(contents.attempts.session == place[session.id])
+                made = at_equivalents(contents.attempts.rows(rows), positions)
+                self._writer.add_attempts(session.id, made, ids)
+                self._report.attempts += len(made)
+            replayed, nodes = from_records(replay.attempts.get(session.id, []))
+            self._writer.add_attempts(session.id, replayed, nodes)
+
+
+def _root(joined: dict[int, int], label: int) -> int:
+    """The component that a component has become part of."""
+    while label in joined:
+        label = joined[label]
+    return label
+
+
+def _is_new(centre: Centre, edge: Edge) -> bool:
+    """An edge between two of the centre's nodes that it lacks; bridges stand for what it has."""
+    return (
+        edge.kind is not EdgeKind.BRIDGE
+        and edge.a in centre.graph
+        and edge.b in centre.graph
+        and centre.graph.find_edge(edge.a, edge.b, edge.kind) is None
+    )
+
+
+def _carries(centre: Centre, robot: HandedIn, omitted: NodeId) -> Position | None:
+    """Where a node that the robot's map had omitted is in the centre; None if it needs no word."""
+    omission = robot.omissions[omitted]
+    known = centre.equivalent(omission.node)
+    if known is None or centre.knows(omitted) or omitted in robot.nodes:
+        return None
+    return known.carried_on(omission.node_from_omitted, np.zeros((6, 6)))

@@ -1,0 +1,304 @@
+"""Replaying a robot's segments in the centre as if they were live streams (SPEC §7 MERGE 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from engram.drive import Settings
+from engram.experience.model import (
+    Attempt,
+    Edge,
+    EdgeKind,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    Session,
+    SessionId,
+)
+from engram.experience.proximity import lay_proximity_edges, tighten_chain
+from engram.fleet.centre import Centre
+from engram.fleet.handed_in import HandedIn
+from engram.fleet.positions import beyond, recomposed, seen_from, uncertainty_m2
+from engram.fleet.report import Reason, RunReport, Seed, SegmentReport
+from engram.fleet.segments import Segment
+from engram.frontend import Frame, FrameStatus
+from engram.localiser import (
+    Budget,
+    Localisation,
+    LocalisationStatus,
+    Localiser,
+    Position,
+    Relocaliser,
+)
+from engram.mapper import match_edges
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.store import BulkWriter, StoredNode
+
+# A segment is seeded from a neighbour this far along it: farther, places are looked up instead.
+# Source: the distance after which own nodes are neighbours again (SPEC §3.1).
+_SEED_WITHIN_M = 30.0
+# What measured a relation, and did not dead-reckon it.
+_MEASURED = frozenset({EdgeKind.ODOMETRY, EdgeKind.MATCH, EdgeKind.TIE, EdgeKind.BRIDGE})
+# Iterations between two segments of a session: a match in one vouches for nothing in the other.
+_ITERATION_GAP = 100
+
+
+@dataclass(frozen=True, slots=True)
+class MergeOptions:
+    """How maps are merged.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each replayed frame; a count, never a deadline, so that the
+            same input gives the same map.
+        relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
+        author: who merges; None for the robots whose drives are handed in.
+    """
+
+    policy: str = "path"
+    lanes: int = 2
+    rounds: int = 4
+    relocaliser: str | None = "fabmap"
+    author: str | None = None
+
+
+class Replay:
+    """Replays segments one after another and writes what the centre takes.
+
+    Args:
+        centre: grows.
+        robot: whose segments they are.
+        writer: the open revision.
+        settings: of localiser and mapper.
+        options: policy and budget.
+        relocaliser: shared by all segments.
+        advance: called once for each node with a word on what became of it.
+
+    Attributes:
+        edges: how many were written.
+        match_attempts: how many were made.
+        attempts: those to be remembered, by session, in the order of iterations.
+        entries: what the replay matched, by session, in the order of time; not yet numbered.
+    """
+
+    def __init__(
+        self,
+        centre: Centre,
+        robot: HandedIn,
+        writer: BulkWriter,
+        settings: Settings,
+        options: MergeOptions,
+        relocaliser: Relocaliser | None,
+        advance: Callable[[str], None],
+    ) -> None:
+        self.edges = 0
+        self.match_attempts = 0
+        self.attempts: dict[SessionId, list[Attempt]] = {}
+        self.entries: dict[SessionId, list[PathEntry]] = {}
+        self._centre = centre
+        self._robot = robot
+        self._writer = writer
+        self._settings = settings
+        self._options = options
+        self._relocaliser = relocaliser
+        self._advance = advance
+        self._taken: set[NodeId] = set()
+        self._run: list[int] = []  # nodes taken one after another, by their dense indices
+        self._iterations: dict[SessionId, int] = {}
+
+    def segment(self, session: Session, segment: Segment) -> SegmentReport:
+        """Replays one segment: what localises is omitted, the rest is taken (SPEC §7 MERGE 3)."""
+        report = SegmentReport(str(session.id), session.robot, segment.nodes[0].stamp_ns)
+        seed = self._seed(segment)
+        if seed is not None:
+            report.seed = Seed.NEIGHBOUR
+        if self._relocaliser is not None:
+            self._relocaliser.forget_failures()
+        with self._localiser(session, segment) as localiser:
+            if seed is not None:
+                localiser.start_at(seed)
+            for stored, odometry in self._stream(segment):
+                frame = self._robot.store.frames.decode(stored)
+                found = self._localise(localiser, stored.node.id, frame, odometry)
+                if found.status is LocalisationStatus.LOCALISED:
+                    self._omit(stored, found, localiser)
+                    _count_omitted(report)
+                else:
+                    reason, begins = _reason(frame, found), not self._run
+                    self._take(stored, frame, localiser)
+                    _count_taken(report, stored, odometry, reason, begins=begins)
+                self.match_attempts += found.attempts
+                self._advance("omitted" if found.node else "taken")
+            self._end_run()
+            self._remember(session, localiser)
+        return report
+
+    # -- the stream
+
+    def _localiser(self, session: Session, segment: Segment) -> Localiser:
+        centre, options = self._centre.opened, self._options
+        localiser = centre.localiser(
+            self._robot.contents.cameras[segment.nodes[0].camera],
+            self._settings,
+            policy=options.policy,
+            budget=Budget(options.lanes, options.rounds),
+            relocaliser=self._relocaliser,
+            live=session.id,
+            saves=True,
+            clock=session,
+        )
+        if session.id not in self._iterations:
+            made = self._robot.last_iterations.get(session.id, -1)
+            made = max(made, centre.last_iterations.get(session.id, -1))
+            self._iterations[session.id] = made + _ITERATION_GAP
+        localiser.replay_from(segment.nodes[0].driven_m, self._iterations[session.id])
+        return localiser
+
+    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, OdometryStep]]:
+        """The nodes in the order of time, each with its motion since the one before."""
+        steps = [OdometryStep(OdometryStatus.FIRST)]
+        for (before, _), edge in zip(pairwise(segment.nodes), segment.steps, strict=True):
+            _, prev_from_curr, covariance = seen_from(edge, before.id)
+            steps.append(OdometryStep(OdometryStatus.OK, prev_from_curr, covariance))
+        yield from zip(self._robot.store.frames.stored(segment.nodes), steps, strict=True)
+
+    def _localise(
+        self, localiser: Localiser, node: NodeId, frame: Frame, odometry: OdometryStep
+    ) -> Localisation:
+        """One frame; where the robot itself measured how it lies to a known node, from there."""
+        known = self._known_neighbour(node, _MEASURED) if self._run else None
+        if known is None or self._centre.graph.index(known.node) in self._run:
+            return localiser.localise(frame, odometry)
+        localiser.carry_on(odometry)
+        localiser.start_at(known)
+        return localiser.localise(frame, OdometryStep(OdometryStatus.FIRST))
+
+    def _seed(self, segment: Segment) -> Position | None:
+        """Where the first frame is, by the nearest node of the segment with a known neighbour."""
+        from_first = Position.at(segment.nodes[0].id)
+        for number, node in enumerate(segment.nodes):
+            if number:
+                _, motion, covariance = seen_from(
+                    segment.steps[number - 1], segment.nodes[number - 1].id
+                )
+                from_first = from_first.carried_on(motion, covariance)
+                if from_first.node_from_live.distance_m > _SEED_WITHIN_M:
+                    return None
+            known = self._known_neighbour(node.id, frozenset(EdgeKind))
+            if known is not None:
+                node_from_first = from_first.node_from_live.inverse()
+                adjoint = node_from_first.adjoint()
+                return known.carried_on(
+                    node_from_first, adjoint @ from_first.covariance @ adjoint.T
+                )
+        return None
+
+    def _known_neighbour(self, node: NodeId, kinds: frozenset[EdgeKind]) -> Position | None:
+        """Where a node is, by the surest of its edges to nodes that the centre knows."""
+        found = []
+        for edge in self._robot.edges_of.get(node, ()):
+            other = self._centre.equivalent(edge.b if edge.a == node else edge.a)
+            if other is not None and edge.kind in kinds:
+                found.append(beyond(other, edge, node))
+        return min(found, key=lambda one: uncertainty_m2(one.covariance), default=None)
+
+    # -- what becomes of a frame
+
+    def _omit(self, stored: StoredNode, found: Localisation, localiser: Localiser) -> None:
+        """The centre shows this place alike already."""
+        assert found.node is not None
+        assert found.node_from_live is not None
+        assert found.covariance is not None
+        node = stored.node.id
+        position = Position(found.node, found.node_from_live, found.covariance)
+        self._writer.add_omission(self._centre.omit(node, position))
+        self._link(node)
+        self._end_run()
+        for edge in match_edges(localiser.outcomes):
+            self._add_edge(edge)
+
+    def _take(self, stored: StoredNode, frame: Frame, localiser: Localiser) -> None:
+        """A node that the centre is lacking, with its own edges."""
+        node = stored.node
+        index = self._centre.graph.add_node(node)
+        self._writer.add_node(stored, frame)
+        self._taken.add(node.id)
+        self._run.append(index)
+        self._link(node.id)
+        self._write(lay_proximity_edges(self._centre.graph, index))
+        localiser.settle_in(node.id, node.stamp_ns)
+
+    def _link(self, node: NodeId) -> None:
+        """The robot's edges from a node to what is resolved already, to the equivalents of both."""
+        for edge in self._robot.edges_of.get(node, ()):
+            a, b = self._centre.equivalent(edge.a), self._centre.equivalent(edge.b)
+            if a is None or b is None or not {edge.a, edge.b} & self._taken:
+                continue
+            moved = recomposed(edge, a, b)
+            if moved is not None:
+                self._add_edge(moved)
+
+    def _end_run(self) -> None:
+        """Nodes were taken one after another up to here: their far end is tied now, or never."""
+        run, self._run = self._run, []
+        if run:
+            self._write(tighten_chain(self._centre.graph, run))
+
+    def _add_edge(self, edge: Edge) -> None:
+        """Adds an edge; of two with one key, moved from different nodes, the surer one stays."""
+        known = self._centre.graph.find_edge(edge.a, edge.b, edge.kind)
+        if known is None or uncertainty_m2(edge.covariance) < uncertainty_m2(known.covariance):
+            self._centre.graph.add_edge(edge)
+            self._write([edge])
+
+    def _write(self, edges: list[Edge]) -> None:
+        """Edges that are in the graph already."""
+        for edge in edges:
+            self._writer.add_edge(edge)
+        self.edges += len(edges)
+
+    def _remember(self, session: Session, localiser: Localiser) -> None:
+        """Attempts and matches of a segment, for the session's attempts and its path."""
+        self._iterations[session.id] = localiser.iteration + _ITERATION_GAP
+        self.attempts.setdefault(session.id, []).extend(localiser.take_attempts())
+        self.entries.setdefault(session.id, []).extend(
+            replace(entry, kind=PathEntryKind.REPLAYED)
+            for entry in localiser.walk.take_new()
+            if entry.kind is PathEntryKind.MATCHED
+        )
+
+
+def _reason(frame: Frame, found: Localisation) -> Reason:
+    """Why a frame was not matched."""
+    if frame.status is not FrameStatus.OK:
+        return Reason.UNUSABLE_FRAME
+    if found.candidates:
+        return Reason.NO_MATCH
+    return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
+
+
+def _count_omitted(report: SegmentReport) -> None:
+    if report.seed is Seed.NONE:
+        report.seed = Seed.PLACE
+    report.omitted += 1
+
+
+def _count_taken(
+    report: SegmentReport,
+    stored: StoredNode,
+    odometry: OdometryStep,
+    reason: Reason,
+    *,
+    begins: bool,
+) -> None:
+    """Counts a node taken, in a run of its own if what came before it was omitted."""
+    if begins:
+        report.runs.append(RunReport(stored.node.stamp_ns))
+    run = report.runs[-1]
+    if not begins and odometry.prev_from_curr is not None:
+        run.length_m += odometry.prev_from_curr.distance_m
+    run.nodes += 1
+    run.reasons[reason] += 1
+    report.taken += 1

@@ -1,0 +1,201 @@
+"""What a merge came to: per segment what was taken and omitted, and why a run did not localise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from engram.config import to_dict
+
+# Lines of segments that people are shown; JSON has all.
+_SHOWN_SEGMENTS = 12
+
+
+class Seed(StrEnum):
+    """How the replay of a segment knew where it was."""
+
+    NEIGHBOUR = "neighbour"
+    PLACE = "place"
+    NONE = "none"
+
+
+class Reason(StrEnum):
+    """Why a frame of the replay did not localise."""
+
+    UNUSABLE_FRAME = "unusable_frame"
+    NOTHING_NEAR = "nothing_near"
+    NO_PLACE = "no_place"
+    NO_MATCH = "no_match"
+
+
+_WORDS = {
+    Reason.UNUSABLE_FRAME: "frames of no use on their own",
+    Reason.NOTHING_NEAR: "nothing known is near",
+    Reason.NO_PLACE: "no place of the map looks like it",
+    Reason.NO_MATCH: "what is near does not match",
+}
+
+
+@dataclass(slots=True)
+class RunReport:
+    """Nodes of a segment, one after another, that did not localise and were taken.
+
+    Attributes:
+        first_stamp_ns: of the first of them.
+        nodes: how many.
+        length_m: odometry distance from first to last.
+        reasons: why each did not localise.
+    """
+
+    first_stamp_ns: int
+    nodes: int = 0
+    length_m: float = 0.0
+    reasons: Counter[Reason] = field(default_factory=Counter)
+
+    @property
+    def reason(self) -> Reason:
+        """The most frequent reason; of equals the first in `Reason`."""
+        return max(Reason, key=lambda reason: self.reasons[reason])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "first_stamp_ns": self.first_stamp_ns,
+            "nodes": self.nodes,
+            "length_m": self.length_m,
+            "reason": self.reason.value,
+        }
+
+
+@dataclass(slots=True)
+class SegmentReport:
+    """What became of one segment.
+
+    Attributes:
+        session: UUID of the drive.
+        robot: name of the robot.
+        first_stamp_ns: stamp of its first node.
+        seed: how the replay knew where it was.
+        taken, omitted: nodes.
+        runs: the nodes taken, run by run.
+    """
+
+    session: str
+    robot: str
+    first_stamp_ns: int
+    seed: Seed = Seed.NONE
+    taken: int = 0
+    omitted: int = 0
+    runs: list[RunReport] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "session": self.session,
+            "robot": self.robot,
+            "first_stamp_ns": self.first_stamp_ns,
+            "seed": self.seed.value,
+            "taken": self.taken,
+            "omitted": self.omitted,
+            "runs": [run.to_dict() for run in self.runs],
+        }
+
+    def text(self) -> str:
+        """For people."""
+        line = f"  {self.robot} {self.session[:8]}: {self.taken} taken, {self.omitted} omitted"
+        line += {Seed.NEIGHBOUR: "", Seed.PLACE: ", found by its looks", Seed.NONE: ", not found"}[
+            self.seed
+        ]
+        reasons = Counter[Reason]()
+        for run in self.runs:
+            reasons[run.reason] += run.nodes
+        told = [f"{_WORDS[reason]} ({count})" for reason, count in reasons.most_common()]
+        return f"{line}: {'; '.join(told)}" if told else line
+
+
+@dataclass(slots=True)
+class MergeReport:
+    """What handing in one robot's map came to.
+
+    Attributes:
+        source: the robot's map.
+        source_hash: its content hash.
+        robots: whose drives it holds.
+        revision: number of the new revision; None where nothing changed, and in a dry run.
+        dry_run: whether the centre was left as it was on purpose.
+        interrupted: whether it was stopped; the centre is as it was.
+        content_hash: of the centre afterwards; of what would have been in a dry run.
+        sessions: drives that were new to the centre.
+        known, known_omissions: nodes that the centre had, and had omitted before.
+        taken, omitted: nodes.
+        edges, path_entries, attempts: how many were added.
+        match_attempts: match attempts of the replay, what the merge costs.
+        components: connected components of the centre afterwards.
+        segments: one report each, in the order of replay.
+        notes: what somebody should look at.
+    """
+
+    source: str
+    source_hash: str
+    robots: Sequence[str]
+    revision: int | None = None
+    dry_run: bool = False
+    interrupted: bool = False
+    content_hash: str = ""
+    sessions: int = 0
+    known: int = 0
+    known_omissions: int = 0
+    taken: int = 0
+    omitted: int = 0
+    edges: int = 0
+    path_entries: int = 0
+    attempts: int = 0
+    match_attempts: int = 0
+    components: int = 0
+    segments: list[SegmentReport] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def changed(self) -> bool:
+        """Whether the centre has learnt anything."""
+        return bool(self.sessions or self.taken or self.omitted or self.edges or self.path_entries)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``merge --json`` prints for this map."""
+        values: dict[str, Any] = {
+            name: to_dict(getattr(self, name))
+            for name in self.__slots__
+            if name not in {"segments", "robots"}
+        }
+        return {
+            **values,
+            "robots": list(self.robots),
+            "changed": self.changed,
+            "segments": [segment.to_dict() for segment in self.segments],
+        }
+
+    def text(self) -> str:
+        """For people."""
+        lines = [f"{self.source} ({', '.join(self.robots) or 'no drives'}): {self._outcome()}"]
+        if self.changed and not self.interrupted:
+            lines.append(
+                f"  {self.taken} nodes taken, {self.omitted} omitted, {self.known} known already, "
+                f"{self.known_omissions} omitted before; {self.sessions} new sessions, "
+                f"{self.path_entries} path entries, {self.attempts} attempts carried over"
+            )
+            lines += [one.text() for one in self.segments[:_SHOWN_SEGMENTS]]
+            if len(self.segments) > _SHOWN_SEGMENTS:
+                lines.append(f"  … and {len(self.segments) - _SHOWN_SEGMENTS} more segments")
+        lines += [f"  note: {note}" for note in self.notes]
+        return "\n".join(lines)
+
+    def _outcome(self) -> str:
+        if self.interrupted:
+            return "interrupted: the centre is as it was; give the same command again"
+        if not self.changed:
+            return "nothing new"
+        made = "dry run" if self.dry_run else f"revision {self.revision}"
+        return f"{made}, content {self.content_hash}, {self.components} components"

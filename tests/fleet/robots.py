@@ -1,0 +1,48 @@
+"""Robots that drove past simulated places, and the maps that they hand in."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from engram.drive import Settings
+from engram.experience.model import NodeId
+from engram.fleet import MergeOptions, MergeReport, merge_maps
+from engram.geometry import SE3
+from mapping_rig import Mapped, map_simulated
+from synthetic_world import World, drive
+
+DAY_NS = 86_400_000_000_000
+WORLD = World(length_m=60.0, seed=11)
+# FAB-MAP knows nothing of random descriptors: every node is looked at instead.
+OPTIONS = MergeOptions(relocaliser="exhaustive")
+
+
+@contextmanager
+def silent(what: str, total: int):
+    yield lambda word: None
+
+
+def robot_map(
+    path: Path,
+    places_m: np.ndarray,
+    appearance: int | np.ndarray = 0,
+    *,
+    name: str = "r1",
+    day: int = 1,
+    aside_m: float = 0.0,
+    world: World = WORLD,
+) -> Mapped:
+    """One more drive in a robot's map, which is made if there is none."""
+    steps = drive(world, places_m, appearance, aside_m=aside_m, start_ns=day * DAY_NS, seed=day)
+    return map_simulated(path, steps, name)
+
+
+def merged(centre: Path, *robots: Path, **options: object) -> list[MergeReport]:
+    return merge_maps(centre, robots, Settings(), OPTIONS, progress=silent, **options)
+
+
+def truth_of(*maps: Mapped) -> dict[NodeId, SE3]:
+    return {node: pose for one in maps for node, pose in one.saved.items()}

@@ -1,0 +1,222 @@
+"""What a merge takes, omits and ties; that it may be repeated; that nothing is half done."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+
+from engram.drive import open_map
+from engram.experience.model import EdgeKind, PathEntryKind, path_id
+from engram.fleet import Reason, Seed
+from engram.store import MapStore
+
+from .robots import merged, robot_map, truth_of
+
+
+def assert_sound(path) -> None:
+    assert MapStore.check(path).problems == ()
+
+
+def test_an_empty_centre_takes_everything_to_the_byte(tmp_path, fleet):
+    centre, (robot, _) = tmp_path / "centre.engram", fleet["first"]
+    (report,) = merged(centre, robot)
+    with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
+        mine, given = ours.load(), theirs.load()
+        assert mine.nodes == given.nodes
+        assert mine.sessions == given.sessions
+        assert mine.path_entries == given.path_entries
+        assert ours.landmark_hashes() == theirs.landmark_hashes()
+        assert ours.omissions() == {}
+        for session in given.sessions:
+            kept = mine.attempts_of(session.id)[: len(given.attempts_of(session.id))]
+            assert kept == given.attempts_of(session.id)
+    assert (report.taken, report.omitted, report.revision) == (len(given.nodes), 0, 1)
+    assert report.segments[0].seed is Seed.NONE
+    assert_sound(centre)
+
+
+def test_what_localises_is_omitted_and_remembered_where_it_lies(tmp_path, fleet):
+    centre = tmp_path / "centre.engram"
+    (first, mapped_first), (same, mapped_same) = fleet["first"], fleet["same"]
+    _, report = merged(centre, first, same)
+    assert report.omitted >= 0.9 * len(mapped_same.saved)
+    assert report.components == 1
+    truth = truth_of(mapped_first, mapped_same)
+    with MapStore.open(centre) as store:
+        omissions = store.omissions()
+        sessions = {session.robot: session for session in store.load().sessions}
+        entries = store.load().path_entries
+    assert len(omissions) == report.omitted
+    for omitted, omission in omissions.items():
+        true = truth[omission.node].inverse() @ truth[omitted]
+        error = true.inverse() @ omission.node_from_omitted
+        assert error.distance_m < 0.15  # 0.3 px of noise at up to 40 m
+    # The robot's own entries keep their numbers and stand at the equivalents; then what the
+    # replay matched.
+    own = [entry for entry in entries if entry.path == path_id(sessions["r2"].id)]
+    with MapStore.open(same) as store:
+        given = store.load().path_entries
+    assert [entry.sequence for entry in own[: len(given)]] == [one.sequence for one in given]
+    for entry, one in zip(own, given, strict=False):
+        expected = omissions[one.node].node if one.node in omissions else one.node
+        assert entry.node == expected
+    replayed = own[len(given) :]
+    assert replayed
+    assert {entry.kind for entry in replayed} == {PathEntryKind.REPLAYED}
+    assert replayed[0].sequence == 2**32
+    assert_sound(centre)
+
+
+def test_a_run_that_does_not_localise_is_taken_and_tied_where_it_began(tmp_path, fleet):
+    centre = tmp_path / "centre.engram"
+    (first, mapped_first), (longer, mapped_longer) = fleet["first"], fleet["longer"]
+    _, report = merged(centre, first, longer)
+    assert report.omitted >= 15
+    assert report.taken >= 10
+    assert report.components == 1
+    (segment,) = report.segments
+    assert segment.seed is Seed.PLACE
+    assert sum(run.nodes for run in segment.runs) == segment.taken
+    truth = truth_of(mapped_first, mapped_longer)
+    with open_map(centre) as opened:
+        graph = opened.graph
+        a = graph.index(min(mapped_first.saved, key=lambda one: truth[one].translation[2]))
+        b = graph.index(
+            max(
+                (node for node in mapped_longer.saved if node in graph),
+                key=lambda one: truth[one].translation[2],
+            )
+        )
+        predicted, _ = graph.predict(a, b)
+        true = truth[graph.node(a).id].inverse() @ truth[graph.node(b).id]
+        # 1 % of odometry noise a step over 60 m, and a tie.
+        assert (predicted.translation - true.translation)[2] == pytest.approx(0, abs=1.0)
+        kinds = {edge.kind for edge in graph.edges}
+    assert EdgeKind.TIE in kinds
+    assert_sound(centre)
+
+
+def test_what_finds_no_place_becomes_a_component_of_its_own(tmp_path, fleet):
+    centre = tmp_path / "centre.engram"
+    (first, _), (other, mapped_other) = fleet["first"], fleet["other"]
+    _, report = merged(centre, first, other)
+    assert (report.taken, report.omitted) == (len(mapped_other.saved), 0)
+    assert report.components == 2
+    (segment,) = report.segments
+    assert segment.seed is Seed.NONE
+    assert [run.reason for run in segment.runs] == [Reason.NO_PLACE]
+    assert_sound(centre)
+
+
+@pytest.mark.parametrize("names", [("first",), ("first", "same"), ("first", "longer", "other")])
+def test_handing_in_the_same_again_changes_nothing(tmp_path, fleet, names):
+    centre = tmp_path / "centre.engram"
+    robots = [fleet[name][0] for name in names]
+    before = merged(centre, *robots)[-1]
+    again = merged(centre, *robots)
+    assert [report.revision for report in again] == [None] * len(names)
+    assert not any(report.changed for report in again)
+    assert again[-1].content_hash == before.content_hash
+    with MapStore.open(centre) as store:
+        assert store.revision == len(names)
+    assert MapStore.check(centre).abandoned_rows == 0
+
+
+def test_the_same_in_the_same_order_gives_the_same_map(tmp_path, fleet):
+    robots = [fleet[name][0] for name in ("same", "first", "longer", "other")]
+    together = merged(tmp_path / "a.engram", *robots)[-1]
+    for robot in robots:
+        (alone,) = merged(tmp_path / "b.engram", robot)
+    assert alone.content_hash == together.content_hash
+
+
+def test_a_robot_goes_out_with_the_centre_and_hands_back_what_it_added(tmp_path, fleet):
+    centre, robot = tmp_path / "centre.engram", tmp_path / "robot.engram"
+    merged(centre, fleet["first"][0])
+    shutil.copy(centre, robot)
+    back = robot_map(robot, np.arange(10, 60, 0.5), 0, name="r1", day=9)
+    assert 0 < len(back.saved) < 40
+    (report,) = merged(centre, robot)
+    assert report.known == len(fleet["first"][1].saved)
+    assert report.components == 1
+    assert {segment.seed for segment in report.segments} == {Seed.NEIGHBOUR}
+    # What the robot could not localise the centre cannot either: it holds nothing else.
+    assert report.taken == len(back.saved)
+    with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
+        mine, given = ours.load(), theirs.load()
+        assert set(mine.path_entries) >= set(given.path_entries)
+        edges = {(edge.a, edge.b, edge.kind) for edge in mine.edges}
+        assert edges >= {(edge.a, edge.b, edge.kind) for edge in given.edges}
+    assert not merged(centre, robot)[0].changed
+    assert_sound(centre)
+
+
+def test_later_robots_localise_in_what_earlier_ones_of_the_merge_brought(tmp_path, fleet):
+    robot = tmp_path / "two-days.engram"
+    shutil.copy(fleet["other"][0], robot)
+    twin = tmp_path / "twin.engram"
+    robot_map(twin, np.arange(0, 40, 0.5), 1, name="r5", day=6, aside_m=0.2)
+    # Two drives alike in one map that never met: the second finds the first one's nodes.
+    both = tmp_path / "both.engram"
+    merged(both, robot, twin)
+    centre = tmp_path / "centre.engram"
+    merged(centre, fleet["first"][0])
+    (report,) = merged(centre, both)
+    assert report.components == 2
+    assert report.known_omissions == 0
+    with MapStore.open(both) as store, MapStore.open(centre) as ours:
+        # The omissions of the map handed in go along.
+        assert set(ours.omissions()) >= set(store.omissions())
+        assert report.omitted >= len(store.omissions())
+
+
+def test_two_parts_of_the_centre_are_joined_by_a_drive_through_both(tmp_path):
+    centre = tmp_path / "centre.engram"
+    parts = [tmp_path / "a.engram", tmp_path / "b.engram"]
+    robot_map(parts[0], np.arange(0, 20, 0.5), 0, name="r1", day=1)
+    robot_map(parts[1], np.arange(20.5, 40, 0.5), 1, name="r2", day=2)
+    *_, before = merged(centre, *parts)
+    assert before.components == 2
+    through = tmp_path / "through.engram"
+    places_m = np.arange(0, 40, 0.5)
+    robot_map(through, places_m, np.where(places_m < 20.25, 0, 1), name="r3", day=3)
+    (report,) = merged(centre, through)
+    # It changes over within a few metres: until the localiser counts as lost it tries what is near.
+    assert report.omitted > 0.75 * (report.omitted + report.taken)
+    assert report.components == 1
+    assert not merged(centre, through)[0].changed
+
+
+def test_attempts_go_along_to_the_equivalents(tmp_path, fleet):
+    centre = tmp_path / "centre.engram"
+    (first, _), (same, _) = fleet["first"], fleet["same"]
+    robot = tmp_path / "robot.engram"
+    shutil.copy(same, robot)
+    again = robot_map(robot, np.arange(0, 40, 0.5), 0, name="r2", day=7, aside_m=-0.4)
+    assert len(again.saved) < 5
+    _, report = merged(centre, first, robot)
+    with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
+        mine, given = ours.load(), theirs.load()
+        omissions = ours.omissions()
+    (drive,) = [
+        one for one in given.sessions if one.start_ns == max(s.start_ns for s in given.sessions)
+    ]
+    made, kept = given.attempts_of(drive.id), mine.attempts_of(drive.id)
+    assert report.attempts > 0
+    assert len(kept) >= len(made) > 50
+    for one, now in zip(made, kept, strict=False):
+        assert (now.iteration, now.accepted, now.inliers) == (
+            one.iteration,
+            one.accepted,
+            one.inliers,
+        )
+        if one.node in omissions:
+            moved = omissions[one.node].node_from_omitted @ np.array(
+                [[one.across_m, 0.0, one.along_m]]
+            )
+            assert now.node == omissions[one.node].node
+            assert (now.across_m, now.along_m) == pytest.approx(moved[0, [0, 2]], abs=2e-2)
+        else:
+            assert now.along_m == pytest.approx(one.along_m, abs=1e-6)
