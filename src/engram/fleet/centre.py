@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from engram.drive import OpenMap
 from engram.experience.model import NodeId, Omission, PathEntry, PathEntryKind, PathId
 from engram.frontend import Frame
+from engram.geometry import SE3
 from engram.localiser import Position, Relocaliser
 from engram.store import MapStore
 
@@ -133,7 +134,17 @@ class LazyRelocaliser:
         self.new_place = self._made.new_place
         return proposed
 
-    def forget_failures(self) -> None:
+    def carry_on(self, motion: SE3 | None) -> None:
+        """See `Relocaliser`; one that was never asked believes nothing yet."""
+        if self._made is not None:
+            self._made.carry_on(motion)
+
+    def failed(self, nodes: Sequence[int]) -> None:
         """See `Relocaliser`."""
         if self._made is not None:
-            self._made.forget_failures()
+            self._made.failed(nodes)
+
+    def forget(self) -> None:
+        """See `Relocaliser`."""
+        if self._made is not None:
+            self._made.forget()

@@ -115,7 +115,7 @@ class Replay:
         if seed is not None:
             report.seed = Seed.NEIGHBOUR
         if self._relocaliser is not None:
-            self._relocaliser.forget_failures()
+            self._relocaliser.forget()
         with self._localiser(session, segment) as localiser:
             if seed is not None:
                 localiser.start_at(seed)
