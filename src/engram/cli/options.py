@@ -13,7 +13,10 @@ DrivePath: TypeAlias = Annotated[
 ]
 Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 At: TypeAlias = Annotated[
-    int | None, typer.Option("--at", metavar="REV", help="Read the map as of this revision.")
+    str | None,
+    typer.Option(
+        "--at", metavar="REV|TAG", help="Read the map as of this revision: 7, a tag, head~2."
+    ),
 ]
 Format: TypeAlias = Annotated[
     str | None,

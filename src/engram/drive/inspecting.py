@@ -11,7 +11,7 @@ from engram.drive.opened_map import OpenMap
 from engram.store import MapStore
 
 
-def describe_map(path: Path, at: int | None = None) -> dict[str, Any]:
+def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
     """A map in numbers, for ``engram info``.
 
     Raises:

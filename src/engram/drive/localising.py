@@ -27,7 +27,7 @@ class LocaliseOptions:
         lanes, rounds: the budget of each frame.
         deadline_ms: no attempt starts later than this after its frame arrived; None for no limit.
         relocaliser: key of `RELOCALISERS`; None for none.
-        at: number of the map's revision; None for the newest.
+        at: number or tag of the map's revision; None for the newest.
         rate_hz: replay in real time; None for as fast as it goes.
         preload: decode all images before the first frame.
     """
@@ -37,7 +37,7 @@ class LocaliseOptions:
     rounds: int = 2
     deadline_ms: float | None = None
     relocaliser: str | None = "fabmap"
-    at: int | None = None
+    at: int | str | None = None
     rate_hz: float | None = None
     preload: bool = False
 

@@ -51,7 +51,7 @@ class Confusion:
 
 
 def find_lookalikes(
-    map_path: Path, at: int | None = None, *, advance: Callable[[str], None]
+    map_path: Path, at: int | str | None = None, *, advance: Callable[[str], None]
 ) -> Confusion:
     """Compares every node of a map with every other by their words.
 

@@ -306,12 +306,12 @@ class LiveRobot:
         return self._localiser.localise(frame, odometry, deadline)
 
 
-def open_map(path: str | Path, at: int | None = None) -> OpenMap:
+def open_map(path: str | Path, at: int | str | None = None) -> OpenMap:
     """Opens a map for localising in it.
 
     Args:
         path: NAME.engram.
-        at: number of a revision, to see the map as it was then; None for the newest.
+        at: number or tag of a revision, to see the map as it was then; None for the newest.
 
     Raises:
         MapError: the file is no map, of a newer format, or damaged.

@@ -70,7 +70,7 @@ def relocalise_drive(
     *,
     relocaliser: str = "fabmap",
     budget: Budget | None = None,
-    at: int | None = None,
+    at: int | str | None = None,
     advance: Callable[[str], None],
 ) -> list[ColdStart]:
     """Finds every frame of a drive in a map as if the robot had just been switched on.
@@ -81,7 +81,7 @@ def relocalise_drive(
         settings: the resolved configuration.
         relocaliser: key of `RELOCALISERS`.
         budget: of each frame; 2 lanes × 2 rounds by default.
-        at: number of the map's revision; None for the newest.
+        at: number or tag of the map's revision; None for the newest.
         advance: called once per frame with a word on how it went.
 
     Raises:

@@ -16,6 +16,7 @@ from engram.store.records import (
     StoredSession,
 )
 from engram.store.session_writer import SessionWriter
+from engram.store.tags import Tag
 
 __all__ = [
     "AttemptArrays",
@@ -31,6 +32,7 @@ __all__ = [
     "SessionWriter",
     "StoredNode",
     "StoredSession",
+    "Tag",
     "WritableMapStore",
     "decode_landmarks",
     "decode_thumbnail",

@@ -31,7 +31,6 @@ from engram.store.rows import (
     verified,
 )
 from engram.store.schema import (
-    FORMAT_VERSION,
     VERSIONED,
     attempts,
     cameras,
@@ -48,6 +47,7 @@ from engram.store.schema import (
     revisions,
     sessions,
     statistics,
+    tags,
     vocabularies,
 )
 
@@ -61,7 +61,7 @@ _REFERENCES = {
     "b": nodes,
     "path": paths,
 }
-_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED)
+_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags)
 assert set(_ORDER) == set(metadata.sorted_tables)
 
 # Rotations come out of chains of products: what is left of skew is rounding.
@@ -238,9 +238,10 @@ class _Checking:
         )
 
 
-def _check_format(_: _Checking, row: Row) -> None:
-    if row["version"] != FORMAT_VERSION:
-        raise MapCorruptError(f"says format {row['version']}, the file says {FORMAT_VERSION}")
+def _check_format(checking: _Checking, row: Row) -> None:
+    expected = checking.database.format_version
+    if row["version"] != expected:
+        raise MapCorruptError(f"says format {row['version']}, the file says {expected}")
 
 
 def _check_revision(checking: _Checking, row: Row) -> None:
@@ -339,6 +340,12 @@ def _check_hidden(checking: _Checking, row: Row) -> None:
         raise MapCorruptError(f"hides row {row['target']} of {row['record']}, which is missing")
 
 
+def _check_tag(checking: _Checking, row: Row) -> None:
+    numbers = {one["number"] for one in checking.revision_rows.values()} - {None}
+    if row["number"] is not None and row["number"] not in numbers:
+        raise MapCorruptError(f"tag {row['name']} names revision {row['number']}, which is missing")
+
+
 def _check_rotation(rotation: np.ndarray[Any, np.dtype[np.float64]]) -> None:
     skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not skew <= _ROTATION_TOLERANCE:
@@ -361,4 +368,5 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     statistics: _check_statistic,
     vocabularies: _check_vocabulary,
     hidden: _check_hidden,
+    tags: _check_tag,
 }

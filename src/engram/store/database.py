@@ -35,6 +35,11 @@ class Database(Protocol):
         """Path or address, for messages."""
         ...
 
+    @property
+    def format_version(self) -> int:
+        """Format of the map as it lies there; becoming its writer raises it to the newest."""
+        ...
+
     def reading(self) -> AbstractContextManager[Connection]:
         """A connection for selects, from any thread."""
         ...
@@ -51,7 +56,7 @@ class Database(Protocol):
         ...
 
     def lock_for_writing(self) -> Lock:
-        """Become the only writer.
+        """Become the only writer. A map of an older format is raised to the newest.
 
         Raises:
             MapLockedError: somebody else is.

@@ -59,6 +59,7 @@ from engram.store.rows import (
 from engram.store.schema import nodes, path_entries, paths, revisions, sessions, vocabularies
 from engram.store.session_writer import SessionWriter
 from engram.store.sqlite import SqliteDatabase
+from engram.store.tags import Tag, checked_tag, load_tags, resolve, write_tag
 from engram.store.view import View, head
 
 
@@ -85,14 +86,11 @@ class MapStore:
     """
 
     def __init__(
-        self, database: Database, *, at: int | None, cache_bytes: int = DEFAULT_CACHE_BYTES
+        self, database: Database, *, at: int | str | None, cache_bytes: int = DEFAULT_CACHE_BYTES
     ) -> None:
         self._database = database
         with database.reading() as connection:
-            newest = head(connection)
-        if at is not None and not 0 <= at <= newest:
-            raise RevisionError(f"{database.name} has revisions 1 to {newest}, not {at}")
-        self._view = View(newest if at is None else at)
+            self._view = View(resolve(connection, at, database.name))
         self.frames = FrameReader(database, self._view, cache_bytes)
 
     @staticmethod
@@ -111,13 +109,17 @@ class MapStore:
 
     @staticmethod
     def open(
-        location: Path | str, *, at: int | None = None, cache_bytes: int = DEFAULT_CACHE_BYTES
+        location: Path | str,
+        *,
+        at: int | str | None = None,
+        cache_bytes: int = DEFAULT_CACHE_BYTES,
     ) -> MapStore:
         """Open a map for reading.
 
         Args:
             location: path of the map file, or address of a map in PostgreSQL.
-            at: number of the revision to see; None for the newest, 0 for the map before the first.
+            at: number or name of the revision to see (`resolve`); None for the newest, 0 for the
+                map before the first.
             cache_bytes: how much memory decoded frames may take.
 
         Raises:
@@ -159,10 +161,29 @@ class MapStore:
         with self._database.reading() as connection:
             return reading.log(connection, self._view)
 
+    def tags(self) -> dict[str, Tag]:
+        """The names that were given to revisions, also to those not seen from here."""
+        with self._database.reading() as connection:
+            return load_tags(connection)
+
+    def resolve(self, named: int | str | None) -> int:
+        """Number of a revision of the whole map, however it is named.
+
+        Raises:
+            RevisionError: there is none.
+        """
+        with self._database.reading() as connection:
+            return resolve(connection, named, self._database.name)
+
     def info(self) -> MapInfo:
         """The map in numbers."""
         with self._database.reading() as connection:
-            return reading.info(connection, self._view, self._database.size_bytes())
+            return reading.info(
+                connection,
+                self._view,
+                format_version=self._database.format_version,
+                size_bytes=self._database.size_bytes(),
+            )
 
     def statistics(self) -> dict[str, dict[str, Any]]:
         """The newest of every statistic of the map, by name."""
@@ -430,6 +451,57 @@ class WritableMapStore(MapStore):
             revision = commit_revision(connection, opened["key"])
         self._see(View(revision.number))
         return revision
+
+    def tag(
+        self,
+        name: str,
+        named: int | str | None = None,
+        *,
+        author: str,
+        message: str = "",
+        move: bool = False,
+    ) -> Tag:
+        """Give a revision a name. History and content hash stay as they are.
+
+        Args:
+            name: a letter, then letters, digits and ``. _ / + -``.
+            named: the revision; None for the newest.
+            author: who.
+            message: why.
+            move: whether a name that another revision has may be taken from it.
+
+        Raises:
+            InputError: the name cannot be one.
+            RevisionError: there is no such revision, or another one has the name.
+        """
+        checked_tag(name)
+        with self._database.writing() as connection:
+            number = resolve(connection, named, self._database.name)
+            if number == 0:
+                raise RevisionError(f"{self._database.name} has no revision yet to tag")
+            known = load_tags(connection).get(name)
+            if known is not None and known.number != number and not move:
+                raise RevisionError(
+                    f"revision {known.number} of {self._database.name} is tagged {name!r} already; "
+                    "choose another name, or move the tag"
+                )
+            if known is None or known.number != number:
+                write_tag(connection, self._keys, name, number, author, message)
+            return load_tags(connection)[name]
+
+    def untag(self, name: str, *, author: str) -> Tag:
+        """Take a name away; returns what it was.
+
+        Raises:
+            RevisionError: there is no such tag.
+        """
+        with self._database.writing() as connection:
+            known = load_tags(connection)
+            if name not in known:
+                told = ", ".join(known) or "none"
+                raise RevisionError(f"{self._database.name} has no tag {name!r}; its tags: {told}")
+            write_tag(connection, self._keys, name, None, author, "")
+        return known[name]
 
     def clean(self) -> int:
         """Remove the rows of abandoned revisions; returns how many there were."""

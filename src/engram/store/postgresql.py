@@ -18,6 +18,8 @@ from sqlalchemy import (
     Select,
     Table,
     create_engine,
+    delete,
+    event,
     insert,
     inspect,
     make_url,
@@ -25,6 +27,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import Insert
 from sqlalchemy.exc import ArgumentError, DBAPIError
+from sqlalchemy.schema import CreateTable
 
 from engram import __version__
 from engram.errors import (
@@ -39,7 +42,13 @@ from engram.errors import (
 )
 from engram.store.lock import Holder
 from engram.store.rows import sealed
-from engram.store.schema import FORMAT_VERSION, map_format, metadata
+from engram.store.schema import (
+    FORMAT_VERSION,
+    map_format,
+    metadata,
+    missing_in,
+    rebuilt_from,
+)
 
 # The first half of the advisory lock's key says that it is ours, the second which map.
 _LOCK_CLASS = 0x4547524D
@@ -65,16 +74,23 @@ class PostgresDatabase:
         self.name = f"{url.render_as_string(hide_password=True)} map {self._schema}"
         self._url = url
         self._engine = _engine(url, self._schema)
+        self.format_version = self._read_version()
+        if self.format_version < FORMAT_VERSION:
+            _show_missing_tables(self._engine, self.format_version)
+            self._engine.dispose()
+
+    def _read_version(self) -> int:
         with self.reading() as connection:
             if not inspect(connection).has_table(map_format.name, schema=self._schema):
                 raise NotAMapError(f"{self.name}: there is no such map")
             found = connection.execute(text("SELECT version FROM map_format ORDER BY key"))
-            version = found.scalar() or 0
+            version = int(found.scalar() or 0)
         if version > FORMAT_VERSION:
             raise FormatVersionError(
                 f"{self.name} is of format {version}, this Engram ({__version__}) reads up to "
                 f"{FORMAT_VERSION}; install a newer one"
             )
+        return version
 
     @staticmethod
     def create(address: str) -> None:
@@ -117,7 +133,25 @@ class PostgresDatabase:
 
     def lock_for_writing(self) -> AdvisoryLock:
         """Become the only writer."""
-        return AdvisoryLock(self._url, self._schema, self)
+        lock = AdvisoryLock(self._url, self._schema, self)
+        try:
+            self._raise_format()
+        except BaseException:
+            lock.release()
+            raise
+        return lock
+
+    def _raise_format(self) -> None:
+        """Bring an older map to the newest format: all of it, in one transaction."""
+        if self._read_version() < FORMAT_VERSION:
+            self._engine.dispose()
+            self._engine = _engine(self._url, self._schema)
+            with self.writing() as connection:
+                _raise_tables(connection, self.format_version)
+        if self.format_version < FORMAT_VERSION:
+            self._engine.dispose()
+            self._engine = _engine(self._url, self._schema)
+            self.format_version = FORMAT_VERSION
 
     def writer(self) -> Holder | None:
         """Who writes now."""
@@ -231,6 +265,43 @@ def _engine(url: URL, schema: str, **options: str) -> Engine:
         raise MissingExtraError(
             "maps in PostgreSQL need its driver: pip install 'engram[server]'"
         ) from error
+
+
+def _show_missing_tables(engine: Engine, version: int) -> None:
+    """What a map of an older format lacks is seen as empty tables of each connection alone."""
+    definitions = [
+        str(CreateTable(table).compile(dialect=engine.dialect)).replace(
+            "CREATE TABLE", "CREATE TEMP TABLE", 1
+        )
+        for table in missing_in(version)
+    ]
+
+    @event.listens_for(engine, "connect")
+    def connect(connection: Any, _: object) -> None:
+        for definition in definitions:
+            connection.execute(definition)
+        connection.commit()
+
+
+def _raise_tables(connection: Connection, version: int) -> None:
+    for table in missing_in(version):
+        connection.execute(CreateTable(table))
+    for table in rebuilt_from(version):
+        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO older"))
+        # Constraints keep their names, which the new table needs.
+        names = connection.execute(
+            text("SELECT conname FROM pg_constraint WHERE conrelid = 'older'::regclass")
+        )
+        for name in names.scalars().all():
+            connection.execute(text(f'ALTER TABLE older RENAME CONSTRAINT "{name}" TO "o_{name}"'))
+        connection.execute(CreateTable(table))
+        columns = ", ".join(table.columns.keys())
+        copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
+        connection.execute(text(copied))
+        connection.execute(text("DROP TABLE older"))
+    connection.execute(delete(map_format))
+    row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
+    connection.execute(insert(map_format), sealed(map_format, row))
 
 
 def _map_number(schema: str) -> int:

@@ -38,7 +38,6 @@ from engram.store.rows import (
     verified,
 )
 from engram.store.schema import (
-    FORMAT_VERSION,
     attempts,
     cameras,
     edges,
@@ -138,7 +137,9 @@ def revision_from_row(row: Row) -> Revision:
     )
 
 
-def info(connection: Connection, view: View, size_bytes: int) -> MapInfo:
+def info(
+    connection: Connection, view: View, *, format_version: int, size_bytes: int
+) -> MapInfo:
     """The map in numbers, without reading it whole."""
     by_kind = dict.fromkeys(EdgeKind, 0)
     mapped_m = 0.0
@@ -155,7 +156,7 @@ def info(connection: Connection, view: View, size_bytes: int) -> MapInfo:
     )
     counted = view.select(attempts).with_only_columns(func.sum(attempts.c.count)).order_by(None)
     return MapInfo(
-        format_version=FORMAT_VERSION,
+        format_version=format_version,
         revision=view.at,
         descriptor=descriptor_of(connection, view),
         cameras=connection.execute(select(func.count()).select_from(used.subquery())).scalar_one(),
@@ -279,12 +280,12 @@ def _path_entries(
         for row in view.rows(connection, paths)
     }
     place = {key: at for at, key in enumerate(path_ids)}
-    rows = [
-        row
+    newest = {
+        (row["path"], row["sequence"]): row
         for row in view.rows(connection, path_entries)
         if row["path"] in path_ids and row["node"] in node_ids
-    ]
-    rows.sort(key=lambda row: (place[row["path"]], row["sequence"]))
+    }
+    rows = sorted(newest.values(), key=lambda row: (place[row["path"]], row["sequence"]))
     return tuple(
         path_entry_from_row(row, path_ids[row["path"]], node_ids[row["node"]]) for row in rows
     )

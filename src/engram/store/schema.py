@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import SchemaItem
 from sqlalchemy.types import TypeEngine
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 # SQLite's INTEGER and REAL are 64 bits wide.
 _INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
@@ -172,7 +172,7 @@ path_entries = _table(
     _int("node"),
     _text("kind"),
     _int("stamp_ns"),
-    UniqueConstraint("path", "sequence"),
+    UniqueConstraint("path", "sequence", "revision"),  # format 1: path, sequence
 )
 
 omissions = _table(
@@ -182,7 +182,7 @@ omissions = _table(
     _int("revision"),
     _int("node"),
     _bytes("node_from_omitted"),
-    UniqueConstraint("uuid"),
+    UniqueConstraint("uuid", "revision"),  # format 1: uuid
 )
 
 attempts = _table(
@@ -221,6 +221,18 @@ hidden = _table(
     _int("hidden"),  # 1 hides it, 0 shows it again
 )
 
+# Names that people give to revisions. They are no part of what a revision holds: a tag that is set,
+# moved or taken away leaves history and content hash as they were. Of a name the newest row counts.
+tags = _table(
+    "tags",
+    _key(),
+    _text("name"),
+    _int("number", nullable=True),  # of the revision; NULL takes the name away
+    _text("author"),
+    _text("message"),
+    _int("tagged_ns"),
+)
+
 # In the order in which rows may refer to earlier tables.
 VERSIONED: tuple[Table, ...] = (
     sessions,
@@ -236,3 +248,19 @@ VERSIONED: tuple[Table, ...] = (
     hidden,
 )
 KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)
+
+# Tables by the format that brought them; all others are of format 1. A map of an older format reads
+# as one in which they are empty.
+NEWER: dict[int, tuple[Table, ...]] = {2: (tags,)}
+# Tables whose columns stand since format 1, but whose constraints a later format loosened.
+LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
+
+
+def missing_in(version: int) -> list[Table]:
+    """The tables that a map of an older format does not have."""
+    return [table for since, news in NEWER.items() if since > version for table in news]
+
+
+def rebuilt_from(version: int) -> list[Table]:
+    """The tables that a map of an older format has with stricter constraints."""
+    return [table for since, news in LOOSENED.items() if since > version for table in news]

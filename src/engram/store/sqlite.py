@@ -18,10 +18,22 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sqlalchemy import Connection, Engine, Select, Table, create_engine, event, insert
+from sqlalchemy import (
+    Connection,
+    Engine,
+    Select,
+    Table,
+    create_engine,
+    delete,
+    event,
+    insert,
+    text,
+)
+from sqlalchemy.dialects import sqlite as sqlite_dialect
 from sqlalchemy.dialects.sqlite import Insert
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import QueuePool
+from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.compiler import SQLCompiler
 
 from engram import __version__
@@ -36,7 +48,13 @@ from engram.errors import (
 )
 from engram.store.lock import Holder, WriterLock, current_holder
 from engram.store.rows import sealed
-from engram.store.schema import FORMAT_VERSION, map_format, metadata
+from engram.store.schema import (
+    FORMAT_VERSION,
+    map_format,
+    metadata,
+    missing_in,
+    rebuilt_from,
+)
 
 # "EGRM": tells `file` and other programs that this SQLite file is a map.
 APPLICATION_ID = 0x4547524D
@@ -65,12 +83,13 @@ class SqliteDatabase:
         path = path.resolve()  # one lock per map, whatever links lead to it
         self.path = path
         _check_header(path)
-        self._reader = _engine(_reading_uri(path), _prepare_reader)
+        self.format_version = _format_version(path)
+        self._reader = self._reading_engine()
         self._writer: Engine | None = None
         self._compiled: dict[Select[Any], tuple[str, tuple[str, ...]]] = {}
         self._idle: deque[sqlite3.Connection] = deque()  # as many as there were threads at once
         with self.reading() as connection:
-            _check_tables(connection, path)
+            _check_tables(connection, path, self.format_version)
 
     @staticmethod
     def create(path: Path) -> None:
@@ -106,7 +125,7 @@ class SqliteDatabase:
             try:
                 connection = self._idle.pop()
             except IndexError:
-                connection = _connect(_reading_uri(self.path), _prepare_reader)
+                connection = _connect(_reading_uri(self.path), self._prepare_reader)
             try:
                 row: tuple[Any, ...] | None = connection.execute(
                     statement, [parameters[name] for name in names]
@@ -127,7 +146,13 @@ class SqliteDatabase:
         """Become the only writer."""
         if not os.access(self.path, os.W_OK):
             raise MapError(f"{self.path} is read-only; copy it where it may be written")
-        return WriterLock(self.path)
+        lock = WriterLock(self.path)
+        try:
+            self._raise_format()
+        except BaseException:
+            lock.release()
+            raise
+        return lock
 
     def writer(self) -> Holder | None:
         """Who writes now."""
@@ -178,12 +203,57 @@ class SqliteDatabase:
 
     def close(self) -> None:
         """Close all connections; the last one to close empties the write-ahead log."""
-        self._reader.dispose()
-        while self._idle:
-            self._idle.pop().close()
+        self._end_readers()
         if self._writer is not None:
             with _translated(self.name):
                 self._writer.dispose()
+
+
+    def _end_readers(self) -> None:
+        self._reader.dispose()
+        while self._idle:
+            self._idle.pop().close()
+
+    def _reading_engine(self) -> Engine:
+        return _engine(_reading_uri(self.path), self._prepare_reader)
+
+    def _prepare_reader(self, connection: sqlite3.Connection) -> None:
+        """What a map of an older format lacks is seen as empty tables of this connection alone."""
+        _prepare(connection)
+        for table in missing_in(self.format_version):
+            connection.execute(_definition(table).replace("CREATE TABLE", "CREATE TEMP TABLE", 1))
+        connection.execute("PRAGMA query_only=ON")
+
+    def _raise_format(self) -> None:
+        """Bring an older map to the newest format: all of it, in one transaction."""
+        if _format_version(self.path) < FORMAT_VERSION:
+            with self.writing() as connection:
+                _raise_tables(connection, self.format_version)
+        if self.format_version < FORMAT_VERSION:
+            self.format_version = FORMAT_VERSION
+            self._end_readers()
+            self._reader = self._reading_engine()
+
+
+def _definition(table: Table) -> str:
+    """The statement that makes a table."""
+    return str(CreateTable(table).compile(dialect=sqlite_dialect.dialect())).strip()
+
+
+def _raise_tables(connection: Connection, version: int) -> None:
+    for table in missing_in(version):
+        connection.execute(CreateTable(table))
+    for table in rebuilt_from(version):
+        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO older"))
+        connection.execute(CreateTable(table))
+        columns = ", ".join(table.columns.keys())
+        copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
+        connection.execute(text(copied))
+        connection.execute(text("DROP TABLE older"))
+    connection.execute(delete(map_format))
+    row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
+    connection.execute(insert(map_format), sealed(map_format, row))
+    connection.execute(text(f"PRAGMA user_version={FORMAT_VERSION}"))
 
 
 def _uri(path: Path, options: str) -> str:
@@ -240,11 +310,6 @@ def _prepare(connection: sqlite3.Connection) -> None:
     connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")
 
 
-def _prepare_reader(connection: sqlite3.Connection) -> None:
-    _prepare(connection)
-    connection.execute("PRAGMA query_only=ON")
-
-
 def _prepare_writer(connection: sqlite3.Connection) -> None:
     _prepare(connection)
     connection.execute("PRAGMA synchronous=FULL")
@@ -256,6 +321,16 @@ def _check_version() -> None:
             f"this Python comes with SQLite {sqlite3.sqlite_version}; maps need "
             f"{'.'.join(map(str, _OLDEST_SQLITE))} or newer"
         )
+
+
+def _format_version(path: Path) -> int:
+    """As SQLite sees it: the write-ahead log may be newer than the file's first page."""
+    with _translated(str(path)):
+        connection = _connect(_reading_uri(path), _prepare)
+        try:
+            return int(connection.execute("PRAGMA user_version").fetchone()[0])
+        finally:
+            connection.close()
 
 
 def _check_header(path: Path) -> None:
@@ -285,7 +360,7 @@ def _check_header(path: Path) -> None:
         raise MapCorruptError(f"{path}: format {version} never existed; restore a copy")
 
 
-def _check_tables(connection: Connection, path: Path) -> None:
+def _check_tables(connection: Connection, path: Path, version: int) -> None:
     """Only our tables with our columns: no view, trigger or computed column of a stranger."""
     found = connection.exec_driver_sql(
         "SELECT type, name, tbl_name FROM sqlite_schema ORDER BY name"
@@ -293,11 +368,12 @@ def _check_tables(connection: Connection, path: Path) -> None:
     rows = [tuple(row) for row in found]
     tables = {name for kind, name, _ in rows if kind == "table"}
     strange = [f"{kind} {name}" for kind, name, _ in rows if kind not in {"table", "index"}]
-    missing = sorted(metadata.tables.keys() - tables)
-    strange += sorted(f"table {name}" for name in tables - metadata.tables.keys())
+    expected = metadata.tables.keys() - {table.name for table in missing_in(version)}
+    missing = sorted(expected - tables)
+    strange += sorted(f"table {name}" for name in tables - expected)
     if missing or strange:
         raise MapCorruptError(
-            f"{path}: not the tables of format {FORMAT_VERSION}: missing {missing}, "
+            f"{path}: not the tables of format {version}: missing {missing}, "
             f"strange {strange}"
         )
     for table in metadata.sorted_tables:
