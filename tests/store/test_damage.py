@@ -26,7 +26,7 @@ from engram.errors import (
 from engram.experience.model import path_id
 from engram.store import MapStore
 from engram.store.rows import sealed
-from engram.store.schema import edges, nodes, path_entries
+from engram.store.schema import FORMAT_VERSION, edges, nodes, path_entries
 
 from .frames import assert_same_landmarks
 from .maps import Drive, assert_same_edges, begin, session, write_drive

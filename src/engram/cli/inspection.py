@@ -1,4 +1,4 @@
-"""`engram info`, `log`, `check`, `seal`: what a map holds, and whether it is sound."""
+"""`engram info`, `check`, `seal`: what a map holds, and whether it is sound."""
 
 from __future__ import annotations
 
@@ -28,27 +28,6 @@ def info(
         return
     for key, value in found.items():
         typer.echo(f"{key.replace('_', ' '):22s} {_plain(value)}")
-
-
-def log(map_path: options.MapPath, *, as_json: options.Json = False) -> None:
-    """List the revisions of a map, newest first: when, who, what.
-
-    \b
-    Examples:
-      engram log town.engram
-      engram log town.engram --json
-    """
-    from engram.drive import map_log
-
-    revisions = map_log(map_path)
-    if as_json:
-        print(json.dumps(revisions))
-        return
-    for revision in revisions:
-        typer.echo(
-            f"{revision['number']:5d}  {revision['when']}  {revision['author']}: "
-            f"{revision['message']}"
-        )
 
 
 def check(

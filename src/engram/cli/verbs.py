@@ -13,7 +13,8 @@ from engram.cli.benchmark import bench
 from engram.cli.demonstration import demo
 from engram.cli.evaluation import evaluate
 from engram.cli.extraction import extract
-from engram.cli.inspection import check, info, log, seal
+from engram.cli.history import blame, diff, log, revert, show, tag
+from engram.cli.inspection import check, info, seal
 from engram.cli.localisation import localise
 from engram.cli.mapping import map_
 from engram.cli.merging import merge
@@ -27,6 +28,11 @@ VERBS: dict[str, Callable[..., None]] = {
     "localise": localise,
     "info": info,
     "log": log,
+    "show": show,
+    "diff": diff,
+    "tag": tag,
+    "revert": revert,
+    "blame": blame,
     "check": check,
     "merge": merge,
     "seal": seal,

@@ -1,7 +1,18 @@
 """Whole drives: open, replay, extract, map, localise, summarise."""
 
+from engram.drive.difference import MapDifference, diff_revisions
 from engram.drive.extracting import ExtractReport, extract_log
-from engram.drive.inspecting import check_map, describe_map, map_log, seal_map
+from engram.drive.history import (
+    RevertReport,
+    blame_node,
+    delete_tag,
+    map_log,
+    map_tags,
+    revert_revision,
+    show_revision,
+    tag_revision,
+)
+from engram.drive.inspecting import check_map, describe_map, seal_map
 from engram.drive.live import LiveFrame, live_frames
 from engram.drive.localising import LocaliseOptions, LocaliseRun
 from engram.drive.mapping import MapOptions, MapReport, map_drive
@@ -22,27 +33,36 @@ __all__ = [
     "LiveRobot",
     "LocaliseOptions",
     "LocaliseRun",
+    "MapDifference",
     "MapOptions",
     "MapReport",
     "OpenMap",
     "PictureWriter",
+    "RevertReport",
     "Settings",
     "SimulateReport",
     "ThereAndBack",
+    "blame_node",
     "campaign_folder",
     "chain_trajectory",
     "check_map",
+    "delete_tag",
     "describe_map",
+    "diff_revisions",
     "extract_log",
     "live_frames",
     "load_settings",
     "map_drive",
     "map_log",
+    "map_tags",
     "open_drive",
     "open_map",
+    "revert_revision",
     "seal_map",
     "session_of_drive",
+    "show_revision",
     "simulate",
     "summarise",
+    "tag_revision",
     "write_trajectory",
 ]

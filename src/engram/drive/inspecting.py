@@ -1,9 +1,8 @@
-"""What a map holds, how it came about, and whether it is sound, as plain values."""
+"""What a map holds and whether it is sound, as plain values."""
 
 from __future__ import annotations
 
 from collections import Counter
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -41,28 +40,6 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
             "size_bytes": info.size_bytes,
             "interrupted": [str(one.session.id) for one in store.interrupted()],
         }
-
-
-def map_log(path: Path) -> list[dict[str, Any]]:
-    """The revisions of a map, newest first, for ``engram log``.
-
-    Raises:
-        MapError: the map cannot be read.
-    """
-    with MapStore.open(path) as store:
-        return [
-            {
-                "number": revision.number,
-                "parent": revision.parent,
-                "when": _utc(revision.committed_ns),
-                "author": revision.author,
-                "host": revision.host,
-                "message": revision.message,
-                "tool_version": revision.tool_version,
-                "contents": dict(revision.contents),
-            }
-            for revision in reversed(store.log())
-        ]
 
 
 def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
@@ -104,7 +81,3 @@ def seal_map(path: Path) -> list[dict[str, Any]]:
             }
             for one in store.interrupted()
         ]
-
-
-def _utc(stamp_ns: int) -> str:
-    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="seconds")

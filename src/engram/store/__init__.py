@@ -2,7 +2,9 @@
 
 from engram.store.blob import decode_landmarks, decode_thumbnail, encode_landmarks, encode_thumbnail
 from engram.store.bulk_writer import BulkWriter
+from engram.store.hiding import Reverted
 from engram.store.map_store import MapStore, WritableMapStore
+from engram.store.provenance import Origin
 from engram.store.records import (
     AttemptArrays,
     CheckReport,
@@ -26,7 +28,9 @@ __all__ = [
     "MapContents",
     "MapInfo",
     "MapStore",
+    "Origin",
     "Problem",
+    "Reverted",
     "Revision",
     "SessionState",
     "SessionWriter",

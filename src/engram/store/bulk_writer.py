@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, insert, select
+from sqlalchemy import Connection, Table, insert
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.experience.model import (
@@ -31,6 +31,7 @@ from engram.store.committing import commit_revision, revision_contents
 from engram.store.database import Database
 from engram.store.edge_checks import check_edge
 from engram.store.frame_reader import FrameReader
+from engram.store.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.store.keys import KeyBook
 from engram.store.records import AttemptArrays, Revision, RevisionStatus, StoredNode
 from engram.store.rows import (
@@ -42,7 +43,6 @@ from engram.store.rows import (
     session_row,
     to_json,
     transform_bytes,
-    verified,
 )
 from engram.store.schema import (
     edges,
@@ -52,11 +52,11 @@ from engram.store.schema import (
     omissions,
     path_entries,
     paths,
-    revisions,
     sessions,
     statistics,
     vocabularies,
 )
+from engram.store.session_states import open_sessions
 from engram.store.view import View
 
 # What waits in memory before it is written in one transaction.
@@ -94,6 +94,7 @@ class BulkWriter:
         self._keys = keys
         self._frames = frame_reader
         self._revision_key = revision_key
+        self._view = view
         self._on_cameras = on_cameras
         self._on_end = on_end
         self._ended = False
@@ -108,10 +109,9 @@ class BulkWriter:
             self._session_keys = _keys_of(connection, view, sessions)
             self._path_keys = _keys_of(connection, view, paths)
             self._hidden = {
-                table: _hidden_rows(connection, view, table)
-                for table in (sessions, nodes, paths, path_entries)
+                table: hidden_rows(connection, view, table) for table in (sessions, nodes, paths)
             }
-            self._interrupted = _interrupted_sessions(connection)
+            self._interrupted = open_sessions(connection)
         self._sequences: dict[int, set[int]] = {}
         self._omitted: set[bytes] = set()
         self._clear()
@@ -161,6 +161,9 @@ class BulkWriter:
             )
         self._descriptor = descriptor
         camera_key, frontend_key = self._ensure(camera, descriptor, frontend)
+        again = self._hidden[sessions].get(session.id.bytes)
+        if again is not None:
+            check_same_session(again, session, camera_key, frontend_key)
         key = self._shown_again(sessions, session.id.bytes)
         if key is None:
             key = self._keys.next(sessions)
@@ -189,8 +192,8 @@ class BulkWriter:
         if self._keys.find_node(node.id) is not None:
             raise InputError(f"node {node.id} is in the map already; a node is saved once")
         again = self._hidden[nodes].get(node.id.bytes)
-        if again is not None and again["landmark_hash"] != stored.landmark_hash:
-            raise InputError(f"node {node.id} was in the map before, with other landmarks")
+        if again is not None:
+            check_same_node(again, node, stored.landmark_hash)
         key = self._shown_again(nodes, node.id.bytes)
         if key is None:
             key = self._insert_node(stored, session_key)
@@ -229,10 +232,6 @@ class BulkWriter:
         if entry.sequence in taken:
             raise InputError(f"path {entry.path} has an entry {entry.sequence} already")
         taken.add(entry.sequence)
-        again = self._hidden[path_entries].pop((path_key, entry.sequence), None)
-        if again is not None:
-            self._show(path_entries, again["key"])
-            return
         row = {
             "key": self._keys.next(path_entries),
             "revision": self._revision_key,
@@ -332,6 +331,7 @@ class BulkWriter:
         self._check_open()
         with self._database.writing() as connection:
             self._write(connection)
+        self._frames.show(self._rows[hidden])
         self._frames.release(self._held)
         self._clear()
 
@@ -490,13 +490,15 @@ class BulkWriter:
         return np.array(keys, np.int64)[inverse]
 
     def _sequences_of(self, path_key: int) -> set[int]:
-        """Sequence numbers that are taken in a path, hidden entries left out."""
+        """Sequence numbers of the entries of a path that are seen."""
         if path_key not in self._sequences:
-            query = select(path_entries.c.sequence).where(path_entries.c.path == path_key)
+            query = (
+                self._view.select(path_entries)
+                .with_only_columns(path_entries.c.sequence)
+                .where(path_entries.c.path == path_key)
+            )
             with self._database.reading() as connection:
-                found = set(connection.execute(query.order_by(path_entries.c.sequence)).scalars())
-            again = {number for path, number in self._hidden[path_entries] if path == path_key}
-            self._sequences[path_key] = found - again
+                self._sequences[path_key] = set(connection.execute(query).scalars())
         return self._sequences[path_key]
 
     def _shown_again(self, table: Table, uuid: bytes) -> int | None:
@@ -508,13 +510,7 @@ class BulkWriter:
         return int(again["key"])
 
     def _show(self, table: Table, key: int) -> None:
-        row = {
-            "key": self._keys.next(hidden),
-            "revision": self._revision_key,
-            "record": str(table.name),
-            "target": key,
-            "hidden": 0,
-        }
+        row = hidden_row(self._keys, self._revision_key, table, key, hide=False)
         self._put(hidden, row)
 
 
@@ -522,28 +518,3 @@ def _keys_of(connection: Connection, view: View, table: Table) -> dict[bytes, in
     """Keys of the rows that are seen, by UUID."""
     query = view.select(table).with_only_columns(table.c.uuid, table.c.key)
     return {row[0]: row[1] for row in connection.execute(query)}
-
-
-def _hidden_rows(connection: Connection, view: View, table: Table) -> dict[Any, Row]:
-    """The rows that a revert has hidden, by what names them."""
-    query = (
-        select(table)
-        .where(table.c.key.in_(view.hidden_keys(table)))
-        .where(table.c.revision.in_(view.revision_keys()))
-        .order_by(table.c.key)
-    )
-    rows = verified(table, connection.execute(query))
-    if table is path_entries:
-        return {(row["path"], row["sequence"]): row for row in rows}
-    return {row["uuid"]: row for row in rows}
-
-
-def _interrupted_sessions(connection: Connection) -> frozenset[bytes]:
-    """UUIDs of the sessions that nobody has committed or abandoned."""
-    query = (
-        select(sessions.c.uuid)
-        .join(revisions, revisions.c.key == sessions.c.revision)
-        .where(revisions.c.status == str(RevisionStatus.OPEN))
-        .order_by(sessions.c.key)
-    )
-    return frozenset(connection.execute(query).scalars())

@@ -96,6 +96,8 @@ class _Checking:
     uuids: dict[tuple[Table, int], str] = field(default_factory=dict)
     brought: Counter[tuple[int, str]] = field(default_factory=Counter)
     session_ids: dict[int, SessionId] = field(default_factory=dict)
+    # Sessions that an open revision shows again: who brings them now.
+    shown_again: dict[int, int] = field(default_factory=dict)
 
     def report(self, table: Table | None, record: str, fact: str) -> None:
         self.problems.append(Problem("file" if table is None else table.name, record, fact))
@@ -214,6 +216,10 @@ class _Checking:
                         f"{found} are there",
                     )
 
+    def _brought_by(self, session_key: int) -> Row | None:
+        revision = self.shown_again.get(session_key, self.revision_of[sessions][session_key])
+        return self.revision_rows.get(revision)
+
     def result(self) -> CheckReport:
         abandoned = {key for key, row in self.revision_rows.items() if row["status"] == "abandoned"}
         writer = self.database.writer()
@@ -221,7 +227,7 @@ class _Checking:
         interrupted = tuple(
             identity
             for key, identity in self.session_ids.items()
-            if (revision := self.revision_rows.get(self.revision_of[sessions][key])) is not None
+            if (revision := self._brought_by(key)) is not None
             and revision["status"] == "open"
             and revision["writer"] != live
         )
@@ -338,6 +344,9 @@ def _check_hidden(checking: _Checking, row: Row) -> None:
     table = metadata.tables.get(row["record"])
     if table is None or row["target"] not in checking.revision_of.get(table, {}):
         raise MapCorruptError(f"hides row {row['target']} of {row['record']}, which is missing")
+    revision = checking.revision_rows.get(row["revision"])
+    if table is sessions and not row["hidden"] and revision and revision["status"] == "open":
+        checking.shown_again[row["target"]] = row["revision"]
 
 
 def _check_tag(checking: _Checking, row: Row) -> None:

@@ -64,8 +64,9 @@ def content_hash(connection: Connection, at: int) -> str:
     }
     canonical[str(hidden.name)] = _hidden_rows(connection, view, identities, canonical)
     for name, rows in canonical.items():
-        digest.update(_encode([name, len(rows)]))
-        for row in sorted(rows.values()):
+        canonical_rows = sorted(set(rows.values()))  # attempts: one for all bodies of a session
+        digest.update(_encode([name, len(canonical_rows)]))
+        for row in canonical_rows:
             digest.update(row)
     return digest.hexdigest()[:32]
 
@@ -103,7 +104,7 @@ def _identities(connection: Connection, view: View) -> Identities:
 def _canonical_rows(
     connection: Connection, view: View, table: Table, identities: Identities
 ) -> dict[int, bytes]:
-    """One byte string per row, by key; attempts in one per revision and session."""
+    """One byte string per row, by key; the same for all attempts of a revision and session."""
     query = (
         select(table)
         .where(table.c.revision.in_(view.revision_keys()))
@@ -129,10 +130,10 @@ def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, by
     packed: dict[tuple[int, int], list[Row]] = {}
     for row in rows:
         packed.setdefault((row["revision"], row["session"]), []).append(row)
-    found = {}
+    found: dict[int, bytes] = {}
     for (revision, session), bodies in packed.items():
         table = concatenate([unpack(row["body"], row["count"]) for row in bodies])
-        found[bodies[0]["key"]] = _encode(
+        content = _encode(
             [
                 _identity(identities, "revisions", revision),
                 _identity(identities, "sessions", session),
@@ -141,6 +142,7 @@ def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, by
                 *(_column_bytes(table, name, identities) for name, _ in COLUMNS),
             ]
         )
+        found.update((row["key"], content) for row in bodies)
     return found
 
 

@@ -54,6 +54,7 @@ class FrameReader:
         self._wanted_changed = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None
         self._closed = False
+        self._hidden: frozenset[Any] = frozenset()
         self.set_view(view)
 
     def frame(self, node: NodeId) -> Frame:
@@ -159,6 +160,11 @@ class FrameReader:
             if frame is not None:
                 self._remember(node, frame)
 
+    def show(self, rows: Sequence[Row]) -> None:
+        """These rows of `hidden` were written: nodes among them can be read again."""
+        shown = {row["target"] for row in rows if row["record"] == nodes.name}
+        self._hidden = self._hidden - shown
+
     def forget(self) -> None:
         """Drop all that is held or cached."""
         with self._lock:
@@ -170,7 +176,8 @@ class FrameReader:
         """See the map as of another revision."""
         with self._database.reading() as connection:
             self._revisions = frozenset(connection.execute(view.revision_keys()).scalars())
-            self._hidden = frozenset(connection.execute(view.hidden_keys(nodes)).scalars())
+            found = connection.execute(view.hidden_keys(nodes))
+            self._hidden = frozenset(row[0] for row in found)
             self._cameras: dict[int, StereoCamera] = load_cameras(connection)
             self._frontends: dict[int, tuple[DescriptorKind, str]] = load_frontends(connection)
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
-from uuid import UUID
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, insert, select
 
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
 from engram.experience.model import (
     NodeId,
     Omission,
-    PathEntry,
-    PathEntryKind,
     PathId,
     Session,
     SessionId,
@@ -33,8 +31,17 @@ from engram.store.committing import change_revision, commit_revision
 from engram.store.content import content_hash
 from engram.store.database import Database, Lock
 from engram.store.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
+from engram.store.hiding import (
+    Reverted,
+    check_same_session,
+    compare,
+    hidden_row,
+    hidden_rows,
+    hide_revision,
+)
 from engram.store.keys import KeyBook
 from engram.store.postgresql import PostgresDatabase
+from engram.store.provenance import Origin, origin_of
 from engram.store.records import (
     CheckReport,
     InterruptedSession,
@@ -49,14 +56,18 @@ from engram.store.records import (
 from engram.store.rows import (
     Row,
     checked_text,
-    node_from_row,
     sealed,
     session_from_row,
     session_row,
     to_json,
     verified,
 )
-from engram.store.schema import nodes, path_entries, paths, revisions, sessions, vocabularies
+from engram.store.schema import hidden, nodes, paths, revisions, sessions, vocabularies
+from engram.store.session_states import (
+    interrupted_sessions,
+    session_and_revision,
+    stored_session,
+)
 from engram.store.session_writer import SessionWriter
 from engram.store.sqlite import SqliteDatabase
 from engram.store.tags import Tag, checked_tag, load_tags, resolve, write_tag
@@ -223,10 +234,22 @@ class MapStore:
         with self._database.reading() as connection:
             return reading.partial_paths(connection, self._view)
 
+    def origin(self, prefix: str) -> Origin:
+        """Where a node comes from, also one that a revert has hidden.
+
+        Args:
+            prefix: its UUID, or enough of its beginning.
+
+        Raises:
+            InputError: no node, or several, begin so.
+        """
+        with self._database.reading() as connection:
+            return origin_of(connection, self._view, prefix)
+
     def session_state(self, session: SessionId) -> SessionState:
         """What the map knows of a session: ask before handing one in."""
         with self._database.reading() as connection:
-            found = _session_and_revision(connection, session)
+            found = session_and_revision(connection, session, self._view.at)
         if found is None or found[1]["status"] == "abandoned":
             return SessionState.ABSENT
         _, revision = found
@@ -241,7 +264,9 @@ class MapStore:
         with self._database.reading() as connection:
             opened = list(verified(revisions, connection.execute(query)))
             gone = [row for row in opened if not self._is_alive(row)]
-            return [one for row in gone for one in _interrupted(connection, row)]
+            return [
+                one for row in gone for one in interrupted_sessions(connection, row, self._view.at)
+            ]
 
     def content_hash(self) -> str:
         """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
@@ -293,6 +318,10 @@ class MapStore:
     def _is_alive(self, revision: Row) -> bool:
         holder = self._database.writer()
         return holder is not None and holder.token == revision["writer"]
+
+
+class _DryRunError(Exception):
+    """Ends a transaction of which nothing shall stay."""
 
 
 class WritableMapStore(MapStore):
@@ -376,7 +405,7 @@ class WritableMapStore(MapStore):
                 pid=self._holder.pid,
                 writer=self._holder.token,
             )
-            stored = _stored_session(connection, View(self._view.at, revision["key"]), row)
+            stored = stored_session(connection, View(self._view.at, revision["key"]), row)
         return self._writer(session, stored)
 
     def seal(self, session: SessionId) -> Revision:
@@ -421,6 +450,44 @@ class WritableMapStore(MapStore):
             on_end=self._writing_ended,
         )
         return self._bulk
+
+    def revert(
+        self, named: int | str, *, author: str, message: str = "", dry_run: bool = False
+    ) -> Reverted:
+        """Take a revision back, by a new revision that hides what it brought (`hide_revision`).
+
+        Args:
+            named: the revision.
+            author: who.
+            message: why.
+            dry_run: only say what would come of it.
+
+        Raises:
+            RevisionError: there is no such revision, nothing of it is left to take back, or a
+                session is being written.
+            StorageFullError: no space; the map is as it was.
+        """
+        self._check_none_open()
+        number = self.resolve(named)
+        if number == 0:
+            raise RevisionError(f"{self._database.name}: there is no revision 0 to take back")
+        said = f"revert revision {number}" + (f": {message}" if message else "")
+        opened = self._revision_row(author, said, to_json({"revert": number}))
+        try:
+            with self._database.writing() as connection:
+                connection.execute(insert(revisions), [sealed(revisions, opened)])
+                own = View(self._view.at, opened["key"])
+                hide_revision(connection, self._keys, own, number, opened["key"])
+                done = compare(connection, number, self._view, own)
+                if dry_run:
+                    raise _DryRunError
+                done = replace(done, revision=commit_revision(connection, opened["key"]))
+        except _DryRunError:
+            return done
+        self.frames.forget()
+        self._keys.forget_nodes()
+        self._see(View(self.resolve(None)))
+        return done
 
     def put_vocabulary(
         self, body: bytes, *, author: str, message: str, configuration: Mapping[str, Any]
@@ -537,10 +604,13 @@ class WritableMapStore(MapStore):
     def _insert_session(
         self, connection: Connection, session: Session, revision: int, camera: int, frontend: int
     ) -> None:
-        """The session and its path."""
-        key = self._keys.next(sessions)
+        """The session and its path: new rows, or those that a revert has hidden."""
+        again = hidden_rows(connection, self._view, sessions).get(session.id.bytes)
+        if again is not None:
+            check_same_session(again, session, camera, frontend)
+        key = self._keys.next(sessions) if again is None else again["key"]
+        path_again = hidden_rows(connection, self._view, paths).get(path_id(session.id).bytes)
         row = session_row(session, key, revision, camera, frontend)
-        connection.execute(insert(sessions), [sealed(sessions, row)])
         path: Row = {
             "key": self._keys.next(paths),
             "uuid": path_id(session.id).bytes,
@@ -548,18 +618,25 @@ class WritableMapStore(MapStore):
             "session": key,
             "partial": 0,
         }
-        connection.execute(insert(paths), [sealed(paths, path)])
+        for table, new, old in ((sessions, row, again), (paths, path, path_again)):
+            if old is None:
+                connection.execute(insert(table), [sealed(table, new)])
+            else:
+                shown = hidden_row(self._keys, revision, table, old["key"], hide=False)
+                connection.execute(insert(hidden), [shown])
 
     def _writer(self, session: SessionId, stored: StoredSession) -> SessionWriter:
         with self._database.reading() as connection:
-            found = _session_and_revision(connection, session)
+            found = session_and_revision(connection, session, self._view.at)
             assert found is not None
             row, revision = found
             camera = reading.load_cameras(connection)[row["camera"]]
             path_query = select(paths.c.key).where(paths.c.uuid == path_id(session).bytes)
             path_key = connection.execute(path_query.order_by(paths.c.key)).scalar_one()
             frontend = reading.load_frontends(connection)[row["frontend"]]
-        self._see(View(self._view.at, revision["key"]))
+            own = View(self._view.at, revision["key"])
+            hidden_nodes = hidden_rows(connection, own, nodes)
+        self._see(own)
         self._open_session = SessionWriter(
             self._database,
             self._keys,
@@ -571,6 +648,7 @@ class WritableMapStore(MapStore):
             camera_key=row["camera"],
             frontend=(row["frontend"], *frontend),
             stored=stored,
+            hidden_nodes=hidden_nodes,
             on_end=self._writing_ended,
         )
         return self._open_session
@@ -613,7 +691,7 @@ class WritableMapStore(MapStore):
 
     def _interrupted_rows(self, session: SessionId) -> tuple[Row, Row]:
         with self._database.reading() as connection:
-            found = _session_and_revision(connection, session)
+            found = session_and_revision(connection, session, self._view.at)
             if found is None or found[1]["status"] != "open":
                 raise RevisionError(
                     f"{self._database.name} has no interrupted session {session}; "
@@ -623,85 +701,3 @@ class WritableMapStore(MapStore):
                 connection, reading.load_frontends(connection)[found[0]["frontend"]][0]
             )
         return found
-
-
-def _session_and_revision(connection: Connection, session: SessionId) -> tuple[Row, Row] | None:
-    """Rows of a session and of the revision that brought it, whatever its status."""
-    query = select(sessions).where(sessions.c.uuid == session.bytes).order_by(sessions.c.key)
-    row = next(verified(sessions, connection.execute(query)), None)
-    if row is None:
-        return None
-    query = select(revisions).where(revisions.c.key == row["revision"]).order_by(revisions.c.key)
-    revision = next(verified(revisions, connection.execute(query)), None)
-    if revision is None:
-        raise MapCorruptError(f"session {session}: its revision is missing; run engram check")
-    return row, revision
-
-
-def _interrupted(connection: Connection, revision: Row) -> list[InterruptedSession]:
-    """The sessions of one open revision: one, or none for a revision of another kind."""
-    query = select(sessions).where(sessions.c.revision == revision["key"]).order_by(sessions.c.key)
-    cameras = reading.load_cameras(connection)
-    found = []
-    for row in verified(sessions, connection.execute(query)):
-        saved = select(func.count(), func.max(nodes.c.stamp_ns)).where(
-            nodes.c.session == row["key"]
-        )
-        count, last_stamp_ns = connection.execute(saved).one()
-        found.append(
-            InterruptedSession(
-                session=session_from_row(row, cameras[row["camera"]].id),
-                author=revision["author"],
-                host=revision["host"],
-                pid=revision["pid"],
-                opened_ns=revision["opened_ns"],
-                nodes=count,
-                last_stamp_ns=last_stamp_ns,
-            )
-        )
-    return found
-
-
-def _stored_session(connection: Connection, view: View, session: Row) -> StoredSession:
-    cameras = reading.load_cameras(connection)
-    session_id = session_from_row(session, cameras[session["camera"]].id).id
-    query = select(nodes).where(nodes.c.session == session["key"]).order_by(nodes.c.key)
-    saved = tuple(
-        node_from_row(row, session_id, cameras[row["camera"]].id)
-        for row in verified(nodes, connection.execute(query))
-    )
-    last_entry = _last_path_entry(connection, session["key"], session_id)
-    made = reading.attempt_tables(connection, view).get(session["key"])
-    return StoredSession(
-        nodes=saved,
-        last_entry=last_entry,
-        next_sequence=0 if last_entry is None else last_entry.sequence + 1,
-        next_iteration=0 if made is None else int(made.columns["iteration"].max()) + 1,
-    )
-
-
-def _last_path_entry(
-    connection: Connection, session_key: int, session: SessionId
-) -> PathEntry | None:
-    query = (
-        select(*path_entries.columns, nodes.c.uuid.label("node_uuid"))
-        .select_from(
-            path_entries.join(paths, paths.c.key == path_entries.c.path).join(
-                nodes, nodes.c.key == path_entries.c.node
-            )
-        )
-        .where(paths.c.session == session_key)
-        .order_by(path_entries.c.sequence.desc())
-        .limit(1)
-    )
-    found = connection.execute(query).first()
-    if found is None:
-        return None
-    row = next(verified(path_entries, [found]))
-    return PathEntry(
-        path_id(session),
-        row["sequence"],
-        NodeId(UUID(bytes=found[-1])),
-        PathEntryKind(row["kind"]),
-        row["stamp_ns"],
-    )

@@ -137,9 +137,7 @@ def revision_from_row(row: Row) -> Revision:
     )
 
 
-def info(
-    connection: Connection, view: View, *, format_version: int, size_bytes: int
-) -> MapInfo:
+def info(connection: Connection, view: View, *, format_version: int, size_bytes: int) -> MapInfo:
     """The map in numbers, without reading it whole."""
     by_kind = dict.fromkeys(EdgeKind, 0)
     mapped_m = 0.0

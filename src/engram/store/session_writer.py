@@ -28,6 +28,7 @@ from engram.store.committing import change_revision, commit_revision
 from engram.store.database import Database
 from engram.store.edge_checks import check_edge
 from engram.store.frame_reader import FrameReader
+from engram.store.hiding import check_same_node, hidden_row
 from engram.store.keys import KeyBook
 from engram.store.records import Revision, StoredSession
 from engram.store.rows import (
@@ -38,7 +39,7 @@ from engram.store.rows import (
     sealed,
     to_json,
 )
-from engram.store.schema import edges, frames, nodes, path_entries, statistics
+from engram.store.schema import edges, frames, hidden, nodes, path_entries, statistics
 
 
 class SessionWriter:
@@ -67,6 +68,7 @@ class SessionWriter:
         camera_key: int,
         frontend: tuple[int, DescriptorKind, str],
         stored: StoredSession,
+        hidden_nodes: Mapping[bytes, Row],
         on_end: Callable[[], None],
     ) -> None:
         self.session = session
@@ -81,6 +83,7 @@ class SessionWriter:
         self._camera_key = camera_key
         self._frontend_key, self._descriptor, self._frontend = frontend
         self._next_sequence = stored.next_sequence
+        self._hidden_nodes = hidden_nodes
         self._on_end = on_end
         self._ended = False
         self._lock = threading.RLock()
@@ -101,6 +104,11 @@ class SessionWriter:
             self._check_open()
             if self._keys.find_node(node.id) is not None:
                 raise InputError(f"node {node.id} is in the map already; a node is saved once")
+            again = self._hidden_nodes.get(node.id.bytes)
+            if again is not None:
+                check_same_node(again, node, blob_hash(landmarks))
+                self._show_again(node, frame, again["key"])
+                return
             key = self._keys.next(nodes)
             row = {
                 "key": key,
@@ -122,9 +130,7 @@ class SessionWriter:
             }
             self._rows[nodes].append(sealed(nodes, row))
             self._rows[frames].append(sealed(frames, frame_row))
-            self._keys.learn_node(node.id, key)
-            self._frames.hold(node.id, frame)
-            self._saved.append(node.id)
+            self._expect(node, frame, key)
 
     def add_edge(self, edge: Edge) -> None:
         """Add an edge; it takes the place of an older one with the same (a, b, kind).
@@ -214,6 +220,7 @@ class SessionWriter:
                 return
             with self._database.writing() as connection:
                 self._write(connection)
+            self._frames.show(self._rows[hidden])
             self._frames.release(self._saved)
             self._clear()
 
@@ -241,6 +248,19 @@ class SessionWriter:
             self._keys.forget_nodes()
             self._frames.forget()
             self._end()
+
+    def _show_again(self, node: Node, frame: Frame, key: int) -> None:
+        """A node that a revert has hidden comes back with its old row."""
+        self._rows[hidden].append(
+            hidden_row(self._keys, self._revision_key, nodes, key, hide=False)
+        )
+        self._expect(node, frame, key)
+
+    def _expect(self, node: Node, frame: Frame, key: int) -> None:
+        """From now on the node is known, and its frame is read from memory."""
+        self._keys.learn_node(node.id, key)
+        self._frames.hold(node.id, frame)
+        self._saved.append(node.id)
 
     def _end(self) -> None:
         self._ended = True
@@ -281,7 +301,12 @@ class SessionWriter:
         return bool(any(self._rows.values()) or self._edges or self._attempts or self._statistics)
 
     def _clear(self) -> None:
-        self._rows: dict[Table, list[Row]] = {nodes: [], frames: [], path_entries: []}
+        self._rows: dict[Table, list[Row]] = {
+            nodes: [],
+            frames: [],
+            path_entries: [],
+            hidden: [],
+        }
         self._edges: dict[tuple[int, int, str], Row] = {}
         self._statistics: dict[str, Row] = {}
         self._attempts: list[AttemptTable] = []

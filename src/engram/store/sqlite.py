@@ -187,7 +187,7 @@ class SqliteDatabase:
             MapError: it cannot be written.
         """
         with _new_file(target) as draft, _translated(str(target)):
-            source = _connect(_reading_uri(self.path), _prepare_reader)
+            source = _connect(_reading_uri(self.path), _prepare)
             copy = _connect(_uri(draft, "mode=rwc"), _prepare_writer)
             try:
                 source.backup(copy)
@@ -207,7 +207,6 @@ class SqliteDatabase:
         if self._writer is not None:
             with _translated(self.name):
                 self._writer.dispose()
-
 
     def _end_readers(self) -> None:
         self._reader.dispose()
@@ -373,8 +372,7 @@ def _check_tables(connection: Connection, path: Path, version: int) -> None:
     strange += sorted(f"table {name}" for name in tables - expected)
     if missing or strange:
         raise MapCorruptError(
-            f"{path}: not the tables of format {version}: missing {missing}, "
-            f"strange {strange}"
+            f"{path}: not the tables of format {version}: missing {missing}, strange {strange}"
         )
     for table in metadata.sorted_tables:
         columns = [

@@ -1,4 +1,4 @@
-"""How people name revisions: by number, by tag, as `head`, and so many steps before any of these."""
+"""How people name revisions: by number, by tag, as `head`, or so many steps before one."""
 
 from __future__ import annotations
 

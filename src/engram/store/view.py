@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, Select, Table, and_, func, or_, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_, select
 
 from engram.store.rows import Row, verified
 from engram.store.schema import hidden, nodes, revisions
@@ -40,13 +40,12 @@ class View:
         Ordered by their revision's place in history, then by key: of rows that supersede each
         other the newest is last.
         """
-        place = func.coalesce(revisions.c.number, _NEWEST)
         query = (
             select(*table.columns)
             .select_from(table.join(revisions, revisions.c.key == table.c.revision))
             .where(table.c.revision.in_(self.revision_keys()))
             .where(table.primary_key.columns[0].not_in(self.hidden_keys(table)))
-            .order_by(place, table.primary_key.columns[0])
+            .order_by(place_in_history(), table.primary_key.columns[0])
         )
         for end in sorted(_NODE_COLUMNS & set(table.columns.keys())):
             query = query.where(table.c[end].not_in(self.hidden_keys(nodes)))
@@ -58,7 +57,7 @@ class View:
 
     def hidden_keys(self, table: Table) -> Select[tuple[int]]:
         """Keys of the table's rows whose newest `hidden` row hides them."""
-        place = func.coalesce(revisions.c.number, _NEWEST)
+        place = place_in_history()
         latest = (
             select(
                 hidden.c.target,
@@ -73,6 +72,11 @@ class View:
             .subquery()
         )
         return select(latest.c.target).where(latest.c.age == 1, latest.c.hidden == 1)
+
+
+def place_in_history() -> ColumnElement[int]:
+    """By what revisions are ordered: their numbers, and an open one after all."""
+    return func.coalesce(revisions.c.number, _NEWEST)
 
 
 def head(connection: Connection) -> int:

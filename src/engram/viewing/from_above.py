@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import MissingExtraError
+from engram.errors import InputError, MissingExtraError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -19,16 +19,19 @@ class Track:
     Attributes:
         label: for the legend.
         points_m: (N, 2) float64, x to the right and z forward in the picture's frame, metres.
+        colour: as Matplotlib names it; None for the next of a series.
     """
 
     label: str
     points_m: NDArray[np.float64]
+    colour: str | None = None
 
 
 def draw_from_above(tracks: Sequence[Track], path: Path, title: str) -> None:
     """Draws tracks from above into an image file.
 
     Raises:
+        InputError: the file cannot be written.
         MissingExtraError: Matplotlib is not installed.
     """
     draw_panels([(title, tracks)], path)
@@ -42,6 +45,7 @@ def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> No
         path: image file.
 
     Raises:
+        InputError: the file cannot be written.
         MissingExtraError: Matplotlib is not installed.
     """
     names = dict.fromkeys(_name(track) for _, tracks in panels for track in tracks)
@@ -50,7 +54,7 @@ def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> No
     for axes, (title, tracks) in zip(all_axes, panels, strict=True):
         for track in tracks:
             x, z = track.points_m[:, 0], track.points_m[:, 1]
-            colour = colours[_name(track)]
+            colour = track.colour or colours[_name(track)]
             axes.plot(x, z, ".", color=colour, markersize=5, label=track.label)
         axes.set_aspect("equal")
         axes.set_xlabel("x, m")
@@ -75,6 +79,7 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
         title: over the picture.
 
     Raises:
+        InputError: the file cannot be written.
         MissingExtraError: Matplotlib is not installed.
     """
     figure, (axes,) = _axes(wide=True)
@@ -106,5 +111,9 @@ def _axes(wide: bool = False, columns: int = 1):  # type: ignore[no-untyped-def]
 def _save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001, as above
     from matplotlib import pyplot
 
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # no such folder; an ending that means no format
+        raise InputError(f"the picture {path} cannot be written: {error}") from error
+    finally:
+        pyplot.close(figure)

@@ -1,0 +1,135 @@
+"""The history of a map as its users see it: log, show, diff, tag, revert, blame."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from engram.drive import MapOptions, Settings, map_drive, open_drive
+from engram.store import MapStore
+
+
+@pytest.fixture
+def town(two_drives: Path, tmp_path: Path) -> Path:
+    return shutil.copy(two_drives, tmp_path / "town.engram")
+
+
+@pytest.fixture(scope="module")
+def two_drives(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two revisions: the street, driven by two robots."""
+    path = tmp_path_factory.mktemp("maps") / "town.engram"
+    for robot in ("r1", "r2"):
+        sequence = open_drive(street, robot=robot, start="2026-03-01T09:30:00", longitude_deg=0.0)
+        map_drive(path, sequence, Settings(), MapOptions())
+    return path
+
+
+def test_log_tells_who_when_what_and_tags(engram, town: Path) -> None:
+    assert engram("tag", town, "first", 1, "-m", "before r2").status == 0
+    newest, oldest = engram("log", town, "--json").json
+    assert (newest["number"], oldest["number"]) == (2, 1)
+    assert (newest["author"], oldest["author"]) == ("r2", "r1")
+    assert (newest["tags"], oldest["tags"]) == ([], ["first"])
+    assert oldest["contents"]["nodes"] > 0
+    text = engram("log", town).out
+    assert "revision 1 (tag: first)" in text
+    assert "Author: r1 on" in text
+    assert f"{oldest['contents']['nodes']} nodes" in text
+    assert len(engram("log", town, "--oneline", "--limit", 1).out.splitlines()) == 1
+
+
+def test_every_reading_verb_takes_a_tag(engram, town: Path, street: Path) -> None:
+    engram("tag", town, "first", 1)
+    assert engram("info", town, "--at", "first", "--json").json["revision"] == 1
+    found = engram("localise", town, street, "--at", "first", "--json").json
+    assert found["summary"]["share_localised"] == 1.0
+    assert len(engram("log", town, "--at", "first", "--json").json) == 1
+    for verb in ("places", "relocalise"):
+        arguments = (street,) if verb == "relocalise" else ()
+        assert engram(verb, town, *arguments, "--at", "head~1", "--json").status == 0
+
+
+def test_show_and_diff_tell_the_same_change(engram, town: Path, tmp_path: Path) -> None:
+    shown = engram("show", town, 1, "--json").json
+    assert (shown["number"], shown["author"]) == (1, "r1")
+    assert len(shown["sessions"]) == 1
+    assert set(shown["hours"]) == {"09"}
+    changed = engram("diff", town, 0, 1, "--stretch", 5, "--json").json
+    assert shown["difference"]["nodes"] == changed["nodes"]
+    nodes = changed["nodes"]["added"]
+    assert nodes == sum(shown["hours"].values())
+    assert sum(region["added"] for region in changed["regions"]) == nodes
+    assert [region["from_m"] for region in changed["regions"]] == [0.0, 5.0]
+    assert changed["mapped_m"]["after"] == pytest.approx(8.8, rel=0.1)  # 11 steps of 0.8 m
+    picture = tmp_path / "change.png"
+    text = engram("diff", town, 0, "head", "--picture", picture).out
+    assert "09 h 0 →" in text
+    assert picture.stat().st_size > 1000
+
+
+def test_revert_and_its_undoing(engram, town: Path) -> None:
+    before = engram("info", town, "--json").json
+    dry = engram("revert", town, 1, "--dry-run", "--json").json
+    assert dry["revision"] is None
+    assert engram("info", town, "--json").json == before
+    done = engram("revert", town, 1, "-m", "loose camera", "--author", "me", "--json").json
+    assert (done["reverted"], done["revision"]) == (1, 3)
+    assert (
+        done["difference"]["nodes"]["after"]
+        == before["nodes"] - (dry["difference"]["nodes"]["removed"])
+    )
+    assert done["lost_by_others"] == dry["lost_by_others"]
+    text = engram("revert", town, 3).out
+    assert "taken back by 4" in text
+    after = engram("info", town, "--json").json
+    assert after["nodes"] == before["nodes"]
+    assert after["components"] == before["components"]
+    assert engram("check", town).status == 0
+    assert engram("log", town, "--json").json[1]["message"] == "revert revision 1: loose camera"
+
+
+def test_blame_names_robot_session_and_revision(engram, town: Path) -> None:
+    session = engram("show", town, 1, "--json").json["sessions"][0]
+    with MapStore.open(town) as store:
+        node = store.load().nodes[0]
+    (found,) = engram("blame", town, str(node.id)[:10], "--json").json
+    assert (found["robot"], found["session"]) == ("r1", session["session"])
+    assert (found["revision"], found["visible"], found["told"]) == (1, True, [])
+    assert found["hour"] == pytest.approx(9.5, abs=0.01)
+    engram("revert", town, 1)
+    text = engram("blame", town, node.id).out
+    assert "saved by r1" in text
+    assert "taken back by revision 3" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("show", "TOWN", 9), "revisions 1 to 2, not 9"),
+        (("show", "TOWN", "spring"), "its tags: first"),
+        (("diff", "TOWN", "first", "later"), "'later'"),
+        (("diff", "TOWN", 1, 2, "--stretch", 0), "0.0 m long"),
+        (("diff", "TOWN", 1, 2, "--picture", "no/folder/a.png"), "no/folder"),
+        (("tag", "TOWN", "7up"), "cannot be a tag"),
+        (("tag", "TOWN", "first", 2), "already"),
+        (("tag", "TOWN", "other", 5), "not 5"),
+        (("tag", "TOWN", "other", "--delete"), "no tag 'other'"),
+        (("revert", "TOWN", 0), "no revision 0"),
+        (("revert", "TOWN", "11"), "not 11"),
+        (("blame", "TOWN", "zz"), "no UUID"),
+        (("blame", "TOWN", "00000000"), "begins with"),
+        (("info", "TOWN", "--at", "head~9"), "not -7"),
+        (("log", "absent.engram"), "absent.engram"),
+        (("revert", "absent.engram", 1), "absent.engram"),
+        (("tag", "absent.engram", "x"), "absent.engram"),
+    ],
+)
+def test_mistakes_end_in_one_clear_line(engram, town: Path, arguments, says: str) -> None:
+    engram("tag", town, "first", 1)
+    ran = engram(*(town if one == "TOWN" else one for one in arguments))
+    assert ran.status == 2
+    assert ran.err.startswith("engram: ")
+    assert says in ran.err
+    assert "Traceback" not in ran.err
