@@ -52,8 +52,10 @@ class MatchMemo:
         self.seconds = 0.0
         self._read()
 
-    def __len__(self) -> int:
-        return sum(len(known) for known in self._frames.values())
+    @property
+    def known(self) -> int:
+        """Pairs of frame and node whose match is known, found or not."""
+        return sum(len(matches) for matches in self._frames.values())
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
         """See `Matcher`; a guided match depends on its prediction and is not kept."""

@@ -307,7 +307,7 @@ def _run_in(
             opened,
             frames,
             drive.session.id,
-            matcher or FrameMatcher(opened.store.frames, config.matcher),
+            FrameMatcher(opened.store.frames, config.matcher) if matcher is None else matcher,
             config.acceptance,
         )
     situation = Situation(opened, drive, frames, start, nodes, truth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import lru_cache
 from typing import NewType, Protocol
 from uuid import UUID, uuid5
 
@@ -187,6 +188,7 @@ def session_id(robot: str, camera: CameraId, start_ns: int, first_pair_hash: str
     return SessionId(uuid5(ENGRAM_NAMESPACE, name))
 
 
+@lru_cache(maxsize=1024)  # localisers in step ask for the same frame one after another
 def node_id(session: SessionId, stamp_ns: int) -> NodeId:
     """The same frame of the same drive gets the same UUID (SPEC §2.7)."""
     return NodeId(uuid5(session, f"node:{stamp_ns}"))

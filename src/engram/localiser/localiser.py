@@ -149,10 +149,10 @@ class Localiser:
         self._budget = budget
         self._relocaliser = relocaliser
         self._basin = basin
-        self._search = search or graph.neighbourhood
-        self._attempter = Attempter(
-            matcher or FrameMatcher(frames, self.config.matcher), budget, self.config.acceptance
-        )
+        self._search = graph.neighbourhood if search is None else search
+        if matcher is None:
+            matcher = FrameMatcher(frames, self.config.matcher)
+        self._attempter = Attempter(matcher, budget, self.config.acceptance)
         self._recent = RecentAttempts(self.config.recent)
         self._run = RunLog()
         self.walk = Walk(path_id(self.live))
@@ -455,11 +455,14 @@ class Localiser:
         self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
     ) -> None:
         """What policies learn from while driving."""
-        for outcome in outcomes:
-            row, rate = outcome.candidate.row, np.nan
-            if neighbourhood is not None and row is not None:
-                offset = neighbourhood.along_m[row : row + 1], neighbourhood.across_m[row : row + 1]
-                rate = float(self._basin.success_rate(*offset)[0])
+        rates = np.full(len(outcomes), np.nan)
+        known = [k for k, one in enumerate(outcomes) if one.candidate.row is not None]
+        if neighbourhood is not None and known:
+            rows = [outcomes[k].candidate.row for k in known]
+            rates[known] = self._basin.success_rate(
+                neighbourhood.along_m[rows], neighbourhood.across_m[rows]
+            )
+        for outcome, rate in zip(outcomes, rates.tolist(), strict=True):
             self._run.add(
                 self._driven_m,
                 outcome.candidate.index,
