@@ -456,11 +456,11 @@ class Localiser:
     ) -> None:
         """What policies learn from while driving."""
         rates = np.full(len(outcomes), np.nan)
-        known = [k for k, one in enumerate(outcomes) if one.candidate.row is not None]
-        if neighbourhood is not None and known:
-            rows = [outcomes[k].candidate.row for k in known]
+        rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
+        if neighbourhood is not None and (known := rows >= 0).any():
+            near = rows[known]
             rates[known] = self._basin.success_rate(
-                neighbourhood.along_m[rows], neighbourhood.across_m[rows]
+                neighbourhood.along_m[near], neighbourhood.across_m[near]
             )
         for outcome, rate in zip(outcomes, rates.tolist(), strict=True):
             self._run.add(
