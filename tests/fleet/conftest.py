@@ -10,12 +10,12 @@ from .robots import robot_map
 
 @pytest.fixture(scope="package")
 def fleet(tmp_path_factory):
-    """`first` saw 0–40 m; `same` 0–40 m alike; `longer` 20–60 m alike; `other` 0–40 m unlike.
+    """`first` saw 0–24 m; `same` 0–24 m alike; `longer` 12–40 m alike; `other` 0–24 m unlike.
 
     Each is (path, what mapping came to).
     """
     folder = tmp_path_factory.mktemp("fleet")
-    near, far = np.arange(0, 40, 0.5), np.arange(20, 60, 0.5)
+    near, far = np.arange(0, 24, 0.8), np.arange(12, 40, 0.8)
     return {
         "first": made(folder / "first.engram", near, 0, name="r1", day=1),
         "same": made(folder / "same.engram", near, 0, name="r2", day=2, aside_m=0.3),

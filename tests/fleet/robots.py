@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,9 @@ from mapping_rig import Mapped, map_simulated
 from synthetic_world import World, drive
 
 DAY_NS = 86_400_000_000_000
-WORLD = World(length_m=60.0, seed=11)
+WORLD = World(length_m=40.0, seed=11)
 # FAB-MAP knows nothing of random descriptors: every node is looked at instead.
 OPTIONS = MergeOptions(relocaliser="exhaustive")
-
-
-@contextmanager
-def silent(what: str, total: int):
-    yield lambda word: None
 
 
 def robot_map(
@@ -41,7 +35,7 @@ def robot_map(
 
 
 def merged(centre: Path, *robots: Path, **options: object) -> list[MergeReport]:
-    return merge_maps(centre, robots, Settings(), OPTIONS, progress=silent, **options)
+    return merge_maps(centre, robots, Settings(), OPTIONS, **options)
 
 
 def truth_of(*maps: Mapped) -> dict[NodeId, SE3]:

@@ -73,8 +73,8 @@ def test_a_run_that_does_not_localise_is_taken_and_tied_where_it_began(tmp_path,
     centre = tmp_path / "centre.engram"
     (first, mapped_first), (longer, mapped_longer) = fleet["first"], fleet["longer"]
     _, report = merged(centre, first, longer)
-    assert report.omitted >= 15
-    assert report.taken >= 10
+    assert report.omitted >= 7
+    assert report.taken >= 6
     assert report.components == 1
     (segment,) = report.segments
     assert segment.seed is Seed.PLACE
@@ -136,7 +136,7 @@ def test_a_robot_goes_out_with_the_centre_and_hands_back_what_it_added(tmp_path,
     centre, robot = tmp_path / "centre.engram", tmp_path / "robot.engram"
     merged(centre, fleet["first"][0])
     shutil.copy(centre, robot)
-    back = robot_map(robot, np.arange(10, 60, 0.5), 0, name="r1", day=9)
+    back = robot_map(robot, np.arange(6, 40, 0.8), 0, name="r1", day=9)
     assert 0 < len(back.saved) < 40
     (report,) = merged(centre, robot)
     assert report.known == len(fleet["first"][1].saved)
@@ -157,7 +157,7 @@ def test_later_robots_localise_in_what_earlier_ones_of_the_merge_brought(tmp_pat
     robot = tmp_path / "two-days.engram"
     shutil.copy(fleet["other"][0], robot)
     twin = tmp_path / "twin.engram"
-    robot_map(twin, np.arange(0, 40, 0.5), 1, name="r5", day=6, aside_m=0.2)
+    robot_map(twin, np.arange(0, 24, 0.8), 1, name="r5", day=6, aside_m=0.2)
     # Two drives alike in one map that never met: the second finds the first one's nodes.
     both = tmp_path / "both.engram"
     merged(both, robot, twin)
@@ -175,13 +175,13 @@ def test_later_robots_localise_in_what_earlier_ones_of_the_merge_brought(tmp_pat
 def test_two_parts_of_the_centre_are_joined_by_a_drive_through_both(tmp_path):
     centre = tmp_path / "centre.engram"
     parts = [tmp_path / "a.engram", tmp_path / "b.engram"]
-    robot_map(parts[0], np.arange(0, 20, 0.5), 0, name="r1", day=1)
-    robot_map(parts[1], np.arange(20.5, 40, 0.5), 1, name="r2", day=2)
+    robot_map(parts[0], np.arange(0, 14, 0.8), 0, name="r1", day=1)
+    robot_map(parts[1], np.arange(14, 36, 0.8), 1, name="r2", day=2)
     *_, before = merged(centre, *parts)
     assert before.components == 2
     through = tmp_path / "through.engram"
-    places_m = np.arange(0, 40, 0.5)
-    robot_map(through, places_m, np.where(places_m < 20.25, 0, 1), name="r3", day=3)
+    places_m = np.arange(0, 36, 0.8)
+    robot_map(through, places_m, np.where(places_m < 14, 0, 1), name="r3", day=3)
     (report,) = merged(centre, through)
     # It changes over within a few metres: until the localiser counts as lost it tries what is near.
     assert report.omitted > 0.75 * (report.omitted + report.taken)
@@ -194,7 +194,7 @@ def test_attempts_go_along_to_the_equivalents(tmp_path, fleet):
     (first, _), (same, _) = fleet["first"], fleet["same"]
     robot = tmp_path / "robot.engram"
     shutil.copy(same, robot)
-    again = robot_map(robot, np.arange(0, 40, 0.5), 0, name="r2", day=7, aside_m=-0.4)
+    again = robot_map(robot, np.arange(0, 24, 0.8), 0, name="r2", day=7, aside_m=-0.4)
     assert len(again.saved) < 5
     _, report = merged(centre, first, robot)
     with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
@@ -205,7 +205,7 @@ def test_attempts_go_along_to_the_equivalents(tmp_path, fleet):
     ]
     made, kept = given.attempts_of(drive.id), mine.attempts_of(drive.id)
     assert report.attempts > 0
-    assert len(kept) >= len(made) > 50
+    assert len(kept) >= len(made) > 20
     for one, now in zip(made, kept, strict=False):
         assert (now.iteration, now.accepted, now.inliers) == (
             one.iteration,

@@ -3,7 +3,7 @@
 from engram.fleet.docking import merge_maps
 from engram.fleet.gate import Gate, GateOptions, what_is_worse
 from engram.fleet.handed_in import HandedIn
-from engram.fleet.merging import merge_map
+from engram.fleet.merging import Progress, merge_map, silent
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment, string_segments
@@ -14,6 +14,7 @@ __all__ = [
     "HandedIn",
     "MergeOptions",
     "MergeReport",
+    "Progress",
     "Reason",
     "RunReport",
     "Seed",
@@ -21,6 +22,7 @@ __all__ = [
     "SegmentReport",
     "merge_map",
     "merge_maps",
+    "silent",
     "string_segments",
     "what_is_worse",
 ]

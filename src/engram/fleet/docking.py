@@ -12,7 +12,7 @@ from engram.drive.interruption import deferred_interrupt
 from engram.errors import InputError
 from engram.fleet.gate import Gate
 from engram.fleet.handed_in import HandedIn
-from engram.fleet.merging import Progress, merge_map
+from engram.fleet.merging import Progress, merge_map, silent
 from engram.fleet.pictures import picture_before_and_after
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
@@ -28,7 +28,7 @@ def merge_maps(
     dry_run: bool = False,
     require_better: Sequence[Path] = (),
     picture: Path | None = None,
-    progress: Progress,
+    progress: Progress = silent,
 ) -> list[MergeReport]:
     """Merges robots' maps into a centre, in the order given; the centre is made if there is none.
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from engram import __version__
 from engram.config import to_dict
 from engram.drive import Settings
+from engram.drive.live import ignore
 from engram.experience.model import (
     Edge,
     EdgeKind,
@@ -38,12 +39,19 @@ Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str]
 Gate: TypeAlias = Callable[[WritableMapStore], None]
 
 
+@contextmanager
+def silent(what: str, total: int) -> Iterator[Callable[[str], None]]:
+    """A `Progress` that shows nothing."""
+    del what, total
+    yield ignore
+
+
 def merge_map(
     store: WritableMapStore,
     robot: HandedIn,
     settings: Settings,
     options: MergeOptions,
-    progress: Progress,
+    progress: Progress = silent,
     gate: Gate | None = None,
 ) -> MergeReport:
     """Merges one robot's map into the centre: one revision, or none where nothing is new.
@@ -62,6 +70,7 @@ def merge_map(
     """
     centre = Centre(store)
     check_fits(centre, robot)
+    centre_nodes = len(centre.graph)
     report = MergeReport(robot.name, robot.content_hash, robot.robots)
     report.notes = notes(centre, robot, time.time_ns())
     new = [node for node in robot.contents.nodes if not centre.knows(node.id)]
@@ -75,6 +84,10 @@ def merge_map(
                 writer.flush()
                 gate(store)
             report.revision = writer.commit().number
+    if report.taken and not report.omitted and centre_nodes and not report.known:
+        report.notes.append(
+            "no node of it was found in the centre: another town, or another look of this one"
+        )
     report.components = int(centre.graph.components().max(initial=-1)) + 1
     report.content_hash = store.content_hash()
     return report

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from engram.drive import Settings
+from engram.errors import ConfigError
 from engram.experience.model import (
     Attempt,
     Edge,
@@ -25,6 +26,7 @@ from engram.fleet.report import Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment
 from engram.frontend import Frame, FrameStatus
 from engram.localiser import (
+    RELOCALISERS,
     Budget,
     Localisation,
     LocalisationStatus,
@@ -34,6 +36,7 @@ from engram.localiser import (
 )
 from engram.mapper import match_edges
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.ranking import check_for_robot, policy_named
 from engram.store import BulkWriter, StoredNode
 
 # A segment is seeded from a neighbour this far along it: farther, places are looked up instead.
@@ -62,6 +65,15 @@ class MergeOptions:
     rounds: int = 4
     relocaliser: str | None = "fabmap"
     author: str | None = None
+
+    def __post_init__(self) -> None:
+        policy_named(self.policy)  # refuses what is none
+        check_for_robot(self.policy)
+        Budget(self.lanes, self.rounds)  # refuses what is no budget
+        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+            )
 
 
 class Replay:

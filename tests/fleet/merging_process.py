@@ -1,0 +1,23 @@
+"""Merges a robot's map into a centre, saying so, until somebody kills it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from engram.drive import Settings
+from engram.fleet import merge_maps
+from engram.store import bulk_writer
+
+from .robots import OPTIONS
+
+
+def main(centre: str, robot: str) -> None:
+    bulk_writer._BATCH_BYTES = 100_000  # so that a merge is written in several transactions
+    print("merging", flush=True)
+    merge_maps(Path(centre), [Path(robot)], Settings(), OPTIONS)
+    print("merged", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,333 @@
+"""Handing in: what is refused, what is reported, and that the centre is never half changed."""
+
+from __future__ import annotations
+
+import random
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.drive import Settings
+from engram.errors import IncompatibleError, InputError, MapError, NotAMapError, RefusedError
+from engram.experience.model import Clock
+from engram.fleet import MergeOptions, merge_maps
+from engram.fleet.gate import what_is_worse
+from engram.frontend import DescriptorKind
+from engram.measures import Drive
+from engram.store import MapStore
+
+from .robots import OPTIONS, merged, robot_map
+
+HOUR_NS = 3_600_000_000_000
+
+
+@pytest.fixture
+def centre(tmp_path, fleet):
+    """A centre that has what `first` saw."""
+    path = tmp_path / "centre.engram"
+    merged(path, fleet["first"][0])
+    return path
+
+
+def hash_of(path: Path) -> str:
+    with MapStore.open(path) as store:
+        return store.content_hash()
+
+
+def rewritten(source: Path, target: Path, *, session=None, node=None, descriptor=None) -> Path:
+    """A copy of a map in which records were changed on the way."""
+    with MapStore.open(source) as given, MapStore.create(target) as store:
+        contents, frontends = given.load(), given.frontends()
+        with store.begin_revision(author="tests", message="", configuration={}) as writer:
+            for one in contents.sessions:
+                changed = one if session is None else session(one)
+                kind, frontend = frontends[one.id]
+                writer.add_session(
+                    changed,
+                    contents.cameras[one.camera],
+                    descriptor=descriptor or kind,
+                    frontend=frontend,
+                )
+            for stored in given.frames.stored(contents.nodes):
+                kept = replace(stored, descriptor=descriptor or stored.descriptor)
+                writer.add_node(kept if node is None else node(kept))
+            for edge in contents.edges:
+                writer.add_edge(edge)
+            for entry in contents.path_entries:
+                writer.add_path_entry(entry)
+            writer.commit()
+    return target
+
+
+class TestRefused:
+    def refuses(self, centre: Path, robot: Path, error: type[Exception], *words: str) -> None:
+        before = hash_of(centre)
+        with pytest.raises(error) as raised:
+            merged(centre, robot)
+        assert all(word in str(raised.value) for word in words), raised.value
+        assert hash_of(centre) == before
+        assert MapStore.check(centre).problems == ()
+
+    def test_maps_of_other_descriptors(self, tmp_path, centre, fleet):
+        robot = rewritten(
+            fleet["other"][0], tmp_path / "t.engram", descriptor=DescriptorKind.TEBLID
+        )
+        self.refuses(centre, robot, IncompatibleError, "teblid", "brief")
+
+    def test_a_node_with_the_uuid_of_another(self, tmp_path, centre, fleet):
+        with MapStore.open(fleet["first"][0]) as store:
+            nodes = store.load().nodes
+            other = next(iter(store.frames.stored(nodes[5:6])))
+
+        def swapped(stored):
+            if stored.node.id != nodes[3].id:
+                return stored
+            return replace(stored, landmarks=other.landmarks, landmark_hash=other.landmark_hash)
+
+        robot = rewritten(fleet["first"][0], tmp_path / "r.engram", node=swapped)
+        self.refuses(centre, robot, IncompatibleError, str(nodes[3].id), "another in the centre")
+
+    def test_a_drive_with_the_uuid_of_another(self, tmp_path, centre, fleet):
+        robot = rewritten(
+            fleet["first"][0], tmp_path / "r.engram", session=lambda one: replace(one, robot="x")
+        )
+        self.refuses(centre, robot, IncompatibleError, "session")
+
+    @pytest.mark.parametrize("share", [0.3, 0.7, 0.97])
+    def test_a_truncated_file(self, tmp_path, centre, fleet, share):
+        robot = tmp_path / "cut.engram"
+        content = fleet["longer"][0].read_bytes()
+        robot.write_bytes(content[: int(len(content) * share)])
+        self.refuses(centre, robot, MapError)
+
+    def test_a_file_that_is_missing_or_no_map(self, tmp_path, centre):
+        self.refuses(centre, tmp_path / "nothing.engram", NotAMapError, "no such file")
+        robot = tmp_path / "text.engram"
+        robot.write_text("hello")
+        self.refuses(centre, robot, NotAMapError)
+
+    def test_the_centre_itself(self, centre):
+        self.refuses(centre, centre, InputError, "the centre itself")
+
+    def test_landmarks_that_were_damaged_on_the_way(self, tmp_path, centre, fleet):
+        robot = tmp_path / "damaged.engram"
+        shutil.copy(fleet["longer"][0], robot)
+        with MapStore.open(robot) as store:
+            stored = list(store.frames.stored(store.load().nodes))[-1]
+        content = bytearray(robot.read_bytes())
+        at = content.find(stored.landmarks[300:400])
+        assert at > 0
+        content[at + 50] ^= 1
+        robot.write_bytes(bytes(content))
+        self.refuses(centre, robot, MapError)
+
+
+class TestReported:
+    def test_a_map_of_another_town_becomes_a_part_of_its_own(self, centre, fleet):
+        (report,) = merged(centre, fleet["other"][0])
+        assert report.omitted == 0
+        assert any("no node of it was found" in note for note in report.notes)
+
+    def test_two_robots_of_one_name(self, tmp_path, fleet):
+        maps = []
+        for name in ("same", "other"):
+            robot = tmp_path / f"{name}.engram"
+            maps.append(
+                rewritten(
+                    fleet[name][0],
+                    robot,
+                    session=lambda one: replace(one, clock=Clock.UTC, robot="twin", start_ns=0),
+                )
+            )
+        _, report = merged(tmp_path / "centre.engram", *maps)
+        (note,) = [note for note in report.notes if "same name" in note]
+        assert "'twin'" in note
+
+    def test_a_clock_that_is_ahead_by_years(self, tmp_path, fleet):
+        ahead = rewritten(
+            fleet["other"][0],
+            tmp_path / "ahead.engram",
+            session=lambda one: replace(one, clock=Clock.UTC, start_ns=2**62),
+        )
+        (report,) = merged(tmp_path / "centre.engram", ahead)
+        assert any("hours from now" in note for note in report.notes)
+
+    def test_a_clock_that_runs_backwards(self, tmp_path, fleet):
+        with MapStore.open(fleet["other"][0]) as store:
+            nodes = store.load().nodes
+        middle = nodes[len(nodes) // 2].stamp_ns
+
+        def set_back(stored):
+            if stored.node.stamp_ns < middle:
+                return stored
+            stamp_ns = stored.node.stamp_ns - HOUR_NS
+            return replace(stored, node=replace(stored.node, stamp_ns=stamp_ns))
+
+        robot = rewritten(fleet["other"][0], tmp_path / "back.engram", node=set_back)
+        (report,) = merged(tmp_path / "centre.engram", robot)
+        assert any("runs backwards" in note for note in report.notes)
+        assert report.taken == len(nodes)
+        assert MapStore.check(tmp_path / "centre.engram").problems == ()
+
+    def test_the_report_says_all_of_it_in_text_and_json(self, centre, fleet):
+        (report,) = merged(centre, fleet["longer"][0])
+        assert "nodes taken" in report.text()
+        assert "no place of the map looks like it" in report.text()
+        values = report.to_dict()
+        assert values["revision"] == 2
+        (segment,) = values["segments"]
+        assert segment["taken"] == values["taken"] == sum(run["nodes"] for run in segment["runs"])
+        assert segment["runs"][-1]["reason"] == "no_place"
+
+
+def test_a_dry_run_says_what_would_be_and_leaves_the_centre_alone(tmp_path, centre, fleet):
+    robots = [fleet["longer"][0], fleet["same"][0]]
+    before = centre.read_bytes()
+    tried = merged(centre, *robots, dry_run=True)
+    assert centre.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [centre] or hash_of(centre)
+    done = merged(centre, *robots)
+    assert [one.content_hash for one in tried] == [one.content_hash for one in done]
+    assert [one.taken for one in tried] == [one.taken for one in done]
+    assert "dry run" in tried[0].text()
+
+
+def test_a_dry_run_makes_no_centre(tmp_path, fleet):
+    merged(tmp_path / "new.engram", fleet["first"][0], dry_run=True)
+    assert not (tmp_path / "new.engram").exists()
+
+
+def test_the_picture_shows_the_centre_before_and_after(tmp_path, centre, fleet):
+    picture = tmp_path / "merge.png"
+    merged(centre, fleet["other"][0], picture=picture)
+    assert picture.stat().st_size > 10_000
+
+
+class TestGate:
+    def test_worse_is_a_higher_curve_or_a_much_longer_gap(self):
+        good = Drive(np.ones(40), np.arange(40) % 2 == 0)
+        bad = Drive(np.ones(40), np.arange(40) % 20 == 0)
+        assert what_is_worse([good], [good]) == ""
+        assert what_is_worse([good], [bad]) == ""
+        assert "P(no match within" in what_is_worse([bad], [good])
+        assert "longest gap" in what_is_worse([bad], [good])
+
+    def test_a_merge_that_makes_held_out_drives_worse_is_refused(
+        self, tmp_path, centre, fleet, monkeypatch
+    ):
+        before = hash_of(centre)
+        judged = iter(
+            [[Drive(np.ones(40), np.ones(40, bool))], [Drive(np.ones(40), np.zeros(40, bool))]]
+        )
+        monkeypatch.setattr("engram.fleet.gate.Gate._localise", lambda self, store: next(judged))
+        monkeypatch.setattr("engram.fleet.gate.open_drive", lambda path: path)
+        with pytest.raises(RefusedError, match=r"held-out localise worse.*centre is as it was"):
+            merged(centre, fleet["longer"][0], require_better=[tmp_path / "held-out"])
+        assert hash_of(centre) == before
+        assert MapStore.check(centre).problems == ()
+
+
+def test_ctrl_c_ends_a_merge_between_two_nodes_and_the_next_one_completes_it(
+    tmp_path, centre, fleet
+):
+    before = hash_of(centre)
+    count = 0
+
+    def interrupted(what, total):
+        from contextlib import contextmanager
+
+        @contextmanager
+        def shown():
+            def advance(word):
+                nonlocal count
+                count += 1
+                if count == 5:
+                    signal.raise_signal(signal.SIGINT)
+
+            yield advance
+
+        return shown()
+
+    (report,) = merge_maps(centre, [fleet["longer"][0]], Settings(), OPTIONS, progress=interrupted)
+    assert report.interrupted
+    assert count == 5
+    assert hash_of(centre) == before
+    whole = tmp_path / "whole.engram"
+    expected = merged(whole, fleet["first"][0], fleet["longer"][0])[-1].content_hash
+    assert merged(centre, fleet["longer"][0])[0].content_hash == expected
+    assert MapStore.check(centre).abandoned_rows == 0
+
+
+def kill_and_look(tmp_path: Path, fleet: dict, kills: int, seed: int) -> None:
+    """Kill a merge at random moments: the centre is as before or complete, and sound."""
+    rng = random.Random(seed)
+    centre, whole = tmp_path / "centre.engram", tmp_path / "whole.engram"
+    merged(centre, fleet["first"][0])
+    before = hash_of(centre)
+    after = merged(whole, fleet["first"][0], fleet["longer"][0])[-1].content_hash
+    fresh = centre.read_bytes()
+    seconds = 2.0
+    for _ in range(kills):
+        merging = subprocess.Popen(
+            [sys.executable, "-m", "fleet.merging_process", centre, fleet["longer"][0]],
+            stdout=subprocess.PIPE,
+            cwd=Path(__file__).parents[1],
+            text=True,
+        )
+        assert merging.stdout is not None
+        assert merging.stdout.readline() == "merging\n"
+        done, _, _ = select.select([merging.stdout], [], [], rng.uniform(0, seconds))
+        merging.kill()
+        said = merging.communicate()[0]
+        report = MapStore.check(centre)
+        assert report.problems == ()
+        assert report.interrupted == ()
+        assert hash_of(centre) in ({after} if said else {before, after})
+        if hash_of(centre) == after:
+            assert report.abandoned_rows == 0
+            seconds *= 0.9 if done else 1.0
+            for beside in tmp_path.glob("centre.engram*"):
+                beside.unlink()
+            centre.write_bytes(fresh)
+        else:
+            seconds *= 1.05
+    assert merged(centre, fleet["longer"][0])[0].content_hash == after
+    assert MapStore.check(centre).problems == ()
+
+
+def test_killed_at_any_moment_the_centre_is_as_before_or_complete(tmp_path, fleet):
+    kill_and_look(tmp_path, fleet, kills=3, seed=1)
+
+
+@pytest.mark.long
+def test_killed_many_times_the_centre_is_as_before_or_complete(tmp_path, fleet):
+    kill_and_look(tmp_path, fleet, kills=30, seed=2)
+
+
+def test_a_centre_with_an_interrupted_session_of_that_robot_says_so(tmp_path, fleet):
+    robot, centre = tmp_path / "robot.engram", tmp_path / "centre.engram"
+    robot_map(robot, np.arange(0, 10, 0.5), 0, name="r1", day=1)
+    with MapStore.open(robot) as given, MapStore.create(centre) as store:
+        (session,) = given.load().sessions
+        (camera,) = given.load().cameras.values()
+        kind, frontend = given.frontends()[session.id]
+        store.begin_session(
+            session, camera, descriptor=kind, frontend=frontend, author="r1", configuration={}
+        )
+    with pytest.raises(MapError, match="resume it or seal"):
+        merged(centre, robot)
+
+
+def test_an_unknown_policy_is_refused_before_anything_is_made(tmp_path, fleet):
+    with pytest.raises(InputError, match="nonsense"):
+        merge_maps(
+            tmp_path / "c.engram", [fleet["first"][0]], Settings(), MergeOptions(policy="nonsense")
+        )
+    assert not (tmp_path / "c.engram").exists()
