@@ -16,17 +16,18 @@ class VocabularyAction(StrEnum):
     """What to do with a vocabulary."""
 
     TRAIN = "train"
+    USE = "use"
     SHOW = "show"
 
 
 def vocabulary(
-    action: Annotated[VocabularyAction, typer.Argument(help="train or show.")],
+    action: Annotated[VocabularyAction, typer.Argument(help="train, use or show.")],
     map_path: options.MapPath,
     sources: Annotated[
         list[Path] | None,
         typer.Argument(
             metavar="[SOURCE]...",
-            help="Maps and drives to train on [default: the map itself].",
+            help="Maps and drives to train on [default: the map itself]; for use, whose to take.",
         ),
     ] = None,
     *,
@@ -35,7 +36,7 @@ def vocabulary(
     author: Annotated[str, typer.Option("--author", help="Kept in the map's history.")] = "unknown",
     as_json: options.Json = False,
 ) -> None:
-    """Train the visual words by which lost robots are found in a map, or show which it has.
+    """Train the visual words by which lost robots are found in a map, or take another map's.
 
     A map without a vocabulary of its own uses the one that comes with Engram, which is small and
     was trained on simulated drives only.
@@ -44,27 +45,40 @@ def vocabulary(
     Examples:
       engram vocabulary train town.engram
       engram vocabulary train town.engram monday.framelog tuesday.framelog --words 20000
+      engram vocabulary use robot.engram town.engram
       engram vocabulary show town.engram --json
     """
     from engram.cli.progress import progress
-    from engram.drive.vocabularies import describe_vocabulary, train_map_vocabulary
+    from engram.drive.vocabularies import describe_vocabulary, train_map_vocabulary, use_vocabulary
+    from engram.errors import InputError
     from engram.places import TrainingConfig
 
     if action is VocabularyAction.SHOW:
         report = describe_vocabulary(map_path)
     else:
-        config = TrainingConfig(words=words, seed=seed)
-        with progress("train", 400) as advance:  # four steps of 100 %
-            done = dict.fromkeys(("read", "cluster", "quantise", "relate"), 0)
+        steps: tuple[str, ...] = ("read", "cluster", "quantise", "relate", "words")
+        if action is VocabularyAction.USE:
+            steps = ("words",)
+            if not sources or len(sources) != 1:
+                raise InputError(
+                    "use takes one map, or one vocabulary file, whose words to take: "
+                    "engram vocabulary use MAP SOURCE"
+                )
+        with progress(action.value, 100 * len(steps)) as advance:  # of 100 % each
+            done = dict.fromkeys(steps, 0)
 
             def advance_to(what: str, share: float) -> None:
                 for _ in range(done[what], int(100 * share)):
                     advance(what)
                 done[what] = max(done[what], int(100 * share))
 
-            report = train_map_vocabulary(
-                map_path, sources or [], config, author=author, advance=advance_to
-            )
+            if action is VocabularyAction.USE and sources:
+                report = use_vocabulary(map_path, sources[0], author=author, advance=advance_to)
+            else:
+                config = TrainingConfig(words=words, seed=seed)
+                report = train_map_vocabulary(
+                    map_path, sources or [], config, author=author, advance=advance_to
+                )
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

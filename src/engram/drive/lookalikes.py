@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.drive.opened_map import OpenMap, open_map
+from engram.drive.place_words import stored_words
 from engram.errors import InputError
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import NodeId
@@ -105,9 +106,17 @@ def write_confusion_picture(file: Path, confusion: Confusion) -> None:
 
 
 def _words(opened: OpenMap) -> list[NDArray[np.int32]]:
+    """Of each node, kept in the map or worked out from its landmarks."""
     vocabulary = opened.vocabulary_or_default(DescriptorKind.BRIEF)
-    frames = (opened.store.frames.frame(node.id) for node in opened.graph.nodes)
-    return [vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor) for frame in frames]
+    kept = stored_words(opened.store, vocabulary)
+    found = []
+    for node in opened.graph.nodes:
+        words = kept.get(node.id)
+        if words is None:
+            frame = opened.store.frames.frame(node.id)
+            words = vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
+        found.append(words)
+    return found
 
 
 def _surroundings(graph: ExperienceGraph, index: int) -> list[int]:

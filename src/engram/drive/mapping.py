@@ -9,18 +9,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from engram import __version__
 from engram.config import to_dict
 from engram.drive.live import LiveFrame, ignore, live_frames
 from engram.drive.opened_map import OpenMap
+from engram.drive.place_words import keep_missing_words
 from engram.drive.results import FrameResult, summarise
 from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
 from engram.experience.model import PathEntryKind, Session
-from engram.frontend import Frontend
+from engram.frontend import Frame, Frontend
 from engram.geometry import StereoCamera
 from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Position
-from engram.mapper import LoopConfig, LoopSearch, Mapper, Saver
+from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
+from engram.places import RECOGNISERS, hash_of
 from engram.ranking import check_for_robot
 from engram.sequences import FrameLog
 from engram.store import (
@@ -151,11 +156,22 @@ def map_drive(
             report.resumed = True
         opened = OpenMap(store)
         opened.times.add(session)
+        words = _node_words(opened, store, settings, options)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             if report.resumed:
                 start = None
-            camera = sequence.camera
-            _map_frames(opened, writer, camera, frames, settings, options, report, advance, start)
+            _map_frames(
+                opened,
+                writer,
+                sequence.camera,
+                frames,
+                settings,
+                options,
+                report,
+                advance,
+                start,
+                words,
+            )
     report.skipped = sequence.skipped
     return report
 
@@ -203,9 +219,10 @@ def _map_frames(
     report: MapReport,
     advance: Callable[[str], None],
     start: Position | None,
+    words: NodeWords | None,
 ) -> None:
     """Feeds the mapper; commits at the end, or leaves the session to be resumed."""
-    saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every)
+    saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every, words)
     localiser = opened.localiser(
         camera,
         settings,
@@ -248,6 +265,22 @@ def _map_frames(
             saver.finish()
     if not report.interrupted:
         report.revision = writer.commit().number
+
+
+def _node_words(
+    opened: OpenMap, store: WritableMapStore, settings: Settings, options: MapOptions
+) -> NodeWords | None:
+    """How the words of saved nodes are found; those that older nodes lack are filled in first."""
+    if options.relocaliser not in RECOGNISERS:
+        return None
+    descriptor = settings.frontend.descriptor
+    vocabulary = opened.vocabulary_or_default(descriptor)
+    keep_missing_words(store, vocabulary, [node.id for node in opened.graph.nodes])
+
+    def words_of(frame: Frame) -> NDArray[np.int32]:
+        return vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
+
+    return NodeWords(hash_of(vocabulary), words_of)
 
 
 def loop_search(

@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 
+from engram.drive.place_words import stored_words
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
 from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
@@ -142,7 +143,12 @@ class OpenMap:
                 f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}, none"
             )
         return RELOCALISERS[name](
-            Searched(self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor))
+            Searched(
+                self.graph,
+                self.store.frames,
+                lambda: self.vocabulary_or_default(descriptor),
+                lambda vocabulary: stored_words(self.store, vocabulary),
+            )
         )
 
     def lessons(self, focal_px: float) -> Lessons:

@@ -14,17 +14,20 @@ from numpy.typing import NDArray
 from engram.config import to_dict
 from engram.drive.live import live_frames
 from engram.drive.opened_map import OpenMap
+from engram.drive.place_words import keep_missing_words
 from engram.drive.session import DriveSequence, open_drive
 from engram.drive.settings import Settings
-from engram.errors import IncompatibleError, InputError
+from engram.errors import IncompatibleError, InputError, MapCorruptError
+from engram.experience.model import NodeId
 from engram.frontend import DescriptorKind, Frame, FrameStatus
 from engram.places import (
     TrainingConfig,
     Vocabulary,
+    decode_vocabulary,
     default_vocabulary,
     encode_vocabulary,
+    hash_of,
     train_vocabulary,
-    vocabulary_hash,
 )
 from engram.store import MapStore
 
@@ -126,7 +129,72 @@ def train_map_vocabulary(
             message=f"vocabulary of {len(vocabulary)} words",
             configuration={"vocabulary": to_dict(config), "trained_on": trained_on},
         )
+        keep_missing_words(writable, vocabulary, _node_ids(writable), advance)
     return _report(vocabulary, default=False, revision=revision.number)
+
+
+def use_vocabulary(
+    map_path: Path,
+    source: Path,
+    *,
+    author: str,
+    advance: Callable[[str, float], None],
+) -> VocabularyReport:
+    """Gives a map the vocabulary of another one, in a revision of its own.
+
+    Maps of a fleet that share a vocabulary share the words of their nodes.
+
+    Args:
+        map_path: the map.
+        source: a map with a vocabulary, or an encoded vocabulary.
+        author: who asked for it.
+        advance: called now and then with what is done and the share of it, 0…1.
+
+    Raises:
+        InputError: the source has no vocabulary of its own.
+        IncompatibleError: its words are of another kind of descriptor than the map's.
+        MapError: a map cannot be read, or this one not written.
+    """
+    vocabulary = _read_vocabulary(source)
+    with MapStore.open_for_writing(map_path) as writable:
+        kind = writable.info().descriptor
+        if kind not in {None, vocabulary.descriptor}:
+            raise IncompatibleError(
+                f"the words of {source} are of {vocabulary.descriptor} descriptors, those of "
+                f"{map_path} are {kind}; train a vocabulary for it with engram vocabulary train"
+            )
+        body = encode_vocabulary(vocabulary)
+        if writable.vocabulary() == body:
+            return _report(vocabulary, default=False)
+        revision = writable.put_vocabulary(
+            body,
+            author=author,
+            message=f"vocabulary of {source.name}",
+            configuration={"used": source.name},
+        )
+        keep_missing_words(writable, vocabulary, _node_ids(writable), advance)
+    return _report(vocabulary, default=False, revision=revision.number)
+
+
+def _read_vocabulary(source: Path) -> Vocabulary:
+    if source.suffix != MAP_SUFFIX:
+        try:
+            return decode_vocabulary(source.read_bytes())
+        except OSError as error:
+            raise InputError(f"{source} cannot be read: {error.strerror}") from error
+        except MapCorruptError as error:
+            raise InputError(f"{source}: {error}") from error
+    with MapStore.open(source) as store:
+        body = store.vocabulary()
+    if body is None:
+        raise InputError(
+            f"{source} has no vocabulary of its own; train one with engram vocabulary train"
+        )
+    return decode_vocabulary(body)
+
+
+def _node_ids(store: MapStore) -> list[NodeId]:
+    return [node.id for node in store.load().nodes]
 
 
 def _report(
@@ -136,7 +204,7 @@ def _report(
         descriptor=str(vocabulary.descriptor),
         words=len(vocabulary),
         images=vocabulary.statistics.images,
-        hash=vocabulary_hash(encode_vocabulary(vocabulary)).hex(),
+        hash=hash_of(vocabulary).hex(),
         trained_on=vocabulary.trained_on,
         default=default,
         revision=revision,

@@ -2,7 +2,7 @@
 
 from engram.mapper.loops import LoopConfig, LoopSearch
 from engram.mapper.mapper import Mapper, MapperConfig, MappingStep, edge_through_live, match_edges
-from engram.mapper.saver import Records, RecordWriter, Saver
+from engram.mapper.saver import NodeWords, Records, RecordWriter, Saver
 
 __all__ = [
     "LoopConfig",
@@ -10,6 +10,7 @@ __all__ = [
     "Mapper",
     "MapperConfig",
     "MappingStep",
+    "NodeWords",
     "RecordWriter",
     "Records",
     "Saver",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from queue import Queue
 from threading import Thread
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from engram.experience.model import Attempt, Edge, Node, NodeId, PathEntry
 from engram.frontend import Frame
@@ -23,11 +26,28 @@ class FrameHolder(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class NodeWords:
+    """How the words of saved nodes are found, which are kept with them.
+
+    Attributes:
+        vocabulary: hash of the vocabulary.
+        words_of: the distinct words (n,) of a frame, rising.
+    """
+
+    vocabulary: bytes
+    words_of: Callable[[Frame], NDArray[np.int32]]
+
+
 class RecordWriter(Protocol):
     """Where a session's records go; `engram.store.SessionWriter` is one."""
 
     def add_node(self, node: Node, frame: Frame) -> None:
         """Adds a node with the frame that it was."""
+        ...
+
+    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
+        """Adds the words of a node."""
         ...
 
     def add_edge(self, edge: Edge) -> None:
@@ -77,11 +97,13 @@ class Saver:
         writer: where the records go.
         frames: keeps frames readable until they are written.
         checkpoint_every: live frames between two checkpoints; what a crash may lose.
+        words: how the words of nodes are found; None keeps none.
     """
 
     writer: RecordWriter
     frames: FrameHolder
     checkpoint_every: int = 20
+    words: NodeWords | None = None
     _queue: Queue[Records | _Stop] = field(default_factory=lambda: Queue(_QUEUE_LENGTH))
     _error: BaseException | None = None
     _thread: Thread | None = None
@@ -138,6 +160,9 @@ class Saver:
     def _write(self, records: Records) -> None:
         if records.node is not None and records.frame is not None:
             self.writer.add_node(records.node, records.frame)
+            if self.words is not None:
+                found = self.words.words_of(records.frame)
+                self.writer.add_words(records.node.id, self.words.vocabulary, found)
         for edge in records.edges:
             self.writer.add_edge(edge)
         for entry in records.path_entries:

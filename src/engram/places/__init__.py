@@ -16,6 +16,7 @@ from engram.places.vocabulary import (
     decode_vocabulary,
     default_vocabulary,
     encode_vocabulary,
+    hash_of,
     vocabulary_hash,
 )
 
@@ -41,6 +42,7 @@ __all__ = [
     "decode_vocabulary",
     "default_vocabulary",
     "encode_vocabulary",
+    "hash_of",
     "train_vocabulary",
     "vocabulary_hash",
 ]

@@ -123,6 +123,11 @@ def vocabulary_hash(body: bytes) -> bytes:
     return hashlib.sha256(body).digest()[:16]
 
 
+def hash_of(vocabulary: Vocabulary) -> bytes:
+    """`vocabulary_hash` of a vocabulary at hand."""
+    return vocabulary_hash(encode_vocabulary(vocabulary))
+
+
 def decode_vocabulary(body: bytes) -> Vocabulary:
     """Undoes `encode_vocabulary`; the bytes may come from anywhere.
 

@@ -49,7 +49,9 @@ from engram.store.schema import (
     statistics,
     tags,
     vocabularies,
+    words,
 )
+from engram.store.words import decode_words
 
 # What a column refers to, by its name.
 _REFERENCES = {
@@ -61,7 +63,7 @@ _REFERENCES = {
     "b": nodes,
     "path": paths,
 }
-_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags)
+_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, words)
 assert set(_ORDER) == set(metadata.sorted_tables)
 
 # Rotations come out of chains of products: what is left of skew is rounding.
@@ -138,7 +140,7 @@ class _Checking:
     def _name(self, table: Table, values: Sequence[Any]) -> str:
         """How a row is named to people: by UUIDs wherever it can be."""
         row = dict(zip(table.columns.keys(), values, strict=False))
-        if table is frames:
+        if table in {frames, words}:
             return self.uuids.get((nodes, row["node"]), f"of node row {row['node']}")
         if table is edges:
             ends = [self.uuids.get((nodes, row[end]), f"row {row[end]}") for end in ("a", "b")]
@@ -355,6 +357,13 @@ def _check_tag(checking: _Checking, row: Row) -> None:
         raise MapCorruptError(f"tag {row['name']} names revision {row['number']}, which is missing")
 
 
+def _check_words(checking: _Checking, row: Row) -> None:
+    if row["node"] not in checking.revision_of[nodes]:
+        raise MapCorruptError("the node is missing")
+    checking.blobs += 1
+    decode_words(row["body"])
+
+
 def _check_rotation(rotation: np.ndarray[Any, np.dtype[np.float64]]) -> None:
     skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not skew <= _ROTATION_TOLERANCE:
@@ -378,4 +387,5 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     vocabularies: _check_vocabulary,
     hidden: _check_hidden,
     tags: _check_tag,
+    words: _check_words,
 }

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from sqlalchemy import Connection, delete, select
 
-from engram.store.schema import VERSIONED, revisions
+from engram.store.schema import VERSIONED, nodes, revisions, words
 
 
 def collect_abandoned(connection: Connection) -> int:
     """Remove them; returns how many there were. The revisions themselves stay on record."""
+    lost = select(nodes.c.key).where(nodes.c.revision.in_(_ABANDONED))
+    connection.execute(delete(words).where(words.c.node.in_(lost)))  # keys may be given out again
     return sum(
         connection.execute(delete(table).where(table.c.revision.in_(_ABANDONED))).rowcount
         for table in reversed(VERSIONED)

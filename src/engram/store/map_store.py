@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, insert, select
 
 from engram import __version__
@@ -72,6 +74,7 @@ from engram.store.session_writer import SessionWriter
 from engram.store.sqlite import SqliteDatabase
 from engram.store.tags import Tag, checked_tag, load_tags, resolve, write_tag
 from engram.store.view import View, head
+from engram.store.words import load_words, words_row, write_words
 
 
 def is_address(location: Path | str) -> bool:
@@ -245,6 +248,14 @@ class MapStore:
         """
         with self._database.reading() as connection:
             return origin_of(connection, self._view, prefix)
+
+    def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
+        """The words (n,) of nodes by the vocabulary of this hash, rising, as far as they are kept.
+
+        What is damaged is left out: it can be worked out again from the landmarks.
+        """
+        with self._database.reading() as connection:
+            return load_words(connection, vocabulary)
 
     def session_state(self, session: SessionId) -> SessionState:
         """What the map knows of a session: ask before handing one in."""
@@ -488,6 +499,26 @@ class WritableMapStore(MapStore):
         self._keys.forget_nodes()
         self._see(View(self.resolve(None)))
         return done
+
+    def put_words(self, vocabulary: bytes, found: Mapping[NodeId, NDArray[np.int32]]) -> None:
+        """Keep words of nodes, in one transaction: no revision, since they follow from other rows.
+
+        Args:
+            vocabulary: hash (16 bytes) of the vocabulary.
+            found: the distinct words (n,) of each node, rising.
+
+        Raises:
+            InputError: a node is not in the map, or its words do not rise.
+            StorageFullError: no space; the map is as it was.
+        """
+        rows = []
+        for node, shown in found.items():
+            key = self._keys.find_node(node)
+            if key is None:
+                raise InputError(f"words: node {node} is not in the map")
+            rows.append(words_row(key, vocabulary, shown))
+        with self._database.writing() as connection:
+            write_words(connection, self._database, rows)
 
     def put_vocabulary(
         self, body: bytes, *, author: str, message: str, configuration: Mapping[str, Any]

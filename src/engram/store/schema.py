@@ -233,6 +233,15 @@ tags = _table(
     _int("tagged_ns"),
 )
 
+# The words of nodes by a vocabulary (`engram.places`): worked out from their landmarks, and kept so
+# that nobody has to read those. What stands here follows from other rows: it is of no revision.
+words = _table(
+    "words",
+    Column("node", _INT64, primary_key=True, autoincrement=False),
+    _bytes("vocabulary"),  # its hash
+    _bytes("body"),
+)
+
 # In the order in which rows may refer to earlier tables.
 VERSIONED: tuple[Table, ...] = (
     sessions,
@@ -251,7 +260,7 @@ KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "k
 
 # Tables by the format that brought them; all others are of format 1. A map of an older format reads
 # as one in which they are empty.
-NEWER: dict[int, tuple[Table, ...]] = {2: (tags,)}
+NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words)}
 # Tables whose columns stand since format 1, but whose constraints a later format loosened.
 LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, insert
 
 from engram.errors import IncompatibleError, InputError, RevisionError
@@ -40,6 +41,7 @@ from engram.store.rows import (
     to_json,
 )
 from engram.store.schema import edges, frames, hidden, nodes, path_entries, statistics
+from engram.store.words import words_row, write_words
 
 
 class SessionWriter:
@@ -131,6 +133,22 @@ class SessionWriter:
             self._rows[nodes].append(sealed(nodes, row))
             self._rows[frames].append(sealed(frames, frame_row))
             self._expect(node, frame, key)
+
+    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
+        """Keep the words of a node by the vocabulary of this hash (16 bytes).
+
+        Args:
+            node: a node of the map.
+            vocabulary: the vocabulary's hash.
+            found: (n,) the distinct words that the node shows, rising.
+
+        Raises:
+            InputError: the node is not in the map, or the words do not rise.
+        """
+        with self._lock:
+            self._check_open()
+            key = self._node_key(node, "words")
+            self._words[key] = words_row(key, vocabulary, found)
 
     def add_edge(self, edge: Edge) -> None:
         """Add an edge; it takes the place of an older one with the same (a, b, kind).
@@ -298,7 +316,8 @@ class SessionWriter:
         return key
 
     def _waiting(self) -> bool:
-        return bool(any(self._rows.values()) or self._edges or self._attempts or self._statistics)
+        others = (self._edges, self._attempts, self._statistics, self._words)
+        return any(self._rows.values()) or any(map(len, others))
 
     def _clear(self) -> None:
         self._rows: dict[Table, list[Row]] = {
@@ -309,6 +328,7 @@ class SessionWriter:
         }
         self._edges: dict[tuple[int, int, str], Row] = {}
         self._statistics: dict[str, Row] = {}
+        self._words: dict[int, Row] = {}
         self._attempts: list[AttemptTable] = []
         self._saved: list[NodeId] = []
 
@@ -322,6 +342,7 @@ class SessionWriter:
         if self._statistics:
             statement = self._database.replace(statistics, ("name", "revision"))
             connection.execute(statement, list(self._statistics.values()))
+        write_words(connection, self._database, list(self._words.values()))
         if self._attempts:
             made = concatenate(self._attempts)
             write_attempts(connection, self._keys, self._revision_key, self._session_key, made)
