@@ -234,7 +234,13 @@ def co_occurrence(
     b: NDArray[np.int32],
     excluded: int = -1,
 ) -> NDArray[np.int32]: ...
+
+class ObservedPaths:
+    def __init__(self) -> None: ...
+    def add(self, node: int, path: int) -> None: ...
+
 def path_scores(
+    known: ObservedPaths,
     bits: NDArray[np.uint64],
     path_count: int,
     candidates: NDArray[np.int32],

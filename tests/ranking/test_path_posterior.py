@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from tests.reference.path_posterior import posterior, prior_of, theta_row
 from tests.worlds import flat_graph, memory_of, path_uuid
 
+from engram.experience.model import PathEntry, PathEntryKind
 from engram.experience.path_memory import PathMemory
 
 
@@ -144,3 +145,65 @@ def test_scores_equal_numpy_for_any_number_of_observations(count: int) -> None:
     expected = np.log(np.where(outcomes, theta, 1 - theta)).sum(axis=1)
     scores = memory.scores(candidates, observed, outcomes, None, alpha=0.5)
     np.testing.assert_allclose(scores, expected, rtol=1e-12)
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_what_is_kept_from_frame_to_frame_changes_no_score(data) -> None:
+    """W and the paths change a little from call to call, as on a drive; now and then a lot."""
+    nodes, paths = 40, 70
+    some = st.lists(st.integers(0, nodes - 1), max_size=nodes, unique=True)
+    steps = data.draw(st.lists(st.tuples(some, some, st.integers(0, paths - 1)), max_size=6))
+    observed = data.draw(some)
+    walks: list[list[int]] = [[] for _ in range(paths)]
+    graph = flat_graph(nodes)
+    kept = memory_of(graph, walks)
+    for visited, changed, path in steps:
+        for node in visited:
+            entry = PathEntry(
+                path_uuid(path), len(walks[path]), graph.node(node).id, PathEntryKind.MATCHED, 0
+            )
+            kept.add(entry)
+            walks[path].append(node)
+        # A few leave and a few come: those in both lists leave.
+        observed = [n for n in observed if n not in changed] + [
+            n for n in changed[:2] if n not in observed
+        ]
+        fresh = PathMemory(graph)
+        for number, walk in enumerate(walks):
+            for sequence, node in enumerate(walk):
+                fresh.add(
+                    PathEntry(
+                        path_uuid(number), sequence, graph.node(node).id, PathEntryKind.MATCHED, 0
+                    )
+                )
+        situation = (
+            np.arange(nodes, dtype=np.int32),
+            np.array(observed, np.int32),
+            np.array([n % 2 == 0 for n in observed], np.bool_),
+            3,
+        )
+        np.testing.assert_array_equal(kept.scores(*situation), fresh.scores(*situation))
+
+
+def test_a_node_observed_twice_is_refused_and_harms_nothing() -> None:
+    memory = memory_of(flat_graph(10), EXAMPLE_PATHS)
+    before = memory.scores(*_example())
+    for observed in ([1, 2, 1], [1, 2, 3, 4, 8, 8]):
+        with pytest.raises(ValueError, match="twice"):
+            memory.scores(
+                np.array([5, 9], np.int32),
+                np.array(observed, np.int32),
+                np.ones(len(observed), np.bool_),
+                4,
+            )
+        np.testing.assert_array_equal(memory.scores(*_example()), before)
+
+
+def _example():
+    return (
+        np.array([5, 9], np.int32),
+        np.array(EXAMPLE_OBSERVED, np.int32),
+        np.array(EXAMPLE_OUTCOMES, np.bool_),
+        4,
+    )

@@ -2,6 +2,7 @@
 
 #include "bindings/arrays.hpp"
 
+#include <mutex>
 #include <stdexcept>
 #include <string>
 
@@ -45,7 +46,21 @@ auto co_occurrence(const Input<uint64_t, 2> &bits, int64_t path_count, const Inp
   return engram::to_numpy(std::move(counts), {a_count, b_count});
 }
 
-auto path_scores(const Input<uint64_t, 2> &bits, int64_t path_count,
+// `ObservedPaths` behind a lock: robots on several threads may share a path memory.
+class Observed {
+public:
+  void add(int32_t node, int64_t path) {
+    if (node < 0 || path < 0)
+      throw std::invalid_argument("observed paths: a node and a path are not negative");
+    const std::scoped_lock held(mutex_);
+    ENGRAM_CALL(note_on_path, paths_, node, path);
+  }
+
+  std::mutex mutex_;
+  engram::ObservedPaths paths_;
+};
+
+auto path_scores(Observed &known, const Input<uint64_t, 2> &bits, int64_t path_count,
                  const Input<int32_t, 1> &candidates, const Input<int32_t, 1> &observed,
                  const Input<bool, 1> &outcomes, int64_t reference, double alpha, double gamma,
                  int64_t excluded) {
@@ -67,7 +82,8 @@ auto path_scores(const Input<uint64_t, 2> &bits, int64_t path_count,
   std::vector<double> scores(candidates.shape(0));
   {
     nb::gil_scoped_release unlocked;
-    ENGRAM_CALL(path_scores, paths, candidates.data(), static_cast<int64_t>(scores.size()),
+    const std::scoped_lock held(known.mutex_);
+    ENGRAM_CALL(path_scores, paths, known.paths_, candidates.data(), static_cast<int64_t>(scores.size()),
                 evidence, scores.data());
   }
   const size_t count = scores.size();
@@ -80,7 +96,11 @@ void bind_path_scores(nb::module_ &module) {
   module.def("co_occurrence", &co_occurrence, "bits"_a, "path_count"_a, "a"_a, "b"_a,
              "excluded"_a = -1,
              "Number of paths (A, B) int32 that hold both nodes a (A,) and b (B,).");
-  module.def("path_scores", &path_scores, "bits"_a, "path_count"_a, "candidates"_a, "observed"_a,
+  nb::class_<Observed>(module, "ObservedPaths",
+                       "What is known of the nodes observed lately, kept from frame to frame.")
+      .def(nb::init<>())
+      .def("add", &Observed::add, "node"_a, "path"_a, "A node has come onto a path.");
+  module.def("path_scores", &path_scores, "known"_a, "bits"_a, "path_count"_a, "candidates"_a, "observed"_a,
              "outcomes"_a, "reference"_a, "alpha"_a, "gamma"_a, "excluded"_a = -1,
              "Log of the unnormalised posterior (Y,) float64 of each candidate, [L15 (1)-(5)].");
 }

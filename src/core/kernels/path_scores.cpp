@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #ifdef __AVX512VPOPCNTDQ__
@@ -99,33 +101,108 @@ void transpose_words(const u64x8 *in, int64_t in_step, u64x8 *out, int64_t out_s
   }
 }
 
-// Which of some nodes are on each path: bit j % 512 of row(j / 512, path).
-class NodesByPath { // one at a time on a thread
+u64x8 *rows_of(ObservedPaths &known) {
+  const auto first = reinterpret_cast<uintptr_t>(known.storage.data());
+  return reinterpret_cast<u64x8 *>((first + 63) / 64 * 64);
+}
+
+// Which of some nodes are on each path: bit slot % 512 of row(slot / 512, path).
+class NodesByPath {
 public:
-  NodesByPath(const PathBits &paths, const int32_t *nodes, int64_t count)
-      : vectors_((count + nodes_per_vector - 1) / nodes_per_vector),
-        paths_((paths.words + lanes - 1) / lanes * lanes * 64) {
-    // A megabyte for 10,000 paths: kept between calls, since fresh pages cost more than the work.
-    static thread_local std::vector<u64x8> kept;
-    if (kept.size() < static_cast<size_t>(vectors_ * paths_ + 1))
-      kept.resize(static_cast<size_t>(vectors_ * paths_ + 1));
-    rows_ = kept.data();
-    rows_[vectors_ * paths_] = u64x8{};
-    for (int64_t v = 0; v < vectors_; ++v)
-      for (int64_t w = 0; w < paths.words; w += lanes)
-        fill(paths, nodes + v * nodes_per_vector, std::min(nodes_per_vector, count - v * 512), w,
-             rows_ + v * paths_ + 64 * w);
-    if (paths.excluded >= 0)
-      for (int64_t v = 0; v < vectors_; ++v)
-        rows_[v * paths_ + paths.excluded] = u64x8{};
+  // What is known of other nodes is taken over where few of them are new.
+  NodesByPath(const PathBits &paths, ObservedPaths &known, const int32_t *nodes, int64_t count)
+      : paths_(paths), known_(known), slots_(static_cast<size_t>(count)) {
+    const int64_t padded = (paths.words + lanes - 1) / lanes * lanes * 64;
+    const int64_t vectors = (count + nodes_per_vector - 1) / nodes_per_vector;
+    known_.slot_of.resize(static_cast<size_t>(paths.rows), -1);
+    if (known_.paths != padded || known_.vectors != vectors || !update(nodes, count))
+      build(nodes, count, vectors, padded);
   }
 
-  int64_t vectors() const { return vectors_; }
-  const u64x8 *rows(int64_t vector) const { return rows_ + vector * paths_; }
+  int64_t vectors() const { return known_.vectors; }
+  const u64x8 *rows(int64_t vector) const { return start() + vector * known_.paths; }
   // A row of nothing, for padding.
-  const u64x8 *empty() const { return rows_ + vectors_ * paths_; }
+  const u64x8 *empty() const { return start() + known_.vectors * known_.paths; }
+  int64_t slot(int64_t j) const { return slots_[static_cast<size_t>(j)]; }
 
 private:
+  u64x8 *start() const { return rows_of(known_); }
+
+  void build(const int32_t *nodes, int64_t count, int64_t vectors, int64_t padded) {
+    for (const int32_t node : known_.node_of)
+      if (node >= 0)
+        known_.slot_of[static_cast<size_t>(node)] = -1;
+    known_.vectors = -1; // until all is in place
+    known_.paths = padded;
+    known_.node_of.assign(static_cast<size_t>(vectors * nodes_per_vector), -1);
+    // A megabyte for 10,000 paths: it is kept, since fresh pages cost more than the work.
+    const auto words = static_cast<size_t>((vectors * padded + 1) * lanes) + 7;
+    if (known_.storage.size() < words)
+      known_.storage.resize(words);
+    for (int64_t j = 0; j < count; ++j)
+      take(nodes[j], j, j);
+    for (int64_t v = 0; v < vectors; ++v)
+      for (int64_t w = 0; w < paths_.words; w += lanes)
+        fill(paths_, nodes + v * nodes_per_vector, std::min(nodes_per_vector, count - v * 512), w,
+             start() + v * padded + 64 * w);
+    start()[vectors * padded] = u64x8{};
+    known_.vectors = vectors;
+  }
+
+  void take(int32_t node, int64_t slot, int64_t j) {
+    int32_t &known = known_.slot_of[static_cast<size_t>(node)];
+    if (known >= 0)
+      throw std::invalid_argument("node " + std::to_string(node) + " is observed twice");
+    known = static_cast<int32_t>(slot);
+    known_.node_of[static_cast<size_t>(slot)] = node;
+    slots_[static_cast<size_t>(j)] = known;
+  }
+
+  // Frees the slots of nodes that are gone and gives them to new ones. False, and nothing changed,
+  // where so many are new that all are better built anew.
+  bool update(const int32_t *nodes, int64_t count) {
+    std::vector<uint8_t> stays(known_.node_of.size(), 0);
+    std::vector<int64_t> fresh;
+    for (int64_t j = 0; j < count; ++j) {
+      const int32_t slot = known_.slot_of[static_cast<size_t>(nodes[j])];
+      slots_[static_cast<size_t>(j)] = slot;
+      if (slot < 0)
+        fresh.push_back(j);
+      else if (stays[static_cast<size_t>(slot)]++)
+        throw std::invalid_argument("node " + std::to_string(nodes[j]) + " is observed twice");
+    }
+    if (static_cast<int64_t>(fresh.size()) > count / 8)
+      return false;
+    for (size_t slot = 0; slot < stays.size(); ++slot)
+      if (const int32_t node = known_.node_of[slot]; node >= 0 && !stays[slot]) {
+        write(node, static_cast<int64_t>(slot), false);
+        known_.slot_of[static_cast<size_t>(node)] = -1;
+        known_.node_of[slot] = -1;
+      }
+    size_t free = 0;
+    for (const int64_t j : fresh) {
+      while (known_.node_of[free] >= 0)
+        ++free;
+      take(nodes[j], static_cast<int64_t>(free), j);
+      write(nodes[j], static_cast<int64_t>(free), true);
+    }
+    return true;
+  }
+
+  // Writes the bit of a node in the rows of all its paths.
+  void write(int32_t node, int64_t slot, bool on) {
+    u64x8 *rows = start() + slot / nodes_per_vector * known_.paths;
+    const int64_t lane = slot % nodes_per_vector / 64;
+    const uint64_t bit = uint64_t{1} << (slot % 64);
+    const uint64_t *row = paths_.bits + node * paths_.stride;
+    for (int64_t w = 0; w < paths_.words; ++w)
+      for (uint64_t rest = row[w]; rest != 0; rest &= rest - 1)
+        if (u64x8 &path = rows[64 * w + __builtin_ctzll(rest)]; on)
+          path[lane] |= bit;
+        else
+          path[lane] &= ~bit;
+  }
+
   // The rows of 8 x 64 paths, from word w on, for up to 512 nodes.
   static void fill(const PathBits &paths, const int32_t *nodes, int64_t count, int64_t w,
                    u64x8 *rows) {
@@ -145,16 +222,19 @@ private:
       transpose_words(groups + q, 64, rows + q, 64);
   }
 
-  int64_t vectors_, paths_;
-  u64x8 *rows_;
+  const PathBits &paths_;
+  ObservedPaths &known_;
+  std::vector<int32_t> slots_;
 };
 
-// The numbers of a node's paths. `list` has room for four more than there are paths.
+// The numbers of a node's paths that count. `list` has room for four more than there are paths.
 int64_t list_paths(const PathBits &paths, int32_t node, int32_t *list) {
   int64_t count = 0;
   const uint64_t *row = paths.bits + node * paths.stride;
   for (int64_t w = 0; w < paths.words; ++w) {
     uint64_t rest = row[w];
+    if (paths.excluded >= 0 && w == paths.excluded / 64)
+      rest &= ~(uint64_t{1} << (paths.excluded % 64));
     const int64_t bits = __builtin_popcountll(rest);
     const auto first = static_cast<int32_t>(64 * w);
     // Most words hold a few bits or none: four are written without asking, so that no branch
@@ -185,6 +265,14 @@ struct Counters {
   // Rows come eight at a time; a carry out of a plane waits for the next, so that two of them
   // cost one adder.
   Counters(const int32_t *list, int64_t count, const u64x8 *rows, const u64x8 *empty) {
+    if (count <= 3) { // in a young map most nodes are on a few paths only
+      planes[0] = count > 0 ? rows[list[0]] : *empty;
+      planes[2] = *empty;
+      planes[1] = add(planes[0], count > 1 ? rows[list[1]] : *empty,
+                      count > 2 ? rows[list[2]] : *empty);
+      used = 3;
+      return;
+    }
     u64x8 ones = {}, twos = {}, fours = {}, waiting[plane_count];
     int64_t eights = 0;
     used = 3;
@@ -231,25 +319,36 @@ public:
     uint64_t value, successes, failures;
   };
 
-  explicit Tally(int64_t greatest)
-      : octets_(static_cast<size_t>(greatest / octet + 1)), seen_(octets_.size()) {}
+  // Successes and failures of all the nodes that `count` will be told of.
+  Tally(int64_t greatest, uint64_t successes, uint64_t failures)
+      : successes_(successes), failures_(failures),
+        octets_(static_cast<size_t>(greatest / octet + 1)), seen_(octets_.size()) {}
 
-  void clear() { std::fill(seen_.begin(), seen_.end(), uint8_t{0}); }
+  // Begins anew; no count will be above `greatest`.
+  void clear(int64_t greatest) {
+    greatest_ = static_cast<size_t>(greatest);
+    std::fill_n(seen_.begin(), greatest_ / octet + 1, uint8_t{0});
+  }
 
   void count(const Counters &counters, u64x8 successes, u64x8 failures) {
     split(counters, counters.used - 1, 0, successes | failures, successes);
   }
 
-  // What was counted, values rising; those that no counter holds are left out.
+  // What was counted, values rising; of those above 0 the ones that some counter holds.
   const std::vector<Entry> &entries() {
-    entries_.clear();
-    for (size_t o = 0; o < octets_.size(); ++o)
-      for (size_t k = 0; seen_[o] && k < octet; ++k)
+    // What holds no other value holds 0.
+    Entry none{0, successes_, failures_};
+    entries_.assign(1, none);
+    for (size_t o = 0; o <= greatest_ / octet; ++o)
+      for (size_t k = lowest(o); seen_[o] && k < used(o); ++k)
         if (any(octets_[o].all[k])) {
           const uint64_t successes = sum_of(octets_[o].successes[k]);
-          entries_.push_back(
-              {octet * o + k, successes, sum_of(octets_[o].all[k]) - successes});
+          const uint64_t failures = sum_of(octets_[o].all[k]) - successes;
+          entries_.push_back({octet * o + k, successes, failures});
+          none.successes -= successes;
+          none.failures -= failures;
         }
+    entries_.front() = none;
     return entries_;
   }
 
@@ -273,7 +372,13 @@ private:
     Octet &tally = octets_[number];
     const bool first = !seen_[number];
     seen_[number] = 1;
+    const size_t end = used(number);
+#pragma GCC unroll 8 // so that it is known which planes are turned round
     for (size_t k = 0; k < octet; ++k) {
+      if (k >= end)
+        break;
+      if (k < lowest(number))
+        continue;
       u64x8 equal = mask;
       for (size_t level = 0; level < 3; ++level)
         equal &= (k >> level) & 1 ? counters.planes[level] : ~counters.planes[level];
@@ -283,6 +388,14 @@ private:
     }
   }
 
+  // Values of an octet that are counted and can occur.
+  static size_t lowest(size_t number) { return number == 0 ? 1 : 0; }
+  size_t used(size_t number) const {
+    return std::min(static_cast<size_t>(octet), greatest_ + 1 - octet * number);
+  }
+
+  uint64_t successes_, failures_;
+  size_t greatest_ = 0;
   std::vector<Octet> octets_;
   std::vector<uint8_t> seen_;
   std::vector<Entry> entries_;
@@ -368,14 +481,32 @@ private:
   Logarithms of_success_, of_total_, of_failure_;
 };
 
-// One bit per observed node: whether it succeeded, and whether it failed.
-void outcome_masks(const PathEvidence &evidence, std::vector<u64x8> &successes,
-                   std::vector<u64x8> &failures) {
-  for (int64_t j = 0; j < evidence.observed_count; ++j) {
-    std::vector<u64x8> &masks = evidence.outcomes[j] != 0 ? successes : failures;
-    masks[static_cast<size_t>(j / nodes_per_vector)][(j % nodes_per_vector) / 64] |=
-        uint64_t{1} << (j % 64);
+// 64 bytes of 0 or 1 as bits.
+uint64_t packed(const uint8_t *bytes) {
+  uint64_t bits = 0;
+  for (int k = 0; k < 8; ++k) {
+    uint64_t eight;
+    std::memcpy(&eight, bytes + 8 * k, sizeof eight);
+    bits |= (eight * 0x0102040810204080) >> 56 << (8 * k);
   }
+  return bits;
+}
+
+// One bit per observed node: whether it succeeded, and whether it failed.
+void outcome_masks(const PathEvidence &evidence, const NodesByPath &nodes,
+                   std::vector<u64x8> &successes, std::vector<u64x8> &failures) {
+  // A byte each first: one bit after another into the same word would wait for each other.
+  std::vector<uint8_t> bytes(2 * successes.size() * nodes_per_vector, 0);
+  uint8_t *succeeded = bytes.data(), *failed = succeeded + bytes.size() / 2;
+  for (int64_t j = 0; j < evidence.observed_count; ++j) {
+    succeeded[nodes.slot(j)] = evidence.outcomes[j] != 0;
+    failed[nodes.slot(j)] = evidence.outcomes[j] == 0;
+  }
+  for (size_t v = 0; v < successes.size(); ++v)
+    for (size_t lane = 0; lane < static_cast<size_t>(lanes); ++lane) {
+      successes[v][lane] = packed(succeeded + v * nodes_per_vector + 64 * lane);
+      failures[v][lane] = packed(failed + v * nodes_per_vector + 64 * lane);
+    }
 }
 
 // Number of paths that hold both nodes.
@@ -408,36 +539,51 @@ int64_t most_paths(const PathBits &paths, const int32_t *nodes, int64_t count) {
 
 void co_occurrence(const PathBits &paths, const int32_t *a, int64_t a_count, const int32_t *b,
                    int64_t b_count, int32_t *counts) {
-  const NodesByPath others(paths, b, b_count);
-  std::vector<int32_t> list(static_cast<size_t>(64 * paths.words + 4));
+  // The same node may stand in b more than once: each gets a place of its own.
+  std::vector<int32_t> distinct(b, b + b_count);
+  std::sort(distinct.begin(), distinct.end());
+  distinct.erase(std::unique(distinct.begin(), distinct.end()), distinct.end());
+  std::vector<size_t> places(static_cast<size_t>(b_count));
+  for (int64_t j = 0; j < b_count; ++j)
+    places[static_cast<size_t>(j)] = static_cast<size_t>(
+        std::lower_bound(distinct.begin(), distinct.end(), b[j]) - distinct.begin());
+  ObservedPaths known;
+  const auto distinct_count = static_cast<int64_t>(distinct.size());
+  const NodesByPath others(paths, known, distinct.data(), distinct_count);
+  std::vector<int32_t> list(static_cast<size_t>(64 * paths.words + 4)), row(distinct.size());
   for (int64_t i = 0; i < a_count; ++i) {
     const int64_t length = list_paths(paths, a[i], list.data());
     for (int64_t v = 0; v < others.vectors(); ++v) {
       const Counters counters(list.data(), length, others.rows(v), others.empty());
-      for (int64_t j = v * nodes_per_vector; j < std::min(b_count, (v + 1) * 512); ++j) {
+      for (int64_t j = v * nodes_per_vector; j < std::min(distinct_count, (v + 1) * 512); ++j) {
         int32_t count = 0;
         for (int level = 0; level < counters.used; ++level)
           count |= ((counters.planes[level][j % 512 / 64] >> (j % 64)) & 1) << level;
-        counts[i * b_count + j] = count;
+        row[static_cast<size_t>(j)] = count;
       }
     }
+    for (int64_t j = 0; j < b_count; ++j)
+      counts[i * b_count + j] = row[places[static_cast<size_t>(j)]];
   }
 }
 
-void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count,
-                 const PathEvidence &evidence, double *scores) {
+void path_scores(const PathBits &paths, ObservedPaths &known, const int32_t *candidates,
+                 int64_t count, const PathEvidence &evidence, double *scores) {
   // theta over a single node is 1 whatever the counts: it says nothing.
   const int64_t observed = evidence.observed_count > 1 ? evidence.observed_count : 0;
-  const NodesByPath others(paths, evidence.observed, observed);
+  const NodesByPath others(paths, known, evidence.observed, observed);
   std::vector<u64x8> successes(static_cast<size_t>(others.vectors())),
       failures(static_cast<size_t>(others.vectors()));
   if (observed > 0)
-    outcome_masks(evidence, successes, failures);
+    outcome_masks(evidence, others, successes, failures);
   const int64_t most = most_paths(paths, candidates, count);
   Likelihood likelihood(static_cast<double>(observed), evidence.alpha);
   Logarithms prior(evidence.gamma);
   std::vector<int32_t> list(static_cast<size_t>(most + 4));
-  Tally tally(most);
+  uint64_t succeeded = 0;
+  for (int64_t j = 0; j < observed; ++j)
+    succeeded += evidence.outcomes[j] != 0;
+  Tally tally(most, succeeded, static_cast<uint64_t>(observed) - succeeded);
   for (int64_t i = 0; i < count; ++i) {
     scores[i] = 0;
     if (evidence.reference >= 0) {
@@ -447,12 +593,20 @@ void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count
     if (observed == 0)
       continue;
     const int64_t length = list_paths(paths, candidates[i], list.data());
-    tally.clear();
+    tally.clear(length);
     for (int64_t v = 0; v < others.vectors(); ++v)
       tally.count(Counters(list.data(), length, others.rows(v), others.empty()),
                   successes[static_cast<size_t>(v)], failures[static_cast<size_t>(v)]);
     scores[i] += likelihood.log(tally.entries());
   }
+}
+
+void note_on_path(ObservedPaths &known, int32_t node, int64_t path) {
+  if (static_cast<size_t>(node) >= known.slot_of.size() || path >= known.paths)
+    return; // the rows are built anew before they are used
+  if (const int32_t slot = known.slot_of[static_cast<size_t>(node)]; slot >= 0)
+    rows_of(known)[slot / nodes_per_vector * known.paths + path][slot % nodes_per_vector / 64] |=
+        uint64_t{1} << (slot % 64);
 }
 
 } // namespace engram::ENGRAM_ISA

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 #include "dispatch.hpp"
 
@@ -15,8 +16,16 @@ struct PathBits {
   int64_t excluded; // number of a path that does not count, or -1
 };
 
+// Which of the nodes observed lately are on each path, kept from frame to frame: few of them change.
+struct ObservedPaths {
+  std::vector<uint64_t> storage; // one row of 512 nodes per path and vector, and an empty one
+  int64_t vectors = 0, paths = 0;
+  std::vector<int32_t> node_of; // by slot, which is a node's bit in the rows; -1 where it is free
+  std::vector<int32_t> slot_of; // by node; -1 where it has none
+};
+
 struct PathEvidence {
-  const int32_t *observed; // W
+  const int32_t *observed; // W, each node once
   const uint8_t *outcomes; // (W) z: 1 where the attempt succeeded
   int64_t observed_count;
   int64_t reference; // node k, or -1
@@ -31,5 +40,9 @@ ENGRAM_DECLARE_KERNELS(
                        int64_t b_count, int32_t *counts);
 
     // scores[i] = log of the unnormalised posterior of candidate i [L15 (1)-(5)].
-    void path_scores(const PathBits &paths, const int32_t *candidates, int64_t count,
-                     const PathEvidence &evidence, double *scores);)
+    // Throws std::invalid_argument where a node is observed twice.
+    void path_scores(const PathBits &paths, ObservedPaths &known, const int32_t *candidates,
+                     int64_t count, const PathEvidence &evidence, double *scores);
+
+    // Tells `known` that a node has come onto a path.
+    void note_on_path(ObservedPaths &known, int32_t node, int64_t path);)

@@ -38,6 +38,7 @@ class PathMemory:
         self._paths: list[PathId] = []
         self._number: dict[PathId, int] = {}
         self._bits = np.zeros((16, 1), dtype=np.uint64)
+        self._observed = _core.ObservedPaths()
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -66,6 +67,7 @@ class PathMemory:
         if _insert(self._entries[number], entry) and entry.kind in self.kinds:
             self._make_room()
             self._bits[node, number // 64] |= np.uint64(1 << (number % 64))
+            self._observed.add(node, number)
 
     def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(P, N) bool: whether each path holds each node; unknown paths hold none.
@@ -107,10 +109,12 @@ class PathMemory:
         """(Y,) float64: log p(y = i | Z, θ, π) of each candidate, up to a common constant.
 
         Source: SPEC §4, [L15 §V, eqs. (1)–(7)]. Observing none or one node leaves the prior alone.
+        What is worked out for the observed nodes is kept for the next call, which should ask for
+        much the same ones.
 
         Args:
             candidates: (Y,) int32, dense node indices.
-            observed: (W,) int32, the nodes attempted lately.
+            observed: (W,) int32, the nodes attempted lately, each once.
             outcomes: (W,) bool, z: whether the latest attempt on each succeeded.
             reference: node k in which the robot is localised; None makes the prior uniform.
             excluded: a path that does not count, such as the live session's own.
@@ -119,6 +123,7 @@ class PathMemory:
         """
         self._make_room()
         return _core.path_scores(
+            self._observed,
             self._bits,
             len(self._paths),
             candidates,

@@ -28,7 +28,7 @@ class PathPolicy:
         neighbourhood = context.neighbourhood
         rates = context.basin.success_rate(neighbourhood.along_m, neighbourhood.across_m)
         within = rates >= BASIN_LEVEL
-        if within.all():
+        if np.count_nonzero(within) == len(within):
             return self._formula.rank(context)
         scores = np.zeros(len(neighbourhood))
         scores[within] = self._formula.scores(context, neighbourhood.nodes[within])
