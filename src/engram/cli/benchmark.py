@@ -9,6 +9,8 @@ import typer
 
 from engram.cli import options
 
+_WORLD = "world"
+
 
 def bench(
     *,
@@ -24,19 +26,30 @@ def bench(
     Examples:
       engram bench
       engram bench --only frontend_odometry_512,attempt_512 --json
+      engram bench --only world    (how hard the simulated town is; 3 to 5 minutes)
     """
     from rich.console import Console
 
-    from engram.bench import run_bench
+    from engram.bench import BenchReport, run_bench
+    from engram.bench.world import WorldReport, measure_world
 
     names = only.split(",") if only else None
+    stages = None if names is None else [name for name in names if name != _WORLD]
+    found: list[BenchReport | WorldReport] = []
     with Console(stderr=True).status("") as status:
-        report = run_bench(
-            names,
-            repeats=repeats,
-            progress=lambda stage, done, of: status.update(f"{stage} ({done + 1} of {of})"),
-        )
-    if as_json:
-        print(json.dumps(report.to_dict()))
+        if stages is None or stages:
+            found.append(
+                run_bench(
+                    stages,
+                    repeats=repeats,
+                    progress=lambda stage, done, of: status.update(f"{stage} ({done + 1} of {of})"),
+                )
+            )
+        if names is not None and _WORLD in names:
+            found.append(measure_world(advance=status.update))
+    if not as_json:
+        for report in found:
+            Console().print(report.table())
         return
-    Console().print(report.table())
+    parts = [{_WORLD: r.to_dict()} if isinstance(r, WorldReport) else r.to_dict() for r in found]
+    print(json.dumps({key: value for part in parts for key, value in part.items()}))

@@ -23,6 +23,14 @@ _CLOTH = 0.002  # share of the light that comes through what covers a lens
 # Drops that sit on the glass in the hardest rain, on 512×384 pixels: nine tenths of the picture lie
 # behind one, and a robot in hard rain is lost there whatever its map holds (calibration, row f).
 _DROPS = 300
+# What the hash of the world is made from, besides the robots.
+CONSTANTS = {
+    "target": _TARGET,
+    "most_gain": _MOST_GAIN,
+    "shutter_by_day_s": _SHUTTER_BY_DAY_S,
+    "longest_shutter_s": _LONGEST_SHUTTER_S,
+    "drops": _DROPS,
+}
 
 
 @dataclass(frozen=True, slots=True)
