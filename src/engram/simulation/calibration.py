@@ -103,7 +103,7 @@ class Row:
         if self.high == np.inf:
             bounds = f"at least {self.low:g}"
         else:
-            bounds = f"{self.low:g} to {self.high:g}" if self.low else f"at most {self.high:g}"
+            bounds = f"{self.low:.3g} to {self.high:g}" if self.low else f"at most {self.high:g}"
         return f"holds ({bounds})" if self.holds else f"MISSES {bounds}"
 
     def to_dict(self) -> dict[str, Any]:
