@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
 
 from engram.drive import Settings
-from engram.experience.model import NodeId
+from engram.experience.model import Clock, NodeId
 from engram.fleet import MergeOptions, MergeReport, merge_maps
 from engram.geometry import SE3
+from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
 from mapping_rig import Mapped, map_simulated
 from synthetic_world import World, drive
 
 DAY_NS = 86_400_000_000_000
+HOUR_NS = 3_600_000_000_000
 WORLD = World(length_m=40.0, seed=11)
 # FAB-MAP knows nothing of random descriptors: every node is looked at instead.
 OPTIONS = MergeOptions(relocaliser="exhaustive")
@@ -40,3 +43,33 @@ def merged(centre: Path, *robots: Path, **options: object) -> list[MergeReport]:
 
 def truth_of(*maps: Mapped) -> dict[NodeId, SE3]:
     return {node: pose for one in maps for node, pose in one.saved.items()}
+
+
+def frame_log(
+    path: Path,
+    places_m: np.ndarray,
+    appearance: int = 0,
+    *,
+    name: str = "r1",
+    day: int = 1,
+    hour: float = 12.0,
+    aside_m: float = 0.0,
+) -> Path:
+    """A drive as a frame log, at an hour of the day at Greenwich."""
+    steps = drive(
+        WORLD,
+        places_m,
+        appearance,
+        aside_m=aside_m,
+        start_ns=day * DAY_NS + round(hour * HOUR_NS),
+        seed=day,
+    )
+    first = steps[0].frame
+    info = SequenceInfo(path.stem, "synthetic", Clock.UTC, name, longitude_deg=0.0)
+    header = FrameLogHeader(info, first.camera, first.descriptor, first.frontend)
+    with FrameLogWriter(path, header) as writer:
+        for number, seen in enumerate(steps):
+            logged = LoggedFrame(seen.frame, seen.odometry)
+            writer.append(logged, hashlib.sha256(f"{path.stem} {number}".encode()).hexdigest())
+        writer.close(complete=True)
+    return path

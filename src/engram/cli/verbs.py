@@ -10,6 +10,7 @@ import typer
 
 from engram.cli.app import VerbInterruptedError
 from engram.cli.benchmark import bench
+from engram.cli.building import build
 from engram.cli.demonstration import demo
 from engram.cli.evaluation import evaluate
 from engram.cli.extraction import extract
@@ -35,6 +36,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "blame": blame,
     "check": check,
     "merge": merge,
+    "build": build,
     "seal": seal,
     "simulate": simulate,
     "vocabulary": vocabulary,

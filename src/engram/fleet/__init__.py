@@ -1,7 +1,11 @@
 """The fleet: many robots, one centre (SPEC §7): merging, building."""
 
+from engram.fleet.best_order import BestOrder, JudgeOptions, OrderResult, order_costs
+from engram.fleet.building import BuildOptions, BuildReport, build_map
 from engram.fleet.docking import merge_maps
 from engram.fleet.gate import Gate, GateOptions, what_is_worse
+from engram.fleet.group_mapping import GroupResult, GroupTask, map_group
+from engram.fleet.grouping import GROUPINGS, group_drives
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.merging import Progress, merge_map, silent
 from engram.fleet.replay import MergeOptions
@@ -9,19 +13,31 @@ from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentRep
 from engram.fleet.segments import Segment, string_segments
 
 __all__ = [
+    "GROUPINGS",
+    "BestOrder",
+    "BuildOptions",
+    "BuildReport",
     "Gate",
     "GateOptions",
+    "GroupResult",
+    "GroupTask",
     "HandedIn",
+    "JudgeOptions",
     "MergeOptions",
     "MergeReport",
+    "OrderResult",
     "Progress",
     "Reason",
     "RunReport",
     "Seed",
     "Segment",
     "SegmentReport",
+    "build_map",
+    "group_drives",
+    "map_group",
     "merge_map",
     "merge_maps",
+    "order_costs",
     "silent",
     "string_segments",
     "what_is_worse",

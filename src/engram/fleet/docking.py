@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,8 +68,10 @@ def merge_maps(
             if gate is not None:
                 gate.look_at(store)
         for robot in robots:
+            started = time.perf_counter()
             report = _merge_one(place, robot, settings, options, progress, gate)
             report.dry_run = dry_run
+            report.seconds = time.perf_counter() - started
             reports.append(report)
             if report.interrupted:
                 break

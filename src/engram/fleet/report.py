@@ -133,6 +133,7 @@ class MergeReport:
         taken, omitted: nodes.
         edges, path_entries, attempts: how many were added.
         match_attempts: match attempts of the replay, what the merge costs.
+        seconds: wall time.
         components: connected components of the centre afterwards.
         segments: one report each, in the order of replay.
         notes: what somebody should look at.
@@ -154,6 +155,7 @@ class MergeReport:
     path_entries: int = 0
     attempts: int = 0
     match_attempts: int = 0
+    seconds: float = 0.0
     components: int = 0
     segments: list[SegmentReport] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -1,0 +1,200 @@
+"""Building in groups: the same map whatever dies on the way, and the best order of merging."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from contextlib import contextmanager
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from engram.drive import MapOptions, Settings
+from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
+from engram.fleet import BuildOptions, JudgeOptions, build_map, order_costs
+from engram.fleet.gate import GateOptions
+from engram.store import MapStore
+
+from .robots import OPTIONS, frame_log
+
+MAPPING = MapOptions(relocaliser="exhaustive")
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Three drives by day, one of which sees another look; and one for validation."""
+    folder = tmp_path_factory.mktemp("logs")
+    near, far = np.arange(0, 16, 0.8), np.arange(8, 24, 0.8)
+    return {
+        "a": str(frame_log(folder / "a.framelog", near, 0, day=1)),
+        "b": str(frame_log(folder / "b.framelog", far, 0, day=2, aside_m=0.2)),
+        "c": str(frame_log(folder / "c.framelog", near, 1, day=3)),
+        "held-out": str(frame_log(folder / "held-out.framelog", far, 0, day=9, aside_m=-0.2)),
+    }
+
+
+def options(**changes: object) -> BuildOptions:
+    values = {"workers": 2, "groups": 2, "mapping": MAPPING, "merging": OPTIONS} | changes
+    return BuildOptions(**values)
+
+
+def build(centre, logs, names="abc", progress=None, **changes):
+    shown = {} if progress is None else {"progress": progress}
+    drives = [logs[name] for name in names]
+    return build_map(centre, drives, Settings(), options(**changes), **shown)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory, logs):
+    """The centre of groups (a, b), (c) built without any trouble."""
+    centre = tmp_path_factory.mktemp("built") / "centre.engram"
+    return centre, build(centre, logs)
+
+
+def test_groups_are_mapped_and_merged_into_one_map(built, logs):
+    centre, report = built
+    assert report.groups == [["a.framelog", "b.framelog"], ["c.framelog"]]
+    assert [len(one.sessions) for one in report.mapped] == [2, 1]
+    assert all(one.seconds > 0 and one.retries == 0 for one in report.mapped)
+    assert len(report.merges) == 1
+    assert MapStore.check(centre).problems == ()
+    assert not centre.with_name("centre.engram.build").exists()
+    with MapStore.open(centre) as store:
+        assert len(store.load().sessions) == 3
+        assert store.content_hash() == report.content_hash
+    assert "2 drives" in report.text()
+    assert report.to_dict()["parallel_s"] == pytest.approx(report.parallel_s)
+
+
+def test_a_worker_that_dies_is_replaced_and_the_map_is_the_same(tmp_path, logs, built):
+    killed = []
+
+    def killing(what, total):
+        @contextmanager
+        def shown():
+            def advance(word):
+                if not killed:  # the first word of any worker is its last
+                    killed.append(multiprocessing.active_children()[0].pid)
+                    os.kill(killed[0], signal.SIGKILL)
+
+            yield advance
+
+        return shown()
+
+    report = build(tmp_path / "centre.engram", logs, progress=killing)
+    assert len(killed) == 1
+    assert sum(one.retries for one in report.mapped) == 1
+    assert report.content_hash == built[1].content_hash
+
+
+def test_a_group_that_kills_every_worker_is_given_up(tmp_path, logs):
+    def killing(what, total):
+        @contextmanager
+        def shown():
+            def advance(word):
+                for child in multiprocessing.active_children():
+                    os.kill(child.pid, signal.SIGKILL)
+
+            yield advance
+
+        return shown()
+
+    centre = tmp_path / "centre.engram"
+    with pytest.raises(WorkerError, match="died 4 times"):
+        build(centre, logs, names="a", groups=1, workers=1, progress=killing)
+    assert not centre.exists()
+
+
+def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, built):
+    count = 0
+
+    def interrupting(what, total):
+        @contextmanager
+        def shown():
+            def advance(word):
+                nonlocal count
+                count += 1
+                if count == 25:
+                    signal.raise_signal(signal.SIGINT)
+
+            yield advance
+
+        return shown()
+
+    centre = tmp_path / "centre.engram"
+    report = build(centre, logs, progress=interrupting)
+    assert report.interrupted
+    assert "go on" in report.text()
+    with pytest.raises(ConfigError, match="another build"):
+        build(centre, logs, groups=3)
+    again = build(centre, logs)
+    assert not again.interrupted
+    assert again.content_hash == built[1].content_hash
+
+
+def test_a_centre_that_exists_takes_in_all_groups(tmp_path, logs):
+    centre = tmp_path / "centre.engram"
+    build(centre, logs, names="a", groups=1)
+    report = build(centre, logs, names="bc")
+    assert [one.revision for one in report.merges] == [2, 3]
+    again = build(centre, logs, names="bc")
+    assert [one.revision for one in again.merges] == [None, None]
+    assert again.content_hash == report.content_hash
+
+
+def test_a_drive_that_cannot_be_read_is_named(tmp_path, logs):
+    (tmp_path / "broken.framelog").write_bytes(b"nothing")
+    with pytest.raises(EngramError, match=r"broken\.framelog"):
+        build_map(tmp_path / "c.engram", [str(tmp_path / "broken.framelog")], Settings(), options())
+    with pytest.raises(SequenceError, match="cannot be fetched"):
+        build_map(tmp_path / "c.engram", ["memory://nowhere.framelog"], Settings(), options())
+
+
+def test_all_orders_are_tried_over_a_prefix_tree_and_the_best_is_kept(tmp_path, logs):
+    centre = tmp_path / "centre.engram"
+    judge = JudgeOptions(
+        [logs["held-out"]], 3.0, GateOptions(relocaliser="exhaustive", lanes=1, rounds=8)
+    )
+    report = build(centre, logs, groups=3, judge=judge)
+    best = report.best
+    assert {one.order for one in best.results} == set(permutations(range(3)))
+    # Σ 3!/(3−d)! over d = 2, 3 merges, and a copy for every node of the tree.
+    assert (best.merges, best.copies) == (6 + 6, 3 + 6 + 6)
+    assert [one.rank for one in best.results] == sorted(one.rank for one in best.results)
+    # What was chosen was really built: the centre is the map that was judged.
+    assert report.content_hash == best.results[0].content_hash
+    assert report.groups == [[f"{'abc'[number]}.framelog"] for number in best.order]
+    assert "model (8)" in report.text()
+    assert len(report.to_dict()["best_order"]["orders"]) == 6
+
+
+def test_the_cost_model_gives_the_papers_figure():
+    costs = order_costs(4, 10823, 1829, 27)
+    assert costs.model_s / costs.sequential_s == pytest.approx(0.2244, abs=5e-5)
+    # 60 merges in place of 72; 64 T_G for a tree of sequential building.
+    assert costs.tree_s == pytest.approx(4 * 10823 + 60 * 1829 + 64 * 27)
+    assert costs.sequential_tree_s == pytest.approx(64 * 10823 + 64 * 27)
+
+
+def test_what_cannot_be_built_is_refused(tmp_path, logs):
+    with pytest.raises(ConfigError, match="budgets by count"):
+        options(mapping=MapOptions(deadline_ms=10.0))
+    with pytest.raises(ConfigError, match="validation"):
+        JudgeOptions([])
+    with pytest.raises(ConfigError, match="0 workers"):
+        options(workers=0)
+
+
+def test_a_dask_cluster_builds_the_same_map(tmp_path, logs, built):
+    distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address=None,
+        local_directory=str(tmp_path / "dask"),
+    ) as cluster:
+        report = build(tmp_path / "centre.engram", logs, scheduler=cluster.scheduler_address)
+    assert report.content_hash == built[1].content_hash
