@@ -1,0 +1,280 @@
+"""Random small maps handed in to a centre: what must hold whatever they look like (SPEC §7).
+
+    python benchmarks/merge_graphs.py                          # 10,000 cases
+    python benchmarks/merge_graphs.py --cases 200 --workers 2
+
+A case is a few robots' maps: drives past places of a road in one of two looks, strung by
+odometry with holes and branches, tied here and there; some robots went out with the map of another.
+For each case:
+
+- the merged map is sound (`engram check`), and every node handed in is in it or omitted;
+- nodes that hang together in a robot's map do so in the centre, and it falls into no more parts
+  than both had before;
+- handing any map in again changes nothing;
+- maps of the same content, written in another order, give the same centre.
+
+Prints every violation with its seed, and exits with 1 if there is one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from engram.drive import OpenMap, Settings
+from engram.experience.model import (
+    Clock,
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    Session,
+    node_id,
+    path_id,
+    session_id,
+)
+from engram.fleet import MergeOptions, MergeReport, merge_maps
+from engram.frontend import DescriptorKind, FrameStatus
+from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
+from engram.geometry import SE3, StereoCamera
+from engram.store import MapStore, StoredNode, encode_landmarks
+
+CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
+OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")
+PLACES, APPEARANCES, LANDMARKS = 16, 2, 70
+SIGMA = np.diag([0.02**2] * 3 + [0.003**2] * 3)
+
+
+@dataclass
+class RandomMap:
+    """What one robot hands in, as records.
+
+    Attributes:
+        sessions: its drives.
+        nodes: with place and appearance of each.
+        edges, entries: between them.
+    """
+
+    sessions: list[Session] = field(default_factory=list)
+    nodes: dict[NodeId, tuple[Node, int, int]] = field(default_factory=dict)
+    edges: dict[tuple[NodeId, NodeId, EdgeKind], Edge] = field(default_factory=dict)
+    entries: list[PathEntry] = field(default_factory=list)
+
+    def copy(self) -> RandomMap:
+        """What a robot goes out with."""
+        return RandomMap(
+            list(self.sessions), dict(self.nodes), dict(self.edges), list(self.entries)
+        )
+
+
+@cache
+def blob_of(place: int, appearance: int, look: int) -> bytes:
+    """The landmarks of a place in an appearance, in the pixels and bits of one look at it."""
+    own = np.random.default_rng([place, appearance])
+    depth = own.uniform(4, 30, LANDMARKS)
+    pixels = own.uniform([10, 10], [630, 470], (LANDMARKS, 2))
+    descriptors = own.integers(0, 256, (LANDMARKS, 32), dtype=np.uint8)
+    noise = np.random.default_rng([place, appearance, look])
+    pixels = pixels + noise.normal(0, 0.3, pixels.shape)
+    descriptors = descriptors ^ np.packbits(noise.random((LANDMARKS, 256)) < 0.05, axis=1)
+    codes = quantise(
+        pixels.astype(np.float32),
+        (CAMERA.focal_baseline / depth).astype(np.float32),
+        np.full(LANDMARKS, 0.15, np.float32),
+        pixel_quantum(CAMERA.width, CAMERA.height),
+    )
+    octaves = np.zeros(LANDMARKS, np.uint8)
+    return encode_landmarks(landmarks_from_codes(codes, descriptors, octaves, CAMERA), CAMERA)
+
+
+def add_drive(made: RandomMap, number: int, rng: random.Random) -> None:
+    """One drive past a stretch of the road, saved here and there."""
+    start_ns = 1_000_000_000 * (number + 1)
+    name = f"r{rng.randrange(3)}"
+    drive = Session(
+        session_id(name, CAMERA.id, start_ns, str(number)),
+        name,
+        CAMERA.id,
+        start_ns,
+        Clock.RELATIVE,
+    )
+    made.sessions.append(drive)
+    first, appearance = rng.randrange(PLACES), rng.randrange(APPEARANCES)
+    own: list[NodeId] = []
+    for at in range(rng.randrange(0, 8)):
+        stamp_ns = start_ns + at * 1_000_000
+        node = Node(node_id(drive.id, stamp_ns), drive.id, stamp_ns, CAMERA.id, float(at))
+        made.nodes[node.id] = (node, first + at, appearance)
+        if own and rng.random() < 0.85:
+            add_edge(made, rng.choice([own[-1], own[-1], rng.choice(own)]), node.id, "odometry")
+        others = list(made.nodes)
+        if rng.random() < 0.25 and len(others) > 1:
+            kind = rng.choice(["tie", "match", "proximity"])
+            add_edge(made, rng.choice(others), node.id, kind)
+        own.append(node.id)
+    walked = [rng.choice(list(made.nodes)) for _ in range(rng.randrange(6))] if made.nodes else []
+    for sequence, node in enumerate(own + walked):
+        kind = PathEntryKind.SAVED if sequence < len(own) else PathEntryKind.MATCHED
+        made.entries.append(PathEntry(path_id(drive.id), sequence, node, kind, sequence))
+
+
+def add_edge(made: RandomMap, a: NodeId, b: NodeId, kind: str) -> None:
+    """An edge that tells the truth: places are a metre apart."""
+    if a == b:
+        return
+    ahead_m = float(made.nodes[b][1] - made.nodes[a][1])
+    edge = Edge(a, b, EdgeKind(kind), SE3(np.eye(3), np.array([0.0, 0.0, ahead_m])), SIGMA)
+    made.edges[a, b, edge.kind] = edge
+
+
+def random_fleet(seed: int) -> list[RandomMap]:
+    """Two or three robots' maps; a later one may have gone out with an earlier one's."""
+    rng = random.Random(seed)
+    fleet: list[RandomMap] = []
+    number = 0
+    for _ in range(rng.randrange(2, 4)):
+        made = rng.choice(fleet).copy() if fleet and rng.random() < 0.4 else RandomMap()
+        for _ in range(rng.randrange(1, 3)):
+            add_drive(made, number, rng)
+            number += 1
+        fleet.append(made)
+    return fleet
+
+
+def write(made: RandomMap, path: Path, order: int) -> None:
+    """The map's file; `order` decides in which order the rows come."""
+    rng = random.Random(order)
+    with MapStore.create(path) as store:
+        about = {"author": "robot", "message": "", "configuration": {}}
+        with store.begin_revision(**about) as writer:
+            for one in shuffled(made.sessions, rng):
+                writer.add_session(
+                    one, CAMERA, descriptor=DescriptorKind.BRIEF, frontend="synthetic"
+                )
+            for node, place, appearance in shuffled(made.nodes.values(), rng):
+                blob = blob_of(place, appearance, node.stamp_ns % 1_000_003)
+                writer.add_node(
+                    StoredNode(
+                        node,
+                        DescriptorKind.BRIEF,
+                        "synthetic",
+                        FrameStatus.OK,
+                        blob[:16],
+                        blob,
+                        None,
+                    )
+                )
+            for edge in shuffled(made.edges.values(), rng):
+                writer.add_edge(edge)
+            for entry in shuffled(made.entries, rng):
+                writer.add_path_entry(entry)
+            writer.commit()
+
+
+def shuffled(items, rng: random.Random) -> list:  # noqa: ANN001, any iterable
+    found = list(items)
+    rng.shuffle(found)
+    return found
+
+
+def merged(centre: Path, robot: Path) -> MergeReport:
+    return merge_maps(centre, [robot], Settings(), OPTIONS)[0]
+
+
+def parts(path: Path) -> tuple[dict[NodeId, int], int]:
+    """The part in which each node handed in lies, itself or its equivalent; and how many."""
+    with OpenMap(MapStore.open(path)) as opened:
+        labels = opened.graph.components()
+        found = {node.id: int(labels[at]) for at, node in enumerate(opened.graph.nodes)}
+        for omission in opened.store.omissions().values():
+            found[omission.omitted] = found[omission.node]
+    return found, int(labels.max(initial=-1)) + 1
+
+
+def violations(seed: int) -> Iterator[str]:
+    """What does not hold for one case."""
+    fleet = random_fleet(seed)
+    with tempfile.TemporaryDirectory(prefix="engram-graphs-") as made:
+        folder = Path(made)
+        centre, twin = folder / "centre.engram", folder / "twin.engram"
+        robots = [folder / f"robot-{number}.engram" for number in range(len(fleet))]
+        before = 0
+        for number, (robot, content) in enumerate(zip(robots, fleet, strict=True)):
+            write(content, robot, order=0)
+            report = merged(centre, robot)
+            ours, after = parts(centre)
+            theirs, of_robot = parts(robot)
+            if missing := theirs.keys() - ours.keys():
+                yield f"merge {number}: nodes {missing} are neither taken nor omitted"
+            together: dict[int, set[int]] = {}
+            for node, label in theirs.items():
+                together.setdefault(label, set()).add(ours.get(node, -1))
+            if any(len(labels) > 1 for labels in together.values()):
+                yield f"merge {number}: nodes that hung together are in {together}"
+            if after > before + of_robot or after != report.components:
+                yield f"merge {number}: {after} parts of {before} and {of_robot}"
+            before = after
+        if problems := MapStore.check(centre).problems:
+            yield f"the centre is not sound: {problems}"
+        yield from _again(centre, robots)
+        for number, content in enumerate(fleet):
+            other = folder / f"twin-{number}.engram"
+            write(content, other, order=seed + 1)
+            merged(twin, other)
+        if content_hash(twin) != content_hash(centre):
+            yield "maps of the same content give another centre"
+
+
+def _again(centre: Path, robots: list[Path]) -> Iterator[str]:
+    known = content_hash(centre)
+    for number, robot in enumerate(robots):
+        report = merged(centre, robot)
+        if report.changed or report.revision is not None or content_hash(centre) != known:
+            yield f"handing in {number} again changes the centre: {report.to_dict()}"
+
+
+def content_hash(path: Path) -> str:
+    with MapStore.open(path) as store:
+        return store.content_hash()
+
+
+def told(seed: int) -> list[str]:
+    """For a pool of processes."""
+    try:
+        return list(violations(seed))
+    except Exception as error:  # a crash is a violation
+        return [f"{type(error).__name__}: {error}"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first case")
+    parser.add_argument("--workers", type=int, default=2)
+    asked = parser.parse_args()
+    seeds = range(asked.first, asked.first + asked.cases)
+    found = 0
+    with ProcessPoolExecutor(asked.workers) as pool:
+        for seed, words in zip(seeds, pool.map(told, seeds, chunksize=4), strict=True):
+            for word in words:
+                found += 1
+                print(f"seed {seed}: {word}", flush=True)
+            if (seed - asked.first + 1) % 500 == 0:
+                print(f"{seed - asked.first + 1} cases, {found} violations", flush=True)
+    print(f"{asked.cases} cases, {found} violations")
+    sys.exit(found > 0)
+
+
+if __name__ == "__main__":
+    main()
