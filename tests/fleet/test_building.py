@@ -187,6 +187,7 @@ def test_what_cannot_be_built_is_refused(tmp_path, logs):
         options(workers=0)
 
 
+@pytest.mark.long
 def test_a_dask_cluster_builds_the_same_map(tmp_path, logs, built):
     distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
     with distributed.LocalCluster(

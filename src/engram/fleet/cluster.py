@@ -54,7 +54,7 @@ def map_groups_on_cluster(
             for task in tasks
         ]
         try:
-            for future in as_completed(futures):
+            for future in as_completed(futures, loop=client.loop):
                 result, content = future.result()
                 _keep(place(result.number), content)
                 mapped(result)
