@@ -1,5 +1,6 @@
 // The renderer as Python sees it: a Scene that owns meshes, textures and the maps derived from
 // them.
+#include "kernels/mipmap.hpp"
 #include "kernels/raster.hpp"
 #include "kernels/sensor.hpp"
 #include "kernels/shading.hpp"
@@ -230,7 +231,16 @@ struct Camera {
 class Scene {
 public:
   explicit Scene(const nb::ndarray<const uint8_t, nb::shape<256, 256>, nb::c_contig> &noise)
-      : meshes_(1), noise_(noise.data(), noise.data() + 256 * 256) {}
+      : meshes_(1), noise_quads_(256 * 256) {
+    const uint8_t *at = noise.data();
+    for (int j = 0; j < 256; ++j)
+      for (int i = 0; i < 256; ++i) {
+        const int next = (i + 1) & 255, below = 256 * ((j + 1) & 255);
+        noise_quads_[256 * j + i] = static_cast<int32_t>(
+            at[256 * j + i] | at[256 * j + next] << 8 | at[below + i] << 16 |
+            static_cast<uint32_t>(at[below + next]) << 24);
+      }
+  }
 
   int32_t add_texture(const Image &image, bool coverage);
   void remove_texture(int32_t texture) {
@@ -270,9 +280,11 @@ private:
   std::vector<int32_t> free_meshes_, free_textures_;
   std::vector<StoredTexture> textures_;
   std::vector<StoredLamp> lamps_;
-  std::vector<uint8_t> noise_;
+  std::vector<int32_t> noise_quads_;
   std::vector<Mesh> mesh_table_;
   std::vector<Texture> texture_table_;
+  std::vector<int64_t> mip_texels_;
+  std::vector<int32_t> mip_sizes_, mip_counts_;
   std::vector<float> sun_, moving_sun_, openness_;
   std::vector<int32_t> lamp_starts_, lamp_items_;
   std::vector<int32_t> ids_;
@@ -284,37 +296,58 @@ private:
   bool maps_stand_ = false;
 };
 
+// Copies a level to where its border belongs around it: rows of width + 2 texels.
+void put_with_border(const uint8_t *from, int32_t width, int32_t height, uint8_t *to) {
+  const size_t row_bytes = 4ULL * width;
+  for (int32_t y = -1; y <= height; ++y) {
+    const uint8_t *row = from + row_bytes * static_cast<size_t>((y + height) % height);
+    std::copy_n(row + row_bytes - 4, 4, to);
+    std::copy_n(row, row_bytes, to + 4);
+    std::copy_n(row, 4, to + 4 + row_bytes);
+    to += row_bytes + 8;
+  }
+}
+
+StoredTexture with_levels(const uint8_t *image, int32_t width, int32_t height, bool coverage) {
+  StoredTexture texture = {};
+  Texture &levels = texture.levels;
+  std::array<size_t, kMipLevels> starts{};
+  size_t total = 0;
+  for (int32_t w = width, h = height; levels.level_count < kMipLevels;) {
+    const int32_t k = levels.level_count++;
+    starts[k] = total;
+    levels.widths[k] = w, levels.heights[k] = h;
+    total += 4ULL * (w + 2) * (h + 2);
+    if (w == 1 && h == 1)
+      break;
+    w = std::max(1, w / 2), h = std::max(1, h / 2);
+  }
+  texture.bytes.resize(total);
+  std::vector<uint8_t> finer, level(image, image + 4ULL * width * height);
+  for (int32_t k = 0; k < levels.level_count; ++k) {
+    const int32_t w = levels.widths[k], h = levels.heights[k];
+    if (k > 0) {
+      finer.swap(level);
+      level.resize(4ULL * w * h);
+      ENGRAM_CALL(halve_texture, finer.data(), levels.widths[k - 1], levels.heights[k - 1],
+                  coverage, level.data());
+    }
+    put_with_border(level.data(), w, h, texture.bytes.data() + starts[k]);
+    levels.levels[k] = texture.bytes.data() + starts[k] + 4ULL * (w + 3);
+  }
+  return texture;
+}
+
 int32_t Scene::add_texture(const Image &image, bool coverage) {
   const auto height = static_cast<int32_t>(image.shape(0)),
              width = static_cast<int32_t>(image.shape(1));
   if (height < 1 || width < 1 || height > 16384 || width > 16384)
     throw nb::value_error("texture: sides must be 1 to 16384 texels");
   StoredTexture texture;
-  texture.levels = {};
-  size_t total = 0;
-  std::array<size_t, kMipLevels> starts{};
-  int32_t w = width, h = height, count = 0;
-  for (; count < kMipLevels; ++count) {
-    starts[count] = total;
-    texture.levels.widths[count] = w, texture.levels.heights[count] = h;
-    total += 4ULL * w * h;
-    if (w == 1 && h == 1) {
-      ++count;
-      break;
-    }
-    w = std::max(1, w / 2), h = std::max(1, h / 2);
-  }
-  texture.levels.level_count = count;
-  texture.bytes.resize(total);
   {
     nb::gil_scoped_release unlocked;
-    std::copy_n(image.data(), 4ULL * width * height, texture.bytes.data());
-    for (int32_t k = 1; k < count; ++k)
-      ENGRAM_CALL(halve_texture, texture.bytes.data() + starts[k - 1], texture.levels.widths[k - 1],
-                  texture.levels.heights[k - 1], coverage, texture.bytes.data() + starts[k]);
+    texture = with_levels(image.data(), width, height, coverage);
   }
-  for (int32_t k = 0; k < count; ++k)
-    texture.levels.levels[k] = texture.bytes.data() + starts[k];
   if (free_textures_.empty()) {
     textures_.push_back(std::move(texture));
     return static_cast<int32_t>(textures_.size()) - 1;
@@ -376,8 +409,17 @@ void Scene::point_at_meshes() {
     mesh_table_.push_back({mesh.vertices.data(), mesh.surfaces.data(), mesh.chunks.data(),
                            static_cast<int32_t>(mesh.chunks.size())});
   texture_table_.clear();
-  for (const StoredTexture &texture : textures_)
+  mip_texels_.clear();
+  mip_sizes_.clear();
+  mip_counts_.clear();
+  for (const StoredTexture &texture : textures_) {
     texture_table_.push_back(texture.levels);
+    mip_counts_.push_back(texture.levels.level_count);
+    for (int k = 0; k < kMipLevels; ++k) {
+      mip_texels_.push_back(reinterpret_cast<int64_t>(texture.levels.levels[k]));
+      mip_sizes_.push_back(texture.levels.widths[k] | texture.levels.heights[k] << 16);
+    }
+  }
 }
 
 // (mesh, chunk) pairs within reach, nearest first, so that what is hidden fails the depth test.
@@ -560,7 +602,7 @@ std::vector<Lamp> Scene::lamps_near(const double *centre) {
     near.push_back({{lamp.position[0], lamp.position[1], lamp.position[2]},
                     lamp.power,
                     lamp.range,
-                    lamp.depth.empty() ? nullptr : lamp.depth.data()});
+                    distance2 < 60 * 60 ? lamp.depth.data() : nullptr});
   }
   return near;
 }
@@ -605,13 +647,13 @@ auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
     follow(centre.data(), forward, light);
     const std::vector<Lamp> lamps = lamps_near(centre.data());
     const Surroundings world = {mesh_table_.data(),
-                                texture_table_.data(),
+                                {mip_texels_.data(), mip_sizes_.data(), mip_counts_.data()},
                                 sun_map_,
                                 moving_map_,
                                 openness_map_,
                                 lamps.data(),
                                 lamp_grid(lamps, centre.data()),
-                                noise_.data()};
+                                noise_quads_.data()};
     const auto order = order_from(centre.data(), kFarthest_m, 0, static_cast<int>(meshes_.size()));
     const size_t samples = pixels * kSamples * kSamples;
     ids_.resize(2 * samples);

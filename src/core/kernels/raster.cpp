@@ -77,7 +77,7 @@ inline bool covered(const Polygon &polygon, int32_t x, double u_row, double v_ro
   const int32_t row = static_cast<int32_t>(v * polygon.mask_height);
   const int32_t column_in = column < polygon.mask_width ? column : 0;
   const int32_t row_in = row < polygon.mask_height ? row : 0;
-  return polygon.mask[4 * (row_in * polygon.mask_width + column_in) + 3] >= 128;
+  return polygon.mask[4 * (row_in * (polygon.mask_width + 2) + column_in) + 3] >= 128;
 }
 
 inline void fill_cutout(const Polygon &polygon, int32_t *ids, float *values, int32_t from,

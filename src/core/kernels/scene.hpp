@@ -37,10 +37,19 @@ struct Chunk { // surfaces that stand together
 
 constexpr int kMipLevels = 12;
 
-struct Texture { // RGBA: albedo, slope along u, slope along v, coverage or mirror
-  const uint8_t *levels[kMipLevels];
+// RGBA: albedo, slope along u, slope along v, coverage or mirror. Each level has a border of one
+// texel on all sides that repeats the other end, so a row is widths[level] + 2 texels long.
+struct Texture {
+  const uint8_t *levels[kMipLevels]; // where the first texel within the border is
   int32_t widths[kMipLevels], heights[kMipLevels];
   int32_t level_count;
+};
+
+// The same by number: entry texture · kMipLevels + level.
+struct Mips {
+  const int64_t *texels;  // addresses as in Texture::levels
+  const int32_t *sizes;   // width | height << 16
+  const int32_t *counts;  // of levels, by texture
 };
 
 struct Mesh {
@@ -110,12 +119,12 @@ struct Openness { // share of the sky that the ground sees
 
 struct Surroundings {
   const Mesh *meshes;
-  const Texture *textures;
+  Mips mips;
   DepthMap sun_static, sun_moving; // heights may be null
   Openness openness;
   const Lamp *lamps;
   LampGrid lamp_grid;
-  const uint8_t *noise; // 256×256, tiles
+  const int32_t *noise_quads; // 256×256, tiles: the bytes at (i, j), (i + 1, j), … (i + 1, j + 1)
 };
 
 constexpr int kLampFace = 192; // texels across a face of a lamp's depth map

@@ -9,9 +9,4 @@ ENGRAM_DECLARE_KERNELS(
     // (view.height · view.samples, view.width · view.samples). Each surface that a pixel sees is
     // shaded once, at the middle of the samples it covers there, and weighted by their number.
     void shade_view(const Surroundings &world, const Light &light, const View &view,
-                    const int32_t *ids, int32_t row_begin, int32_t row_end, float *luminance);
-
-    // One level of a texture to the next: each texel the mean of the four it covers. With
-    // keep_coverage the fourth channel is stretched so that the share of texels >= 128 stays.
-    void halve_texture(const uint8_t *from, int32_t width, int32_t height, bool keep_coverage,
-                       uint8_t *to);)
+                    const int32_t *ids, int32_t row_begin, int32_t row_end, float *luminance);)
