@@ -9,12 +9,15 @@ from engram.bench import STAGES, BenchReport, run_bench, runner
 from engram.bench.data import BenchData, load_bench_data, scale_and_crop, synthetic_drive
 from engram.bench.places import DenseTable, made_up_vocabulary
 from engram.bench.plain import load_plain_pipeline
+from engram.bench.ranking import PlainFormula
 from engram.bench.report import Machine, Side, StageResult
 from engram.bench.stages import prepare_attempt, prepare_frontend_odometry
 from engram.errors import ConfigError
 from engram.frontend import Frontend
 from engram.odometry import Odometry
 from engram.places import FabMap
+from engram.ranking import policy_named
+from engram.ranking.synthetic import SyntheticPlace
 
 STEP_M = 0.8
 
@@ -76,10 +79,22 @@ def test_both_sides_of_the_window_stage_solve_a_problem_of_one_size(
     assert prepared.ours(0) == prepared.reference(0)
 
 
-def test_ranking_needs_no_reference(drive: BenchData, plain) -> None:
-    prepared = STAGES["rank_150_paths"](drive, plain)
-    assert prepared.reference is None
+@pytest.mark.parametrize("stage", ["rank_path_150", "rank_recall_150"])
+def test_ranking_stages_are_of_the_size_they_say(stage: str, drive: BenchData) -> None:
+    prepared = STAGES[stage](drive, None)
     assert prepared.ours(0) == {"paths": 150, "candidates": 200, "observed": 1000}
+    assert prepared.best_of == 10
+
+
+def test_the_plain_formula_ranks_as_path_does() -> None:
+    place = SyntheticPlace(150)
+    formula, path = PlainFormula(place), policy_named("path-literal")
+    for _ in range(3):
+        context = place.context(200, 300)
+        scores = formula.scores(context)[path.rank(context)]
+        # Single precision in the reference: sums of 300 logarithms of about -6.
+        assert np.diff(scores).max() < 0.01
+        assert np.ptp(scores) > 1
 
 
 def test_the_dense_table_finds_the_same_places() -> None:

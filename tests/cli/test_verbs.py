@@ -266,9 +266,9 @@ def test_a_second_writer_is_told_who_writes(engram, street: Path, town: Path) ->
 
 
 def test_bench_gives_the_documented_json(engram) -> None:
-    ran = engram("bench", "--only", "attempt_512,rank_150_paths", "--repeats", 3, "--json")
+    ran = engram("bench", "--only", "attempt_512,rank_path_150", "--repeats", 3, "--json")
     stages = ran.json["stages"]
-    assert set(stages) == {"attempt_512", "rank_150_paths"}
+    assert set(stages) == {"attempt_512", "rank_path_150"}
     for stage in stages.values():
         assert {"ms", "p99_ms", "reference_ms", "ratio"} <= set(stage)
         assert math.isfinite(stage["ms"])

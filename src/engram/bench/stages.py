@@ -106,8 +106,10 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "places_query_20000": partial(prepare_places_query, places=20_000, dense=True),
         "places_query_1000000": partial(prepare_places_query, places=1_000_000, dense=False),
         "vocabulary_train": prepare_vocabulary_train,
-        "rank_150_paths": partial(prepare_ranking, paths=150),
-        "rank_10000_paths": partial(prepare_ranking, paths=10_000),
+        "rank_path_150": partial(prepare_ranking, policy="path", paths=150),
+        "rank_path_10000": partial(prepare_ranking, policy="path", paths=10_000),
+        "rank_recall_150": partial(prepare_ranking, policy="recall", paths=150),
+        "rank_recall_10000": partial(prepare_ranking, policy="recall", paths=10_000),
     }
 )
 

@@ -13,6 +13,7 @@ from engram.cli.benchmark import bench
 from engram.cli.building import build
 from engram.cli.demonstration import demo
 from engram.cli.evaluation import evaluate
+from engram.cli.explanation import explain
 from engram.cli.extraction import extract
 from engram.cli.history import blame, diff, log, revert, show, tag
 from engram.cli.inspection import check, info, seal
@@ -27,6 +28,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "extract": extract,
     "map": map_,
     "localise": localise,
+    "explain": explain,
     "info": info,
     "log": log,
     "show": show,

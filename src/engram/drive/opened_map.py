@@ -39,6 +39,7 @@ from engram.ranking import (
     Lessons,
     PastAttempts,
     QuantisedWords,
+    RankingPolicy,
     SessionTimes,
     check_for_robot,
     policy_named,
@@ -174,7 +175,7 @@ class OpenMap:
         camera: StereoCamera,
         settings: Settings,
         *,
-        policy: str = "path",
+        policy: str | RankingPolicy = "path",
         budget: Budget | None = None,
         relocaliser: str | Relocaliser | None = "fabmap",
         live: SessionId = UNNAMED_LIVE_SESSION,
@@ -188,7 +189,7 @@ class OpenMap:
         Args:
             camera: the live camera, which need not be one of the map's.
             settings: the resolved configuration.
-            policy: key of `POLICIES`.
+            policy: key of `POLICIES`, or a policy of the caller's own.
             budget: by default 2 lanes × 2 rounds.
             relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
             live: the live session.
@@ -203,7 +204,7 @@ class OpenMap:
             self.graph,
             self.path_memory,
             self.store.frames,
-            policy=policy_named(policy),
+            policy=policy_named(policy) if isinstance(policy, str) else policy,
             budget=budget or Budget(),
             relocaliser=self.relocaliser(relocaliser, settings.frontend.descriptor)
             if isinstance(relocaliser, str)
@@ -222,7 +223,10 @@ class OpenMap:
         """Made of parts that serve all localisers of this map."""
         if descriptor not in self._words:
             self._words[descriptor] = QuantisedWords(
-                self.graph, self.store.frames, lambda: self.vocabulary_or_default(descriptor)
+                self.graph,
+                self.store.frames,
+                lambda: self.vocabulary_or_default(descriptor),
+                lambda vocabulary: stored_words(self.store, vocabulary),
             )
         return Background(self.times, self.lessons(focal_px), self._words[descriptor])
 

@@ -21,6 +21,7 @@ from engram.ranking.oracle import OraclePolicy
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_literal import PathLiteralPolicy
 from engram.ranking.random import RandomPolicy
+from engram.ranking.reasons import Reasons, reasons_of
 from engram.ranking.recall import RecallPolicy
 from engram.ranking.recent import IterationUnit, Observations, RecentAttempts, RecentConfig
 from engram.ranking.run import RunAttempts, RunLog
@@ -82,6 +83,7 @@ __all__ = [
     "QuantisedWords",
     "RankingContext",
     "RankingPolicy",
+    "Reasons",
     "RecentAttempts",
     "RecentConfig",
     "RunAttempts",
@@ -90,4 +92,5 @@ __all__ = [
     "WordSource",
     "check_for_robot",
     "policy_named",
+    "reasons_of",
 ]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, round_robin
+from engram.ranking.reasons import Reasons
 from engram.ranking.words import WordSource
 
 # An experience looks like its nodes within so many metres do (SPEC §4).
@@ -24,6 +25,11 @@ class BagOfWordsPolicy:
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
         return round_robin(context, -experience_similarities(context))
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        meaning = {"likeness": "cosine of the frame's words and those of the node's drive here"}
+        return Reasons({"likeness": experience_similarities(context)}, meaning)
 
 
 def experience_similarities(context: RankingContext) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
+from engram.ranking.reasons import Reasons
 
 # Source of all four: SPEC §4.
 _MEMORY_M = 8.0
@@ -26,11 +27,24 @@ class BanditPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        successes, failures = session_tallies(context, _MEMORY_M)
-        sessions = context.sessions
-        a, b = successes[sessions], failures[sessions]
+        a, b = self._tallies(context)
         level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
         return _pick_diversely(context, level * context.success_rates())
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        a, b = self._tallies(context)
+        level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
+        meaning = {
+            "successes": "of this run on the node's drive, decayed over 8 m",
+            "failures": "likewise, each as much as a match was likely",
+        }
+        return Reasons({"successes": a, "failures": b}, meaning, level * context.success_rates())
+
+    @staticmethod
+    def _tallies(context: RankingContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        successes, failures = session_tallies(context, _MEMORY_M)
+        return successes[context.sessions], failures[context.sessions]
 
 
 def session_tallies(

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from engram.experience.model import path_id
 from engram.ranking.context import RankingContext, round_robin
+from engram.ranking.reasons import Reasons
 
 # "Decayed with distance" (SPEC §4), by as much as the bandit's memory.
 _DECAY_M = 8.0
@@ -29,6 +30,16 @@ class CollaborativePolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
+        return round_robin(context, -self._scores(context))
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        meaning = {"support": "recent matches that lead to the node's drive, by what it saw here"}
+        return Reasons({"support": self._scores(context)}, meaning)
+
+    @staticmethod
+    def _scores(context: RankingContext) -> NDArray[np.float64]:
+        """(Y,) P / √Q of the candidate's session."""
         run, near = context.run, context.neighbourhood
         numbers, group = np.unique(context.sessions, return_inverse=True)
         share = run.inliers / np.maximum(run.landmarks, 1)
@@ -36,8 +47,7 @@ class CollaborativePolicy:
             run.decay(_DECAY_M) * run.accepted * share
         )
         seen = _reached(context, numbers, near.nodes) @ np.exp(-near.distance_m / _DECAY_M)
-        scores = reached / np.sqrt(np.maximum(seen, 1e-12))
-        return round_robin(context, -scores[group])
+        return np.asarray((reached / np.sqrt(np.maximum(seen, 1e-12)))[group])
 
 
 def _reached(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from engram.experience.basin import BASIN_LEVEL
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.path_literal import PathLiteralPolicy
+from engram.ranking.reasons import Reasons
 
 
 class PathPolicy:
@@ -22,6 +23,10 @@ class PathPolicy:
 
     def __init__(self, alpha: float = 1.0, gamma: float = 1.0) -> None:
         self._formula = PathLiteralPolicy(alpha, gamma)
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`; candidates with g below 0.6 stand behind, by distance."""
+        return self._formula.reasons(context)
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""

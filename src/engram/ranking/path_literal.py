@@ -6,6 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
+from engram.ranking.reasons import Reasons
+
+_MEANING = {
+    "score": "log posterior of [L15 §V], up to a common constant",
+    "with successes": "paths shared with the nodes matched lately, summed over those",
+    "with failures": "paths shared with the nodes that failed lately, likewise",
+    "with k": "paths shared with the node in which the robot is localised, or was last",
+}
 
 
 class PathLiteralPolicy:
@@ -25,6 +33,22 @@ class PathLiteralPolicy:
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
         return order_by(context, -self.scores(context, context.neighbourhood.nodes))
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        memory, seen = context.path_memory, context.observations
+        nodes = context.neighbourhood.nodes
+        shared = memory.co_occurrence(nodes, seen.nodes, excluded=context.own_path)
+        terms = {
+            "score": self.scores(context, nodes),
+            "with successes": shared[:, seen.succeeded].sum(axis=1).astype(np.float64),
+            "with failures": shared[:, ~seen.succeeded].sum(axis=1).astype(np.float64),
+        }
+        if context.reference is not None:
+            k = np.array([context.reference], np.int32)
+            here = memory.co_occurrence(nodes, k, excluded=context.own_path)
+            terms["with k"] = here[:, 0].astype(np.float64)
+        return Reasons(terms, {name: _MEANING[name] for name in terms})
 
     def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
         """(N,) log posterior of nodes up to a common constant.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from uuid import UUID
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.experience.basin import MatchBasin
 from engram.experience.graph import ExperienceGraph
@@ -19,8 +20,11 @@ from engram.experience.model import (
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
 from engram.geometry import CameraId
+from engram.ranking.background import Background
 from engram.ranking.context import RankingContext
+from engram.ranking.lessons import Lessons, PastAttempts
 from engram.ranking.recent import Observations
+from engram.ranking.run import RunAttempts
 
 _CAMERA = CameraId("0" * 32)
 # A lens whose basin holds the whole search radius: every candidate is to be scored.
@@ -49,8 +53,13 @@ class SyntheticPlace:
                 self.graph.add_node(node)
         self._experiences = experiences
         self.memory = PathMemory(self.graph)
-        for path in range(path_count):
-            self._add_path(PathId(UUID(int=(1 << 100) + path)))
+        paths = [PathId(UUID(int=(1 << 100) + path)) for path in range(path_count)]
+        for path in paths:
+            self._add_path(path)
+        hours = self._rng.uniform(6, 20, path_count)
+        lessons = Lessons.learnt(self.graph, self.memory, paths, hours, PastAttempts.none())
+        self._basin = MatchBasin.of(_FOCAL_PX)
+        self._background = Background(lessons=lessons)
 
     def _add_path(self, path: PathId) -> None:
         """At each metre a node of an experience of the path's look, now and then of another."""
@@ -73,14 +82,25 @@ class SyntheticPlace:
             neighbourhood=self._neighbourhood(nodes),
             graph=self.graph,
             path_memory=self.memory,
-            basin=MatchBasin.of(_FOCAL_PX),
+            basin=self._basin,
             observations=Observations(attempted, succeeded),
             reference=int(attempted[np.argmax(succeeded)]),
             own_path=self.memory.paths[0] if self.memory.paths else None,
             stamp_ns=0,
+            run=self._run(attempted, succeeded),
+            hour=12.0,
+            background=self._background,
         )
 
-    def _neighbourhood(self, nodes: np.ndarray[tuple[int], np.dtype[np.int32]]) -> Neighbourhood:
+    def _run(self, attempted: NDArray[np.int32], succeeded: NDArray[np.bool_]) -> RunAttempts:
+        """The attempts four to a frame, frames 0.7 m apart, the last one just made."""
+        count = len(attempted)
+        at_m = -0.7 * (np.arange(count)[::-1] // 4)
+        rates = self._rng.uniform(0.2, 0.95, count)
+        landmarks = np.full(count, 300)
+        return RunAttempts(0.0, at_m, attempted, rates, succeeded, 90 * succeeded, landmarks)
+
+    def _neighbourhood(self, nodes: NDArray[np.int32]) -> Neighbourhood:
         along = self._rng.uniform(-7.5, 7.5, len(nodes))
         across = self._rng.uniform(-0.5, 0.5, len(nodes))
         poses = np.tile(np.eye(4), (len(nodes), 1, 1))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, round_robin
+from engram.ranking.reasons import Reasons
 from engram.ranking.times import hour_difference
 
 _NS_PER_DAY = 86_400_000_000_000
@@ -22,10 +23,22 @@ class TimeOfDayPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
+        return round_robin(context, *self._differences(context))  # what is no number stands last
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        apart_h, age_days = self._differences(context)
+        meaning = {
+            "hours apart": "difference in time of day to the node's drive",
+            "days apart": "difference in date",
+        }
+        return Reasons({"hours apart": apart_h, "days apart": age_days}, meaning)
+
+    @staticmethod
+    def _differences(context: RankingContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(Y,) hours, 0 to 12, and days."""
         sessions, times = context.sessions, context.background.times
         age_days = np.abs(context.stamp_ns / _NS_PER_DAY - times.days(context.graph, sessions))
         if context.hour is None:
-            apart_h = np.zeros(len(sessions))
-        else:
-            apart_h = hour_difference(times.hours(context.graph, sessions), context.hour)
-        return round_robin(context, apart_h, age_days)  # what is no number stands last
+            return np.zeros(len(sessions)), age_days
+        return hour_difference(times.hours(context.graph, sessions), context.hour), age_days

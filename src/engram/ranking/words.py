@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.experience.graph import ExperienceGraph
-from engram.experience.model import LandmarkSource
+from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
 from engram.places import Vocabulary
 from engram.places.bag_of_words import inverse_frequencies
@@ -39,6 +39,7 @@ class QuantisedWords:
         graph: the nodes.
         frames: their landmarks.
         vocabulary: gives the vocabulary; called once, at first use.
+        known: gives the words that the map keeps by it; None where it keeps none.
     """
 
     def __init__(
@@ -46,10 +47,13 @@ class QuantisedWords:
         graph: ExperienceGraph,
         frames: LandmarkSource,
         vocabulary: Callable[[], Vocabulary],
+        known: Callable[[Vocabulary], Mapping[NodeId, NDArray[np.int32]]] | None = None,
     ) -> None:
         self._graph = graph
         self._frames = frames
         self._make_vocabulary = vocabulary
+        self._look_up = known
+        self._known: Mapping[NodeId, NDArray[np.int32]] = {}
         self._vocabulary: Vocabulary | None = None
         self._idf: NDArray[np.float64] | None = None
         self._of_node: dict[int, NDArray[np.int32]] = {}
@@ -83,13 +87,22 @@ class QuantisedWords:
         """
         words = self._of_node.get(node)
         if words is None:
-            frame = self._frames.frame(self._graph.node(node).id)
-            words = self._loaded.words_of(frame.landmarks.descriptors, frame.descriptor)
+            words = self._read(self._graph.node(node).id)
             self._of_node[node] = words
+        return words
+
+    def _read(self, node: NodeId) -> NDArray[np.int32]:
+        vocabulary = self._loaded
+        words = self._known.get(node)
+        if words is None:
+            frame = self._frames.frame(node)
+            words = vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
         return words
 
     @property
     def _loaded(self) -> Vocabulary:
         if self._vocabulary is None:
             self._vocabulary = self._make_vocabulary()
+            if self._look_up is not None:
+                self._known = self._look_up(self._vocabulary)
         return self._vocabulary

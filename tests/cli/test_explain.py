@@ -1,0 +1,72 @@
+"""`engram explain`: the reasons that it gives are those by which it ranked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from engram.ranking import POLICIES
+
+
+@pytest.fixture(scope="module")
+def town(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from engram.drive import MapOptions, Settings, map_drive, open_drive
+
+    path = tmp_path_factory.mktemp("explained") / "town.engram"
+    map_drive(path, open_drive(street), Settings(), MapOptions())
+    return path
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES.keys() - {"oracle"}))
+def test_every_policy_is_explained(engram, street: Path, town: Path, policy: str) -> None:
+    ran = engram("explain", town, street, "--frame", 6, "--policy", policy, "--json")
+    assert ran.status == 0
+    found = ran.json
+    assert (found["frame"], found["policy"], found["status"]) == (6, policy, "localised")
+    candidates = found["candidates"]
+    assert len(candidates) > 3
+    # The frame stands beside the node that was saved from it or from its neighbour.
+    assert any(one["would_match"] and one["inliers"] > 100 for one in candidates)
+    attempted = [one["attempted"] for one in candidates]
+    assert attempted == sorted(attempted, reverse=True), "the best are attempted first"
+    assert 1 <= sum(attempted) <= 4
+    for one in candidates:
+        assert set(one["terms"]) == set(found["meaning"])
+        assert 0 <= one["success_rate"] <= 1
+    if policy == "distance":
+        distances = [one["distance_m"] for one in candidates]
+        assert distances == sorted(distances)
+    if policy.startswith(("path", "recall", "bandit", "bag", "time", "collaborative")):
+        assert candidates[0]["terms"]
+
+
+def test_text_names_terms_and_outcomes(engram, street: Path, town: Path) -> None:
+    ran = engram("explain", town, street, "--frame", 6, "--policy", "recall", "--top", 3)
+    assert ran.status == 0
+    assert "frame 6: localised" in ran.out
+    assert "company: how past drives" in ran.out
+    assert "matched," in ran.out
+    assert "more; --top lists them" in ran.out
+
+
+def test_a_frame_without_candidates_is_told_as_such(engram, street: Path, town: Path) -> None:
+    ran = engram("explain", town, street, "--frame", 0)
+    assert ran.status == 0
+    assert "nothing to order" in ran.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--frame", 99), "no frame 99"),
+        (("--frame", 3, "--policy", "oracle"), "oracle"),
+        (("--frame", 3, "--policy", "nearest"), "no ranking policy"),
+    ],
+)
+def test_what_cannot_be_explained_is_refused(
+    engram, street: Path, town: Path, arguments: tuple[object, ...], complaint: str
+) -> None:
+    ran = engram("explain", town, street, *arguments)
+    assert ran.status == 2
+    assert complaint in ran.err
