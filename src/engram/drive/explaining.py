@@ -38,7 +38,7 @@ class ExplainOptions:
         policy: key of `POLICIES`.
         lanes, rounds: the budget of each frame, up to this one and in it.
         relocaliser: key of `RELOCALISERS`; None for none.
-        at: number of the map's revision; None for the newest.
+        at: number or tag of the map's revision; None for the newest.
     """
 
     frame: int
@@ -46,7 +46,7 @@ class ExplainOptions:
     lanes: int = 2
     rounds: int = 2
     relocaliser: str | None = "fabmap"
-    at: int | None = None
+    at: int | str | None = None
 
     def __post_init__(self) -> None:
         check_for_robot(self.policy)

@@ -245,6 +245,11 @@ class ExperienceGraph:
         """Number of a session in this graph; None if no node is of it."""
         return self._session_index.get(session)
 
+    @property
+    def session_count(self) -> int:
+        """How many sessions saved nodes; their numbers are below it."""
+        return len(self._sessions)
+
     def session(self, number: int) -> SessionId:
         """The session with a number."""
         return self._sessions[number]

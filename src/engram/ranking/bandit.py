@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
+from engram.ranking.run import RunAttempts
 
 # Source of all four: SPEC §4.
 _MEMORY_M = 8.0
@@ -27,13 +28,13 @@ class BanditPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        a, b = self._tallies(context)
+        a, b = session_tallies(context, context.run, _MEMORY_M)
         level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
         return _pick_diversely(context, level * context.success_rates())
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
-        a, b = self._tallies(context)
+        a, b = session_tallies(context, context.run, _MEMORY_M)
         level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
         meaning = {
             "successes": "of this run on the node's drive, decayed over 8 m",
@@ -41,24 +42,17 @@ class BanditPolicy:
         }
         return Reasons({"successes": a, "failures": b}, meaning, level * context.success_rates())
 
-    @staticmethod
-    def _tallies(context: RankingContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        successes, failures = session_tallies(context, _MEMORY_M)
-        return successes[context.sessions], failures[context.sessions]
-
 
 def session_tallies(
-    context: RankingContext, memory_m: float
+    context: RankingContext, run: RunAttempts, memory_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """This run's decayed successes and failures (S,) on each session of the graph."""
-    run = context.run
-    sessions = context.graph.sessions
-    count = int(sessions.max()) + 1 if len(sessions) else 0
-    weights = run.decay(memory_m)
-    attempted = sessions[run.nodes]
-    successes = np.bincount(attempted, weights * run.accepted, count).astype(np.float64)
-    failures = np.bincount(attempted, weights * run.failure_weights(), count).astype(np.float64)
-    return successes, failures
+    """Decayed successes and failures (Y,) of a run on the session that saved each candidate."""
+    graph = context.graph
+    attempted, sessions = graph.sessions[run.nodes], context.sessions
+    weights, count = run.decay(memory_m), graph.session_count
+    successes = np.bincount(attempted, weights * run.accepted, count)[sessions]
+    failures = np.bincount(attempted, weights * run.failure_weights(), count)[sessions]
+    return successes.astype(np.float64), failures.astype(np.float64)
 
 
 def _pick_diversely(context: RankingContext, p: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -169,8 +169,7 @@ def _counts(
 
 def _saving_paths(graph: ExperienceGraph) -> list[PathId]:
     """The path of each session of the graph, by number."""
-    count = int(graph.sessions.max()) + 1 if len(graph) else 0
-    return [path_id(graph.session(number)) for number in range(count)]
+    return [path_id(graph.session(number)) for number in range(graph.session_count)]
 
 
 def _sharing(graph: ExperienceGraph) -> csr_matrix:

@@ -95,7 +95,7 @@ class SyntheticPlace:
     def _run(self, attempted: NDArray[np.int32], succeeded: NDArray[np.bool_]) -> RunAttempts:
         """The attempts four to a frame, frames 0.7 m apart, the last one just made."""
         count = len(attempted)
-        at_m = -0.7 * (np.arange(count)[::-1] // 4)
+        at_m = -0.7 * (np.arange(count)[::-1] // 4).astype(np.float64)
         rates = self._rng.uniform(0.2, 0.95, count)
         landmarks = np.full(count, 300)
         return RunAttempts(0.0, at_m, attempted, rates, succeeded, 90 * succeeded, landmarks)
