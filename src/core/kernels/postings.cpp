@@ -31,14 +31,30 @@ void walk(const std::vector<uint8_t> &list, double weight, double *at) {
   }
 }
 
+// Lists lie far apart: what is walked two words from now is asked for while this one is.
+void fetch(const std::vector<uint8_t> &list) {
+  for (size_t at = 0; at < list.size() && at < 8 * 64; at += 64)
+    __builtin_prefetch(list.data() + at);
+}
+
+void add_weights_to_block(const PlaceIndex &index, int64_t block, const int32_t *words,
+                          const double *weights, int64_t count, double *sums) {
+  for (int64_t i = 0; i < count; ++i) {
+    if (i + 4 < count)
+      __builtin_prefetch(&index.postings(block, words[i + 4]));
+    if (i + 2 < count)
+      fetch(index.postings(block, words[i + 2]));
+    walk(index.postings(block, words[i]), weights[i], sums);
+  }
+}
+
 } // namespace
 
 void add_weights(const PlaceIndex &index, const int32_t *words, const double *weights,
                  int64_t count, double *sums) {
   for (int64_t block = 0; block < index.blocks(); ++block)
-    for (int64_t i = 0; i < count; ++i)
-      walk(index.postings(block, words[i]), weights[i],
-           sums + block * PlaceIndex::block_size - 1);
+    add_weights_to_block(index, block, words, weights, count,
+                         sums + block * PlaceIndex::block_size - 1);
 }
 
 } // namespace engram::ENGRAM_ISA
