@@ -135,7 +135,7 @@ def relocalise(
         return
     typer.echo(
         f"{summary['found']} of {summary['frames']} frames found at once, "
-        f"{summary['new_place']} new places, {summary['unknown']} unknown, "
+        f"{summary['unknown']} not found, {summary['new_place']} new for an empty map, "
         f"{summary['unusable_frame']} unusable; {summary['attempts']} attempts"
     )
 

@@ -35,13 +35,13 @@ class ColdStart:
 
     Attributes:
         stamp_ns: of the frame.
-        status: found by matching; or not found, and the recogniser thinks it is new, or does not
-            know; or the frame was of no use.
+        status: found by matching; or not found; or certainly new, since the map holds no place at
+            all; or the frame was of no use.
         node: the node that it was matched with; None unless found.
         inliers: of that match; 0 unless found.
         attempts: match attempts made.
         new_place: probability of a new place before matching; None where the relocaliser cannot
-            tell.
+            tell. Not to be relied on.
     """
 
     stamp_ns: int
@@ -129,9 +129,9 @@ def _cold_start(
     outcomes = attempter.run(frame, live_id, candidates, None)
     success = best_success(outcomes)
     if success is None:
-        # Even odds: the recogniser holds new places as likely as all known ones before it looks.
-        new = finder.new_place is not None and finder.new_place > 0.5
-        status = PlaceStatus.NEW_PLACE if new else PlaceStatus.UNKNOWN
+        # Where nothing can be tried all is new. Elsewhere the probability does not decide: under
+        # another light it cannot tell known places from new ones (docs/places.md).
+        status = PlaceStatus.UNKNOWN if proposed else PlaceStatus.NEW_PLACE
         return ColdStart(frame.stamp_ns, status, None, 0, len(outcomes), finder.new_place)
     return ColdStart(
         frame.stamp_ns,
