@@ -135,6 +135,12 @@ class ConfigurationResult:
         return int(errors.false.sum()) if len(errors.offset_m) else None
 
     @property
+    def false_share(self) -> float | None:
+        """False successes ÷ successes with known truth; None where there are none."""
+        errors = self.errors
+        return float(errors.false.mean()) if len(errors.offset_m) else None
+
+    @property
     def step_ms(self) -> float:
         """Mean time of a frame."""
         return _over(sum(one.step_ms * one.frames for one in self.sessions), self.frames)

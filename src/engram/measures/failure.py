@@ -56,6 +56,8 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
     lengths: list[float] = []
     failed: list[bool] = []
     for drive in drives:
+        if not len(drive.step_m):
+            continue
         positions = np.cumsum(drive.step_m)
         ends = np.flatnonzero(drive.matched)
         marks = np.concatenate([[0.0], positions[ends], positions[-1:]])

@@ -1,0 +1,308 @@
+"""What the paper claims, beside what was measured: a page in Markdown (issue's "must reach")."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from engram.evaluation.configurations import UNLIMITED, PathKinds, Radius
+from engram.evaluation.summary import CampaignResult, ConfigurationResult
+from engram.measures import Interval, beats, difference, excess_ratio, ratio
+
+# Shares as low as this differ by less than anyone would notice: added to both sides of ratios to
+# the oracle.
+_NEGLIGIBLE = 0.005
+_BEST_KNOWN = "recall"
+
+
+def claims_page(campaigns: Sequence[CampaignResult]) -> str:
+    """The tables of all campaigns, as Markdown. Intervals are 90 %, by bootstrap over sessions."""
+    lines: list[str] = []
+    for campaign in campaigns:
+        lines += [f"## {campaign.name}", "", *_policies(campaign), "", *_claims(campaign), ""]
+        if not campaign.with_truth:
+            lines += [
+                "The drives have no truth beside them: no pose errors, no false successes.",
+                "",
+            ]
+    return "\n".join(lines)
+
+
+def _policies(campaign: CampaignResult) -> list[str]:
+    """All policies at the few lanes, losers too."""
+    head = (
+        "policy",
+        "P(> 10 m)",
+        "P(> 5 m)",
+        "route not localised",
+        "excess over the oracle",
+        "longest gap",
+        "attempts per frame",
+        "ms per frame",
+        "false successes",
+        "median error",
+        "beats distance",
+    )
+    rows = []
+    bound, nearest = campaign.get("oracle"), campaign.get("distance")
+    live = {one.policy: result for one, result in campaign.live.items()}
+    for result in _few_lanes_results(campaign):
+        policy = result.configuration.policy
+        resamples, missed = campaign.resamples, result.not_localised
+        plain = result.configuration.label == policy
+        rows.append(
+            (
+                result.configuration.label,
+                _percent(resamples.interval(result.failure(10.0))),
+                f"{100 * result.failure(5.0).value:.2f} %",
+                _percent(resamples.interval(missed)),
+                "–"
+                if bound is None
+                else _percent(resamples.interval(difference(missed, bound.not_localised))),
+                f"{result.longest_gap_m:.0f} m",
+                f"{result.attempts_per_frame:.2f}",
+                f"{live[policy].step_ms:.1f}" if policy in live and plain else "–",
+                _false(result),
+                _error(result),
+                "–"
+                if nearest is None or result is nearest
+                else ("yes" if beats(result.drives, nearest.drives) else "no"),
+            )
+        )
+    count = max((len(one.sessions) for one in campaign.memo.values()), default=0)
+    driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
+    title = (
+        f"Np = {campaign.few_lanes}, Nr = 1, T = 10; {count} held-out sessions, "
+        f"{driven / 1e3:.1f} km, unguided, no relocalisation"
+    )
+    return [title, "", *_table(head, rows)]
+
+
+def _few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
+    """Every policy, and the variants of the path policies."""
+    found = [campaign.get(policy) for policy in campaign.policies]
+    found += [
+        campaign.get(policy, **variant)
+        for policy in ("path", "path-literal")
+        for variant in ({"radius": Radius.BASIN}, {"paths": PathKinds.MATCHED})
+    ]
+    return [one for one in found if one is not None]
+
+
+def _claims(campaign: CampaignResult) -> list[str]:
+    rows = [*_path_claims(campaign), *_many_lanes(campaign), *_memory(campaign), *_recall(campaign)]
+    rows += [*_growth(campaign), *_errors(campaign), *_order(campaign)]
+    return _table(("what", "paper", "must", "aim", "measured"), rows)
+
+
+Row = tuple[str, str, str, str, str]
+
+
+def _path_claims(campaign: CampaignResult) -> Iterable[Row]:
+    nearest, bound = campaign.get("distance"), campaign.get("oracle")
+    if nearest is None or bound is None:
+        return
+    few = campaign.few_lanes
+    for result in _few_lanes_results(campaign):
+        if result.configuration.policy not in {"path", "path-literal"}:
+            continue
+        label = result.configuration.label
+        excess = excess_ratio(nearest.not_localised, result.not_localised, bound.not_localised)
+        raw = ratio(nearest.not_localised, result.not_localised)
+        far = ratio(nearest.failure(10.0), result.failure(10.0))
+        main = label == "path"
+        yield (
+            f"`distance` ÷ `{label}`, Np = {few}: excess over the oracle of route not localised",
+            "5×" if main else "–",
+            "3×, low end > 1.5×" if main else "reported",
+            "5×" if main else "",
+            f"{_times(campaign.resamples.interval(excess))}; raw "
+            f"{_times(campaign.resamples.interval(raw))}; P(> 10 m) "
+            f"{_times(campaign.resamples.interval(far))}",
+        )
+
+
+def _many_lanes(campaign: CampaignResult) -> Iterable[Row]:
+    path, nearest = campaign.get("path", 2), campaign.get("distance", 4)
+    if path is not None and nearest is not None:
+        yield (
+            "`path` at Np = 2 against `distance` at Np = 4, route not localised",
+            "equal",
+            "equal or better",
+            "",
+            _against(campaign, path, nearest),
+        )
+    better, compared = [], []
+    for lanes in sorted({one.lanes for one in campaign.memo}):
+        a, b = campaign.get("path", lanes), campaign.get("distance", lanes)
+        if a is None or b is None:
+            continue
+        gap = campaign.resamples.interval(difference(a.not_localised, b.not_localised))
+        compared.append(a.configuration.lanes_text)
+        if gap.estimate <= 0 or gap.low <= 0:
+            better.append(a.configuration.lanes_text)
+    if compared:
+        yield (
+            "`path` against `distance` at every Np",
+            "better",
+            "better or within the interval",
+            "",
+            f"at {len(better)} of {len(compared)}: Np = {', '.join(better) or '–'}",
+        )
+    a, b = campaign.get("path", UNLIMITED), campaign.get("distance", UNLIMITED)
+    if a is not None and b is not None:
+        yield ("both at unlimited Np", "equal", "equal", "", _against(campaign, a, b))
+
+
+def _memory(campaign: CampaignResult) -> Iterable[Row]:
+    usual, without = campaign.get("path"), campaign.get("path", T=0)
+    if usual is None or without is None:
+        return
+    yield (
+        "T = 0 against T = 10 for `path`, route not localised",
+        "clearly worse",
+        "worse, interval clear of 0",
+        "",
+        _against(campaign, without, usual),
+    )
+    some = [one for T in (5, 10, 20, 50, 100, 200) if (one := campaign.get("path", T=T))]
+    for name, values in (
+        ("route not localised", [one.not_localised.value for one in some]),
+        ("P(> 10 m)", [one.failure(10.0).value for one in some]),
+    ):
+        spread = f"{max(values) / min(values):.2f}" if min(values) > 0 else "– (0 is reached)"
+        yield (f"max ÷ min over T = 5…200, {name}", "flat", "≤ 1.3", "", spread)
+
+
+def _recall(campaign: CampaignResult) -> Iterable[Row]:
+    ours, bound = campaign.get(_BEST_KNOWN), campaign.get("oracle")
+    if ours is None or bound is None:
+        return
+    to_bound = ratio(ours.not_localised, bound.not_localised, _NEGLIGIBLE)
+    yield (
+        f"`{_BEST_KNOWN}`: (route not localised + 0.5 %) ÷ (oracle's + 0.5 %)",
+        "–",
+        "≤ 1.6",
+        "≤ 1.2",
+        _times(campaign.resamples.interval(to_bound)),
+    )
+    for other in ("path", "distance", "bandit"):
+        result = campaign.get(other)
+        if result is not None:
+            must = "interval clear of 0 on the pooled sessions" if other == "bandit" else "better"
+            yield (
+                f"`{_BEST_KNOWN}` against `{other}`",
+                "–",
+                must,
+                "",
+                _against(campaign, ours, result),
+            )
+    nearest = campaign.get("distance")
+    if nearest is not None:
+        high = campaign.resamples.interval(ours.failure(10.0)).high
+        low = nearest.failure(10.0).value
+        share = f"{high / low:.3f}" if low > 0 else "– (both 0)" if high == 0 else "∞"
+        what = f"P(> 10 m): upper end of `{_BEST_KNOWN}`'s interval ÷ `distance`'s mean"
+        yield (what, "–", "≤ 0.25", "≤ 0.067", share)
+
+
+def _growth(campaign: CampaignResult) -> Iterable[Row]:
+    for policy in ("distance", "path", _BEST_KNOWN):
+        whole, first = campaign.get(policy), campaign.get(policy, sessions=1)
+        if whole is None or first is None:
+            continue
+        fall = ratio(first.failure(10.0), whole.failure(10.0))
+        paper = {"distance": "rises", "path": "falls 4×"}.get(policy, "–")
+        must = "–" if policy == "distance" else "falls ≥ 2×"
+        yield (
+            f"`{policy}`: P(> 10 m) in the smallest map ÷ in the largest (Fig. 9)",
+            paper,
+            must,
+            "" if policy == "distance" else "4×",
+            _times(campaign.resamples.interval(fall)),
+        )
+
+
+def _errors(campaign: CampaignResult) -> Iterable[Row]:
+    if not campaign.with_truth:
+        return
+    results = [one for p in campaign.policies if (one := campaign.get(p)) is not None]
+    worst = max(results, key=lambda one: one.false_share or 0.0, default=None)
+    if worst is not None and worst.false_share is not None:
+        yield (
+            "false successes (> 1 m or > 5°), worst policy",
+            "not told",
+            "< 0.1 %",
+            "0",
+            f"{_false(worst)} (`{worst.configuration.policy}`)",
+        )
+
+
+def _order(campaign: CampaignResult) -> Iterable[Row]:
+    """Whether the guided, unmemoised runs put the policies in the order of the memoised ones."""
+    live = {one.policy: result for one, result in campaign.live.items()}
+    memo = {policy: campaign.get(policy) for policy in live}
+    if len(live) < 2 or any(one is None for one in memo.values()):
+        return
+    known = {policy: one for policy, one in memo.items() if one is not None}
+    by_live = sorted(live, key=lambda p: live[p].not_localised.value)
+    sessions = {one.session for result in live.values() for one in result.sessions}
+    same = {
+        policy: ConfigurationResult(
+            one.configuration, [s for s in one.sessions if s.session in sessions]
+        ).not_localised.value
+        for policy, one in known.items()
+    }
+    by_memo = sorted(known, key=lambda p: same[p])
+    text = ", ".join(f"{p} {100 * live[p].not_localised.value:.2f} %" for p in by_live)
+    if by_live != by_memo:
+        text += "; memoised: " + ", ".join(f"{p} {100 * same[p]:.2f} %" for p in by_memo)
+    what = f"route not localised guided and unmemoised, {len(sessions)} sessions"
+    yield (what, "–", "order as memoised", "", text)
+
+
+def _against(campaign: CampaignResult, a: ConfigurationResult, b: ConfigurationResult) -> str:
+    gap = campaign.resamples.interval(difference(a.not_localised, b.not_localised))
+    ours, theirs = (f"{100 * one.not_localised.value:.2f} %" for one in (a, b))
+    low, high = f"{100 * gap.low:+.2f}", f"{100 * gap.high:+.2f}"
+    points = f"{100 * gap.estimate:+.2f} ({low} … {high}) points"
+    return f"{ours} against {theirs}, difference {points}"
+
+
+def _percent(interval: Interval) -> str:
+    if np.isnan(interval.estimate):
+        return "–"
+    low, high = 100 * interval.low, 100 * interval.high
+    return f"{100 * interval.estimate:.2f} % ({low:.2f} … {high:.2f})"
+
+
+def _times(interval: Interval) -> str:
+    if np.isnan(interval.estimate):
+        return "– (0 ÷ 0)"
+    return f"{_number(interval.estimate)}× ({_number(interval.low)} … {_number(interval.high)})"
+
+
+def _number(value: float) -> str:
+    return "∞" if np.isinf(value) else f"{value:.2f}"
+
+
+def _false(result: ConfigurationResult) -> str:
+    count, share = result.false_successes, result.false_share
+    return "–" if count is None or share is None else f"{count} ({100 * share:.3f} %)"
+
+
+def _error(result: ConfigurationResult) -> str:
+    errors = result.errors
+    if not len(errors.offset_m):
+        return "–"
+    degrees = float(np.rad2deg(np.median(errors.turn_rad)))
+    return f"{100 * float(np.median(errors.offset_m)):.1f} cm, {degrees:.2f}°"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [
+        "| " + " | ".join(head) + " |",
+        "| " + " | ".join("---" for _ in head) + " |",
+        *("| " + " | ".join(row) + " |" for row in rows),
+    ]

@@ -1,0 +1,208 @@
+"""[L15] Figs. 9 to 13 on our data, and what the paper has no figure for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.evaluation.configurations import (
+    T_SWEEP,
+    UNLIMITED,
+    Configuration,
+    PathKinds,
+)
+from engram.evaluation.summary import CURVE_AT_M, CampaignResult, ConfigurationResult
+from engram.measures import FORMULAS, Estimator, Interval, SessionSums
+from engram.viewing import Line, Panel, draw_bars, draw_curves
+
+_P_GT_10M = "P(no match for > 10 m), %"
+_NOT_LOCALISED = "route not localised, %"
+# Unlimited lanes stand one step behind the last number.
+_BEYOND = 20.0
+
+
+def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
+    """Draws every figure for which results are there; returns the files.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    written: list[Path] = []
+
+    def draw(name: str, panels: Iterable[Panel | None], title: str) -> None:
+        shown = [panel for panel in panels if panel is not None and panel.lines]
+        if shown:
+            draw_curves(shown, out / name, title)
+            written.append(out / name)
+
+    np_title = "failure against the number of lanes, Nr = 1, T = 10"
+    draw("fig09_map_size.png", map(_map_size, campaigns), "failure as the map grows, Np = 2")
+    draw("fig10_candidates.png", map(_candidates, campaigns), "candidates along one lap")
+    draw("fig11_lanes.png", [_lanes(one, _p_gt_10m) for one in campaigns], np_title)
+    draw(
+        "fig11_lanes_not_localised.png",
+        [_lanes(one, lambda r: r.not_localised, _NOT_LOCALISED) for one in campaigns],
+        np_title,
+    )
+    for estimator in Estimator:
+        draw(
+            f"fig12_curves_{estimator.value}.png",
+            [_curves(one, lanes, estimator) for one in campaigns for lanes in (2, 4)],
+            f"failure curves; P(X ≥ x) = {FORMULAS[estimator]}",
+        )
+    draw("fig13_T.png", map(_sensitivity, campaigns), "sensitivity of path to T, Np = 2")
+    for campaign in campaigns:
+        written += _draw_costs(out, campaign)
+    return written
+
+
+def _p_gt_10m(result: ConfigurationResult) -> SessionSums:
+    return result.failure(10.0)
+
+
+def _map_size(campaign: CampaignResult) -> Panel | None:
+    """[L15] Fig. 9: P(> 10 m) against nodes, after each training session."""
+    lines = []
+    for policy in campaign.policies:
+        results = _by_map_size(campaign, policy)
+        if len(results) > 1:
+            nodes = np.array([np.mean([s.nodes for s in one.sessions]) for one in results])
+            lines.append(_line(campaign, policy, nodes, results, _p_gt_10m))
+    return Panel(campaign.name, "nodes in the map", _P_GT_10M, lines) if lines else None
+
+
+def _by_map_size(campaign: CampaignResult, policy: str) -> list[ConfigurationResult]:
+    """One per size of map that every fold has, smallest first."""
+    whole = campaign.get(policy)
+    if whole is None:
+        return []
+    sizes = sorted(
+        (
+            one.configuration.sessions or 0
+            for one in campaign.memo.values()
+            if replace(one.configuration, sessions=None) == whole.configuration
+            and one.configuration.sessions is not None
+            and len(one.sessions) == len(whole.sessions)
+        ),
+    )
+    smaller = [campaign.get(policy, sessions=size) for size in sizes]
+    return [one for one in smaller if one is not None] + [whole]
+
+
+def _candidates(campaign: CampaignResult) -> Panel | None:
+    """[L15] Fig. 10: |Y| and how many of it could succeed, along one lap."""
+    lap = campaign.lap
+    if lap is None:
+        return None
+    lines = [
+        Line("candidates |Y|", lap.driven_m, lap.candidates.astype(np.float64), marks=False),
+        Line("that match", lap.driven_m, lap.succeeded.astype(np.float64), marks=False),
+    ]
+    return Panel(f"{campaign.name}, {lap.name}", "driven, m", "nodes", lines)
+
+
+def _lanes(
+    campaign: CampaignResult,
+    measure: Callable[[ConfigurationResult], SessionSums],
+    y_label: str = _P_GT_10M,
+) -> Panel | None:
+    """[L15] Fig. 11: failure against Np."""
+    lines = []
+    variants = [(policy, PathKinds.ALL) for policy in campaign.policies]
+    for policy, paths in [*variants, ("path", PathKinds.MATCHED)]:
+        results = [
+            one
+            for one in campaign.memo.values()
+            if one.configuration == Configuration(policy, one.configuration.lanes, paths=paths)
+        ]
+        results.sort(key=lambda one: one.configuration.lanes)
+        if len(results) > 1:
+            x = np.array([_lanes_place(one.configuration.lanes) for one in results])
+            label = results[0].configuration.label
+            lines.append(_line(campaign, label, x, results, measure))
+    places = sorted({float(x) for line in lines for x in line.x})
+    ticks = [(x, "∞" if x == _BEYOND else f"{x:.0f}") for x in places]
+    return Panel(campaign.name, "Np", y_label, lines, ticks) if lines else None
+
+
+def _lanes_place(lanes: int) -> float:
+    return _BEYOND if lanes == UNLIMITED else float(lanes)
+
+
+def _curves(campaign: CampaignResult, lanes: int, estimator: Estimator) -> Panel | None:
+    """[L15] Fig. 12: P(X ≥ x)."""
+    lines = []
+    for policy in campaign.policies:
+        result = campaign.get(policy, lanes)
+        if result is not None:
+            bands = result.curve(campaign.resamples, estimator)
+            y, low, high = (100 * band for band in bands)
+            lines.append(Line(policy, CURVE_AT_M, y, low, high, marks=False))
+    return Panel(f"{campaign.name}, Np = {lanes}", "x, m", "P(X ≥ x), %", lines) if lines else None
+
+
+def _sensitivity(campaign: CampaignResult) -> Panel | None:
+    """[L15] Fig. 13: T."""
+    results = [campaign.get("path", T=T) for T in T_SWEEP]
+    found = [one for one in results if one is not None]
+    if len(found) < 2:
+        return None
+    places = np.arange(len(found), dtype=np.float64)
+    ticks = [(float(x), str(one.configuration.T)) for x, one in zip(places, found, strict=True)]
+    lines = [
+        _line(campaign, "P(> 10 m)", places, found, _p_gt_10m),
+        _line(campaign, "route not localised", places, found, lambda r: r.not_localised),
+    ]
+    return Panel(campaign.name, "T", "%", lines, ticks)
+
+
+def _line(
+    campaign: CampaignResult,
+    label: str,
+    x: NDArray[np.float64],
+    results: Sequence[ConfigurationResult],
+    measure: Callable[[ConfigurationResult], SessionSums],
+) -> Line:
+    """In per cent, with a 90 % band over sessions."""
+    bands: list[Interval] = [campaign.resamples.interval(measure(one)) for one in results]
+    columns = [[getattr(band, name) for band in bands] for name in ("estimate", "low", "high")]
+    y, low, high = (100 * np.array(column) for column in columns)
+    return Line(label, x, y, low, high)
+
+
+def _draw_costs(out: Path, campaign: CampaignResult) -> list[Path]:
+    """Attempts, time, false successes and pose errors of all policies at the few lanes."""
+    memo = {policy: campaign.get(policy) for policy in campaign.policies}
+    found = {policy: one for policy, one in memo.items() if one is not None}
+    live = {one.policy: result for one, result in campaign.live.items()}
+    bars: list[tuple[str, list[tuple[str, float]]]] = [
+        ("attempts per frame", [(p, one.attempts_per_frame) for p, one in found.items()])
+    ]
+    if live:
+        bars.append(("ms per frame (guided, no memo)", [(p, r.step_ms) for p, r in live.items()]))
+    if campaign.with_truth:
+        bars.append(
+            (
+                "false successes, % of successes",
+                [(p, 100 * (r.false_share or 0.0)) for p, r in found.items()],
+            )
+        )
+        bars.append(
+            (
+                "median error, cm",
+                [
+                    (p, 100 * float(np.median(r.errors.offset_m)))
+                    for p, r in found.items()
+                    if len(r.errors.offset_m)
+                ],
+            )
+        )
+    if not found:
+        return []
+    path = out / f"costs_{campaign.name}.png"
+    draw_bars(bars, path, f"{campaign.name}, Np = {campaign.few_lanes}, Nr = 1")
+    return [path]

@@ -1,0 +1,79 @@
+"""Failure curves, comparisons and pose errors against cases worked by hand."""
+
+import numpy as np
+import pytest
+
+from engram.errors import InputError
+from engram.geometry import SE3
+from engram.measures import (
+    Drive,
+    Estimator,
+    beats,
+    failure_curve,
+    failure_gap,
+    failure_lost,
+    failure_route,
+    pose_errors,
+)
+
+
+def drive(marks: str, step_m: float = 1.0) -> Drive:
+    return Drive(np.full(len(marks), step_m), np.array([mark == "x" for mark in marks]))
+
+
+@pytest.mark.parametrize(
+    ("estimator", "single"),
+    [
+        (Estimator.ROUTE, failure_route),
+        (Estimator.GAP, failure_gap),
+        (Estimator.LOST, failure_lost),
+    ],
+)
+def test_a_curve_is_its_points(estimator: Estimator, single) -> None:
+    drives = [drive(".xx....x.."), drive("x....x", 1.7), drive("......")]
+    at_m = np.array([0.0, 0.5, 1.0, 1.7, 2.0, 5.0, 8.5, 50.0])
+    expected = [single(drives, float(x)) for x in at_m]
+    np.testing.assert_allclose(failure_curve(drives, at_m, estimator), expected, atol=1e-12)
+
+
+def test_route_curve_begins_at_one_and_falls() -> None:
+    curve = failure_curve([drive("..x...x")], np.arange(0.0, 10.0, 0.5))
+    assert curve[0] == 1.0
+    assert (np.diff(curve) <= 0).all()
+    assert curve[-1] == 0.0
+
+
+def test_nothing_driven_has_no_failures() -> None:
+    nothing = Drive(np.zeros(0), np.zeros(0, bool))
+    assert failure_curve([], np.array([1.0]))[0] == 0
+    assert failure_curve([nothing], np.array([1.0]), Estimator.LOST)[0] == 0
+
+
+def test_beats_needs_the_curve_below_and_no_much_longer_gap() -> None:
+    often, seldom = drive("x.x.x.x.x.x."), drive("x..x..x..x..")
+    assert beats([often], [seldom])
+    assert not beats([seldom], [often])
+    assert beats([often], [often])
+    # Better everywhere up to 20 m, yet once lost for far longer: 40 m against 22 m.
+    once = drive("x" * 1000 + "." * 39 + "x")
+    many = drive(("x" + "." * 21) * 40 + "x")
+    assert not beats([once], [many])
+    assert beats([drive("x" * 1000 + "." * 32 + "x")], [many])  # 33 m are 1.5 times 22 m
+
+
+def test_pose_errors_are_metres_and_angles() -> None:
+    true = SE3(np.eye(3), np.array([1.0, 0.0, 2.0]))
+    aside = SE3(np.eye(3), np.array([1.0, 0.3, 2.4]))
+    turned = SE3.exp([0, 0, 0, 0, np.deg2rad(6.0), 0])
+    errors = pose_errors([aside, SE3(turned.rotation, true.translation)], [true, true])
+    np.testing.assert_allclose(errors.offset_m, [0.5, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.rad2deg(errors.turn_rad), [0.0, 6.0], atol=1e-9)
+    assert errors.false.tolist() == [False, True]
+
+
+def test_a_success_more_than_a_metre_off_is_false() -> None:
+    there = SE3.identity()
+    just, beyond = (SE3(np.eye(3), np.array([x, 0.0, 0.0])) for x in (1.0, 1.001))
+    assert pose_errors([just, beyond], [there, there]).false.tolist() == [False, True]
+    with pytest.raises(InputError, match="1 estimated poses, but 2"):
+        pose_errors([there], [there, there])
