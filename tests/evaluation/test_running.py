@@ -16,6 +16,7 @@ from engram.evaluation import (
     Configuration,
     DriveSet,
     Plan,
+    building,
     drives_of,
     make_plan,
     open_campaign,

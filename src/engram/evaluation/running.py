@@ -43,9 +43,11 @@ from engram.evaluation.store import joined, missing, read_runs, write_runs
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher, Matcher
 from engram.ranking import POLICIES
+from engram.store import MapStore
 
 # Policies that cannot run without knowing the outcomes.
 _BOUNDS = ("oracle",)
+_SMALL_CACHE_BYTES = 4 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +194,8 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
+        finally:
+            _earlier_maps.close()
     # Alone on the machine, and in order: these runs are timed.
     for fold in plan.folds[: plan.options.live_folds]:
         for session in fold.held_out:
@@ -260,11 +264,40 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
             write_runs(path, done)
         for count in sorted({one.sessions for one in earlier if one.sessions is not None}):
             some = [one for one in earlier if one.sessions == count]
-            with open_map(built.path, built.revision_after(count)) as opened:
-                done = joined(done, run_one(opened, some))
+            opened = _earlier_maps.open(built.path, built.revision_after(count))
+            done = joined(done, run_one(opened, some))
         if earlier and done is not None:
             memo.save()
             write_runs(path, done)
+
+
+class _EarlierMaps:
+    """Maps of one fold as of earlier revisions, kept open for the next session of that fold."""
+
+    def __init__(self) -> None:
+        self._path: Path | None = None
+        self._known: dict[int, OpenMap] = {}
+
+    def open(self, path: Path, at: int) -> OpenMap:
+        """The map as of a revision."""
+        if path != self._path:
+            self.close()
+            self._path = path
+        if at not in self._known:
+            # Their landmarks are hardly ever read: the memo asks the newest map.
+            store = MapStore.open(path, at=at, cache_bytes=_SMALL_CACHE_BYTES)
+            self._known[at] = OpenMap(store)
+        return self._known[at]
+
+    def close(self) -> None:
+        """Closes them all."""
+        for opened in self._known.values():
+            opened.close()
+        self._known.clear()
+        self._path = None
+
+
+_earlier_maps = _EarlierMaps()  # one per worker
 
 
 def _run_live(plan: Plan, fold: Fold, session: int) -> None:
