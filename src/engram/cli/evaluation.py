@@ -65,6 +65,10 @@ def ranking(
     relocaliser: Annotated[
         str, typer.Option("--relocaliser", help="What finds the lost; none leaves them.")
     ] = "none",
+    redo: Annotated[
+        str | None,
+        typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again."),
+    ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
     campaigns: Annotated[
         Path | None,
@@ -98,6 +102,7 @@ def ranking(
     from engram.evaluation import (
         DEFAULT_LANES,
         RankingOptions,
+        forget,
         make_plan,
         run,
         task_count,
@@ -122,6 +127,8 @@ def ranking(
         for one in _drive_sets(drives, size, campaigns)
     ]
     for plan in plans:
+        if redo:
+            forget(plan, redo.split(","))
         with progress(f"evaluate {plan.drives.name}", task_count(plan)) as advance:
             run(plan, workers, advance)
     files = write_report(out, plans)

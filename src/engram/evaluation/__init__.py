@@ -4,7 +4,7 @@ from engram.evaluation.configurations import DEFAULT_LANES, UNLIMITED, Configura
 from engram.evaluation.drives import DriveSet, EvaluatedDrive, drives_of, open_campaign
 from engram.evaluation.folds import Fold, split
 from engram.evaluation.report import write_report
-from engram.evaluation.running import Plan, RankingOptions, make_plan, run, task_count
+from engram.evaluation.running import Plan, RankingOptions, forget, make_plan, run, task_count
 
 __all__ = [
     "DEFAULT_LANES",
@@ -16,6 +16,7 @@ __all__ = [
     "Plan",
     "RankingOptions",
     "drives_of",
+    "forget",
     "make_plan",
     "open_campaign",
     "run",

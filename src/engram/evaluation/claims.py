@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from engram.evaluation.configurations import UNLIMITED, PathKinds, Radius
+from engram.evaluation.configurations import EVERYTHING, UNLIMITED, PathKinds, Radius
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
 from engram.measures import Interval, beats, difference, excess_ratio, ratio
 
@@ -92,7 +92,8 @@ def _few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
 
 def _claims(campaign: CampaignResult) -> list[str]:
     rows = [*_path_claims(campaign), *_many_lanes(campaign), *_memory(campaign), *_recall(campaign)]
-    rows += [*_growth(campaign), *_errors(campaign), *_order(campaign)]
+    rows += [*_growth(campaign), *_errors(campaign), *_seen(campaign)]
+    rows += [*_order(campaign)]
     return _table(("what", "paper", "must", "aim", "measured"), rows)
 
 
@@ -237,6 +238,17 @@ def _errors(campaign: CampaignResult) -> Iterable[Row]:
             "0",
             f"{_false(worst)} (`{worst.configuration.policy}`)",
         )
+
+
+def _seen(campaign: CampaignResult) -> Iterable[Row]:
+    """Whether the neighbourhood sees every experience of the place (SPEC §3.1)."""
+    result = campaign.memo.get(EVERYTHING)
+    near = 0 if result is None else sum(one.near for one in result.sessions)
+    if result is None or near == 0:
+        return
+    seen = sum(one.near_seen for one in result.sessions)
+    what = "nodes truly within 8 m and 60° of a localised robot that are candidates"
+    yield (what, "–", "≥ 95 %", "", f"{100 * seen / near:.2f} %")
 
 
 def _order(campaign: CampaignResult) -> Iterable[Row]:

@@ -99,6 +99,11 @@ class Configuration:
         )
 
 
+# Attempts every candidate: shows what could have succeeded ([L15] Fig. 10) and whom the
+# neighbourhood overlooks.
+EVERYTHING = Configuration("distance", UNLIMITED)
+
+
 def sweep(
     policies: Sequence[str],
     lanes: Sequence[int] = DEFAULT_LANES,
@@ -119,8 +124,7 @@ def sweep(
     few = FEW_LANES if FEW_LANES in lanes else lanes[0]
     for policy in policies:
         add(Configuration(policy, np, rounds[0]) for np in lanes)
-    # What could have succeeded is seen by attempting everything ([L15] Fig. 10).
-    add([Configuration("distance", UNLIMITED, 1)])
+    add([EVERYTHING])
     for nr in rounds[1:]:
         limited = [np for np in lanes if np != UNLIMITED]
         add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.drive import OpenMap, Settings
-from engram.evaluation.configurations import Configuration, PathKinds, Radius
+from engram.evaluation.configurations import EVERYTHING, Configuration, PathKinds, Radius
 from engram.evaluation.drives import EvaluatedDrive, Truth
 from engram.evaluation.starting import TrueNodes
+from engram.experience.basin import DEFAULT_RADIUS_M
 from engram.experience.model import NodeId
 from engram.experience.neighbourhood import Neighbourhood
 from engram.frontend import Frame
@@ -72,6 +73,8 @@ class Runs:
         attempts: (C, F) int32, match attempts.
         candidates: (C, F) int32, |Y|.
         succeeded: (C, F) int32, attempts that were accepted.
+        near, near_seen: (C, F) int32, nodes truly within 8 m and 60° of a localised robot, and
+            those of them that were candidates; counted for `EVERYTHING` only, else 0.
         offset_m, turn_rad: (C, F) float32, error of the pose of a success; NaN without one, or
             without truth.
         step_ms: (C,) float64, mean time of a frame; with a memo without the making of new matches.
@@ -83,6 +86,8 @@ class Runs:
     attempts: NDArray[np.int32]
     candidates: NDArray[np.int32]
     succeeded: NDArray[np.int32]
+    near: NDArray[np.int32]
+    near_seen: NDArray[np.int32]
     offset_m: NDArray[np.float32]
     turn_rad: NDArray[np.float32]
     step_ms: NDArray[np.float64]
@@ -98,6 +103,8 @@ class Runs:
             attempts=np.zeros(shape, np.int32),
             candidates=np.zeros(shape, np.int32),
             succeeded=np.zeros(shape, np.int32),
+            near=np.zeros(shape, np.int32),
+            near_seen=np.zeros(shape, np.int32),
             offset_m=np.full(shape, np.nan, np.float32),
             turn_rad=np.full(shape, np.nan, np.float32),
             step_ms=np.zeros(shape[0]),
@@ -179,6 +186,11 @@ def run_in_step(
                 if found.node is not None and found.node_from_live is not None:
                     error = judge.error(found.node, found.node_from_live)
                     runs.offset_m[row, number], runs.turn_rad[row, number] = error
+                    if configurations[row] == EVERYTHING:
+                        near = judge.near()
+                        seen = {one.candidate.node for one in localiser.outcomes}
+                        runs.near[row, number] = len(near)
+                        runs.near_seen[row, number] = len(near & seen)
     runs.step_ms[:] /= max(len(frames), 1)
     return runs
 
@@ -191,6 +203,12 @@ class _Judge:
         truth = situation.truth
         self._world_from_live = None if truth is None else truth.at(live.stamp_ns)
         self._known: dict[tuple[NodeId, bytes], tuple[float, float]] = {}
+
+    def near(self) -> set[NodeId]:
+        """The nodes that should be candidates; none where truth is not known."""
+        if self._world_from_live is None:
+            return set()
+        return self._nodes.near(self._world_from_live, DEFAULT_RADIUS_M)
 
     def error(self, node: NodeId, node_from_live: SE3) -> tuple[float, float]:
         """Metres and radians; NaN where truth is not known."""

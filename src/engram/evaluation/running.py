@@ -39,7 +39,7 @@ from engram.evaluation.folds import Fold, split
 from engram.evaluation.lockstep import Runs, Situation, run_in_step
 from engram.evaluation.memo import MatchMemo
 from engram.evaluation.starting import start_by_matching
-from engram.evaluation.store import joined, missing, read_runs, write_runs
+from engram.evaluation.store import joined, missing, only, read_runs, write_runs
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher, Matcher
 from engram.ranking import POLICIES
@@ -201,6 +201,17 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
         for session in fold.held_out:
             _run_live(plan, fold, session)
             advance("timed")
+
+
+def forget(plan: Plan, policies: Sequence[str]) -> None:
+    """Drops the results of some policies, whose code has changed; maps and matches stay."""
+    for session in range(len(plan.drives.drives)):
+        for mode in ("memo", "live"):
+            path = plan.runs_path(session, mode)
+            runs = read_runs(path)
+            if runs is not None:
+                kept = {one for one in runs.configurations if one.policy not in policies}
+                write_runs(path, only(runs, kept))
 
 
 def task_count(plan: Plan) -> int:

@@ -44,6 +44,12 @@ class TrueNodes:
         """``world_from_node``; None where it is not known."""
         return self._poses.get(node)
 
+    def near(self, world_from_live: SE3, radius_m: float) -> set[NodeId]:
+        """The nodes that are truly within a radius and look the same way (SPEC §3.1)."""
+        apart_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
+        alike = self._headings @ world_from_live.rotation[:, 2] >= np.cos(_VIEW_GATE_RAD)
+        return {self._ids[k] for k in np.flatnonzero((apart_m <= radius_m) & alike)}
+
     def start(self, world_from_live: SE3) -> Position | None:
         """The position seen from the nearest node that looks the same way; None without nodes."""
         if not self._ids:

@@ -15,7 +15,7 @@ import numpy as np
 from engram.evaluation.configurations import Configuration
 from engram.evaluation.lockstep import Runs
 
-_VERSION = 1
+_VERSION = 2
 _PER_FRAME = [one.name for one in fields(Runs) if one.name not in {"configurations", "step_m"}]
 
 

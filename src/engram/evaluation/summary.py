@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.evaluation.configurations import UNLIMITED, Configuration
+from engram.evaluation.configurations import EVERYTHING, Configuration
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.running import Plan, built_map
 from engram.evaluation.store import read_runs
@@ -41,6 +41,7 @@ class SessionResult:
         drive: steps and matches, from which every measure of failure follows.
         attempts: match attempts made.
         candidates, succeeded: means over frames of |Y| and of the attempts that were accepted.
+        near, near_seen: as in `Runs`, summed over frames.
         errors: of the poses of its successes, where truth is known.
         step_ms: mean time of a frame.
     """
@@ -52,6 +53,8 @@ class SessionResult:
     attempts: int
     candidates: float
     succeeded: float
+    near: int
+    near_seen: int
     errors: PoseErrors
     step_ms: float
 
@@ -253,6 +256,8 @@ def _session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) -
         attempts=int(runs.attempts[row].sum()),
         candidates=float(runs.candidates[row].mean()),
         succeeded=float(runs.succeeded[row].mean()),
+        near=int(runs.near[row].sum()),
+        near_seen=int(runs.near_seen[row].sum()),
         errors=PoseErrors(
             runs.offset_m[row][known].astype(np.float64),
             runs.turn_rad[row][known].astype(np.float64),
@@ -263,10 +268,9 @@ def _session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) -
 
 def _lap(runs: Runs, name: str) -> Lap | None:
     """From the run that attempted every candidate."""
-    everything = Configuration("distance", UNLIMITED)
-    if everything not in runs.configurations:
+    if EVERYTHING not in runs.configurations:
         return None
-    row = runs.configurations.index(everything)
+    row = runs.configurations.index(EVERYTHING)
     return Lap(name, np.cumsum(runs.step_m), runs.candidates[row], runs.succeeded[row])
 
 
