@@ -113,13 +113,21 @@ def build_map(
 
 def read_built_map(path: Path) -> BuiltMap:
     """How far a fold's map is; nothing where it was not begun."""
-    record = path.with_suffix(".json")
-    if not (record.exists() and path.exists()):
+    recorded = read_record(path)
+    if not (recorded.sessions and path.exists()):
         return BuiltMap(path)
-    known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
     with open_map(path) as opened:
         newest = opened.store.info().revision
-    return BuiltMap(path, [BuiltSession(**one) for one in known if one["revision"] <= newest])
+    return BuiltMap(path, [one for one in recorded.sessions if one.revision <= newest])
+
+
+def read_record(path: Path) -> BuiltMap:
+    """What the record beside a map says, without a look at the map."""
+    record = path.with_suffix(".json")
+    if not record.exists():
+        return BuiltMap(path)
+    known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
+    return BuiltMap(path, [BuiltSession(**one) for one in known])
 
 
 def _start(draft: Path, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> Position | None:

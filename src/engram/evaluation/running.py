@@ -21,7 +21,6 @@ from engram.drive.live import ignore
 from engram.errors import ConfigError
 from engram.evaluation.building import (
     GENEROUS,
-    BuiltMap,
     build_map,
     read_built_map,
     true_nodes,
@@ -363,8 +362,3 @@ def _run_in(
 
 def _file_name(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
-
-
-def built_map(plan: Plan, fold: Fold) -> BuiltMap:
-    """A fold's map, as far as it is built."""
-    return read_built_map(plan.map_path(fold))

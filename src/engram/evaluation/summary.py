@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.evaluation.building import read_record
 from engram.evaluation.configurations import EVERYTHING, Configuration
 from engram.evaluation.lockstep import Runs
-from engram.evaluation.running import Plan, built_map
+from engram.evaluation.running import Plan
 from engram.evaluation.store import read_runs
 from engram.measures import (
     Drive,
@@ -160,7 +161,7 @@ class ConfigurationResult:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # no slots: it remembers its draws
 class CampaignResult:
     """All results of one campaign.
 
@@ -223,7 +224,7 @@ def collect(plan: Plan) -> CampaignResult:
     by_mode: dict[str, dict[Configuration, list[SessionResult]]] = {"memo": {}, "live": {}}
     lap: Lap | None = None
     for fold in plan.folds:
-        built = built_map(plan, fold)
+        built = read_record(plan.map_path(fold))
         for session in fold.held_out:
             for mode, found in by_mode.items():
                 runs = read_runs(plan.runs_path(session, mode))
