@@ -142,7 +142,8 @@ def _curves(campaign: CampaignResult, lanes: int, estimator: Estimator) -> Panel
             bands = result.curve(campaign.resamples, estimator)
             y, low, high = (100 * band for band in bands)
             lines.append(Line(policy, CURVE_AT_M, y, low, high, marks=False))
-    return Panel(f"{campaign.name}, Np = {lanes}", "x, m", "P(X ≥ x), %", lines) if lines else None
+    title = f"{campaign.name}, Np = {lanes}"
+    return Panel(title, "x, m", "P(X ≥ x), %", lines, least_y=0.01) if lines else None
 
 
 def _sensitivity(campaign: CampaignResult) -> Panel | None:

@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.evaluation.building import read_record
-from engram.evaluation.configurations import EVERYTHING, Configuration
+from engram.evaluation.configurations import (
+    EVERYTHING,
+    Configuration,
+    map_sizes,
+    sweep,
+)
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.running import Plan
 from engram.evaluation.store import read_runs
@@ -220,7 +225,11 @@ class Lap:
 
 
 def collect(plan: Plan) -> CampaignResult:
-    """Reads all that was run of a plan."""
+    """Reads what was run of a plan; what the folder holds beyond what the plan asks is left out."""
+    options = plan.options
+    wanted = set(sweep(options.policies, options.lanes, options.rounds))
+    for fold in plan.folds:
+        wanted.update(map_sizes(options.policies, options.few_lanes, len(fold.training)))
     by_mode: dict[str, dict[Configuration, list[SessionResult]]] = {"memo": {}, "live": {}}
     lap: Lap | None = None
     for fold in plan.folds:
@@ -231,6 +240,8 @@ def collect(plan: Plan) -> CampaignResult:
                 if runs is None:
                     continue
                 for row, one in enumerate(runs.configurations):
+                    if one not in wanted:
+                        continue
                     count = len(fold.training) if one.sessions is None else one.sessions
                     nodes = built.sessions[count - 1].nodes
                     result = _session_result(runs, row, session, fold.number, nodes)
@@ -241,7 +252,6 @@ def collect(plan: Plan) -> CampaignResult:
         {one: ConfigurationResult(one, sessions) for one, sessions in found.items()}
         for found in by_mode.values()
     )
-    options = plan.options
     return CampaignResult(
         plan.drives.name, memo, live, plan.drives.has_truth, options.seed, options.few_lanes, lap
     )

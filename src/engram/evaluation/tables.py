@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from engram.evaluation.configurations import Configuration
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
 from engram.measures import Estimator, Resamples
 
@@ -21,7 +23,7 @@ def summary_rows(campaign: CampaignResult) -> list[dict[str, Any]]:
     rows = []
     for mode, results in (("memo", campaign.memo), ("live", campaign.live)):
         for result in results.values():
-            bound = campaign.get("oracle", result.configuration.lanes) if mode == "memo" else None
+            bound = campaign.memo.get(_bound(result.configuration)) if mode == "memo" else None
             rows += [
                 _row(campaign, mode, result.of_fold(fold), str(fold), None, None)
                 for fold in sorted({one.fold for one in result.sessions})
@@ -31,11 +33,19 @@ def summary_rows(campaign: CampaignResult) -> list[dict[str, Any]]:
     return rows
 
 
+def _bound(configuration: Configuration) -> Configuration:
+    """The oracle under the same budget, in the same map."""
+    plain = Configuration("oracle", configuration.lanes, configuration.rounds)
+    return replace(plain, sessions=configuration.sessions)
+
+
 def session_rows(campaign: CampaignResult) -> list[dict[str, Any]]:
-    """One row per configuration and session."""
+    """One row per configuration and session, in the whole map."""
     rows = []
     for mode, results in (("memo", campaign.memo), ("live", campaign.live)):
         for result in results.values():
+            if result.configuration.sessions is not None:
+                continue
             for session in result.sessions:
                 alone = ConfigurationResult(result.configuration, [session])
                 row = _row(campaign, mode, alone, str(session.fold), None, None)

@@ -45,7 +45,7 @@ class Panel:
         title, x_label, y_label: words beside it.
         lines: what is drawn.
         x_ticks: places of ticks and what stands there; None for Matplotlib's own.
-        log_y: whether the ordinate is logarithmic.
+        least_y: the ordinate is logarithmic from here on; None for a linear one from 0.
     """
 
     title: str
@@ -53,7 +53,7 @@ class Panel:
     y_label: str
     lines: Sequence[Line]
     x_ticks: Sequence[tuple[float, str]] | None = None
-    log_y: bool = False
+    least_y: float | None = None
 
 
 @dataclass(slots=True)
@@ -93,10 +93,11 @@ def draw_curves(panels: Sequence[Panel], path: Path, title: str) -> None:
                 linewidth=1.3,
             )
             handles.setdefault(line.label, handle)
-        if panel.log_y:
-            one.set_yscale("log")
-        else:
+        if panel.least_y is None:
             one.set_ylim(0, None)
+        else:
+            one.set_yscale("log", nonpositive="clip")
+            one.set_ylim(panel.least_y, None)
         if panel.x_ticks is not None:
             one.set_xticks([at for at, _ in panel.x_ticks], [text for _, text in panel.x_ticks])
         one.set_title(panel.title, fontsize=10)
@@ -132,6 +133,7 @@ def draw_bars(
         one.set_yticks(places, labels, fontsize=8)
         one.invert_yaxis()
         one.margins(x=0.15)
+        one.set_xlim(0, None if max(lengths, default=0) > 0 else 1)
         one.set_title(quantity, fontsize=9)
     figure.suptitle(title, fontsize=11)
     save(figure, path)
