@@ -21,8 +21,10 @@ from engram.drive.live import ignore
 from engram.errors import ConfigError
 from engram.evaluation.building import (
     GENEROUS,
+    BuiltMap,
     build_map,
     read_built_map,
+    read_record,
     true_nodes,
     write_json,
 )
@@ -362,3 +364,8 @@ def _run_in(
 
 def _file_name(name: str) -> str:
     return "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
+
+
+def built_map(plan: Plan, fold: Fold) -> BuiltMap:
+    """A fold's map, as far as its record says that it is built."""
+    return read_record(plan.map_path(fold))

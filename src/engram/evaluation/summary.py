@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.evaluation.building import read_record
 from engram.evaluation.configurations import (
     EVERYTHING,
     Configuration,
@@ -18,7 +17,7 @@ from engram.evaluation.configurations import (
     sweep,
 )
 from engram.evaluation.lockstep import Runs
-from engram.evaluation.running import Plan
+from engram.evaluation.running import Plan, built_map
 from engram.evaluation.store import read_runs
 from engram.measures import (
     Drive,
@@ -233,7 +232,7 @@ def collect(plan: Plan) -> CampaignResult:
     by_mode: dict[str, dict[Configuration, list[SessionResult]]] = {"memo": {}, "live": {}}
     lap: Lap | None = None
     for fold in plan.folds:
-        built = read_record(plan.map_path(fold))
+        built = built_map(plan, fold)
         for session in fold.held_out:
             for mode, found in by_mode.items():
                 runs = read_runs(plan.runs_path(session, mode))
