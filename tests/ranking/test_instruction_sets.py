@@ -9,6 +9,7 @@ import numpy as np
 
 from engram import _core
 from engram.geometry import SE3
+from engram.ranking.recall import RecallPolicy
 from engram.ranking.synthetic import SyntheticPlace
 
 PRINT_DIGEST = """
@@ -25,6 +26,7 @@ def digest() -> str:
     parts = []
     for path_count in (0, 1, 150, 700):
         context = SyntheticPlace(path_count).context()
+        parts.append(RecallPolicy().judge(context).chances.tobytes())
         parts.append(
             context.path_memory.scores(
                 context.neighbourhood.nodes,

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-PSEUDO, NOBODY, PICKS, UNKNOWN_BASE = 0.5, 1.0, 16, 0.4
+PSEUDO, NOBODY, PICKS, UNKNOWN_BASE = 0.5, 1.0, 8, 0.4
 
 
 def logit(p: float) -> float:

@@ -21,9 +21,14 @@ template <typename T> void require_length(const Input<T, 1> &array, size_t count
   require(array.shape(0) == count, "arrays of one group must have one length");
 }
 
-void check_nodes(const Input<int32_t, 1> &nodes) {
-  for (size_t i = 0; i < nodes.shape(0); ++i)
-    require(nodes.data()[i] >= 0, "nodes must not be negative");
+void check_nodes(const Input<int32_t, 1> &nodes, const Input<int32_t, 1> &sessions,
+                 int64_t session_count) {
+  for (size_t i = 0; i < nodes.shape(0); ++i) {
+    const int32_t node = nodes.data()[i];
+    require(node >= 0 && static_cast<size_t>(node) < sessions.shape(0), "no such node");
+    require(sessions.data()[node] >= 0 && sessions.data()[node] < session_count,
+            "no such session");
+  }
 }
 
 // Lessons whose rows lie within their entries. They are checked when they are made, too: this only
@@ -65,43 +70,49 @@ private:
 };
 
 auto recall_order(const Lessons &lessons, const Input<int32_t, 1> &run_nodes,
-                  const Input<double, 1> &run_successes, const Input<double, 1> &run_failures,
-                  const Input<double, 1> &prior, const Input<int32_t, 1> &nodes,
-                  const Input<int32_t, 1> &groups, const Input<double, 1> &rates,
-                  const Input<double, 1> &fixed, const Input<double, 1> &successes,
-                  const Input<double, 1> &failures, double trust, double nobody,
-                  double unknown_base, double company, double own, double pseudo, double regret,
-                  int64_t picks, int64_t shortlist) {
-  const size_t count = nodes.shape(0);
-  check_nodes(nodes);
-  check_nodes(run_nodes);
-  require_length(run_successes, run_nodes.shape(0));
-  require_length(run_failures, run_nodes.shape(0));
+                  const Input<double, 1> &run_ago_m, const Input<double, 1> &run_rates,
+                  const Input<bool, 1> &run_accepted, const Input<double, 1> &prior,
+                  const Input<int32_t, 1> &nodes, const Input<double, 1> &rates,
+                  const Input<double, 1> &fixed, const Input<int32_t, 1> &sessions,
+                  int64_t session_count, double company, double own, double node, double own_m,
+                  double node_m, double viewers_m, double trust, double nobody,
+                  double unknown_base, double pseudo, double regret, int64_t picks,
+                  int64_t shortlist) {
+  const size_t count = nodes.shape(0), attempts = run_nodes.shape(0);
+  check_nodes(nodes, sessions, session_count);
+  check_nodes(run_nodes, sessions, session_count);
+  require_length(run_ago_m, attempts);
+  require_length(run_rates, attempts);
+  require_length(run_accepted, attempts);
   require_length(prior, static_cast<size_t>(lessons.view().viewer_count));
-  require_length(groups, count);
   require_length(rates, count);
   require_length(fixed, count);
-  require_length(successes, count);
-  require_length(failures, count);
   require(nobody > 0 && pseudo > 0, "nobody and pseudo must be positive");
+  require(own_m > 0 && node_m > 0 && viewers_m > 0, "memories must be positive");
   require(picks >= 0 && shortlist >= 0, "picks and shortlist must not be negative");
   engram::RecallJudgement judged;
   {
     nb::gil_scoped_release unlocked;
-    const engram::RecallRun run{run_nodes.data(), run_successes.data(), run_failures.data(),
-                                static_cast<int64_t>(run_nodes.shape(0))};
-    const engram::RecallCandidates candidates{
-        nodes.data(),     groups.data(),   rates.data(),
-        fixed.data(),     successes.data(), failures.data(),
-        static_cast<int64_t>(count)};
-    const engram::RecallConstants constants{trust,  nobody, unknown_base, company,  own,
-                                            pseudo, regret, picks,        shortlist};
+    const engram::RecallRun run{run_nodes.data(), run_ago_m.data(), run_rates.data(),
+                                run_accepted.data(), static_cast<int64_t>(attempts)};
+    const engram::RecallCandidates candidates{nodes.data(),
+                                              rates.data(),
+                                              fixed.data(),
+                                              static_cast<int64_t>(count),
+                                              sessions.data(),
+                                              static_cast<int64_t>(sessions.shape(0)),
+                                              session_count};
+    const engram::RecallConstants constants{company, own,    node,         own_m,  node_m,
+                                            viewers_m, trust, nobody,       unknown_base,
+                                            pseudo,  regret, picks,        shortlist};
     judged = ENGRAM_CALL(recall_order, lessons.view(), run, prior.data(), candidates, constants);
   }
   const size_t viewer_count = judged.viewers.size();
   return nb::make_tuple(engram::to_numpy(std::move(judged.order), {count}),
                         engram::to_numpy(std::move(judged.chances), {count}),
                         engram::to_numpy(std::move(judged.company), {count}),
+                        engram::to_numpy(std::move(judged.own), {count}),
+                        engram::to_numpy(std::move(judged.node), {count}),
                         engram::to_numpy(std::move(judged.viewers), {viewer_count}));
 }
 
@@ -115,10 +126,11 @@ void bind_recall(nb::module_ &module) {
                     int64_t>(),
            "starts"_a, "viewers"_a, "rates"_a, "on_success"_a, "on_failure"_a, "base"_a,
            "viewer_count"_a);
-  module.def("recall_order", &recall_order, "lessons"_a, "run_nodes"_a, "run_successes"_a,
-             "run_failures"_a, "prior"_a, "nodes"_a, "groups"_a, "rates"_a, "fixed"_a,
-             "successes"_a, "failures"_a, nb::kw_only(), "trust"_a, "nobody"_a, "unknown_base"_a,
-             "company"_a, "own"_a, "pseudo"_a, "regret"_a, "picks"_a, "shortlist"_a,
-             "Rows (Y,) int64 best first; by row the chance as picked and the company (Y,); by "
-             "viewer its weight (V,).");
+  module.def("recall_order", &recall_order, "lessons"_a, "run_nodes"_a, "run_ago_m"_a,
+             "run_rates"_a, "run_accepted"_a, "prior"_a, "nodes"_a, "rates"_a, "fixed"_a,
+             "sessions"_a, "session_count"_a, nb::kw_only(), "company"_a, "own"_a, "node"_a,
+             "own_m"_a, "node_m"_a, "viewers_m"_a, "trust"_a, "nobody"_a, "unknown_base"_a,
+             "pseudo"_a, "regret"_a, "picks"_a, "shortlist"_a,
+             "Rows (Y,) int64 best first; by row (Y,) the chance as picked, the company, and the "
+             "log odds of this run's tallies on session and node; by viewer its weight (V,).");
 }

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <numeric>
 
 // The next pick is made as if those before it had failed: that maximises the chance that any of them
@@ -14,53 +13,37 @@ namespace {
 
 constexpr double kLeastChance = 1e-3;
 
+size_t at(int64_t index) { return static_cast<size_t>(index); }
+
 double log_odds(double p) {
   p = std::clamp(p, kLeastChance, 1 - kLeastChance);
   return std::log(p / (1 - p));
 }
 
+// How much a failure tells: as much as a match was likely, nothing where nothing was predicted.
+double failure_weight(const RecallRun &run, int64_t j) {
+  return run.accepted[j] || std::isnan(run.rates[j]) ? 0 : run.rates[j];
+}
+
 // How much the live drive is like each past one.
 class Viewers {
 public:
-  Viewers(const RecallLessons &lessons, const double *prior, const RecallConstants &constants)
-      : lessons_(lessons), nobody_(std::log(constants.nobody)),
-        log_weights_(prior, prior + lessons.viewer_count) {}
-
-  // A success or failure on a node, by its weights.
-  void learn(int32_t node, double success, double failure) {
-    if (node >= lessons_.nodes)
-      return;
-    for (int64_t e = lessons_.starts[node]; e < lessons_.starts[node + 1]; ++e)
-      log_weights_[static_cast<size_t>(lessons_.viewers[e])] +=
-          success * static_cast<double>(lessons_.on_success[e]) +
-          failure * static_cast<double>(lessons_.on_failure[e]);
-  }
-
-  // A node at which a match was as likely as `rate`, had appearances been compatible, failed.
-  void suppose_failure(int32_t node, double rate, double base, double regret) {
-    const double of_others = std::log(1 - rate * base);
-    if (node < lessons_.nodes)
-      for (int64_t e = lessons_.starts[node]; e < lessons_.starts[node + 1]; ++e)
-        log_weights_[static_cast<size_t>(lessons_.viewers[e])] +=
-            regret *
-            (std::log(1 - rate * static_cast<double>(lessons_.rates[e])) - of_others);
-  }
-
-  // Weights that add up to 1, together with that of being like none.
-  void normalise() {
-    double greatest = nobody_;
-    for (const double value : log_weights_)
+  Viewers(const RecallLessons &lessons, const RecallRun &run, const double *prior,
+          const RecallConstants &constants)
+      : lessons_(lessons), weights_(prior, prior + lessons.viewer_count) {
+    for (int64_t j = 0; j < run.count; ++j)
+      learn(run, j, constants.trust * std::exp(-run.ago_m[j] / constants.viewers_m));
+    const double nobody = std::log(constants.nobody);
+    double greatest = nobody;
+    for (const double value : weights_)
       greatest = std::max(greatest, value);
-    double sum = std::exp(nobody_ - greatest);
-    weights_.resize(log_weights_.size());
-    for (size_t m = 0; m < weights_.size(); ++m) {
+    sum_ = std::exp(nobody - greatest);
+    for (double &weight : weights_) {
       // e^-40 of the best weighs nothing, and an exponential costs more than to see that.
-      const double below = log_weights_[m] - greatest;
-      weights_[m] = below > -40 ? std::exp(below) : 0;
-      sum += weights_[m];
+      const double below = weight - greatest;
+      weight = below > -40 ? std::exp(below) : 0;
+      sum_ += weight;
     }
-    for (double &weight : weights_)
-      weight /= sum;
   }
 
   // Share of like-minded drives that match a node; those that never tried do as all others do.
@@ -69,26 +52,142 @@ public:
       return base;
     double sum = 0;
     for (int64_t e = lessons_.starts[node]; e < lessons_.starts[node + 1]; ++e)
-      sum += weights_[static_cast<size_t>(lessons_.viewers[e])] *
-             (static_cast<double>(lessons_.rates[e]) - base);
-    return base + sum;
+      sum += weights_[at(lessons_.viewers[e])] * (static_cast<double>(lessons_.rates[e]) - base);
+    return base + sum / sum_;
   }
 
-  const std::vector<double> &weights() const { return weights_; }
+  // A node at which a match was as likely as `rate`, had appearances been compatible, failed.
+  // Against those who never tried it, only the weight of those who did changes.
+  void suppose_failure(int32_t node, double rate, double base, double regret) {
+    if (node >= lessons_.nodes || regret == 0)
+      return;
+    for (int64_t e = lessons_.starts[node]; e < lessons_.starts[node + 1]; ++e) {
+      double &weight = weights_[at(lessons_.viewers[e])];
+      const double ratio =
+          (1 - rate * static_cast<double>(lessons_.rates[e])) / (1 - rate * base);
+      const double less = weight * (regret == 1 ? ratio : std::pow(ratio, regret));
+      sum_ += less - weight;
+      weight = less;
+    }
+  }
+
+  std::vector<double> normalised() const {
+    std::vector<double> shares(weights_);
+    for (double &share : shares)
+      share /= sum_;
+    return shares;
+  }
 
 private:
+  void learn(const RecallRun &run, int64_t j, double weight) {
+    const int32_t node = run.nodes[j];
+    if (node >= lessons_.nodes)
+      return;
+    const double factor = weight * (run.accepted[j] ? 1 : failure_weight(run, j));
+    const float *gains = run.accepted[j] ? lessons_.on_success : lessons_.on_failure;
+    for (int64_t e = lessons_.starts[node]; e < lessons_.starts[node + 1]; ++e)
+      weights_[at(lessons_.viewers[e])] += factor * static_cast<double>(gains[e]);
+  }
+
   const RecallLessons &lessons_;
-  double nobody_;
-  std::vector<double> log_weights_, weights_;
+  std::vector<double> weights_; // logarithms while learning
+  double sum_ = 0;              // of the weights and that of being like none
 };
+
+// This run's decayed successes and failures by candidate: of its session, or of the very node.
+struct Tallies {
+  std::vector<double> successes, failures;
+
+  double odds(int64_t row, double pseudo) const {
+    return std::log((successes[at(row)] + pseudo) / (failures[at(row)] + pseudo));
+  }
+};
+
+Tallies of_sessions(const RecallRun &run, const RecallCandidates &candidates, double memory_m) {
+  std::vector<double> successes(at(candidates.session_count), 0), failures(successes);
+  for (int64_t j = 0; j < run.count; ++j) {
+    const double weight = std::exp(-run.ago_m[j] / memory_m);
+    const size_t session = at(candidates.sessions[run.nodes[j]]);
+    if (run.accepted[j])
+      successes[session] += weight;
+    else
+      failures[session] += weight * failure_weight(run, j);
+  }
+  Tallies tallies;
+  for (int64_t row = 0; row < candidates.count; ++row) {
+    const size_t session = at(candidates.sessions[candidates.nodes[row]]);
+    tallies.successes.push_back(successes[session]);
+    tallies.failures.push_back(failures[session]);
+  }
+  return tallies;
+}
+
+Tallies of_nodes(const RecallRun &run, const RecallCandidates &candidates, double memory_m) {
+  const std::vector<double> none(at(candidates.count), 0);
+  Tallies tallies{none, none};
+  const int32_t *end = candidates.nodes + candidates.count;
+  for (int64_t j = 0; j < run.count; ++j) {
+    const int32_t *found = std::find(candidates.nodes, end, run.nodes[j]);
+    if (found == end)
+      continue;
+    const double weight = std::exp(-run.ago_m[j] / memory_m);
+    const size_t row = at(found - candidates.nodes);
+    if (run.accepted[j])
+      tallies.successes[row] += weight;
+    else
+      tallies.failures[row] += weight * failure_weight(run, j);
+  }
+  return tallies;
+}
 
 class Picking {
 public:
-  Picking(const RecallLessons &lessons, Viewers &viewers, const RecallCandidates &candidates,
-          const RecallConstants &constants)
-      : lessons_(lessons), viewers_(viewers), candidates_(candidates), constants_(constants),
-        failures_(candidates.failures, candidates.failures + candidates.count) {}
+  Picking(const RecallLessons &lessons, const RecallRun &run, const double *prior,
+          const RecallCandidates &candidates, const RecallConstants &constants)
+      : lessons_(lessons), candidates_(candidates), constants_(constants),
+        viewers_(lessons, run, prior, constants),
+        own_(of_sessions(run, candidates, constants.own_m)) {
+    const Tallies nodes = of_nodes(run, candidates, constants.node_m);
+    judged.viewers = viewers_.normalised();
+    const size_t count = at(candidates.count);
+    judged.chances.resize(count);
+    for (int64_t row = 0; row < candidates.count; ++row) {
+      judged.company.push_back(company(row));
+      judged.own.push_back(own_.odds(row, constants.pseudo));
+      judged.node.push_back(nodes.odds(row, constants.pseudo));
+      fixed_.push_back(candidates.fixed[row] + constants.node * judged.node.back());
+      judge(row, judged.company.back());
+    }
+    judged.order.resize(count);
+    std::iota(judged.order.begin(), judged.order.end(), int64_t{0});
+    sort(0, candidates.count);
+  }
 
+  // The shortlist in the order of greedy picks, then by what is left of its chances.
+  void pick() {
+    std::vector<int64_t> &order = judged.order;
+    const auto shortlist = std::min(constants_.shortlist, candidates_.count);
+    const auto picks = std::min(constants_.picks, shortlist);
+    // Back in the order of rows: of equals the first is preferred.
+    std::sort(order.begin(), order.begin() + shortlist);
+    for (int64_t place = 0; place < picks; ++place) {
+      if (place > 0) {
+        suppose_failure(order[at(place - 1)]);
+        for (int64_t other = place; other < shortlist; ++other)
+          judge(order[at(other)], company(order[at(other)]));
+      }
+      const auto best = std::max_element(
+          order.begin() + place, order.begin() + shortlist, [&](int64_t a, int64_t b) {
+            return judged.chances[at(a)] < judged.chances[at(b)];
+          });
+      std::rotate(order.begin() + place, best, best + 1);
+    }
+    sort(picks, shortlist);
+  }
+
+  RecallJudgement judged;
+
+private:
   double base(int64_t row) const {
     const int32_t node = candidates_.nodes[row];
     return node < lessons_.nodes ? lessons_.base[node] : constants_.unknown_base;
@@ -96,29 +195,33 @@ public:
 
   double company(int64_t row) const { return viewers_.company(candidates_.nodes[row], base(row)); }
 
-  double chance(int64_t row, double company) const {
-    const double own = std::log((candidates_.successes[row] + constants_.pseudo) /
-                                (failures_[static_cast<size_t>(row)] + constants_.pseudo));
-    const double odds =
-        candidates_.fixed[row] + constants_.company * log_odds(company) + constants_.own * own;
-    return 1 / (1 + std::exp(-odds));
+  void judge(int64_t row, double company) {
+    const double odds = fixed_[at(row)] + constants_.company * log_odds(company) +
+                        constants_.own * own_.odds(row, constants_.pseudo);
+    judged.chances[at(row)] = 1 / (1 + std::exp(-odds));
   }
 
   void suppose_failure(int64_t row) {
     const double rate = std::clamp(candidates_.rates[row], 0.0, 1 - kLeastChance);
     viewers_.suppose_failure(candidates_.nodes[row], rate, base(row), constants_.regret);
-    viewers_.normalise();
+    const int32_t session = candidates_.sessions[candidates_.nodes[row]];
     for (int64_t other = 0; other < candidates_.count; ++other)
-      if (candidates_.groups[other] == candidates_.groups[row])
-        failures_[static_cast<size_t>(other)] += constants_.regret * rate;
+      if (candidates_.sessions[candidates_.nodes[other]] == session)
+        own_.failures[at(other)] += constants_.regret * rate;
   }
 
-private:
+  void sort(int64_t from, int64_t to) {
+    std::stable_sort(
+        judged.order.begin() + from, judged.order.begin() + to,
+        [&](int64_t a, int64_t b) { return judged.chances[at(a)] > judged.chances[at(b)]; });
+  }
+
   const RecallLessons &lessons_;
-  Viewers &viewers_;
   const RecallCandidates &candidates_;
   const RecallConstants &constants_;
-  std::vector<double> failures_;
+  Viewers viewers_;
+  Tallies own_;
+  std::vector<double> fixed_;
 };
 
 } // namespace
@@ -126,50 +229,9 @@ private:
 RecallJudgement recall_order(const RecallLessons &lessons, const RecallRun &run,
                              const double *prior, const RecallCandidates &candidates,
                              const RecallConstants &constants) {
-  Viewers viewers(lessons, prior, constants);
-  for (int64_t j = 0; j < run.count; ++j)
-    viewers.learn(run.nodes[j], constants.trust * run.successes[j],
-                  constants.trust * run.failures[j]);
-  viewers.normalise();
-  Picking picking(lessons, viewers, candidates, constants);
-  const auto count = static_cast<size_t>(candidates.count);
-  RecallJudgement judged;
-  judged.viewers = viewers.weights();
-  judged.company.resize(count);
-  judged.chances.resize(count);
-  for (size_t row = 0; row < count; ++row) {
-    judged.company[row] = picking.company(static_cast<int64_t>(row));
-    judged.chances[row] = picking.chance(static_cast<int64_t>(row), judged.company[row]);
-  }
-  std::vector<int64_t> &order = judged.order;
-  order.resize(count);
-  std::iota(order.begin(), order.end(), int64_t{0});
-  std::stable_sort(order.begin(), order.end(), [&](int64_t a, int64_t b) {
-    return judged.chances[static_cast<size_t>(a)] > judged.chances[static_cast<size_t>(b)];
-  });
-  const auto shortlist = std::min<int64_t>(constants.shortlist, candidates.count);
-  const auto picks = std::min(constants.picks, shortlist);
-  // The shortlist back in the order of rows: of equals the first is preferred.
-  std::sort(order.begin(), order.begin() + shortlist);
-  for (int64_t pick = 0; pick < picks; ++pick) {
-    int64_t best = pick;
-    double greatest = -1;
-    for (int64_t place = pick; place < shortlist; ++place) {
-      const int64_t row = order[static_cast<size_t>(place)];
-      if (pick > 0)
-        judged.chances[static_cast<size_t>(row)] = picking.chance(row, picking.company(row));
-      if (judged.chances[static_cast<size_t>(row)] > greatest) {
-        greatest = judged.chances[static_cast<size_t>(row)];
-        best = place;
-      }
-    }
-    std::rotate(order.begin() + pick, order.begin() + best, order.begin() + best + 1);
-    picking.suppose_failure(order[static_cast<size_t>(pick)]);
-  }
-  std::stable_sort(order.begin() + picks, order.begin() + shortlist, [&](int64_t a, int64_t b) {
-    return judged.chances[static_cast<size_t>(a)] > judged.chances[static_cast<size_t>(b)];
-  });
-  return judged;
+  Picking picking(lessons, run, prior, candidates, constants);
+  picking.pick();
+  return std::move(picking.judged);
 }
 
 } // namespace engram::ENGRAM_ISA

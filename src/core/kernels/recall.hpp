@@ -12,45 +12,50 @@ namespace engram {
 struct RecallLessons {
   const int64_t *starts; // (nodes + 1)
   const int32_t *viewers;
-  const float *rates;       // how likely the viewer matches the node
-  const float *on_success;  // log(rate / base): what a success here says for being like the viewer
-  const float *on_failure;  // log((1 - rate) / (1 - base)): what a failure says
-  const double *base;       // (nodes) how likely anybody does
+  const float *rates;      // how likely the viewer matches the node
+  const float *on_success; // log(rate / base): what a success here says for being like the viewer
+  const float *on_failure; // log((1 - rate) / (1 - base)): what a failure says
+  const double *base;      // (nodes) how likely anybody does
   int64_t nodes, viewer_count;
 };
 
 // What this run attempted lately.
 struct RecallRun {
   const int32_t *nodes;
-  const double *successes, *failures; // weights, of which one is 0
+  const double *ago_m; // metres driven since, not negative
+  const double *rates; // g at the predicted offset; NaN where there was no prediction
+  const bool *accepted;
   int64_t count;
 };
 
 // The candidates, nearest first: of equals the first is preferred.
 struct RecallCandidates {
-  const int32_t *nodes, *groups; // groups: the session that saved each
-  const double *rates;           // g(d)
-  const double *fixed;           // log odds from all that does not change with a pick
-  const double *successes, *failures; // this run's tallies of the candidate's session
+  const int32_t *nodes;
+  const double *rates; // g(d)
+  const double *fixed; // log odds from what is not worked out here
   int64_t count;
+  const int32_t *sessions; // (graph_nodes) which session saved each node of the graph
+  int64_t graph_nodes, session_count;
 };
 
 struct RecallConstants {
-  double trust;        // what evidence of one attempt counts for in weighing viewers
-  double nobody;       // weight of "like none of them"
-  double unknown_base; // how likely anybody matches a node that taught nothing
-  double company, own; // factors of two terms of the log odds
-  double pseudo;       // pseudo-count of the tallies
-  double regret;       // how much a pick counts as failed once it is picked
-  int64_t picks;       // how many picks are made greedily
-  int64_t shortlist;   // among how many
+  double company, own, node;       // factors of three terms of the log odds
+  double own_m, node_m, viewers_m; // memories
+  double trust;                    // what evidence of one attempt counts for in weighing viewers
+  double nobody;                   // weight of "like none of them"
+  double unknown_base;             // how likely anybody matches a node that taught nothing
+  double pseudo;                   // pseudo-count of the tallies
+  double regret;                   // how much a pick counts as failed once it is picked
+  int64_t picks;                   // how many picks are made greedily
+  int64_t shortlist;               // among how many
 };
 
 struct RecallJudgement {
   std::vector<int64_t> order;
-  std::vector<double> chances;  // by row: as it was picked, or at the end
-  std::vector<double> company;  // by row: share of like-minded viewers that match it, at first
-  std::vector<double> viewers;  // by viewer: weight at first, adding up to 1 with "none of them"
+  // By row of the candidates: the chance as it was picked, or at the end; at first, the share of
+  // like-minded viewers that match it and the log odds of this run's tallies.
+  std::vector<double> chances, company, own, node;
+  std::vector<double> viewers; // weights at first, adding up to 1 with "none of them"
 };
 
 } // namespace engram

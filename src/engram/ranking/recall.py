@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.ranking.bandit import session_tallies
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.lessons import UNKNOWN_BASE
 from engram.ranking.reasons import Reasons
-from engram.ranking.run import RunAttempts
 from engram.ranking.times import hour_difference
 
 Array = NDArray[np.float64]
+_Judged: TypeAlias = tuple[NDArray[np.int64], Array, Array, Array, Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,21 +50,21 @@ class RecallConstants:
     regret: float
 
 
-# Not fitted yet. The factors are those of a logistic regression over a made-up world of appearances
-# (hours, weathers and random likings of sessions for each other, without images), rounded; memories
-# are as long as lets a single lane leave an experience that has stopped matching within 8 m,
-# against all that past drives say. `benchmarks/fit_recall.py` fits them on rendered towns.
+# Not fitted yet: set by hand on a made-up world of appearances (hours, weathers and random likings
+# of sessions for each other, without images). Memories are as long as lets a single lane leave an
+# experience that has stopped matching within 8 m, against all that past drives say.
+# `benchmarks/fit_recall.py` fits them on rendered towns.
 RECALL = RecallConstants(
     bias=0.1,
     offset=1.3,
-    company=0.5,
-    own=0.6,
+    company=0.6,
+    own=0.8,
     node=0.2,
-    hour=-0.2,
+    hour=-0.1,
     own_m=5.0,
     node_m=3.0,
     viewers_m=15.0,
-    trust=0.5,
+    trust=0.25,
     viewer_hour=-0.1,
     regret=1.0,
 )
@@ -80,14 +80,14 @@ _MEANING = {
 }
 _PSEUDO = 0.5
 _NOBODY = 1.0
-_PICKS = 16
-_SHORTLIST = 48
+_PICKS = 8
+_SHORTLIST = 32
 # A match that is all but ruled out by its distance is no more than that.
 _LEAST_RATE = 1e-4
 # Beyond so many hours the light is another anyway; an unknown hour is as far as the average one.
 _FARTHEST_H, _UNKNOWN_H = 8.0, 4.0
-# The newest of this run's attempts are enough: 40 m at four attempts every 0.7 m.
-_MOST_ATTEMPTS = 256
+# The newest of this run's attempts are enough: 20 m at four attempts every 0.7 m.
+_MOST_ATTEMPTS = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,22 +130,26 @@ class RecallPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        return self._judge(context, order_by(context))[0]
+        canonical = order_by(context)
+        order: NDArray[np.int64] = canonical[self._judge(context, canonical)[0][0]]
+        return order
 
     def judge(self, context: RankingContext) -> RecallJudgement:
         """The ranking with its reasons."""
-        canonical = order_by(context)
-        order, chances, company, viewers, fixed, own = self._judge(context, canonical)
-        rows = np.empty_like(canonical)
-        rows[canonical] = np.arange(len(canonical))
+        c, canonical = self._constants, order_by(context)
+        found, fixed = self._judge(context, canonical)
+        order, chances, company, own, node, viewers = found
         share = np.clip(company, 1e-3, 1 - 1e-3)
         terms = {
             **fixed,
-            "company": self._constants.company * np.log(share / (1 - share)),
-            "this run": self._constants.own * own,
+            "company": c.company * np.log(share / (1 - share)),
+            "this run": c.own * own,
+            "this node": c.node * node,
         }
+        rows = np.empty_like(canonical)
+        rows[canonical] = np.arange(len(canonical))
         return RecallJudgement(
-            order,
+            canonical[order],
             chances[rows],
             company[rows],
             {name: values[rows] for name, values in terms.items()},
@@ -161,57 +165,52 @@ class RecallPolicy:
 
     def _judge(
         self, context: RankingContext, canonical: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], Array, Array, Array, dict[str, Array], Array]:
-        """Order; then by canonical place: chances, company; viewers; fixed terms; own log odds."""
-        c = self._constants
+    ) -> tuple[_Judged, dict[str, Array]]:
+        """What the core says of the candidates, nearest first, and the terms given to it."""
+        c, graph = self._constants, context.graph
         nodes = context.neighbourhood.nodes[canonical]
-        sessions = context.sessions[canonical]
         rates = context.success_rates()[canonical]
+        fixed = self._fixed_terms(context, nodes, rates)
         run = context.run.newest(_MOST_ATTEMPTS)
-        a, b = (tally[canonical] for tally in session_tallies(context, run, c.own_m))
-        fixed = self._fixed_terms(context, run, nodes, sessions, rates)
-        weights = run.decay(c.viewers_m)
-        picked, chances, company, viewers = _core.recall_order(
+        judged = _core.recall_order(
             context.background.lessons.table,
             run.nodes,
-            weights * run.accepted,
-            weights * run.failure_weights(),
+            run.driven_m - run.at_m,
+            run.rates,
+            run.accepted,
             self._prior(context),
             nodes,
-            sessions,
             rates,
             sum(fixed.values(), np.zeros(len(nodes))),
-            a,
-            b,
+            graph.sessions,
+            graph.session_count,
+            company=c.company,
+            own=c.own,
+            node=c.node,
+            own_m=c.own_m,
+            node_m=c.node_m,
+            viewers_m=c.viewers_m,
             trust=c.trust,
             nobody=_NOBODY,
             unknown_base=UNKNOWN_BASE,
-            company=c.company,
-            own=c.own,
             pseudo=_PSEUDO,
             regret=c.regret,
             picks=_PICKS,
             shortlist=_SHORTLIST,
         )
-        own = np.log((a + _PSEUDO) / (b + _PSEUDO))
-        return canonical[picked], chances, company, viewers, fixed, own
+        return judged, fixed
 
     def _fixed_terms(
-        self,
-        context: RankingContext,
-        run: RunAttempts,
-        nodes: NDArray[np.int32],
-        sessions: NDArray[np.int32],
-        rates: Array,
+        self, context: RankingContext, nodes: NDArray[np.int32], rates: Array
     ) -> dict[str, Array]:
-        """Log odds that do not change with a pick."""
+        """Log odds from bias, distance and hour."""
         c = self._constants
         terms = {
             "bias": np.full(len(nodes), c.bias),
             "distance": c.offset * np.log(np.maximum(rates, _LEAST_RATE)),
-            "this node": c.node * _node_log_odds(run, nodes, c.node_m),
         }
         if self._clock and context.hour is not None:
+            sessions = context.graph.sessions[nodes]
             hours = context.background.times.hours(context.graph, sessions)
             terms["hour"] = c.hour * _capped(hour_difference(hours, context.hour))
         return terms
@@ -228,19 +227,6 @@ class RecallPolicy:
         if own is not None:
             prior[own] = -np.inf
         return prior
-
-
-def _node_log_odds(run: RunAttempts, nodes: NDArray[np.int32], memory_m: float) -> Array:
-    """(Y,) log odds of this run's tally on each of the nodes."""
-    if len(run) == 0 or len(nodes) == 0:
-        return np.zeros(len(nodes))
-    in_order = np.argsort(nodes)
-    place = np.minimum(np.searchsorted(nodes, run.nodes, sorter=in_order), len(nodes) - 1)
-    row = in_order[place]
-    weights = run.decay(memory_m) * (nodes[row] == run.nodes)
-    a = np.bincount(row, weights * run.accepted, len(nodes))
-    b = np.bincount(row, weights * run.failure_weights(), len(nodes))
-    return np.asarray(np.log((a + _PSEUDO) / (b + _PSEUDO)))
 
 
 def _capped(apart_h: Array) -> Array:
