@@ -110,3 +110,16 @@ def test_an_image_without_words_is_no_error() -> None:
 def test_words_that_cannot_be_are_refused(words: list[int]) -> None:
     with pytest.raises(ValueError, match="word"):
         FabMap(VOCABULARY).add(np.array(words, np.int32))
+
+
+def test_evidence_is_what_a_place_gives_beyond_what_it_gives_to_the_samples() -> None:
+    rng = np.random.default_rng(3)
+    recogniser = FabMap(VOCABULARY)
+    for place in places(40, rng):
+        recogniser.add(words_of(place, rng))
+    query = words_of(places(1, rng)[0], rng)
+    usual = np.mean([recogniser.log_likelihoods(one) for one in VOCABULARY.samples], axis=0)
+    evidence = recogniser.compare(query).evidence
+    # Sums of thousands of terms in another order.
+    assert evidence == pytest.approx(recogniser.log_likelihoods(query) - usual, abs=1e-8)
+    assert usual.std() > 0.01  # what is taken off differs from place to place

@@ -65,6 +65,8 @@ class FabMap:
         self._elsewhere = _Likelihoods(len(vocabulary), model)
         for sample in vocabulary.samples:
             self._elsewhere.add(sample)
+        self._usual, self._usual_weights = self._of_samples(vocabulary)
+        self._expected = np.zeros(16)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -72,11 +74,28 @@ class FabMap:
     @property
     def bytes_per_place(self) -> float:
         """Memory that each place takes, vocabulary not counted."""
-        return self._places.bytes / max(len(self), 1)
+        return (self._places.bytes + self._expected.nbytes) / max(len(self), 1)
 
     def add(self, words: NDArray[np.int32]) -> int:
         """See `PlaceRecogniser`."""
-        return self._places.add(words)
+        number = self._places.add(words)
+        if number == len(self._expected):
+            self._expected = np.concatenate([self._expected, np.zeros(max(16, number // 8))])
+        self._expected[number] = (
+            self._places.base(number) + self._usual + self._usual_weights[words].sum()
+        )
+        return number
+
+    def _of_samples(self, vocabulary: Vocabulary) -> tuple[float, NDArray[np.float64]]:
+        """Mean constant, and mean weight (W,) of each word, when the samples are the queries."""
+        weights = np.zeros(len(vocabulary))
+        constant = 0.0
+        for sample in vocabulary.samples:
+            query = self._query.weigh(sample)
+            weights[query.words] += query.weights
+            constant += query.constant
+        count = max(len(vocabulary.samples), 1)
+        return constant / count, weights / count
 
     def log_likelihoods(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
         """Log p(Z | L) (P,) of an image with these words at each place."""
@@ -87,12 +106,20 @@ class FabMap:
         return self._judge(words)[1]
 
     def compare(self, words: NDArray[np.int32]) -> Comparison:
-        """See `PlaceRecogniser`: log-likelihoods, and what the samples leave to new places."""
+        """See `PlaceRecogniser`: by how much each place beats what it gives to the samples.
+
+        In a map of several conditions the likelihoods themselves mislead: those of a drive in
+        dull light lie tens of nats above all others, whatever the robot sees, and take all
+        attempts. What a place gives to images of other places on average says how much that is.
+        """
         scores, elsewhere = self._judge(words)
         if len(scores) == 0:
             return Comparison(scores, 1.0)
         evidence = self._evidence(scores, elsewhere)
-        return Comparison(scores, float(np.exp(self._prior_elsewhere + elsewhere - evidence)))
+        return Comparison(
+            scores - self._expected[: len(self)],
+            float(np.exp(self._prior_elsewhere + elsewhere - evidence)),
+        )
 
     def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
         """See `PlaceRecogniser`. Before looking, all places are equally likely."""
@@ -197,6 +224,10 @@ class _Likelihoods:
             self._base = np.concatenate([self._base, np.zeros(max(16, number // 8))])
         self._base[number] = self._gain_unseen[words].sum()
         return number
+
+    def base(self, number: int) -> float:
+        """What a place's words give when nothing is seen."""
+        return float(self._base[number])
 
     def of(self, query: _Weighed) -> NDArray[np.float64]:
         """(P,) float64."""

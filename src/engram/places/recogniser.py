@@ -31,8 +31,9 @@ class Comparison:
     """How well an image fits each place.
 
     Attributes:
-        evidence: (P,) float64, log-likelihoods, or similarities of 0…1 where the recogniser knows
-            no probabilities. What one place is given does not depend on the others.
+        evidence: (P,) float64, log-likelihoods beyond what the place gives to any image, or
+            similarities of 0…1 where the recogniser knows no probabilities. What one place is
+            given does not depend on the others.
         new_place: see `Recognition`.
     """
 
