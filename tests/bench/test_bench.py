@@ -148,6 +148,15 @@ def test_ratio_is_reference_over_ours() -> None:
     report = BenchReport(machine, (stage,))
     assert report.to_dict()["stages"]["a"]["ratio"] == 4.0
     assert report.table().row_count == 1
+    assert report.to_dict()["stages"]["a"]["in_attempts"] is None
+
+
+def test_times_are_given_in_attempts_of_the_same_run() -> None:
+    machine = Machine("cpu", "v4", 1, "3", "2", "5", None, "data")
+    attempt = StageResult("attempt_512", 5, Side(0.5, 0.6), None)
+    pair = StageResult("render_pair_512", 5, Side(40.0, 50.0), None)
+    stages = BenchReport(machine, (attempt, pair)).to_dict()["stages"]
+    assert stages["render_pair_512"]["in_attempts"] == 80.0
 
 
 def test_unknown_stages_are_refused(drive: BenchData) -> None:

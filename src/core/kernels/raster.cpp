@@ -4,14 +4,24 @@
 
 #include <vector>
 
+#include "kernels/pixel_lanes.hpp"
+
 namespace engram::ENGRAM_ISA {
 namespace {
+
+using namespace wide;
 
 constexpr double kNear = 0.1; // metres
 
 // Everything is linear in the sample's column x and row y: f = dx·x + dy·y + at.
 struct Linear {
   double dx, dy, at;
+};
+
+// An edge crosses row y at column slope · y + at, and what lies beyond it is outside.
+struct Bound {
+  enum Side { kLeft, kRight, kLevel } side;
+  double slope, at;
 };
 
 struct Target {
@@ -24,6 +34,7 @@ struct Target {
 // texture coordinates are.
 struct Polygon {
   Linear edges[4];
+  Bound bounds[4]; // what the edges say of a row
   Linear value;
   double x_min, x_max, y_min, y_max;
   Linear u, v;       // of texture coordinates, times value when perspective
@@ -67,52 +78,94 @@ inline void fill_depth(float *values, int32_t from, int32_t to, float at, float 
   }
 }
 
-inline bool covered(const Polygon &polygon, int32_t x, double u_row, double v_row, float value) {
-  const double scale = polygon.perspective ? 1.0 / static_cast<double>(value) : 1.0;
-  double u = (u_row + polygon.u.dx * x) * scale + polygon.u_at;
-  double v = (v_row + polygon.v.dx * x) * scale + polygon.v_at;
-  u -= floor(u);
-  v -= floor(v);
-  const int32_t column = static_cast<int32_t>(u * polygon.mask_width);
-  const int32_t row = static_cast<int32_t>(v * polygon.mask_height);
-  const int32_t column_in = column < polygon.mask_width ? column : 0;
-  const int32_t row_in = row < polygon.mask_height ? row : 0;
-  return polygon.mask[4 * (row_in * (polygon.mask_width + 2) + column_in) + 3] >= 128;
+typedef double Doubles __attribute__((vector_size(8 * kWide)));
+
+// The part of 0…1 that a number stands at.
+inline Doubles fraction(Doubles x) {
+  const Doubles whole = __builtin_convertvector(__builtin_convertvector(x, Ints), Doubles);
+  const Doubles part = x - whole;
+  return part < 0 ? part + 1 : part;
 }
 
-inline void fill_cutout(const Polygon &polygon, int32_t *ids, float *values, int32_t from,
+inline Ints texel_at(Doubles place, int32_t size) {
+  const Ints texel = __builtin_convertvector(fraction(place) * size, Ints);
+  return texel & (texel >= 0) & (texel < size); // lanes outside the polygon may hold anything
+}
+
+// Where the texture of a cutout covers the samples of some columns.
+inline Ints covered(const Polygon &polygon, Doubles columns, double u_row, double v_row,
+                    Floats value) {
+  const Doubles one = Doubles{} + 1.0;
+  const Doubles scale =
+      polygon.perspective ? one / __builtin_convertvector(value, Doubles) : one;
+  const Doubles u = (u_row + polygon.u.dx * columns) * scale + polygon.u_at;
+  const Doubles v = (v_row + polygon.v.dx * columns) * scale + polygon.v_at;
+  const Ints column = texel_at(u, polygon.mask_width), row = texel_at(v, polygon.mask_height);
+  const Ints texels = gather(reinterpret_cast<const int32_t *>(polygon.mask),
+                             row * (polygon.mask_width + 2) + column);
+  return texels < 0; // the fourth channel, the word's highest byte, is 128 or more
+}
+
+inline Floats load_some(const float *values, int32_t count) {
+  Floats lanes = {};
+  __builtin_memcpy(&lanes, values, 4 * static_cast<size_t>(count));
+  return lanes;
+}
+
+inline void fill_cutout(const Polygon &polygon, const Target &target, int64_t row, int32_t from,
                         int32_t to, float at, float step, int32_t y, int32_t id) {
   const double u_row = polygon.u.dy * y + polygon.u.at, v_row = polygon.v.dy * y + polygon.v.at;
-  for (int32_t x = from; x <= to; ++x) {
-    const float value = at + step * static_cast<float>(x);
-    if (value <= values[x] || !covered(polygon, x, u_row, v_row, value))
+  Ints lanes;
+  for (int lane = 0; lane < kWide; ++lane)
+    lanes[lane] = lane;
+  for (int32_t first = from; first <= to; first += kWide) {
+    float *values = target.values + row + first;
+    const Ints columns = first + lanes;
+    const Floats value = at + step * to_floats(columns);
+    const bool whole = first + kWide <= target.width;
+    const Floats before = whole ? load(values) : load_some(values, target.width - first);
+    Ints wins = (value > before) & (columns <= to);
+    if (!any(wins))
       continue;
-    values[x] = value;
-    if (ids != nullptr)
-      ids[x] = id;
+    wins &= covered(polygon, __builtin_convertvector(columns, Doubles), u_row, v_row, value);
+    float won[kWide];
+    store(won, value);
+    for (uint32_t left = bits_of(wins); left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      values[lane] = won[lane];
+      if (target.ids != nullptr)
+        target.ids[row + first + lane] = id;
+    }
   }
+}
+
+Bound bound_of(const Linear &edge) {
+  if (edge.dx > 1e-12)
+    return {Bound::kLeft, -edge.dy / edge.dx, -edge.at / edge.dx};
+  if (edge.dx < -1e-12)
+    return {Bound::kRight, -edge.dy / edge.dx, -edge.at / edge.dx};
+  return {Bound::kLevel, edge.dy, edge.at};
 }
 
 // The interval of columns of row y that lies inside all edges.
 inline bool interval(const Polygon &polygon, int32_t y, double &low, double &high) {
   low = polygon.x_min;
   high = polygon.x_max;
-  for (const Linear &edge : polygon.edges) {
-    const double at = edge.dy * y + edge.at;
-    if (edge.dx > 1e-12) {
-      const double x = -at / edge.dx;
+  for (const Bound &bound : polygon.bounds) {
+    const double x = bound.slope * y + bound.at;
+    if (bound.side == Bound::kLeft)
       low = x > low ? x : low;
-    } else if (edge.dx < -1e-12) {
-      const double x = -at / edge.dx;
+    else if (bound.side == Bound::kRight)
       high = x < high ? x : high;
-    } else if (at < 0) {
+    else if (x < 0)
       return false;
-    }
   }
   return low <= high;
 }
 
-void fill(const Polygon &polygon, const Target &target, int32_t id) {
+void fill(Polygon &polygon, const Target &target, int32_t id) {
+  for (int i = 0; i < 4; ++i)
+    polygon.bounds[i] = bound_of(polygon.edges[i]);
   const int32_t first = static_cast<int32_t>(
       ceil(polygon.y_min > target.row_begin ? polygon.y_min : target.row_begin));
   const double last_row = target.row_end - 1;
@@ -128,7 +181,7 @@ void fill(const Polygon &polygon, const Target &target, int32_t id) {
     const int64_t row = static_cast<int64_t>(y) * target.width;
     int32_t *ids = target.ids == nullptr ? nullptr : target.ids + row;
     if (polygon.mask != nullptr)
-      fill_cutout(polygon, ids, target.values + row, from, to, at, step, y, id);
+      fill_cutout(polygon, target, row, from, to, at, step, y, id);
     else if (ids != nullptr)
       fill_solid(ids, target.values + row, from, to, at, step, id);
     else
@@ -245,6 +298,83 @@ bool set_up_in_view(Polygon &polygon, const float *vertices, const Surface &surf
   return true;
 }
 
+// What lies behind all that a square of samples shows already needs not be drawn. The squares'
+// least values are taken anew after 32, 64, 128 … chunks; between those they are a little out of
+// date, which is safe: values only grow.
+class Covered {
+public:
+  explicit Covered(const Target &target)
+      : target_(target), across_((target.width + kSide - 1) / kSide),
+        down_((target.row_end - target.row_begin + kSide - 1) / kSide),
+        least_(static_cast<size_t>(across_) * static_cast<size_t>(down_), 0.0f) {}
+
+  void look() {
+    for (int32_t j = 0; j < down_; ++j)
+      for (int32_t i = 0; i < across_; ++i)
+        least_[static_cast<size_t>(j * across_ + i)] = least_in(i * kSide, j * kSide);
+  }
+
+  // Whether nothing in a box of samples can show a value up to `most`.
+  bool hides(double x_min, double x_max, double y_min, double y_max, double most) const {
+    const int32_t i0 = square(x_min, across_), i1 = square(x_max, across_);
+    const int32_t j0 = square(y_min - target_.row_begin, down_),
+                  j1 = square(y_max - target_.row_begin, down_);
+    for (int32_t j = j0; j <= j1; ++j)
+      for (int32_t i = i0; i <= i1; ++i)
+        if (static_cast<double>(least_[static_cast<size_t>(j * across_ + i)]) < most)
+          return false;
+    return true;
+  }
+
+private:
+  static constexpr int32_t kSide = 32;
+
+  static int32_t square(double sample, int32_t count) {
+    const double at = sample < 0 ? 0 : sample / kSide;
+    return at < count - 1 ? static_cast<int32_t>(at) : count - 1;
+  }
+
+  float least_in(int32_t column, int32_t row) const {
+    const int32_t last_row = row + kSide < target_.row_end - target_.row_begin
+                                 ? row + kSide
+                                 : target_.row_end - target_.row_begin;
+    const int32_t last_column =
+        column + kSide < target_.width ? column + kSide : target_.width;
+    float least = 1e9f;
+    for (int32_t y = row; y < last_row; ++y) {
+      const float *values =
+          target_.values + static_cast<int64_t>(y + target_.row_begin) * target_.width;
+      for (int32_t x = column; x < last_column; ++x)
+        least = values[x] < least ? values[x] : least;
+    }
+    return least;
+  }
+
+  Target target_;
+  int32_t across_, down_;
+  std::vector<float> least_;
+};
+
+// The most that a value computed in floats exceeds its exact one by, as a factor.
+constexpr double kRounding = 1.001;
+
+bool hidden(const Chunk &chunk, const View &view, const Grid &grid, const Covered &covered) {
+  const double from_centre[3] = {chunk.centre[0] - view.centre[0], chunk.centre[1] - view.centre[1],
+                                 chunk.centre[2] - view.centre[2]};
+  double c[3];
+  turn(view.rotation, from_centre, c);
+  const double r = chunk.radius, nearest = c[2] - r, farthest = c[2] + r;
+  if (nearest < 1)
+    return false;
+  const double left = (c[0] - r) / (c[0] > r ? farthest : nearest),
+               right = (c[0] + r) / (c[0] > -r ? nearest : farthest),
+               top = (c[1] - r) / (c[1] > r ? farthest : nearest),
+               bottom = (c[1] + r) / (c[1] > -r ? nearest : farthest);
+  return covered.hides((left - grid.x.at) / grid.x.dx, (right - grid.x.at) / grid.x.dx,
+                       (top - grid.y.at) / grid.y.dy, (bottom - grid.y.at) / grid.y.dy,
+                       kRounding / nearest);
+}
+
 // Whether a sphere can be seen: against the near plane and the four sides of the picture.
 bool in_view(const Chunk &chunk, const View &view) {
   const double from_centre[3] = {chunk.centre[0] - view.centre[0], chunk.centre[1] - view.centre[1],
@@ -326,12 +456,16 @@ void raster_view(const Mesh *meshes, const Texture *textures, const int32_t *ord
          i < static_cast<int64_t>(row_end) * columns; ++i)
       ids[i] = -1;
   const Grid grid = grid_of(view);
+  Covered covered(target);
+  int32_t drawn = 0;
   for (int32_t k = 0; k < order_count; ++k) {
     const int32_t slot = order[2 * k];
     const Mesh &mesh = meshes[slot];
     const Chunk &chunk = mesh.chunks[order[2 * k + 1]];
-    if (!in_view(chunk, view))
+    if (!in_view(chunk, view) || (drawn >= 32 && hidden(chunk, view, grid, covered)))
       continue;
+    if (++drawn >= 32 && (drawn & (drawn - 1)) == 0)
+      covered.look();
     for (int32_t i = chunk.first; i < chunk.last; ++i) {
       Polygon polygon;
       if (set_up_in_view(polygon, mesh.vertices + 12 * static_cast<int64_t>(i), mesh.surfaces[i],

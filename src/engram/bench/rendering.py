@@ -1,4 +1,4 @@
-"""The stage of the renderer: one stereo pair of a town on a clear day, camera model included."""
+"""The stages of the renderer: one stereo pair of a town, with camera model and moving things."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from engram.bench.plain import PlainPipeline
 from engram.bench.stage import Prepared
 from engram.simulation import SimulatedDrive, campaign_named
 
-_SESSION = 1  # of `village`: a clear morning
+CLEAR, RAIN, NIGHT = 1, 6, 7  # sessions of `village`: a morning, wet streets, lamps
 _FIRST_FRAME, _FRAMES = 200, 60
 
 
-def prepare_rendering(data: BenchData, plain: PlainPipeline | None) -> Prepared:
+def prepare_rendering(
+    data: BenchData, plain: PlainPipeline | None, *, session: int = CLEAR
+) -> Prepared:
     """The pairs follow each other as in a drive; the tiles around them are built beforehand."""
     del data, plain
-    drive = SimulatedDrive(campaign_named("village"), _SESSION)
-    for _ in drive.frames(
-        _FIRST_FRAME,
-        _FIRST_FRAME + _FRAMES,
-    ):
+    drive = SimulatedDrive(campaign_named("village"), session)
+    for _ in drive.frames(_FIRST_FRAME, _FIRST_FRAME + _FRAMES):
         pass
     frames = drive.frames(_FIRST_FRAME, _FIRST_FRAME + _FRAMES)
 

@@ -26,7 +26,9 @@ Progress = Callable[[str, int, int], None]
 
 # A quarter of a second or so for one run of either side: fewer runs tell enough.
 _SLOW_STAGES = {
-    "render_pair_512": 10,
+    "render_pair_512": 40,
+    "render_pair_512_rain": 40,
+    "render_pair_512_night": 40,
     "window_ba_512": 10,
     "places_query_20000": 40,
     "places_query_1000000": 20,

@@ -14,7 +14,7 @@ from engram.bench.data import BenchData
 from engram.bench.places import prepare_places_query, prepare_vocabulary_train
 from engram.bench.plain import PlainPipeline
 from engram.bench.ranking import prepare_ranking
-from engram.bench.rendering import prepare_rendering
+from engram.bench.rendering import NIGHT, RAIN, prepare_rendering
 from engram.bench.stage import Prepared, Run, Stage
 from engram.bench.window import prepare_window
 from engram.frontend import Frontend, MatcherConfig, StereoPair, match_frames
@@ -102,6 +102,8 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "attempt_512": partial(prepare_attempt, size="512"),
         "attempt_full": partial(prepare_attempt, size="full"),
         "render_pair_512": prepare_rendering,
+        "render_pair_512_rain": partial(prepare_rendering, session=RAIN),
+        "render_pair_512_night": partial(prepare_rendering, session=NIGHT),
         "window_ba_512": prepare_window,
         "places_query_20000": partial(prepare_places_query, places=20_000, dense=True),
         "places_query_1000000": partial(prepare_places_query, places=1_000_000, dense=False),

@@ -64,6 +64,7 @@ class CameraModel:
         self._seed = seed
         self._lens = lens
         self._gain: float | None = None
+        self._sitting = [((-1, -1), np.zeros((0, 0), dtype=np.float32))] * 2
         self._dirt = [self._specks(eye) for eye in range(2)] if lens.dirt > 0 else []
 
     def expose(
@@ -141,21 +142,28 @@ class CameraModel:
         rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0x3A14, frame, eye])
         air = float(np.quantile(light[::8, ::8], 0.8))
         streaks = np.zeros((height, width), dtype=np.float32)
-        for _ in range(int(150 * rain)):
-            x, y, long = rng.uniform(0, width), rng.uniform(-20, height), rng.uniform(8, 28)
+        low, high = np.array([[0, -20, 8, 0.05], [width, height, 28, 0.22]])
+        for x, y, long, bright in low + (high - low) * rng.random((int(150 * rain), 4)):
             end = (int(x + 0.08 * long), int(y + long))
-            cv2.line(streaks, (int(x), int(y)), end, float(air * rng.uniform(0.05, 0.22)), 1)
+            cv2.line(streaks, (int(x), int(y)), end, float(air * bright), 1)
         light = light + cv2.GaussianBlur(streaks, (0, 0), 0.6)
-        # Drops sit on the glass for some frames before they run off.
-        sitting = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD209, eye, frame // 9])
-        drops = np.zeros((height, width), dtype=np.float32)
-        per_image = _DROPS * rain**1.6 * height * width / (384 * 512)
-        for _ in range(int(per_image)):
-            centre = (int(sitting.uniform(0, width)), int(sitting.uniform(0, height)))
-            cv2.circle(drops, centre, int(sitting.uniform(8, 30)), 1.0, -1)
-        soft = cv2.GaussianBlur(drops, (0, 0), 3.0)
+        soft = self._drops(int(_DROPS * rain**1.6 * height * width / (384 * 512)), frame, eye)
         through = cv2.blur(np.minimum(light, 2 * air), (27, 27))
         return np.asarray(light * (1 - soft) + through * soft, dtype=np.float32)
+
+    def _drops(self, count: int, frame: int, eye: int) -> Luminance:
+        """How much of each pixel drops take, 0…1; they sit for nine frames before they run off."""
+        key = (count, frame // 9)
+        if self._sitting[eye][0] != key:
+            camera = self._robot.camera
+            rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD209, eye, frame // 9])
+            drops = np.zeros((camera.height, camera.width), dtype=np.float32)
+            low, high = np.array([[0, 0, 8], [camera.width, camera.height, 30]])
+            for x, y, radius in low + (high - low) * rng.random((count, 3)):
+                cv2.circle(drops, (int(x), int(y)), int(radius), 1.0, -1)
+            soft = np.asarray(cv2.GaussianBlur(drops, (0, 0), 3.0), dtype=np.float32)
+            self._sitting[eye] = (key, soft)
+        return self._sitting[eye][1]
 
 
 def _covered(luminance: Luminance) -> Luminance:

@@ -150,6 +150,10 @@ class Town:
         self.materials: Materials = shared_materials(self.scene, self.noise, style, plan.seed)
         self.cast = Cast.of_seed(self.materials, plan.seed)
         self._driven = set(route.streets())
+        near = {
+            (a + i, b + j) for a, b in route.junctions for i in range(-3, 3) for j in range(-3, 3)
+        }
+        self._blocks = np.array(sorted(near))  # that are built at all
         self._pool = [
             facade(
                 np.random.default_rng([plan.seed, 0xF00, k]), self.noise, style,
@@ -178,15 +182,10 @@ class Town:
     def blocks_near(self, position: Points, reach_m: float) -> list[Junction]:
         """Blocks whose middle is within reach of a point (2,), nearest first."""
         spacing = self.plan.spacing_m
-        middle = np.floor(np.asarray(position)[:2] / spacing).astype(int)
-        span = int(np.ceil(reach_m / spacing)) + 1
-        found = []
-        for i in range(middle[0] - span, middle[0] + span + 1):
-            for j in range(middle[1] - span, middle[1] + span + 1):
-                away = float(np.hypot(*((np.array([i, j]) + 0.5) * spacing - position[:2])))
-                if away < reach_m + 0.7 * spacing and self._near_route((i, j)):
-                    found.append((away, (i, j)))
-        return [block for _, block in sorted(found)]
+        away_m = np.hypot(*((self._blocks + 0.5) * spacing - np.asarray(position)[:2]).T)
+        nearest = np.lexsort((self._blocks[:, 1], self._blocks[:, 0], away_m))
+        near = nearest[away_m[nearest] < reach_m + 0.7 * spacing]
+        return [(int(i), int(j)) for i, j in self._blocks[near]]
 
     def build_tile(self, block: Junction, today: Today) -> Tile:
         """Builds a block as it is today and hands it to the scene."""
@@ -202,10 +201,6 @@ class Town:
     def is_driven(self, start: Junction, end: Junction) -> bool:
         """Whether the route runs along a street."""
         return (min(start, end), max(start, end)) in self._driven
-
-    def _near_route(self, block: Junction) -> bool:
-        i, j = block
-        return any(-2 <= a - i <= 3 and -2 <= b - j <= 3 for a, b in self.route.junctions)
 
 
 class _TileBuilder:
