@@ -12,6 +12,7 @@ from engram.cli.app import VerbInterruptedError
 from engram.cli.benchmark import bench
 from engram.cli.building import build
 from engram.cli.demonstration import demo
+from engram.cli.downloading import download
 from engram.cli.evaluation import evaluate
 from engram.cli.explanation import explain
 from engram.cli.extraction import extract
@@ -39,6 +40,7 @@ VERBS: dict[str, Callable[..., None]] = {
     "check": check,
     "merge": merge,
     "build": build,
+    "download": download,
     "seal": seal,
     "simulate": simulate,
     "vocabulary": vocabulary,

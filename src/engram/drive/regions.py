@@ -56,7 +56,7 @@ def regions_of(
     component = graph.components()
     stretch = np.zeros(len(graph), np.int32)
     oldest = []
-    links = _links(graph)
+    links = edge_lengths(graph)
     for number in range(int(component.max(initial=-1)) + 1):
         nodes = np.flatnonzero(component == number)
         held = {graph.session(int(at)) for at in np.unique(graph.sessions[nodes])}
@@ -70,8 +70,8 @@ def regions_of(
     return Regions(component, stretch, tuple(oldest), stretch_m)
 
 
-def _links(graph: ExperienceGraph) -> csr_matrix:
-    """(N, N) lengths of edges, metres."""
+def edge_lengths(graph: ExperienceGraph) -> csr_matrix:
+    """(N, N) sparse: length of the shortest edge between two nodes, metres, once for each pair."""
     ends = np.array(
         [(graph.index(edge.a), graph.index(edge.b)) for edge in graph.edges], np.int64
     ).reshape(-1, 2)

@@ -1,22 +1,28 @@
-"""The fleet: many robots, one centre (SPEC §7): merging, building."""
+"""The fleet: many robots, one centre (SPEC §7): merging, downloading, building."""
 
 from engram.fleet.best_order import BestOrder, JudgeOptions, OrderResult, order_costs
 from engram.fleet.building import BuildOptions, BuildReport, build_map
 from engram.fleet.docking import merge_maps
+from engram.fleet.download import DownloadReport, download
 from engram.fleet.gate import Gate, GateOptions, what_is_worse
 from engram.fleet.group_mapping import GroupResult, GroupTask, map_group
 from engram.fleet.grouping import GROUPINGS, group_drives
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.merging import Progress, merge_map, silent
+from engram.fleet.mission import DownloadOptions, bytes_from_text, hour_from_text
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment, string_segments
+from engram.fleet.selections import SELECTIONS
 
 __all__ = [
     "GROUPINGS",
     "BestOrder",
     "BuildOptions",
     "BuildReport",
+    "SELECTIONS",
+    "DownloadOptions",
+    "DownloadReport",
     "Gate",
     "GateOptions",
     "GroupResult",
@@ -35,6 +41,9 @@ __all__ = [
     "build_map",
     "group_drives",
     "map_group",
+    "bytes_from_text",
+    "download",
+    "hour_from_text",
     "merge_map",
     "merge_maps",
     "order_costs",

@@ -89,6 +89,7 @@ class BulkWriter:
         view: View,
         on_cameras: Callable[[], None],
         on_end: Callable[[], None],
+        committed_ns: int | None = None,
     ) -> None:
         self._database = database
         self._keys = keys
@@ -97,6 +98,7 @@ class BulkWriter:
         self._view = view
         self._on_cameras = on_cameras
         self._on_end = on_end
+        self._committed_ns = committed_ns
         self._ended = False
         with database.reading() as connection:
             self._descriptor = reading.descriptor_of(connection, view)
@@ -346,7 +348,11 @@ class BulkWriter:
             contents = revision_contents(connection, self._revision_key)
         with self._database.writing() as connection:
             revision = commit_revision(
-                connection, self._revision_key, was=RevisionStatus.ABANDONED, contents=contents
+                connection,
+                self._revision_key,
+                was=RevisionStatus.ABANDONED,
+                contents=contents,
+                committed_ns=self._committed_ns,
             )
         self._end()
         return revision

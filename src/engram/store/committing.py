@@ -22,6 +22,7 @@ def commit_revision(
     *,
     was: RevisionStatus = RevisionStatus.OPEN,
     contents: dict[str, float] | None = None,
+    committed_ns: int | None = None,
 ) -> Revision:
     """Flip a revision to committed and give it its number.
 
@@ -30,6 +31,7 @@ def commit_revision(
         revision_key: its row.
         was: the status that it was written under.
         contents: of `revision_contents`, where they were counted before; None counts here.
+        committed_ns: when, UTC; None for now.
 
     Raises:
         RevisionError: it has another status.
@@ -44,7 +46,7 @@ def commit_revision(
         status=str(RevisionStatus.COMMITTED),
         number=parent + 1,
         parent=parent or None,
-        committed_ns=time.time_ns(),
+        committed_ns=time.time_ns() if committed_ns is None else committed_ns,
         contents=to_json(contents),
     )
     return log(connection, View(parent + 1))[-1]

@@ -157,6 +157,11 @@ class MapStore:
         return WritableMapStore(open_database(location), cache_bytes=cache_bytes)
 
     @property
+    def location(self) -> str:
+        """Where the map lies, for messages."""
+        return self._database.name
+
+    @property
     def revision(self) -> int:
         """Number of the newest revision that is seen; 0 for an empty map."""
         return self._view.at
@@ -232,6 +237,11 @@ class MapStore:
         with self._database.reading() as connection:
             return reading.landmark_hashes(connection, self._view)
 
+    def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
+        """Bytes of each node's landmarks and of its thumbnail."""
+        with self._database.reading() as connection:
+            return reading.blob_sizes(connection, self._view)
+
     def partial_paths(self) -> frozenset[PathId]:
         """Paths of which some entries stayed elsewhere."""
         with self._database.reading() as connection:
@@ -295,6 +305,22 @@ class MapStore:
         database = SqliteDatabase(source)
         try:
             database.copy_to(target)
+        finally:
+            database.close()
+
+    @staticmethod
+    def compact(source: Path, target: Path) -> None:
+        """Writes a map file anew, its rows in order and without gaps.
+
+        The same rows written in the same order give the same bytes, with one version of SQLite.
+
+        Raises:
+            InputError: the target exists already, or its folder does not.
+            MapError: the source cannot be read, or the target not written.
+        """
+        database = SqliteDatabase(source)
+        try:
+            database.compact_to(target)
         finally:
             database.close()
 
@@ -429,7 +455,12 @@ class WritableMapStore(MapStore):
         return self.resume_session(session).commit()
 
     def begin_revision(
-        self, *, author: str, message: str, configuration: Mapping[str, Any]
+        self,
+        *,
+        author: str,
+        message: str,
+        configuration: Mapping[str, Any],
+        at_ns: int | None = None,
     ) -> BulkWriter:
         """Begin to write one revision that brings records of many sessions at once.
 
@@ -437,6 +468,8 @@ class WritableMapStore(MapStore):
             author: who, or which robot.
             message: what `log` shows.
             configuration: the resolved settings, plain JSON data.
+            at_ns: a time that stands for when it was written, UTC; the revision then names no host
+                either, so that the same records give the same bytes. None for now and here.
 
         Raises:
             RevisionError: a session or another such revision is being written.
@@ -444,6 +477,8 @@ class WritableMapStore(MapStore):
         """
         self._check_none_open()
         row = self._revision_row(author, message, to_json(configuration))
+        if at_ns is not None:
+            row |= {"opened_ns": at_ns, "host": "", "pid": 0, "writer": ""}
         row["status"] = str(RevisionStatus.ABANDONED)
         with self._database.writing() as connection:
             collect_abandoned(connection)  # whose UUIDs may come again
@@ -459,6 +494,7 @@ class WritableMapStore(MapStore):
             view=own,
             on_cameras=lambda: self.frames.set_view(own),
             on_end=self._writing_ended,
+            committed_ns=at_ns,
         )
         return self._bulk
 

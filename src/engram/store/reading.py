@@ -41,6 +41,7 @@ from engram.store.schema import (
     attempts,
     cameras,
     edges,
+    frames,
     frontends,
     nodes,
     omissions,
@@ -217,6 +218,20 @@ def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
     """The hash of each node's landmarks."""
     query = view.select(nodes).with_only_columns(nodes.c.uuid, nodes.c.landmark_hash)
     return {NodeId(UUID(bytes=row[0])): row[1] for row in connection.execute(query)}
+
+
+def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:
+    """Bytes of each node's landmarks and of its thumbnail."""
+    seen = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
+    ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(seen)}
+    query = select(
+        frames.c.node, func.length(frames.c.landmarks), func.length(frames.c.thumbnail)
+    ).order_by(frames.c.node)
+    return {
+        ids[key]: (landmarks, thumbnail or 0)
+        for key, landmarks, thumbnail in connection.execute(query)
+        if key in ids
+    }
 
 
 def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:

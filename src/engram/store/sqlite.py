@@ -196,6 +196,25 @@ class SqliteDatabase:
                 copy.close()
                 source.close()
 
+    def compact_to(self, target: Path) -> None:
+        """Writes the map anew, without what deleting and growing left; whole or not at all.
+
+        Raises:
+            InputError: something is there already, or the folder is not.
+            MapError: it cannot be written.
+        """
+        with _new_file(target) as draft, _translated(str(target)):
+            source = _connect(_reading_uri(self.path), _prepare)
+            try:
+                source.execute("VACUUM INTO ?", [str(draft)])
+            finally:
+                source.close()
+            compact = _connect(_uri(draft, "mode=rw"), _prepare_writer)
+            try:
+                compact.execute("PRAGMA journal_mode=WAL")
+            finally:
+                compact.close()
+
     def size_bytes(self) -> int:
         """The file and its write-ahead log."""
         log = self.path.with_name(self.path.name + "-wal")

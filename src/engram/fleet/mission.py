@@ -1,0 +1,101 @@
+"""What a robot asks of the centre before it sets out: when, where, and how much it can carry."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from engram.errors import ConfigError
+
+_HOURS = 24.0
+_CLOCK = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d{2}))?", re.ASCII)
+_SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kMGT]?i?B?)", re.ASCII)
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+_UNITS |= {f"{name}i": 2 ** (10 * power) for power, name in enumerate("kMGT", start=1)}
+
+
+@dataclass(frozen=True, slots=True)
+class DownloadOptions:
+    """What to download; kept with the map that is sent.
+
+    Attributes:
+        policy: key of `SELECTIONS`.
+        start_h, end_h: the mission's hours of day, in [0, 24); None for not said.
+        window_min: `tod`: how far a node's time of day may be from the mission's start, minutes.
+            180: [G16] §VI-D.
+        epoch_min: `paths`: length Δt of an epoch, minutes. 60: SPEC §7.
+        best_percent: `paths`: share of the paths of each epoch that is sent. 50: [G16] §VI-D.
+        buffer_min: widens the mission at both ends, minutes.
+        budget_bytes: `budget`: what the file may take.
+        near: `region`: beginnings of UUIDs of nodes.
+        route: `route`, and `budget` if it is to serve one: beginning of the UUID of a session
+            that drove it.
+        radius_m: of regions and routes, along the edges, metres.
+        thumbnails: whether pictures for people go along; None for all policies but `budget`.
+    """
+
+    policy: str = "copy"
+    start_h: float | None = None
+    end_h: float | None = None
+    window_min: float = 180.0
+    epoch_min: float = 60.0
+    best_percent: float = 50.0
+    buffer_min: float = 0.0
+    budget_bytes: int | None = None
+    near: tuple[str, ...] = ()
+    route: str | None = None
+    radius_m: float = 20.0
+    thumbnails: bool | None = None
+
+    def __post_init__(self) -> None:
+        _check(self.window_min, "window", "minutes", 0.0, 720.0)
+        _check(self.epoch_min, "epoch", "minutes", 1.0, 1440.0)
+        _check(self.best_percent, "best", "per cent", 0.0, 100.0)
+        _check(self.buffer_min, "buffer", "minutes", 0.0, 720.0)
+        _check(self.radius_m, "radius", "metres", 0.0, 1e6)
+        for name, hour in (("start", self.start_h), ("end", self.end_h)):
+            if hour is not None and not 0 <= hour < _HOURS:
+                raise ConfigError(f"{name} is {hour} h, must be from 0:00 to 23:59")
+        if self.budget_bytes is not None and self.budget_bytes <= 0:
+            raise ConfigError(f"budget is {self.budget_bytes} bytes, must be > 0")
+
+    @property
+    def with_thumbnails(self) -> bool:
+        """Whether pictures for people go along."""
+        return self.policy != "budget" if self.thumbnails is None else self.thumbnails
+
+
+def hour_from_text(text: str | None, name: str) -> float | None:
+    """Hour of day of "9", "9:30" or "09:30"; None of None.
+
+    Raises:
+        ConfigError: it is no time of day.
+    """
+    if text is None:
+        return None
+    found = _CLOCK.fullmatch(text.strip())
+    if found is None or int(found["hour"]) > 23 or int(found["minute"] or 0) > 59:
+        raise ConfigError(f"{name} is {text!r}, must be a time of day such as 9:30 or 23:05")
+    return int(found["hour"]) + int(found["minute"] or 0) / 60
+
+
+def bytes_from_text(text: str | None) -> int | None:
+    """Bytes of "200MB", "1.5 GiB" or "4096"; None of None.
+
+    Raises:
+        ConfigError: it is no size.
+    """
+    if text is None:
+        return None
+    found = _SIZE.fullmatch(text.strip())
+    unit = found["unit"].removesuffix("B") if found else ""
+    if found is None or unit not in _UNITS:
+        raise ConfigError(f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096")
+    return int(float(found["number"]) * _UNITS[unit])
+
+
+def _check(value: float, name: str, unit: str, least: float, most: float) -> None:
+    if not (np.isfinite(value) and least <= value <= most):
+        raise ConfigError(f"{name} is {value} {unit}, must be from {least:g} to {most:g}")
