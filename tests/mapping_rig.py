@@ -39,14 +39,16 @@ class Mapped:
         }
 
 
-def session_for(drive: list[Seen], name: str) -> Session:
+def session_for(drive: list[Seen], name: str, longitude_deg: float | None = None) -> Session:
+    """The session of a drive; its stamps are of UTC where a longitude is given."""
     first = drive[0].frame
     return Session(
         session_id(name, first.camera.id, first.stamp_ns, name),
         name,
         first.camera.id,
         first.stamp_ns,
-        Clock.RELATIVE,
+        Clock.RELATIVE if longitude_deg is None else Clock.UTC,
+        longitude_deg,
     )
 
 
@@ -57,12 +59,13 @@ def map_simulated(
     policy: str = "path",
     *,
     closes_loops: bool = False,
+    longitude_deg: float | None = None,
     **budget: int,
 ) -> Mapped:
     first = drive[0].frame
     opening = MapStore.open_for_writing if path.exists() else MapStore.create
     with opening(path) as store:
-        session = session_for(drive, name)
+        session = session_for(drive, name, longitude_deg)
         writer = store.begin_session(
             session,
             first.camera,

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from engram.cli import options
+
+if TYPE_CHECKING:
+    from engram.fleet import DownloadOptions
 
 
 def download(
@@ -58,7 +61,19 @@ def download(
             help="Send pictures for people too [default: not with budget].",
         ),
     ] = None,
+    check: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--check",
+            metavar="DRIVE",
+            help="Localise this held-out drive in such a download and in everything, and say what "
+            "was promised and what came of it; repeat.",
+        ),
+    ] = None,
+    lanes: options.Lanes = 2,
+    rounds: options.Rounds = 2,
     at: options.At = None,
+    config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
     """Write the part of a centre that a robot needs for its next mission, as a map of its own.
@@ -72,9 +87,10 @@ def download(
       engram download centre.engram r1.engram --policy tod --start 9:30
       engram download centre.engram r1.engram --policy tod+paths --start 9:30 --end 11:00
       engram download centre.engram r1.engram --policy budget --budget 200MB --start 17:00
+      engram download centre.engram r1.engram --policy tod --start 9:30 --check monday.framelog
     """
     from engram.cli.progress import progress
-    from engram.fleet import DownloadOptions, bytes_from_text, hour_from_text
+    from engram.fleet import DownloadOptions, TrialSummary, bytes_from_text, hour_from_text
     from engram.fleet import download as send
 
     asked = DownloadOptions(
@@ -92,4 +108,40 @@ def download(
         thumbnails=thumbnails,
     )
     report = send(centre, out, asked, at=at, progress=progress)
-    typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
+    held_out = _check(centre, asked, check or [], lanes, rounds, at, config) if check else []
+    if as_json:
+        print(json.dumps({**report.to_dict(), "check": held_out}))
+        return
+    typer.echo(report.text())
+    for one in held_out:
+        typer.echo(TrialSummary(**one).text())
+
+
+def _check(
+    centre: Path,
+    asked: DownloadOptions,
+    drives: list[Path],
+    lanes: int,
+    rounds: int,
+    at: str | None,
+    config: Path | None,
+) -> list[dict[str, Any]]:
+    """What such downloads promised held-out drives, and what came of it."""
+    from dataclasses import asdict, replace
+    from functools import partial
+
+    from engram.cli.progress import progress
+    from engram.drive import LocaliseOptions, load_settings, open_drive
+    from engram.fleet import DownloadOptions, summarise_trials, try_downloads
+
+    wanted = {asked.policy: replace(asked, start_h=None, end_h=None), "copy": DownloadOptions()}
+    trials = try_downloads(
+        centre,
+        wanted,
+        [partial(open_drive, drive) for drive in drives],
+        load_settings(config),
+        LocaliseOptions(lanes=lanes, rounds=rounds),
+        progress,
+        at=at,
+    )
+    return [asdict(one) for one in summarise_trials(trials)]

@@ -14,6 +14,7 @@ from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment, string_segments
 from engram.fleet.selections import SELECTIONS
+from engram.fleet.trial import Trial, TrialSummary, summarise_trials, try_downloads
 
 __all__ = [
     "GROUPINGS",
@@ -41,6 +42,8 @@ __all__ = [
     "build_map",
     "group_drives",
     "map_group",
+    "Trial",
+    "TrialSummary",
     "bytes_from_text",
     "download",
     "hour_from_text",
@@ -49,5 +52,7 @@ __all__ = [
     "order_costs",
     "silent",
     "string_segments",
+    "summarise_trials",
+    "try_downloads",
     "what_is_worse",
 ]

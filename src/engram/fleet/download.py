@@ -35,7 +35,7 @@ _ROWS_BYTES = 2500
 _PAGE_BYTES = 4096
 _TRIES = 8
 # A try that leaves less than this free is good enough.
-_FULL_ENOUGH = 0.97
+_FULL_ENOUGH = 0.99
 
 
 @dataclass(frozen=True, slots=True, eq=False)

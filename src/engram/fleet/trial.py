@@ -1,0 +1,210 @@
+"""Downloads tried out: what they promised beside what then happened on held-out drives.
+
+The mission of each trial is that of the drive itself: it begins at the drive's hour of day.
+Source: [G16] Fig. 9 (nodes, time per localisation, failure); SPEC §7 (the forecast).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engram.drive import (
+    DriveSequence,
+    FrameResult,
+    LocaliseOptions,
+    LocaliseRun,
+    Settings,
+    session_of_drive,
+)
+from engram.experience.clock import hour_of_day
+from engram.fleet.download import DownloadReport, Progress, download
+from engram.fleet.mission import DownloadOptions
+from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+
+OpenDrive = Callable[[], DriveSequence]
+# Stages that are the robot's own business, whatever map it has.
+_BEFORE_THE_MAP = ("read", "frontend", "odometry")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One drive in one download.
+
+    Attributes:
+        name: of the options.
+        drive: session of the drive, as text.
+        start_h: the drive's hour of day; None if it is not known.
+        report: of the download.
+        steps: of the drive: distances and matches.
+        ms_per_frame: mean time of localising a frame, relocalisation included, without front-end
+            and odometry.
+    """
+
+    name: str
+    drive: str
+    start_h: float | None
+    report: DownloadReport
+    steps: Drive
+    ms_per_frame: float
+
+    @property
+    def missed(self) -> float:
+        """Share of the drive without a match."""
+        return route_not_localised([self.steps])
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSummary:
+    """All drives in one kind of download.
+
+    Attributes:
+        name: of the options.
+        drives: how many.
+        route_m: how far they went together.
+        nodes, size_bytes: mean over the downloads.
+        expected_missed, missed: share of the way without a match, promised and met.
+        p_no_match_10m: failure curve at 10 m (estimator *route*).
+        longest_gap_m: of all drives.
+        ms_per_frame: mean over the drives.
+    """
+
+    name: str
+    drives: int
+    route_m: float
+    nodes: float
+    size_bytes: float
+    expected_missed: float
+    missed: float
+    p_no_match_10m: float
+    longest_gap_m: float
+    ms_per_frame: float
+
+    def text(self) -> str:
+        """One line for people."""
+        return (
+            f"{self.name:16s} {self.nodes:7.0f} nodes {self.size_bytes / 1e6:7.1f} MB  "
+            f"missed {self.missed:6.1%} (promised {self.expected_missed:6.1%})  "
+            f"P(> 10 m) {self.p_no_match_10m:6.2%}  longest {self.longest_gap_m:5.1f} m  "
+            f"{self.ms_per_frame:6.2f} ms a frame"
+        )
+
+
+def try_downloads(
+    centre: Path,
+    wanted: Mapping[str, DownloadOptions],
+    drives: Sequence[OpenDrive],
+    settings: Settings,
+    localise: LocaliseOptions,
+    progress: Progress,
+    *,
+    at: int | str | None = None,
+) -> list[Trial]:
+    """Download for each drive in each way, and localise it there without writing anything.
+
+    Args:
+        centre: the map.
+        wanted: options by name; where they name no start, that of the drive takes its place.
+        drives: open a held-out drive each.
+        settings: of the localiser.
+        localise: policy and budget.
+        progress: shows how it goes.
+        at: revision of the centre; None for the newest.
+
+    Raises:
+        InputError: a drive's options fit nothing.
+        MapError: the centre cannot be read, or a download not be written.
+    """
+    trials = []
+    with tempfile.TemporaryDirectory(prefix="engram-trial-") as folder:
+        for open_drive in drives:
+            session = session_of_drive(open_drive())
+            hour = hour_of_day(session, session.start_ns)
+            for number, (name, asked) in enumerate(wanted.items()):
+                options = replace(asked, start_h=hour) if asked.start_h is None else asked
+                out = Path(folder) / f"{session.id}-{number}.engram"
+                report = download(centre, out, options, at=at, progress=progress)
+                results = _localised(out, open_drive(), settings, localise, progress)
+                trials.append(
+                    Trial(name, str(session.id), hour, report, _steps(results), _ms(results))
+                )
+                out.unlink()
+    return trials
+
+
+def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
+    """One row for each name, in the order of first appearance."""
+    summaries = []
+    for name in dict.fromkeys(trial.name for trial in trials):
+        own = [trial for trial in trials if trial.name == name]
+        steps = [trial.steps for trial in own]
+        lengths = np.array([route_m([one]) for one in steps])
+        promised = np.array([trial.report.expected_missed for trial in own])
+        total_m = float(lengths.sum())
+        summaries.append(
+            TrialSummary(
+                name=name,
+                drives=len(own),
+                route_m=total_m,
+                nodes=float(np.mean([trial.report.nodes for trial in own])),
+                size_bytes=float(np.mean([trial.report.size_bytes for trial in own])),
+                expected_missed=float(promised @ lengths / total_m) if total_m else 0.0,
+                missed=route_not_localised(steps),
+                p_no_match_10m=failure_route(steps, 10.0),
+                longest_gap_m=longest_gap_m(steps),
+                ms_per_frame=float(np.mean([trial.ms_per_frame for trial in own])),
+            )
+        )
+    return summaries
+
+
+def trial_dict(trial: Trial) -> dict[str, Any]:
+    """A trial as plain values."""
+    return {
+        "name": trial.name,
+        "drive": trial.drive,
+        "start_h": trial.start_h,
+        "nodes": trial.report.nodes,
+        "size_bytes": trial.report.size_bytes,
+        "expected_missed": trial.report.expected_missed,
+        "missed": trial.missed,
+        "ms_per_frame": trial.ms_per_frame,
+    }
+
+
+def _localised(
+    out: Path,
+    sequence: DriveSequence,
+    settings: Settings,
+    localise: LocaliseOptions,
+    progress: Progress,
+) -> list[FrameResult]:
+    with (
+        LocaliseRun(out, sequence, settings, localise) as run,
+        progress("localise", len(sequence)) as advance,
+    ):
+        results = []
+        for _, result in run:
+            results.append(result)
+            advance(result.localisation.status.value)
+        return results
+
+
+def _steps(results: Sequence[FrameResult]) -> Drive:
+    return Drive(
+        np.array([one.step_m for one in results], np.float64),
+        np.array([one.localised for one in results], np.bool_),
+    )
+
+
+def _ms(results: Sequence[FrameResult]) -> float:
+    times = [
+        sum(ms for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP)
+        for one in results
+    ]
+    return float(np.mean(times)) if times else 0.0

@@ -1,0 +1,314 @@
+"""What a download holds, that it is whole, and that a robot can work with nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.errors import ConfigError, InputError, NotAMapError, RevisionError
+from engram.experience.model import EdgeKind, path_id
+from engram.fleet import DownloadOptions, DownloadReport, download
+from engram.store import MapStore
+from mapping_rig import localise_simulated, map_simulated
+from synthetic_world import drive
+
+from .robots import DAY_NS, WORLD, merged, silent
+
+HOUR_NS = 3_600_000_000_000
+# Robot, hour of day, from, to (metres), and up to where the street looks as in the morning: two
+# mornings and two evenings of one street. The evenings never saw the same place as each other.
+DRIVES = (
+    ("r1", 9.0, 0, 40, 40),
+    ("r2", 18.0, 0, 15, 3),
+    ("r3", 9.5, 20, 60, 60),
+    ("r4", 23.75, 25, 60, 28),
+)
+
+
+def steps_of(
+    hour: float,
+    start_m: float,
+    end_m: float,
+    morning_to_m: float,
+    *,
+    day: int,
+    aside_m: float = 0.0,
+):
+    begin_ns = day * DAY_NS + round(hour * HOUR_NS)
+    places = np.arange(start_m, end_m, 0.5)
+    appearance = np.where(places < morning_to_m, 0, 1)
+    return drive(WORLD, places, appearance, aside_m=aside_m, start_ns=begin_ns, seed=day)
+
+
+@pytest.fixture(scope="module")
+def centre(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("fleet") / "centre.engram"
+    for day, (name, hour, *way) in enumerate(DRIVES, start=1):
+        steps = steps_of(hour, *way, day=day, aside_m=0.1 * day)
+        map_simulated(path, steps, name, longitude_deg=0.0)
+    return path
+
+
+def sent(centre: Path, out: Path, policy: str, **options) -> DownloadReport:
+    return download(centre, out, DownloadOptions(policy, **options), progress=silent)
+
+
+def robots_of(path: Path) -> dict[str, int]:
+    """How many nodes of each robot a map holds."""
+    with MapStore.open(path) as store:
+        contents = store.load()
+    names = {session.id: session.robot for session in contents.sessions}
+    found = [names[node.session] for node in contents.nodes]
+    return {name: found.count(name) for name in sorted(set(found))}
+
+
+def node_ids(path: Path) -> set:
+    with MapStore.open(path) as store:
+        return {node.id for node in store.load().nodes}
+
+
+POLICIES = {
+    "copy": {},
+    "tod": {"start_h": 9.0, "window_min": 60.0},
+    "paths": {"start_h": 18.0, "end_h": 18.0},
+    "tod+paths": {"start_h": 9.0, "window_min": 60.0, "best_percent": 50.0},
+    "route": {"route": None, "radius_m": 3.0},
+    "budget": {"budget_bytes": 600_000, "start_h": 9.0},
+}
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_download_is_sound_and_the_same_every_time(centre, tmp_path, policy):
+    options = dict(POLICIES[policy])
+    if policy == "route":
+        with MapStore.open(centre) as store:
+            options["route"] = str(store.load().sessions[0].id)
+    one = sent(centre, tmp_path / "one.engram", policy, **options)
+    again = sent(centre, tmp_path / "again.engram", policy, **options)
+    assert (tmp_path / "one.engram").read_bytes() == (tmp_path / "again.engram").read_bytes()
+    assert one.content_hash == again.content_hash
+    assert MapStore.check(tmp_path / "one.engram").problems == ()
+    assert 0 < one.nodes <= one.of_nodes
+    assert [file.name for file in sorted(tmp_path.iterdir())] == ["again.engram", "one.engram"]
+
+
+@pytest.mark.parametrize("policy", ["copy", "tod", "budget"])
+def test_merging_an_unchanged_download_changes_nothing(centre, tmp_path, policy):
+    mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
+    sent(mine, tmp_path / "robot.engram", policy, **POLICIES[policy])
+    with MapStore.open(mine) as store:
+        before = store.revision, store.content_hash()
+    (report,) = merged(mine, tmp_path / "robot.engram")
+    assert report.revision is None
+    with MapStore.open(mine) as store:
+        assert (store.revision, store.content_hash()) == before
+
+
+def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
+    report = sent(centre, tmp_path / "robot.engram", "copy")
+    with MapStore.open(centre) as ours, MapStore.open(tmp_path / "robot.engram") as theirs:
+        mine, given = ours.load(), theirs.load()
+        assert set(mine.nodes) == set(given.nodes)
+        assert set(mine.sessions) == set(given.sessions)
+        assert set(mine.path_entries) == set(given.path_entries)
+        assert len(mine.attempts) == len(given.attempts)
+        for session in mine.sessions:
+            assert mine.attempts_of(session.id) == given.attempts_of(session.id)
+        keys = [{(e.a, e.b, e.kind) for e in one.edges} for one in (mine, given)]
+        assert keys[0] == keys[1]
+        assert ours.landmark_hashes() == theirs.landmark_hashes()
+        assert theirs.partial_paths() == frozenset()
+        assert theirs.log()[0].committed_ns == ours.log()[-1].committed_ns
+        assert theirs.log()[0].configuration["download"]["source"] == ours.content_hash()
+    assert (report.bridges, report.expected_missed) == (0, report.copy_missed)
+
+
+def test_tod_sends_what_was_saved_near_that_hour_over_midnight_too(centre, tmp_path):
+    everything = robots_of(centre)
+    sent(centre, tmp_path / "morning.engram", "tod", start_h=9.0, window_min=60.0)
+    assert robots_of(tmp_path / "morning.engram") == {
+        name: everything[name] for name in ("r1", "r3")
+    }
+    # 23:45 and later is within 30 minutes of 0:05.
+    sent(centre, tmp_path / "night.engram", "tod", start_h=5 / 60, window_min=30.0)
+    assert robots_of(tmp_path / "night.engram") == {"r4": everything["r4"]}
+
+
+def test_paths_send_every_node_of_the_chosen_drives(centre, tmp_path):
+    report = sent(centre, tmp_path / "out.engram", "paths", start_h=18.0, end_h=18.0)
+    with MapStore.open(centre) as store:
+        contents = store.load()
+    r2 = next(session for session in contents.sessions if session.robot == "r2")
+    assert report.why["epochs"] == [18]
+    assert str(path_id(r2.id)) in report.why["paths"]
+    chosen = set(report.why["paths"])
+    expected = {e.node for e in contents.path_entries if str(e.path) in chosen}
+    assert node_ids(tmp_path / "out.engram") == expected
+
+
+def test_tod_and_paths_send_what_passes_both(centre, tmp_path):
+    both = sent(centre, tmp_path / "both.engram", "tod+paths", start_h=9.0, window_min=60.0)
+    sent(centre, tmp_path / "tod.engram", "tod", start_h=9.0, window_min=60.0)
+    assert node_ids(tmp_path / "both.engram") <= node_ids(tmp_path / "tod.engram")
+    assert both.nodes > 0
+
+
+def test_entries_left_behind_make_a_path_partial(centre, tmp_path):
+    with MapStore.open(centre) as store:
+        first = store.load().nodes[0]
+    report = sent(centre, tmp_path / "out.engram", "region", near=(str(first.id),), radius_m=5.0)
+    assert 3 <= report.nodes < report.of_nodes / 2
+    with MapStore.open(tmp_path / "out.engram") as store:
+        contents = store.load()
+        partial = store.partial_paths()
+        assert {entry.path for entry in contents.path_entries} == partial
+        for node in contents.nodes:
+            assert len(store.frames.frame(node.id).landmarks) > 0
+
+
+def test_gaps_are_closed_by_bridges_and_no_more_pieces_come(centre, tmp_path):
+    # The evenings hang together through the mornings only.
+    report = sent(centre, tmp_path / "out.engram", "tod", start_h=21.0, window_min=180.0)
+    with MapStore.open(tmp_path / "out.engram") as store:
+        kinds = store.info().edges_of_kind
+    assert set(robots_of(tmp_path / "out.engram")) == {"r2", "r4"}
+    assert kinds["bridge"] == report.bridges >= 1
+    assert report.components == 1
+    # From 15 m to 25 m nothing is there: a robot that drives on finds itself again beyond.
+    whole = steps_of(18.5, 0, 60, 0, day=9)
+    known = [one.node is not None for one in localise_simulated(tmp_path / "out.engram", whole)]
+    assert np.mean(known[8:26]) > 0.9
+    assert np.mean(known[62:]) > 0.9
+
+
+def test_a_budget_is_kept_and_more_of_it_promises_more(centre, tmp_path):
+    whole = sent(centre, tmp_path / "copy.engram", "copy")
+    before = 1.1
+    for percent in (30, 60, 100):
+        out = tmp_path / f"{percent}.engram"
+        budget = whole.size_bytes * percent // 100
+        report = sent(centre, out, "budget", budget_bytes=budget, start_h=9.2)
+        assert out.stat().st_size == report.size_bytes <= budget
+        assert report.expected_missed <= before
+        before = report.expected_missed
+    assert report.nodes == whole.of_nodes
+    small = robots_of(tmp_path / "30.engram")
+    # Nine in the morning: the mornings are worth more than the evenings.
+    assert small.get("r1", 0) + small.get("r3", 0) > 2 * (small.get("r2", 0) + small.get("r4", 0))
+
+
+def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(centre, tmp_path):
+    mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
+    robot = tmp_path / "robot.engram"
+    sent(mine, robot, "tod", start_h=9.0, window_min=60.0)
+    morning = steps_of(9.2, 0, 40, 40, day=7, aside_m=0.4)
+    found = localise_simulated(robot, morning)
+    assert np.mean([one.node is not None for one in found]) > 0.9
+    # At noon the street looks new from 10 m to 30 m.
+    places = np.arange(0, 40, 0.5)
+    appearance = np.where((places < 10) | (places >= 30), 0, 2)
+    noon = drive(WORLD, places, appearance, start_ns=8 * DAY_NS + 12 * HOUR_NS, seed=8)
+    added = map_simulated(robot, noon, "r5", longitude_deg=0.0).saved
+    assert len(added) > 10
+    (report,) = merged(mine, robot)
+    assert (report.revision, report.taken) == (5, len(added))
+    assert report.components == 1
+    assert MapStore.check(mine).problems == ()
+    with MapStore.open(mine) as store:
+        contents = store.load()
+    assert {node.id for node in contents.nodes} >= set(added)
+    assert not any(edge.kind is EdgeKind.BRIDGE for edge in contents.edges)
+    # The next robot that leaves at noon gets it.
+    sent(mine, tmp_path / "next.engram", "tod", start_h=12.0, window_min=30.0)
+    assert node_ids(tmp_path / "next.engram") == set(added)
+
+
+def test_as_of_an_older_revision_or_tag(centre, tmp_path):
+    mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
+    with MapStore.open_for_writing(mine) as store:
+        store.tag("first", 1, author="me")
+    options = DownloadOptions()
+    report = download(mine, tmp_path / "old.engram", options, at="first", progress=silent)
+    assert report.revision == 1
+    assert list(robots_of(tmp_path / "old.engram")) == ["r1"]
+    with pytest.raises(RevisionError, match="'second'"):
+        download(mine, tmp_path / "none.engram", options, at="second", progress=silent)
+
+
+def test_what_was_taken_back_is_not_sent(centre, tmp_path):
+    mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
+    with MapStore.open_for_writing(mine) as store:
+        store.revert(2, author="me")
+    sent(mine, tmp_path / "out.engram", "copy")
+    assert "r2" not in robots_of(tmp_path / "out.engram")
+    assert MapStore.check(tmp_path / "out.engram").problems == ()
+
+
+class TestMistakes:
+    @pytest.mark.parametrize(
+        ("options", "says"),
+        [
+            ({"policy": "best"}, "known: copy, tod"),
+            ({"policy": "tod"}, "needs --start"),
+            ({"policy": "tod+paths"}, "needs --start"),
+            ({"policy": "budget"}, "needs --budget"),
+            ({"policy": "region"}, "needs --near"),
+            ({"policy": "route"}, "needs --route"),
+            ({"policy": "tod", "start_h": 24.0}, "start is 24.0 h"),
+            ({"policy": "tod", "start_h": float("nan")}, "start is nan"),
+            ({"window_min": -1.0}, "window is -1.0 minutes"),
+            ({"epoch_min": 0.0}, "epoch is 0.0 minutes"),
+            ({"best_percent": 101.0}, "best is 101.0 per cent"),
+            ({"budget_bytes": 0}, "budget is 0 bytes"),
+            ({"radius_m": float("inf")}, "radius is inf"),
+        ],
+    )
+    def test_options_that_do_not_fit(self, centre, tmp_path, options, says):
+        policy = options.pop("policy", "copy")
+        with pytest.raises(ConfigError, match=says):
+            sent(centre, tmp_path / "out.engram", policy, **options)
+        assert not (tmp_path / "out.engram").exists()
+
+    @pytest.mark.parametrize(
+        ("options", "says"),
+        [
+            ({"policy": "tod", "start_h": 13.0, "window_min": 30.0}, "no node was saved within 30"),
+            ({"policy": "paths", "start_h": 12.0, "end_h": 13.0}, "no epoch from 12:00 to 13:00"),
+            ({"policy": "region", "near": ("zz",)}, "no UUID"),
+            ({"policy": "region", "near": ("00000000",)}, "begins with"),
+            ({"policy": "route", "route": "00000000"}, "0 sessions begin with"),
+            ({"policy": "budget", "budget_bytes": 5000}, "not one node fits into 5000"),
+        ],
+    )
+    def test_nothing_to_send(self, centre, tmp_path, options, says):
+        with pytest.raises(InputError, match=says):
+            sent(centre, tmp_path / "out.engram", **options)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_places_that_cannot_be_read_or_written(self, centre, tmp_path):
+        (tmp_path / "there.engram").touch()
+        for out, says in (("there.engram", "exists already"), ("no/out.engram", "is no folder")):
+            with pytest.raises(InputError, match=says):
+                sent(centre, tmp_path / out, "copy")
+        with pytest.raises(NotAMapError):
+            sent(tmp_path / "there.engram", tmp_path / "out.engram", "copy")
+        MapStore.create(tmp_path / "empty.engram").close()
+        with pytest.raises(InputError, match="holds no nodes"):
+            sent(tmp_path / "empty.engram", tmp_path / "out.engram", "copy")
+
+    @pytest.mark.parametrize("policy", ["tod", "paths", "tod+paths", "budget"])
+    def test_a_map_without_hours_of_day_says_what_it_lacks(self, tmp_path, policy):
+        timeless = tmp_path / "timeless.engram"
+        map_simulated(timeless, steps_of(9.0, 0, 5, 5, day=1), "r1")
+        with pytest.raises(InputError, match=r"1 of 1 sessions \(r1 .*--longitude or --zone"):
+            sent(timeless, tmp_path / "out.engram", policy, start_h=9.0, budget_bytes=10**6)
+        # Without a time it can be chosen by what promises most.
+        assert sent(timeless, tmp_path / "out.engram", "budget", budget_bytes=10**6).nodes > 0
+
+
+def test_options_are_plain_values():
+    assert dataclasses.asdict(DownloadOptions())["policy"] == "copy"
