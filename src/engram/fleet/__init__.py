@@ -3,7 +3,7 @@
 from engram.fleet.best_order import BestOrder, JudgeOptions, OrderResult, order_costs
 from engram.fleet.building import BuildOptions, BuildReport, build_map
 from engram.fleet.docking import merge_maps
-from engram.fleet.download import DownloadReport, download
+from engram.fleet.downloading import DownloadReport, download
 from engram.fleet.gate import Gate, GateOptions, what_is_worse
 from engram.fleet.group_mapping import GroupResult, GroupTask, map_group
 from engram.fleet.grouping import GROUPINGS, group_drives

@@ -23,7 +23,8 @@ from engram.drive import (
     session_of_drive,
 )
 from engram.experience.clock import hour_of_day
-from engram.fleet.download import DownloadReport, Progress, download
+from engram.fleet.downloading import DownloadReport, download
+from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 

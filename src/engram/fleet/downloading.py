@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +21,11 @@ from engram.errors import ConfigError, InputError
 from engram.experience.model import Edge, PathId, path_id
 from engram.fleet.bridges import close_gaps, components
 from engram.fleet.coverage import expected_missed
+from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
 from engram.fleet.selections import SELECTIONS, Selection, coverage_for
 from engram.fleet.stock import Mask, Stock
 from engram.store import BulkWriter, MapStore, WritableMapStore
-
-Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
 # What a node takes beside its blobs: rows and indices of it, its edges and path entries; measured
 # on maps of `hamlet`. Only where the search for the budget begins: the file itself is measured.
