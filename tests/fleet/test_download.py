@@ -11,12 +11,12 @@ import pytest
 
 from engram.errors import ConfigError, InputError, NotAMapError, RevisionError
 from engram.experience.model import EdgeKind, path_id
-from engram.fleet import DownloadOptions, DownloadReport, download
+from engram.fleet import DownloadOptions, DownloadReport, download, silent
 from engram.store import MapStore
 from mapping_rig import localise_simulated, map_simulated
 from synthetic_world import drive
 
-from .robots import DAY_NS, WORLD, merged, silent
+from .robots import DAY_NS, WORLD, merged
 
 HOUR_NS = 3_600_000_000_000
 # Robot, hour of day, from, to (metres), and up to where the street looks as in the morning: two

@@ -1,4 +1,4 @@
-"""A map of every past format opens for ever; and the page that describes the format is right."""
+"""A map of every format opens for ever; and the page that describes the format is right."""
 
 from __future__ import annotations
 
@@ -87,3 +87,36 @@ def test_the_page_on_the_format_names_every_table_and_column():
         for column in table.columns:
             if column.name not in {"key", "checksum"}:
                 assert f"`{column.name}`" in rows[table.name], f"{table.name}.{column.name}"
+
+
+@pytest.fixture
+def second(tmp_path):
+    """Format 2: two drives, one taken back and mapped again; a tag; the words of one node."""
+    return shutil.copy(DATA / "format-2.engram", tmp_path / "second.engram")
+
+
+def test_format_2_reads_as_it_was_written(second):
+    drives = (session("robot-1"), session("robot-2"))
+    counts = {1: (3, 0), 2: (3, 3), 3: (3, 0), 4: (3, 4)}
+    for at, (first, other) in counts.items():
+        with MapStore.open(second, at=at) as store:
+            expected = [node(drives[0], index) for index in range(first)]
+            expected += [node(drives[1], index) for index in range(other)]
+            assert set(store.load().nodes) == set(expected)
+            assert len(store.load().path_entries) == len(expected)
+    with MapStore.open(second, at="both") as store:
+        assert store.revision == 2
+        assert store.tags()["both"].message == "two drives"
+        (found,) = store.words(bytes(16)).items()
+        assert found[0] == node(drives[1], 0).id
+        np.testing.assert_array_equal(found[1], [1, 5, 9])
+    assert MapStore.check(second).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [(2, "c9d498a5dce9f96aee4ff70849091cb5"), (4, "9f56160275237e470163fb0528ea3502")],
+)
+def test_format_2_keeps_its_content_hash(second, at, expected):
+    with MapStore.open(second, at=at) as store:
+        assert store.content_hash() == expected

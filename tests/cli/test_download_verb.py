@@ -1,0 +1,72 @@
+"""`engram download` as its users meet it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from engram.drive import MapOptions, Settings, map_drive, open_drive
+
+KEYS = {
+    "out", "policy", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",
+    "partial_paths", "edges", "bridges", "components", "size_bytes", "of_bytes", "why",
+    "expected_missed", "copy_missed", "check",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("fleet") / "centre.engram"
+    sequence = open_drive(street, start="2026-03-01T09:30:00", longitude_deg=0.0)
+    map_drive(path, sequence, Settings(), MapOptions())
+    return path
+
+
+def test_it_writes_a_map_and_says_what_it_promises(engram, centre: Path, tmp_path: Path) -> None:
+    out = tmp_path / "r1.engram"
+    told = engram("download", centre, out, "--policy", "tod", "--start", "9:00", "--json").json
+    assert set(told) == KEYS
+    assert told["nodes"] == told["of_nodes"] > 0
+    assert engram("info", out, "--json").json["content_hash"] == told["content_hash"]
+    text = engram("download", centre, tmp_path / "r2.engram", "--policy", "copy").out
+    assert "expected share of the way without a match" in text
+
+
+def test_a_promise_is_held_against_a_drive(
+    engram, centre: Path, street: Path, tmp_path: Path
+) -> None:
+    asked = ("--policy", "tod", "--start", "9:00", "--window", 700, "--check", street)
+    (mine, whole) = engram("download", centre, tmp_path / "a.engram", *asked, "--json").json[
+        "check"
+    ]
+    assert (mine["name"], whole["name"]) == ("tod", "copy")
+    # The very drive of which the map was made.
+    assert mine["missed"] == whole["missed"] == 0.0
+    assert 0.0 <= mine["expected_missed"] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--policy", "best"), "known: copy, tod"),
+        (("--policy", "tod"), "needs --start"),
+        (("--policy", "tod", "--start", "25:00"), "start is '25:00'"),
+        (("--policy", "tod", "--start", "9h"), "start is '9h'"),
+        (("--policy", "tod", "--start", "21:00"), "widen the --window"),
+        (("--policy", "paths", "--start", "3:00", "--end", "4:00"), "there is some from 9:00"),
+        (("--policy", "budget", "--budget", "much"), "budget is 'much'"),
+        (("--policy", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
+        (("--policy", "region", "--near", "xyz"), "no UUID"),
+        (("--policy", "route", "--route", "00"), "0 sessions begin with '00'"),
+        (("--at", "summer"), "it has no tags"),
+    ],
+)
+def test_mistakes_end_in_one_clear_line(
+    engram, centre: Path, tmp_path: Path, arguments, says: str
+) -> None:
+    ran = engram("download", centre, tmp_path / "out.engram", *arguments)
+    assert ran.status == 2
+    assert ran.err.startswith("engram: ")
+    assert says in ran.err
+    assert list(tmp_path.iterdir()) == []
