@@ -34,6 +34,9 @@ def vocabulary(
     words: Annotated[int, typer.Option("--words", help="How many words to find.")] = 10_000,
     seed: Annotated[int, typer.Option("--seed", help="Of all that is drawn at random.")] = 0,
     author: Annotated[str, typer.Option("--author", help="Kept in the map's history.")] = "unknown",
+    at: Annotated[
+        str | None, typer.Option("--at", metavar="REV|TAG", help="show: as of this revision.")
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Train the visual words by which lost robots are found in a map, or take another map's.
@@ -54,7 +57,7 @@ def vocabulary(
     from engram.places import TrainingConfig
 
     if action is VocabularyAction.SHOW:
-        report = describe_vocabulary(map_path)
+        report = describe_vocabulary(map_path, at)
     else:
         steps: tuple[str, ...] = ("read", "cluster", "quantise", "relate", "words")
         if action is VocabularyAction.USE:

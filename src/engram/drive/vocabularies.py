@@ -71,13 +71,17 @@ class VocabularyReport:
         )
 
 
-def describe_vocabulary(map_path: Path) -> VocabularyReport:
+def describe_vocabulary(map_path: Path, at: int | str | None = None) -> VocabularyReport:
     """The vocabulary by which robots find themselves in a map.
 
+    Args:
+        map_path: the map.
+        at: number or tag of its revision; None for the newest.
+
     Raises:
-        MapError: the map cannot be read.
+        MapError: the map cannot be read, or has no such revision.
     """
-    with OpenMap(MapStore.open(map_path)) as opened:
+    with OpenMap(MapStore.open(map_path, at=at)) as opened:
         own = opened.vocabulary
         kind = opened.descriptor or DescriptorKind.BRIEF
         return _report(own or default_vocabulary(kind), default=own is None)
