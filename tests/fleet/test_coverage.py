@@ -154,22 +154,22 @@ def test_a_mission_asks_for_the_map_of_its_own_hour(stock):
         coverage = coverage_for(stock, DownloadOptions(start_h=hour))
         missed = {robot: expected_missed(coverage, robots == robot) for robot in ("r1", "r2")}
         other = "r2" if own == "r1" else "r1"
-        assert missed[own] < 0.3 < missed[other]
+        assert missed[own] + 0.2 < missed[other]
         everything = expected_missed(coverage, stock.everything())
         assert everything <= missed[own]
         order = greedy_order(coverage, np.ones(len(stock)), np.arange(len(stock)))
-        assert np.mean(robots[order[:10]] == own) > 0.8
+        assert np.mean(robots[order[:10]] == own) >= 0.8
 
 
 def test_elsewhere_asks_for_nothing(stock):
-    where = np.zeros(len(stock), bool)
-    where[:5] = True
+    """Every drive began at 0 m of the street: the distance driven is the place."""
+    driven_m = np.array([node.driven_m for node in stock.nodes])
+    where, far = driven_m < 5, driven_m > 20
     near = Coverage(stock, Demand.of(stock, DownloadOptions(), where))
     anywhere = coverage_for(stock, DownloadOptions())
-    assert near.demand.total < anywhere.demand.total / 3
-    assert expected_missed(near, where) == pytest.approx(
-        expected_missed(near, where | (np.arange(len(stock)) % 9 == 8)), abs=0.2
-    )
+    assert 0 < near.demand.total < anywhere.demand.total / 3
+    assert expected_missed(near, far) == 1.0
+    assert expected_missed(near, where | far) == expected_missed(near, where) < 0.9
 
 
 def test_nobody_anywhere_is_all_missed():

@@ -127,14 +127,14 @@ def _check(
     config: Path | None,
 ) -> list[dict[str, Any]]:
     """What such downloads promised held-out drives, and what came of it."""
-    from dataclasses import asdict, replace
+    from dataclasses import asdict
     from functools import partial
 
     from engram.cli.progress import progress
     from engram.drive import LocaliseOptions, load_settings, open_drive
     from engram.fleet import DownloadOptions, summarise_trials, try_downloads
 
-    wanted = {asked.policy: replace(asked, start_h=None, end_h=None), "copy": DownloadOptions()}
+    wanted = {asked.policy: asked, "copy": DownloadOptions()}
     trials = try_downloads(
         centre,
         wanted,

@@ -229,7 +229,7 @@ def _begin(draft: WritableMapStore, stock: Stock, options: DownloadOptions) -> B
         configuration={
             "download": {
                 **to_dict(options),
-                "source": stock.store.content_hash(),
+                "source": stock.content_hash,
                 "revision": newest.number,
             }
         },
@@ -335,7 +335,7 @@ def _report(stock: Stock, done: _Sent, out: Path, options: DownloadOptions) -> D
         out=out,
         policy=options.policy,
         revision=stock.store.revision,
-        source_hash=stock.store.content_hash(),
+        source_hash=stock.content_hash,
         content_hash=content_hash,
         nodes=info.nodes,
         of_nodes=len(stock),

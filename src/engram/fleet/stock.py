@@ -64,6 +64,11 @@ class Stock:
         return np.ones(len(self), np.bool_)
 
     @cached_property
+    def content_hash(self) -> str:
+        """Of the centre at this revision."""
+        return self.store.content_hash()
+
+    @cached_property
     def node_ids(self) -> list[NodeId]:
         """UUIDs of `nodes`."""
         return [node.id for node in self.nodes]

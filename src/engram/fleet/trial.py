@@ -110,7 +110,7 @@ def try_downloads(
 
     Args:
         centre: the map.
-        wanted: options by name; where they name no start, that of the drive takes its place.
+        wanted: options by name; the drive's hour of day, where it is known, stands for theirs.
         drives: open a held-out drive each.
         settings: of the localiser.
         localise: policy and budget.
@@ -127,7 +127,7 @@ def try_downloads(
             session = session_of_drive(open_drive())
             hour = hour_of_day(session, session.start_ns)
             for number, (name, asked) in enumerate(wanted.items()):
-                options = replace(asked, start_h=hour) if asked.start_h is None else asked
+                options = asked if hour is None else replace(asked, start_h=hour, end_h=hour)
                 out = Path(folder) / f"{session.id}-{number}.engram"
                 report = download(centre, out, options, at=at, progress=progress)
                 results = _localised(out, open_drive(), settings, localise, progress)
