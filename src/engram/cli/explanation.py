@@ -80,13 +80,13 @@ def _print(found: Explanation, top: int) -> None:
     names = list(found.candidates[0].terms)
     chance = "chance  " if found.candidates[0].chance is not None else ""
     head = "".join(f"{name:>{_width(name)}}" for name in names)
-    typer.echo(f"   # node     {'drive':28s} {'ahead':>7s}{'aside':>7s}{'yaw':>6s}{'g':>6s}  "
+    typer.echo(f"   # node     {'drive':34s} {'ahead':>7s}{'aside':>7s}{'yaw':>6s}{'g':>6s}  "
                f"{chance}{head}  outcome")  # fmt: skip
     for place, one in enumerate(found.candidates[:top], 1):
         terms = "".join(f"{value:>{_width(name)}.2f}" for name, value in one.terms.items())
         reckoned = "" if one.chance is None else f"{one.chance:6.1%}  "
         typer.echo(
-            f"{place:4d} {str(one.node)[:8]} {one.drive:28.28s} {one.along_m:+7.2f}"
+            f"{place:4d} {str(one.node)[:8]} {one.drive:34.34s} {one.along_m:+7.2f}"
             f"{one.across_m:+7.2f}{57.29578 * one.yaw_rad:+6.0f}{one.success_rate:6.2f}  "
             f"{reckoned}{terms}  {_outcome(one.would_match, one.inliers, one.attempted)}"
         )
