@@ -23,7 +23,7 @@ from engram.frontend import DescriptorKind
 from engram.measures import Drive
 from engram.store import MapStore
 
-from .robots import OPTIONS, merged, robot_map
+from .robots import OPTIONS, frame_log, merged, robot_map
 
 HOUR_NS = 3_600_000_000_000
 
@@ -232,6 +232,12 @@ class TestGate:
             merged(centre, fleet["longer"][0], require_better=[tmp_path / "held-out"])
         assert hash_of(centre) == before
         assert MapStore.check(centre).problems == ()
+
+
+def test_a_merge_that_serves_held_out_drives_passes_the_gate(tmp_path, centre, fleet):
+    held_out = frame_log(tmp_path / "held-out.framelog", np.arange(12, 36, 0.8), 0, day=8)
+    (report,) = merged(centre, fleet["longer"][0], require_better=[held_out])
+    assert report.revision == 2
 
 
 def test_ctrl_c_ends_a_merge_between_two_nodes_and_the_next_one_completes_it(

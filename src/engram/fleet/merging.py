@@ -32,10 +32,14 @@ from engram.fleet.positions import recomposed, uncertainty_m2
 from engram.fleet.replay import MergeOptions, Replay
 from engram.fleet.report import MergeReport
 from engram.fleet.segments import Segment, string_segments
+from engram.fleet.words import keep_words
 from engram.localiser import Position
+from engram.places import RECOGNISERS
 from engram.store import BulkWriter, WritableMapStore
 
 Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
+# Relocalisers that know places by their words.
+_BY_WORDS = frozenset(RECOGNISERS)
 Gate: TypeAlias = Callable[[WritableMapStore], None]
 
 
@@ -84,6 +88,8 @@ def merge_map(
                 writer.flush()
                 gate(store)
             report.revision = writer.commit().number
+        if options.relocaliser in _BY_WORDS:
+            keep_words(store, centre, robot, settings.frontend.descriptor)
     if report.taken and not report.omitted and centre_nodes and not report.known:
         report.notes.append(
             "no node of it was found in the centre: another town, or another look of this one"

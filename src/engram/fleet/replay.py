@@ -180,8 +180,8 @@ class Replay:
         self, localiser: Localiser, node: NodeId, frame: Frame, odometry: OdometryStep
     ) -> Localisation:
         """One frame; where the robot itself measured how it lies to a known node, from there."""
-        known = self._known_neighbour(node, _MEASURED) if self._run else None
-        if known is None or self._centre.graph.index(known.node) in self._run:
+        known = self._known_neighbour(node, _MEASURED, self._run[0]) if self._run else None
+        if known is None:
             return localiser.localise(frame, odometry)
         localiser.carry_on(odometry)
         localiser.start_at(known)
@@ -207,12 +207,23 @@ class Replay:
                 )
         return None
 
-    def _known_neighbour(self, node: NodeId, kinds: frozenset[EdgeKind]) -> Position | None:
-        """Where a node is, by the surest of its edges to nodes that the centre knows."""
+    def _known_neighbour(
+        self, node: NodeId, kinds: frozenset[EdgeKind], before: int | None = None
+    ) -> Position | None:
+        """Where a node is, by the surest of its edges to nodes that the centre knows.
+
+        Args:
+            node: of the robot's map.
+            kinds: of the edges that count.
+            before: nodes from this dense index on do not count: those of the run being taken,
+                which say no more than odometry does.
+        """
         found = []
         for edge in self._robot.edges_of.get(node, ()):
             other = self._centre.equivalent(edge.b if edge.a == node else edge.a)
-            if other is not None and edge.kind in kinds:
+            if other is None or edge.kind not in kinds:
+                continue
+            if before is None or self._centre.graph.index(other.node) < before:
                 found.append(beyond(other, edge, node))
         return min(found, key=lambda one: uncertainty_m2(one.covariance), default=None)
 

@@ -1,0 +1,44 @@
+"""`engram merge` and `engram build` as they are typed."""
+
+from __future__ import annotations
+
+import pytest
+
+
+@pytest.fixture
+def robot(engram, street, tmp_path):
+    """A robot's map of the street."""
+    path = tmp_path / "r1.engram"
+    assert engram("map", path, street, "--robot", "r1").status == 0
+    return path
+
+
+def test_merge_hands_in_a_map_once(engram, robot, tmp_path):
+    centre = tmp_path / "centre.engram"
+    tried = engram("merge", centre, robot, "--dry-run", "--json").json["merges"][0]
+    assert not centre.exists()
+    done = engram("merge", centre, robot, "--json").json["merges"][0]
+    assert done["revision"] == 1
+    assert done["taken"] > 0
+    assert done["content_hash"] == tried["content_hash"]
+    again = engram("merge", centre, robot)
+    assert again.status == 0
+    assert "nothing new" in again.out
+    assert engram("check", centre).status == 0
+
+
+def test_merge_refuses_what_is_no_map(engram, robot, tmp_path):
+    refused = engram("merge", robot, tmp_path / "nothing.engram", "--json")
+    assert refused.status == 2
+    assert refused.json["error"]["kind"] == "NotAMapError"
+
+
+def test_build_maps_and_merges(engram, street, tmp_path):
+    town = tmp_path / "town.engram"
+    built = engram("build", town, street, "--groups", 1, "--workers", 1, "--json")
+    assert built.status == 0
+    assert built.json["groups"] == [["street"]]
+    assert built.json["mapped"][0]["sessions"][0]["nodes_saved"] > 0
+    refused = engram("build", town, street, "--groups", 3)
+    assert refused.status == 2
+    assert "must be 1 to 1" in refused.err
