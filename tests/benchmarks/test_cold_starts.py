@@ -44,7 +44,7 @@ def test_known_looks_are_found_and_unknown_ones_are_not_possible(
     assert all(one.status == "found" and one.error_m < 0.5 for one in by_drive["000"])
     assert {one.status for one in by_drive["002"]} == {"impossible"}
     count = len(by_drive["000"])
-    assert count > 5
+    assert count >= 5
     assert f"{count} of {count} (100.00 %)" in told
     assert "1 found among the nodes near by truth, 1 among all nodes" in told
     assert file.with_suffix(".txt").read_text() == told

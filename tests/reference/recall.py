@@ -39,8 +39,12 @@ def lessons(graph, viewers: int, attempts, savers) -> tuple[np.ndarray, np.ndarr
     return rates, seen, base
 
 
-def order(context, table, c, viewer_hours) -> list[int]:
-    """Rows best first. `table` is of `lessons`, `c` the constants."""
+def order(context, table, c, viewer_hours, choose=lambda odds, left: np.argmax(odds)) -> list[int]:
+    """Rows best first. `table` is of `lessons`, `c` the constants.
+
+    `choose` takes the log odds of the rows that are left, and the rows, and gives the place of the
+    one to pick.
+    """
     rates, seen, base = table
     near, run, graph = context.neighbourhood, context.run, context.graph
     g = context.success_rates()
@@ -86,9 +90,9 @@ def order(context, table, c, viewer_hours) -> list[int]:
             if context.hour is not None:
                 odds += c.hour * hours_apart(hours[row], context.hour)
             chances.append(odds)
-        best = left.pop(int(np.argmax(chances)))
+        best = left.pop(int(choose(chances, left)))
         picked.append(best)
-        if len(picked) > PICKS:
+        if len(picked) >= PICKS:
             continue
         node, rate = near.nodes[best], min(g[best], 1 - 1e-3)
         for viewer in range(len(weights)):
