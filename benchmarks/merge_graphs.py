@@ -32,7 +32,6 @@ import numpy as np
 
 from engram.drive import OpenMap, Settings
 from engram.experience.model import (
-    Clock,
     Edge,
     EdgeKind,
     Node,
@@ -40,17 +39,13 @@ from engram.experience.model import (
     PathEntry,
     PathEntryKind,
     Session,
-    node_id,
     path_id,
-    session_id,
 )
 from engram.fleet import MergeOptions, MergeReport, merge_maps
-from engram.frontend import DescriptorKind, FrameStatus
-from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
-from engram.geometry import SE3, StereoCamera
-from engram.store import MapStore, StoredNode, encode_landmarks
+from engram.geometry import SE3
+from engram.store import MapStore
+from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_bytes, node_of, stored
 
-CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
 OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")
 PLACES, APPEARANCES, LANDMARKS = 16, 2, 70
 SIGMA = np.diag([0.02**2] * 3 + [0.003**2] * 3)
@@ -81,40 +76,23 @@ class RandomMap:
 @cache
 def blob_of(place: int, appearance: int, look: int) -> bytes:
     """The landmarks of a place in an appearance, in the pixels and bits of one look at it."""
-    own = np.random.default_rng([place, appearance])
-    depth = own.uniform(4, 30, LANDMARKS)
-    pixels = own.uniform([10, 10], [630, 470], (LANDMARKS, 2))
-    descriptors = own.integers(0, 256, (LANDMARKS, 32), dtype=np.uint8)
-    noise = np.random.default_rng([place, appearance, look])
-    pixels = pixels + noise.normal(0, 0.3, pixels.shape)
-    descriptors = descriptors ^ np.packbits(noise.random((LANDMARKS, 256)) < 0.05, axis=1)
-    codes = quantise(
-        pixels.astype(np.float32),
-        (CAMERA.focal_baseline / depth).astype(np.float32),
-        np.full(LANDMARKS, 0.15, np.float32),
-        pixel_quantum(CAMERA.width, CAMERA.height),
+    return landmark_bytes(
+        np.random.default_rng([place, appearance]),
+        np.random.default_rng([place, appearance, look]),
+        LANDMARKS,
     )
-    octaves = np.zeros(LANDMARKS, np.uint8)
-    return encode_landmarks(landmarks_from_codes(codes, descriptors, octaves, CAMERA), CAMERA)
 
 
 def add_drive(made: RandomMap, number: int, rng: random.Random) -> None:
     """One drive past a stretch of the road, saved here and there."""
     start_ns = 1_000_000_000 * (number + 1)
-    name = f"r{rng.randrange(3)}"
-    drive = Session(
-        session_id(name, CAMERA.id, start_ns, str(number)),
-        name,
-        CAMERA.id,
-        start_ns,
-        Clock.RELATIVE,
-    )
+    drive = drive_of(f"r{rng.randrange(3)}", start_ns, str(number))
     made.sessions.append(drive)
     first, appearance = rng.randrange(PLACES), rng.randrange(APPEARANCES)
     own: list[NodeId] = []
     for at in range(rng.randrange(0, 8)):
         stamp_ns = start_ns + at * 1_000_000
-        node = Node(node_id(drive.id, stamp_ns), drive.id, stamp_ns, CAMERA.id, float(at))
+        node = node_of(drive, stamp_ns, float(at))
         made.nodes[node.id] = (node, first + at, appearance)
         if own and rng.random() < 0.85:
             add_edge(made, rng.choice([own[-1], own[-1], rng.choice(own)]), node.id, "odometry")
@@ -159,22 +137,10 @@ def write(made: RandomMap, path: Path, order: int) -> None:
         about = {"author": "robot", "message": "", "configuration": {}}
         with store.begin_revision(**about) as writer:
             for one in shuffled(made.sessions, rng):
-                writer.add_session(
-                    one, CAMERA, descriptor=DescriptorKind.BRIEF, frontend="synthetic"
-                )
+                writer.add_session(one, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND)
             for node, place, appearance in shuffled(made.nodes.values(), rng):
                 blob = blob_of(place, appearance, node.stamp_ns % 1_000_003)
-                writer.add_node(
-                    StoredNode(
-                        node,
-                        DescriptorKind.BRIEF,
-                        "synthetic",
-                        FrameStatus.OK,
-                        blob[:16],
-                        blob,
-                        None,
-                    )
-                )
+                writer.add_node(stored(node, blob))
             for edge in shuffled(made.edges.values(), rng):
                 writer.add_edge(edge)
             for entry in shuffled(made.entries, rng):

@@ -23,25 +23,12 @@ from pathlib import Path
 import numpy as np
 
 from engram.drive import Settings
-from engram.experience.model import (
-    Clock,
-    Edge,
-    EdgeKind,
-    Node,
-    PathEntry,
-    PathEntryKind,
-    Session,
-    node_id,
-    path_id,
-    session_id,
-)
+from engram.experience.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
 from engram.fleet import MergeOptions, merge_maps
-from engram.frontend import DescriptorKind, FrameStatus
-from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
-from engram.geometry import SE3, StereoCamera
-from engram.store import BulkWriter, MapStore, StoredNode, encode_landmarks
+from engram.geometry import SE3
+from engram.store import BulkWriter, MapStore
+from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_bytes, node_of, stored
 
-CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
 SESSION_NODES = 500
 LANDMARKS = 100
 STEP = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
@@ -49,44 +36,19 @@ SIGMA = np.diag([0.01**2] * 3 + [0.002**2] * 3)
 GIB = 2**30
 
 
-def frame_bytes(place: int, rng: np.random.Generator | None) -> bytes:
-    """The landmarks of a place; seen by somebody else, in other pixels and bits."""
-    own = np.random.default_rng(place)
-    depth = own.uniform(4, 30, LANDMARKS)
-    pixels = own.uniform([10, 10], [630, 470], (LANDMARKS, 2))
-    descriptors = own.integers(0, 256, (LANDMARKS, 32), dtype=np.uint8)
-    if rng is not None:
-        pixels = pixels + rng.normal(0, 0.3, pixels.shape)
-        descriptors = descriptors ^ np.packbits(rng.random((LANDMARKS, 256)) < 0.05, axis=1)
-    codes = quantise(
-        pixels.astype(np.float32),
-        (CAMERA.focal_baseline / depth).astype(np.float32),
-        np.full(LANDMARKS, 0.15, np.float32),
-        pixel_quantum(CAMERA.width, CAMERA.height),
-    )
-    octaves = np.zeros(LANDMARKS, np.uint8)
-    return encode_landmarks(landmarks_from_codes(codes, descriptors, octaves, CAMERA), CAMERA)
-
-
 def write_session(
     writer: BulkWriter, robot: str, number: int, places: range, rng: np.random.Generator | None
 ) -> None:
     """One drive past some places, saved whole."""
     start_ns = 1_000_000_000_000 * (number + 1)
-    drive = Session(
-        session_id(robot, CAMERA.id, start_ns, ""), robot, CAMERA.id, start_ns, Clock.RELATIVE
-    )
-    writer.add_session(drive, CAMERA, descriptor=DescriptorKind.BRIEF, frontend="synthetic")
+    drive = drive_of(robot, start_ns)
+    writer.add_session(drive, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND)
     before: Node | None = None
     for at, place in enumerate(places):
         stamp_ns = start_ns + at * 100_000_000
-        node = Node(node_id(drive.id, stamp_ns), drive.id, stamp_ns, CAMERA.id, float(at))
-        blob = frame_bytes(place, rng)
-        writer.add_node(
-            StoredNode(
-                node, DescriptorKind.BRIEF, "synthetic", FrameStatus.OK, blob[:16], blob, None
-            )
-        )
+        node = node_of(drive, stamp_ns, float(at))
+        blob = landmark_bytes(np.random.default_rng(place), rng, LANDMARKS)
+        writer.add_node(stored(node, blob))
         if before is not None:
             writer.add_edge(Edge(before.id, node.id, EdgeKind.ODOMETRY, STEP, SIGMA))
         entry = PathEntry(path_id(drive.id), at, node.id, PathEntryKind.SAVED, stamp_ns)

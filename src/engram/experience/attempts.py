@@ -91,9 +91,10 @@ class AttemptColumns:
 
 
 class AttemptLog:
-    """The attempts of one session, thinned: of each iteration all successes and at most the 16
-    nearest failures (SPEC §3.5).
-    """  # noqa: D205  one sentence, two lines
+    """The attempts of one session, thinned (SPEC §3.5).
+
+    Of each iteration all successes are kept and at most the 16 nearest failures.
+    """
 
     def __init__(self) -> None:
         self._kept: list[Attempt] = []

@@ -141,9 +141,12 @@ class _Search:
         )
 
     def candidates(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-        """Pairs of sent nodes: a spanning tree over the gaps, and for each node the surest one to
-        every other piece of an experience.
-        """  # noqa: D205  one sentence, two lines
+        """Pairs of sent nodes that a bridge may join.
+
+        Returns:
+            A spanning tree over the gaps; and for each node the surest pair to every other piece
+            of an experience.
+        """
         steps, through = self._steps, self._through
         self._border: dict[tuple[int, int], tuple[float, int]] = {}
         for at in np.flatnonzero(through):

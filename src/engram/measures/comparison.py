@@ -15,9 +15,10 @@ _LONGEST_GAP_RATIO = 1.5
 
 
 def beats(a: Sequence[Drive], b: Sequence[Drive]) -> bool:
-    """Whether A beats B: its failure curve is nowhere above B's up to 20 m, and its longest gap is
-    at most 1.5 times B's. Equal results beat each other.
-    """  # noqa: D205  one sentence, two lines
+    """Whether A beats B (SPEC §8); equal results beat each other.
+
+    A's failure curve is nowhere above B's up to 20 m, and its longest gap is at most 1.5 times B's.
+    """
     at_m = np.arange(0.0, _UP_TO_M + _STEP_M / 2, _STEP_M)
     # Sums of the same gaps in another order differ in the last bits.
     below = failure_curve(a, at_m) <= failure_curve(b, at_m) + 1e-12

@@ -18,7 +18,6 @@ from sqlalchemy import (
     Select,
     Table,
     create_engine,
-    delete,
     event,
     insert,
     inspect,
@@ -41,13 +40,13 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.store.lock import Holder
+from engram.store.raising import raise_tables
 from engram.store.rows import sealed
 from engram.store.schema import (
     FORMAT_VERSION,
     map_format,
     metadata,
     missing_in,
-    rebuilt_from,
 )
 
 # The first half of the advisory lock's key says that it is ours, the second which map.
@@ -147,7 +146,7 @@ class PostgresDatabase:
             self._engine.dispose()
             self._engine = _engine(self._url, self._schema)
             with self.writing() as connection:
-                _raise_tables(connection, self.format_version)
+                raise_tables(connection, self.format_version, _free_names)
         if self.format_version < FORMAT_VERSION:
             self._engine.dispose()
             self._engine = _engine(self._url, self._schema)
@@ -283,25 +282,14 @@ def _show_missing_tables(engine: Engine, version: int) -> None:
         connection.commit()
 
 
-def _raise_tables(connection: Connection, version: int) -> None:
-    for table in missing_in(version):
-        connection.execute(CreateTable(table))
-    for table in rebuilt_from(version):
-        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO older"))
-        # Constraints keep their names, which the new table needs.
-        names = connection.execute(
-            text("SELECT conname FROM pg_constraint WHERE conrelid = 'older'::regclass")
-        )
-        for name in names.scalars().all():
-            connection.execute(text(f'ALTER TABLE older RENAME CONSTRAINT "{name}" TO "o_{name}"'))
-        connection.execute(CreateTable(table))
-        columns = ", ".join(table.columns.keys())
-        copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
-        connection.execute(text(copied))
-        connection.execute(text("DROP TABLE older"))
-    connection.execute(delete(map_format))
-    row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
-    connection.execute(insert(map_format), sealed(map_format, row))
+def _free_names(connection: Connection, renamed: str) -> None:
+    """Constraints keep their names when their table is renamed; the new table needs them."""
+    names = connection.execute(
+        text("SELECT conname FROM pg_constraint WHERE conrelid = CAST(:table AS regclass)"),
+        {"table": renamed},
+    )
+    for name in names.scalars().all():
+        connection.execute(text(f'ALTER TABLE {renamed} RENAME CONSTRAINT "{name}" TO "o_{name}"'))
 
 
 def _map_number(schema: str) -> int:

@@ -24,7 +24,6 @@ from sqlalchemy import (
     Select,
     Table,
     create_engine,
-    delete,
     event,
     insert,
     text,
@@ -47,13 +46,13 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.store.lock import Holder, WriterLock, current_holder
+from engram.store.raising import raise_tables
 from engram.store.rows import sealed
 from engram.store.schema import (
     FORMAT_VERSION,
     map_format,
     metadata,
     missing_in,
-    rebuilt_from,
 )
 
 # "EGRM": tells `file` and other programs that this SQLite file is a map.
@@ -246,7 +245,8 @@ class SqliteDatabase:
         """Bring an older map to the newest format: all of it, in one transaction."""
         if _format_version(self.path) < FORMAT_VERSION:
             with self.writing() as connection:
-                _raise_tables(connection, self.format_version)
+                raise_tables(connection, self.format_version, _free_no_names)
+                connection.execute(text(f"PRAGMA user_version={FORMAT_VERSION}"))
         if self.format_version < FORMAT_VERSION:
             self.format_version = FORMAT_VERSION
             self._end_readers()
@@ -258,20 +258,8 @@ def _definition(table: Table) -> str:
     return str(CreateTable(table).compile(dialect=sqlite_dialect.dialect())).strip()
 
 
-def _raise_tables(connection: Connection, version: int) -> None:
-    for table in missing_in(version):
-        connection.execute(CreateTable(table))
-    for table in rebuilt_from(version):
-        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO older"))
-        connection.execute(CreateTable(table))
-        columns = ", ".join(table.columns.keys())
-        copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
-        connection.execute(text(copied))
-        connection.execute(text("DROP TABLE older"))
-    connection.execute(delete(map_format))
-    row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
-    connection.execute(insert(map_format), sealed(map_format, row))
-    connection.execute(text(f"PRAGMA user_version={FORMAT_VERSION}"))
+def _free_no_names(connection: Connection, renamed: str) -> None:
+    """SQLite's constraints have no names that could clash."""
 
 
 def _uri(path: Path, options: str) -> str:
