@@ -6,9 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import hypothesis
 import pytest
 
 from engram.bench.data import synthetic_drive
+
+# A busy machine is no failure: no test has a time limit.
+hypothesis.settings.register_profile("engram", deadline=None, print_blob=True)
+hypothesis.settings.load_profile("engram")
 
 
 @pytest.fixture(scope="session", autouse=True)

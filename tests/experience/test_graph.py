@@ -50,7 +50,7 @@ def random_graph(seed: int, nodes: int = 60, extra: int = 60) -> ExperienceGraph
 
 
 @given(st.integers(0, 2**31), st.floats(2, 12), st.floats(0.3, 3.2), st.floats(0, 6))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_neighbourhood_equals_plain_python(seed, radius_m, gate_rad, margin_m) -> None:
     graph = random_graph(seed)
     rng = np.random.default_rng(seed)
@@ -77,7 +77,7 @@ def test_neighbourhood_equals_plain_python(seed, radius_m, gate_rad, margin_m) -
 
 
 @given(st.integers(0, 2**31))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_chains_equal_plain_python(seed) -> None:
     graph = random_graph(seed, nodes=30, extra=20)
     tree = graph.chains_from(3)
@@ -94,7 +94,7 @@ def test_chains_equal_plain_python(seed) -> None:
 
 
 @given(st.integers(0, 2**31), st.lists(st.integers(0, 29), min_size=1, max_size=6))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_search_with_goals_is_the_beginning_of_the_whole_search(seed, goals) -> None:
     graph = random_graph(seed, nodes=30, extra=20)
     whole, cut = graph.chains_from(3), graph.chains_from(3, goals=goals)

@@ -41,7 +41,7 @@ def test_mutual_information_is_that_of_the_entropies() -> None:
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_tree_has_the_greatest_information_of_all_trees(seed: int) -> None:
     images = drawn_images(seed)
     shown = table(images, 14)

@@ -37,7 +37,7 @@ def by_the_book(config: FabMapConfig, query: np.ndarray, place: np.ndarray) -> f
     st.sampled_from([DetectorModel(), DetectorModel(0.8, 0.05), DetectorModel(0.6, 0.0)]),
     st.booleans(),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_likelihoods_are_those_of_the_published_equations(seed, detector, naive) -> None:
     rng = np.random.default_rng(seed)
     config = FabMapConfig(detector, naive_bayes=naive)

@@ -9,7 +9,7 @@ from engram import _core
 
 
 @given(st.integers(0, 10_000), st.integers(1, 700))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_sums_are_those_of_the_dense_table(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     # Words from common to so rare that gaps take several bytes.
@@ -24,7 +24,6 @@ def test_sums_are_those_of_the_dense_table(seed: int, count: int) -> None:
 
 
 @given(st.lists(st.integers(-5, 5), max_size=60), st.integers(0, 70))
-@settings(deadline=None)
 def test_the_best_come_in_order_and_ties_by_number(scores: list[int], most: int) -> None:
     found = _core.best_scores(np.array(scores, float), most)
     order = sorted(range(len(scores)), key=lambda i: (-scores[i], i))

@@ -41,7 +41,7 @@ def test_groups_that_lie_apart_do_not_share_a_word() -> None:
 
 
 @given(st.integers(0, 10_000), st.integers(1, 40))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_k_majority_ends_where_neither_half_step_changes_anything(seed: int, k: int) -> None:
     descriptors = np.random.default_rng(seed).integers(0, 256, (80, 32), dtype=np.uint8)
     centres, part = _core.k_majority(descriptors, k, 1000, seed)

@@ -64,7 +64,7 @@ def test_the_hash_tells_vocabularies_apart() -> None:
 
 
 @given(st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_damage_is_refused_or_harmless(data) -> None:
     damaged = bytearray(BODY)
     for _ in range(data.draw(st.integers(1, 4))):

@@ -65,7 +65,7 @@ def situations(draw):
 
 
 @given(situations())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_posterior_equals_the_equations_in_exact_fractions(situation) -> None:
     nodes, paths, candidates, observed, outcomes, reference = situation
     sets = [set(path) for path in paths]
@@ -148,7 +148,7 @@ def test_scores_equal_numpy_for_any_number_of_observations(count: int) -> None:
 
 
 @given(st.data())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_what_is_kept_from_frame_to_frame_changes_no_score(data) -> None:
     """W and the paths change a little from call to call, as on a drive; now and then a lot."""
     nodes, paths = 40, 70

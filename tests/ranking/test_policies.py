@@ -75,14 +75,14 @@ class TestContract:
         assert policy_named(name).name == name
 
     @given(context=contexts())
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     def test_ranking_is_a_permutation_of_the_rows(self, name: str, context) -> None:
         order = policy_named(name).rank(context)
         assert order.dtype == np.int64
         assert sorted(order.tolist()) == list(range(len(context.neighbourhood)))
 
     @given(context=contexts(), seed=st.integers(0, 2**32))
-    @settings(max_examples=25, deadline=None)
+    @settings(max_examples=25)
     def test_order_of_nodes_does_not_depend_on_the_order_of_rows(
         self, name: str, context, seed: int
     ) -> None:
@@ -100,7 +100,7 @@ class TestContract:
         np.testing.assert_array_equal(nodes, again)
 
     @given(context=contexts())
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=15)
     def test_one_policy_serves_again_and_gives_the_same(self, name: str, context) -> None:
         policy = policy_named(name)
         first = policy.rank(context)

@@ -52,7 +52,7 @@ def situations(draw):
 
 
 @given(situations())
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_order_is_that_of_the_formulas(situation) -> None:
     context, lessons, hours = situation
     count = int(context.graph.sessions.max()) + 1

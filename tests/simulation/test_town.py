@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
@@ -19,7 +19,6 @@ from engram.simulation.textures import Style, facade
 from engram.simulation.town import _Side, _slide_m
 
 
-@settings(deadline=None)
 @given(st.floats(100, 8000), st.integers(0, 2**31 - 1))
 def test_a_loop_has_about_its_length_and_goes_from_junction_to_junction(
     length_m: float, seed: int
@@ -72,7 +71,6 @@ def _inside(point: np.ndarray, outline: np.ndarray) -> bool:
     return bool((crosses & (x > point[0])).sum() % 2)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 10_000))
 def test_wall_pieces_and_openings_cover_a_front_once(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -58,14 +58,14 @@ def test_an_attempt_takes_at_most_20_bytes():
 
 
 @given(count=st.integers(1, 400), seed=st.integers(0, 1000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_attempts_come_back(count, seed):
     written = table(count, seed)
     assert_close(unpack_all(pack(written)), written)
 
 
 @given(seed=st.integers(0, 100))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_packing_what_was_unpacked_changes_nothing(seed):
     bodies = pack(table(200, seed))
     assert pack(unpack_all(bodies)) == bodies
@@ -92,7 +92,7 @@ def test_what_is_unknown_or_out_of_range_stays_so():
 
 
 @given(data=st.data())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_hostile_bodies_give_attempts_or_a_clear_error(data):
     ((count, body),) = pack(table(20))
     broken = bytearray(body)

@@ -205,7 +205,7 @@ class PostgresMachine(MapMachine):
 
 TestFileMachine = MapMachine.TestCase
 TestFileMachine.settings = settings(
-    max_examples=8, stateful_step_count=20, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=8, stateful_step_count=20, suppress_health_check=list(HealthCheck)
 )
 if os.environ.get("ENGRAM_TEST_POSTGRES"):
     TestPostgresMachine = PostgresMachine.TestCase
