@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, MissingExtraError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +98,7 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
     _save(figure, path)
 
 
-def _axes(wide: bool = False, columns: int = 1):  # type: ignore[no-untyped-def]  # noqa: ANN202, Matplotlib's types
+def _axes(wide: bool = False, columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
     try:
         import matplotlib
     except ImportError as error:
@@ -108,7 +113,7 @@ def _axes(wide: bool = False, columns: int = 1):  # type: ignore[no-untyped-def]
     return figure, axes[0]
 
 
-def _save(figure, path: Path) -> None:  # type: ignore[no-untyped-def]  # noqa: ANN001, as above
+def _save(figure: Figure, path: Path) -> None:
     from matplotlib import pyplot
 
     try:
