@@ -8,6 +8,7 @@ from typing import cast
 
 import typer
 
+from engram.cli.verbs import VerbInterruptedError, register
 from engram.errors import EngramError
 
 app = typer.Typer(
@@ -27,15 +28,9 @@ EXIT_INTERRUPTED = 130
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 
 
-class VerbInterruptedError(Exception):
-    """A verb was stopped by Ctrl-C before it had a result."""
-
-
 def main() -> None:
     """Runs the program; an error that Engram foresaw is one line, never a traceback."""
-    from engram.cli import verbs  # registers the verbs on `app`
-
-    verbs.register(app)
+    register(app)
     try:
         code = app(prog_name="engram", standalone_mode=False)
     except _UsageError as error:  # a verb or option that is mistyped

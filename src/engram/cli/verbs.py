@@ -8,7 +8,6 @@ from typing import Any
 
 import typer
 
-from engram.cli.app import VerbInterruptedError
 from engram.cli.benchmark import bench
 from engram.cli.building import build
 from engram.cli.demonstration import demo
@@ -51,6 +50,10 @@ VERBS: dict[str, Callable[..., None]] = {
 
 # Verbs that have verbs below them.
 GROUPS: tuple[typer.Typer, ...] = (evaluate,)
+
+
+class VerbInterruptedError(Exception):
+    """A verb was stopped by Ctrl-C before it had a result."""
 
 
 def register(app: typer.Typer) -> None:
