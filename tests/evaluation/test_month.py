@@ -1,5 +1,6 @@
 """The month of laps by which the town's difficulty is judged."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ from tests.evaluation.campaigns import write_campaign
 
 from engram.errors import SequenceError
 from engram.evaluation.month import LAPS, measure_laps, month, month_laps
+from engram.simulation import Size, campaign_named
 
 
 def test_the_month_is_begbroke_in_small() -> None:
@@ -15,9 +17,18 @@ def test_the_month_is_begbroke_in_small() -> None:
     starts = [plan.start for plan in campaign.sessions]
     assert starts == sorted(set(starts))
     assert 25 < (starts[-1] - starts[0]).days <= 30
-    # Day and night, as begbroke24h; a regular choice of every third or fourth lap meets four hours.
     assert len({start.hour for start in starts}) > 12
     assert [plan.number for plan in campaign.sessions] == list(range(LAPS))
+
+
+@pytest.mark.parametrize("seed", range(1, 6))
+def test_the_month_has_every_weather_in_its_share(seed: int) -> None:
+    whole = Counter(
+        plan.weather for plan in campaign_named("begbroke24h", seed, Size.FULL).sessions
+    )
+    some = Counter(plan.weather for plan in month(seed).sessions)
+    for weather, count in whole.items():
+        assert abs(some[weather] - count * LAPS / 140) <= 1.0
 
 
 def test_laps_that_look_alike_are_saved_once_and_fail_nowhere(tmp_path: Path) -> None:

@@ -34,15 +34,17 @@ _EXHAUSTIVE = MapOptions(policy="distance", lanes=1, rounds=UNLIMITED, relocalis
 
 
 def month(seed: int = 1, laps: int = LAPS) -> Campaign:
-    """`begbroke24h` in small: a loop of 0.15 km and some of its 140 laps, drawn by the seed.
+    """`begbroke24h` in small: a loop of 0.15 km and some of its 140 laps.
 
-    All hours are met, as any regular choice of so few laps would not.
+    A systematic sample of the laps in the order of weather and hour, so that few laps meet all
+    hours and every weather in its share: how many of them are rainy decides what fails.
     """
     whole = campaign_named("begbroke24h", seed, Size.FULL)
-    drawn = np.random.default_rng([seed, 0x40]).choice(len(whole.sessions), laps, replace=False)
-    sessions = tuple(
-        replace(whole.sessions[int(k)], number=number) for number, k in enumerate(np.sort(drawn))
-    )
+    ordered = sorted(whole.sessions, key=lambda lap: (lap.weather, lap.start.time(), lap.number))
+    first = np.random.default_rng([seed, 0x40]).random()
+    drawn = [ordered[int((k + first) * len(ordered) / laps)] for k in range(laps)]
+    drawn.sort(key=lambda lap: lap.number)
+    sessions = tuple(replace(lap, number=number) for number, lap in enumerate(drawn))
     return replace(whole, name="month", home="month", length_m=LOOP_M, sessions=sessions)
 
 

@@ -141,9 +141,10 @@ def _planned(
     )  # fmt: skip
 
 
-# How often each weather comes in an English summer, and in the dark half of the year.
-_SUMMER = (("clear", 0.24), ("fair", 0.2), ("broken", 0.2), ("overcast", 0.2), ("showers", 0.06),
-           ("rain", 0.05), ("damp", 0.05))  # fmt: skip
+# How often each weather comes, on the wet side of an English summer: drops on the lens are what our
+# own matcher fails at, and held-out laps shall fail as calibration (f) asks.
+_SUMMER = (("clear", 0.23), ("fair", 0.19), ("broken", 0.19), ("overcast", 0.19), ("showers", 0.08),
+           ("rain", 0.06), ("damp", 0.06))  # fmt: skip
 
 
 def _drawn(rng: np.random.Generator, count: int) -> list[str]:
