@@ -30,10 +30,10 @@ demo: setup
 	$(BIN)/engram demo --out demo
 
 test: setup
-	$(BIN)/python -m pytest -n 2 -m 'not long'
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not long'
 
 test-long: setup
-	$(BIN)/python -m pytest -n 2 -m long
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
 check: setup
 	$(BIN)/ruff format --check src tests benchmarks
