@@ -13,7 +13,6 @@ import typer
 
 import engram
 from engram.cli.app import app
-from engram.cli.verbs import register
 from engram.drive import MapOptions, map_drive, open_drive
 
 ROOT = Path(__file__).parent.parent
@@ -31,7 +30,6 @@ def shown_commands() -> Iterator[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize(("page", "words"), list(shown_commands()))
 def test_every_command_shown_is_a_verb_with_these_options(page: str, words: list[str]) -> None:
-    register(app)
     verbs = typer.main.get_command(app).commands
     assert words[1] in verbs, f"{page}: engram {words[1]}"
     verb = verbs[words[1]]

@@ -21,6 +21,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+register(app)
+
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 
@@ -30,7 +32,6 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 
 def main() -> None:
     """Runs the program; an error that Engram foresaw is one line, never a traceback."""
-    register(app)
     try:
         code = app(prog_name="engram", standalone_mode=False)
     except _UsageError as error:  # a verb or option that is mistyped
