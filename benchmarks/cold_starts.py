@@ -32,7 +32,14 @@ from engram.experience.basin import MatchBasin
 from engram.experience.model import SessionId, node_id
 from engram.frontend import FrameStatus
 from engram.geometry import SE3
-from engram.localiser import Budget, FrameMatcher, Localiser, LocaliserConfig, Relocaliser, accept
+from engram.localiser import (
+    AcceptanceConfig,
+    Budget,
+    FrameMatcher,
+    Localiser,
+    LocaliserConfig,
+    Relocaliser,
+)
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
 from engram.sequences import LoggedFrame
@@ -42,9 +49,12 @@ FOLDS = 5
 WITHIN_M = 10.0
 # An answer further from the truth is a wrong place. Source: the issue's table.
 WRONG_M = 5.0
-# A match is believed up to 8 m from its node, and right up to WRONG_M off: all that exhaustive
-# matching could rightly find stands within this.
-REACH_M = 8.0 + WRONG_M
+# A match is believed this far from its node, and right up to WRONG_M off: all that exhaustive
+# matching could rightly find stands within the sum.
+REACH_M = AcceptanceConfig().reach_m
+NEAR_M = REACH_M + WRONG_M
+# What exhaustive matching finds: it does not depend on how strict a robot is with itself.
+FINDABLE_INLIERS = 40
 LARGEST_TURN_RAD = float(np.deg2rad(90.0))
 # A generous budget, so that the map holds little twice.
 MAPPING = MapOptions(lanes=2, rounds=4)
@@ -118,7 +128,7 @@ class Town:
         """Nodes that the live camera could rightly be matched with, nearest first."""
         distance_m = np.linalg.norm(self.centres - world_from_live.translation, axis=1)
         facing = self.axes @ world_from_live.rotation[:, 2] > np.cos(LARGEST_TURN_RAD)
-        rows = np.flatnonzero((distance_m < REACH_M) & facing)
+        rows = np.flatnonzero((distance_m < NEAR_M) & facing)
         return rows[np.argsort(distance_m[rows], kind="stable")]
 
 
@@ -137,7 +147,6 @@ class LiveDrive:
         self.truth = [truth.at(entry.frame.stamp_ns) for entry in self.frames]
         self._town = town
         self._matcher = FrameMatcher(town.opened.store.frames, config.matcher)
-        self._acceptance = config.acceptance
         self._findable: dict[int, bool] = {}
 
     def findable(self, at: int) -> bool:
@@ -158,13 +167,11 @@ class LiveDrive:
         for index in nodes:
             node = graph.node(int(index)).id
             match = self._matcher.match(live, live_id, node, None)
-            if match.reference_from_live is None:
+            pose = match.reference_from_live
+            if pose is None or match.inliers < FINDABLE_INLIERS or pose.distance_m > REACH_M:
                 continue
-            spread = self._matcher.spread(live, live_id, node, match)
-            if accept(match, None, self._acceptance, spread):
-                error_m = self.error_m(at, int(index), match.reference_from_live)
-                if error_m <= WRONG_M:
-                    return True
+            if self.error_m(at, int(index), pose) <= WRONG_M:
+                return True
         return False
 
     def error_m(self, at: int, node: int, node_from_live: SE3) -> float:
@@ -344,7 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--step", type=int, default=2, help="frames from one start to the next")
     parser.add_argument("--relocaliser", default="fabmap")
     parser.add_argument("--lanes", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=Budget().lost_rounds)
     parser.add_argument("--sample", type=int, default=2, help="frames a drive matched with all")
     asked = parser.parse_args(arguments)
 
@@ -368,7 +375,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         relocaliser = opened.relocaliser(asked.relocaliser, settings.frontend.descriptor)
         file = asked.out / f"{name}-{asked.relocaliser}.csv"
-        budget = Budget(asked.lanes, asked.rounds)
+        budget = Budget(asked.lanes, lost_rounds=asked.rounds)
         starts = run_starts(town, drives(), file, asked.step, relocaliser, budget)
         sampled = sample_exhaustively(town, drives(), asked.sample)
     about = f"map of {len(mapped)} sessions, {len(town.world_from_node)} nodes; {asked.relocaliser}"

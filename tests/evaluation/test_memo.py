@@ -109,4 +109,6 @@ def test_the_spread_of_inliers_is_known_too(frames: Frames, tmp_path: Path) -> N
     live_id = node_id(LIVE, live.stamp_ns)
     match = matcher.match(live, live_id, node, None)
     kept = memo.match(live, live_id, node, None)
-    assert memo.spread(live, live_id, node, kept) == matcher.spread(live, live_id, node, match) > 0
+    spread = matcher.spread(live, live_id, node, match)
+    assert memo.spread(live, live_id, node, kept) == spread
+    assert min(spread.image, spread.height_m) > 0

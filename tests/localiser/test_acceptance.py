@@ -5,11 +5,12 @@ import pytest
 
 from engram.frontend.matching import Match
 from engram.geometry import SE3
-from engram.localiser import AcceptanceConfig, Prediction, accept
+from engram.localiser import AcceptanceConfig, Prediction, Spread, accept, accept_lost, plausible
 from engram.localiser.acceptance import inlier_spread
 from synthetic_world import World, see
 
 CONFIG = AcceptanceConfig()
+WIDE = Spread(0.5, 5.0)
 
 
 def match(pose: SE3 | None, inliers: int) -> Match:
@@ -22,7 +23,8 @@ def prediction(sigma_m: float = 0.0, sigma_yaw_rad: float = 0.0) -> Prediction:
 
 
 def test_no_consensus_is_never_accepted() -> None:
-    assert not accept(match(None, 0), None, CONFIG)
+    assert not accept_lost(match(None, 0), lambda: WIDE, CONFIG)
+    assert not plausible(match(None, 0), lambda: WIDE, CONFIG)
     assert not accept(match(None, 0), prediction(), CONFIG)
 
 
@@ -31,9 +33,14 @@ def test_twenty_inliers_where_it_was_expected(inliers: int, accepted: bool) -> N
     assert accept(match(SE3.exp([0, 0, 5, 0, 0, 0]), inliers), prediction(), CONFIG) is accepted
 
 
-@pytest.mark.parametrize(("inliers", "accepted"), [(39, False), (40, True)])
-def test_a_lost_robot_asks_for_more(inliers: int, accepted: bool) -> None:
-    assert accept(match(SE3.identity(), inliers), None, CONFIG) is accepted
+@pytest.mark.parametrize(
+    ("inliers", "accepted", "waits"),
+    [(34, False, False), (35, False, True), (49, False, True), (50, True, True)],
+)
+def test_a_lost_robot_asks_for_more(inliers: int, accepted: bool, waits: bool) -> None:
+    found = match(SE3.identity(), inliers)
+    assert accept_lost(found, lambda: WIDE, CONFIG) is accepted
+    assert plausible(found, lambda: WIDE, CONFIG) is waits
 
 
 @pytest.mark.parametrize(
@@ -57,24 +64,39 @@ def test_heading_must_agree_within_ten_degrees_and_three_sigma(
     assert accept(match(turned, 100), expected, CONFIG) is accepted
 
 
-def test_a_lost_robot_does_not_believe_a_cluster() -> None:
-    found = match(SE3.identity(), 60)
-    assert accept(found, None, CONFIG, spread=0.34)
-    assert not accept(found, None, CONFIG, spread=0.32)
+@pytest.mark.parametrize(
+    ("spread", "accepted"),
+    [
+        (Spread(0.26, 1.6), True),
+        (Spread(0.24, 5.0), False),  # the windows of one house
+        (Spread(0.5, 1.4), False),  # two parked cars, or the road
+    ],
+)
+def test_a_lost_robot_does_not_believe_a_cluster_nor_what_is_low(spread, accepted) -> None:
+    found = match(SE3.identity(), 100)
+    assert accept_lost(found, lambda: spread, CONFIG) is accepted
+    assert plausible(found, lambda: spread, CONFIG) is accepted
 
 
-def test_a_lost_robot_is_found_only_near_a_node() -> None:
-    assert accept(match(SE3.exp([0, 0, 7.9, 0, 0, 0]), 60), None, CONFIG)
-    assert not accept(match(SE3.exp([0, 0, 8.1, 0, 0, 0]), 60), None, CONFIG)
+@pytest.mark.parametrize(("distance_m", "accepted"), [(7.9, True), (8.1, False)])
+def test_a_lost_robot_is_found_only_near_a_node(distance_m: float, accepted: bool) -> None:
+    found = match(SE3.exp([0, 0, distance_m, 0, 0, 0]), 100)
+    assert accept_lost(found, lambda: WIDE, CONFIG) is accepted
 
 
 def test_spread_is_that_of_the_inliers_alone_in_the_poorer_image() -> None:
     world = World(40.0)
     frame = see(world, world.pose_at(5.0), 1)
     everywhere = np.arange(len(frame.landmarks), dtype=np.int32)
-    pixels = frame.landmarks.pixels
-    near_one = np.flatnonzero(np.abs(pixels - pixels[0]).max(axis=1) < 60).astype(np.int32)
-    whole = Match(SE3.identity(), None, len(everywhere), everywhere, everywhere)
-    cluster = Match(SE3.identity(), None, len(near_one), near_one, near_one)
-    assert inlier_spread(whole, frame, frame) > 0.45
-    assert inlier_spread(cluster, frame, frame) <= 120 / 480
+    pixels, heights_m = frame.landmarks.pixels, frame.landmarks.points_in_cam[:, 1]
+    near_one = np.flatnonzero(np.abs(pixels - pixels[0]).max(axis=1) < 40).astype(np.int32)
+    level = np.flatnonzero(np.abs(heights_m - np.median(heights_m)) < 0.3).astype(np.int32)
+
+    def spread(rows: np.ndarray) -> Spread:
+        return inlier_spread(Match(SE3.identity(), None, len(rows), rows, rows), frame, frame)
+
+    assert spread(everywhere).image > 0.25
+    # At most two sides of 80 px in an image of 480 by 360.
+    assert spread(near_one).image <= 80 / np.sqrt(480 * 360)
+    assert spread(level).height_m <= 0.6 < spread(everywhere).height_m
+    assert inlier_spread(match(None, 0), frame, frame) == Spread(0.0, 0.0)

@@ -97,7 +97,7 @@ def relocalise(
         typer.Option("--relocaliser", help="How to search: fabmap, bag-of-words or exhaustive."),
     ] = "fabmap",
     lanes: options.Lanes = 2,
-    rounds: options.Rounds = 2,
+    rounds: options.Rounds = 32,
     at: options.At = None,
     format_: options.Format = None,
     rig: options.Rig = "grey",
@@ -128,7 +128,7 @@ def relocalise(
             sequence,
             load_settings(config),
             relocaliser=relocaliser,
-            budget=Budget(lanes, rounds),
+            budget=Budget(lanes, lost_rounds=rounds),
             at=at,
             advance=advance,
         )

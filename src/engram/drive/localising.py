@@ -67,7 +67,7 @@ class LocaliseRun:
             sequence.camera,
             self._settings,
             policy=options.policy,
-            budget=Budget(options.lanes, options.rounds, options.deadline_ms),
+            budget=Budget(options.lanes, options.rounds, deadline_ms=options.deadline_ms),
             relocaliser=options.relocaliser,
             live=session_of_drive(sequence).id,
             clock=sequence.info,

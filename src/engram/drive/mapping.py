@@ -227,7 +227,7 @@ def _map_frames(
         camera,
         settings,
         policy=options.policy,
-        budget=Budget(options.lanes, options.rounds, options.deadline_ms),
+        budget=Budget(options.lanes, options.rounds, deadline_ms=options.deadline_ms),
         relocaliser=options.relocaliser,
         live=writer.session.id,
         saves=True,

@@ -80,7 +80,7 @@ def relocalise_drive(
         sequence: the drive.
         settings: the resolved configuration.
         relocaliser: key of `RELOCALISERS`.
-        budget: of each frame; 2 lanes × 2 rounds by default.
+        budget: of each frame: that of a lost robot.
         at: number or tag of the map's revision; None for the newest.
         advance: called once per frame with a word on how it went.
 
@@ -92,9 +92,9 @@ def relocalise_drive(
     with open_map(map_path, at) as opened:
         settings = settings.for_descriptor(opened.descriptor)
         finder = opened.relocaliser(relocaliser, settings.frontend.descriptor)
-        matcher = FrameMatcher(opened.store.frames, settings.localiser.matcher)
+        matcher = FrameMatcher(opened.store.frames, settings.localiser.lost_matcher)
         with (
-            Attempter(matcher, budget, settings.localiser.acceptance) as attempter,
+            Attempter(matcher, matcher, budget.lanes, settings.localiser.acceptance) as attempter,
             closing(live_frames(sequence, settings)) as frames,
         ):
             found = []
@@ -120,7 +120,7 @@ def _cold_start(
 ) -> ColdStart:
     if frame.status is not FrameStatus.OK:
         return ColdStart(frame.stamp_ns, PlaceStatus.UNUSABLE_FRAME, None, 0, 0, None)
-    proposed = finder.propose(frame, budget.attempts, lambda _: True)
+    proposed = finder.propose(frame, budget.lost_attempts, lambda _: True)
     candidates = [
         Candidate(index, opened.graph.node(index).id, None, guided=False, row=None)
         for index in proposed

@@ -21,7 +21,7 @@ from engram.experience.model import NodeId
 from engram.frontend import Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
-from engram.localiser import Matcher, Prediction
+from engram.localiser import Matcher, Prediction, Spread
 
 _VERSION = 1
 _NO_ROWS = np.empty(0, dtype=np.int32)
@@ -47,7 +47,7 @@ class MatchMemo:
         self._path = path
         self._hash = matcher_hash
         self._frames: dict[int, dict[NodeId, Match]] = {}
-        self._spreads: dict[tuple[int, NodeId], float] = {}
+        self._spreads: dict[tuple[int, NodeId], Spread] = {}
         self.made = 0
         self.seconds = 0.0
         self._read()
@@ -69,10 +69,10 @@ class MatchMemo:
             match = known[node] = self._make(live, live_id, node)
         return match
 
-    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> float:
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
         if match.reference_from_live is None:
-            return 0.0
+            return Spread(0.0, 0.0)
         key = (live.stamp_ns, node)
         if key not in self._spreads:
             whole = self._matcher.match(live, live_id, node, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from engram.evaluation.drives import Truth
 from engram.experience.model import NodeId, SessionId, node_id
 from engram.frontend import FrameStatus
 from engram.geometry import SE3
-from engram.localiser import AcceptanceConfig, Matcher, Position, accept
+from engram.localiser import AcceptanceConfig, Matcher, Position, accept_lost
 from engram.sequences import LoggedFrame
 
 # What an operator who sets a robot down knows of its place.
@@ -85,10 +86,8 @@ def start_by_matching(
         found = []
         for node in opened.graph.nodes:
             match = matcher.match(frame, live_id, node.id, None)
-            if match.inliers < acceptance.min_inliers_lost:
-                continue
-            spread = matcher.spread(frame, live_id, node.id, match)
-            if accept(match, None, acceptance, spread):
+            spread = partial(matcher.spread, frame, live_id, node.id, match)
+            if accept_lost(match, spread, acceptance):
                 found.append((match, node.id))
         if found:
             match, best = max(found, key=lambda one: (one[0].inliers, one[1].int))

@@ -1,6 +1,13 @@
 """Live frame + neighbourhood + policy + budget → localisation; lost and found again."""
 
-from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept
+from engram.localiser.acceptance import (
+    AcceptanceConfig,
+    Prediction,
+    Spread,
+    accept,
+    accept_lost,
+    plausible,
+)
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
@@ -36,8 +43,11 @@ __all__ = [
     "Prediction",
     "Relocaliser",
     "Searched",
+    "Spread",
     "Walk",
     "accept",
+    "accept_lost",
     "best_places",
+    "plausible",
     "spread",
 ]

@@ -1,10 +1,11 @@
-"""Match attempts within a budget: lanes at once, rounds one after another (SPEC §3.2)."""
+"""Match attempts: lanes at once, rounds one after another (SPEC §3.2)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Protocol, Self
 
@@ -13,8 +14,15 @@ import numpy as np
 from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
 from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
-from engram.localiser.acceptance import AcceptanceConfig, Prediction, accept, inlier_spread
-from engram.localiser.localisation import Budget
+from engram.localiser.acceptance import (
+    AcceptanceConfig,
+    Prediction,
+    Spread,
+    accept,
+    accept_lost,
+    inlier_spread,
+    plausible,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +46,21 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of one attempt."""
+    """What became of one attempt.
+
+    Attributes:
+        candidate: what was attempted.
+        rank: its place in the order, from 0.
+        match: with what it has in common with the live frame.
+        accepted: whether that is a localisation.
+        plausible: whether it would be one if another frame agreed; only where nothing was expected.
+    """
 
     candidate: Candidate
     rank: int
     match: Match
     accepted: bool
+    plausible: bool = False
 
 
 class Matcher(Protocol):
@@ -58,7 +75,7 @@ class Matcher(Protocol):
         """The match of a live frame with a node; `guide` is given for a guided attempt only."""
         ...
 
-    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> float:
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """`inlier_spread` of such a match."""
         ...
 
@@ -90,7 +107,7 @@ class FrameMatcher:
             predicted_covariance=covariance,
         )
 
-    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> float:
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
         del live_id
         return inlier_spread(match, self._frames.frame(node), live)
@@ -101,15 +118,25 @@ class FrameMatcher:
 
 
 class Attempter:
-    """Runs attempts on threads of its own; the core releases the GIL, so they are parallel."""
+    """Runs attempts on threads of its own; the core releases the GIL, so they are parallel.
 
-    def __init__(self, matcher: Matcher, budget: Budget, acceptance: AcceptanceConfig) -> None:
+    Args:
+        matcher: the first half of an attempt.
+        lost_matcher: the same where nothing is expected, and most candidates are other places.
+        lanes: how many run at a time.
+        acceptance: the second half.
+    """
+
+    def __init__(
+        self, matcher: Matcher, lost_matcher: Matcher, lanes: int, acceptance: AcceptanceConfig
+    ) -> None:
         self._matcher = matcher
-        self._budget = budget
+        self._lost_matcher = lost_matcher
+        self._lanes = lanes
         self._acceptance = acceptance
         self._pool = (
-            ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")
-            if budget.lanes > 1 and matcher.threads
+            ThreadPoolExecutor(lanes, thread_name_prefix="engram-lane")
+            if lanes > 1 and matcher.threads
             else None
         )
 
@@ -140,18 +167,17 @@ class Attempter:
         Args:
             live: the live frame.
             live_id: its UUID, which with the node's seeds the matcher.
-            candidates: best first.
+            candidates: best first, as many as the budget allows.
             deadline: `time.perf_counter` value after which no attempt starts; None for none.
 
         Returns:
             One outcome per attempt made, in ranked order.
         """
-        lanes = self._budget.lanes
         outcomes: list[Outcome] = []
-        for start in range(0, min(len(candidates), self._budget.attempts), lanes):
+        for start in range(0, len(candidates), self._lanes):
             if deadline is not None and perf_counter() >= deadline:
                 break
-            ranks = range(start, min(start + lanes, len(candidates), self._budget.attempts))
+            ranks = range(start, min(start + self._lanes, len(candidates)))
             outcomes += self._round(live, live_id, candidates, ranks)
             if any(outcome.accepted for outcome in outcomes):
                 break
@@ -169,14 +195,24 @@ class Attempter:
 
     def _attempt(self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int) -> Outcome:
         prediction = candidate.prediction
-        match = self._matcher.match(
-            live, live_id, candidate.node, prediction if candidate.guided else None
-        )
-        spread = 1.0
         if prediction is None:
-            spread = self._matcher.spread(live, live_id, candidate.node, match)
-        accepted = accept(match, prediction, self._acceptance, spread)
-        return Outcome(candidate, rank, match, accepted)
+            return self._attempt_lost(live, live_id, candidate, rank)
+        guide = prediction if candidate.guided else None
+        match = self._matcher.match(live, live_id, candidate.node, guide)
+        return Outcome(candidate, rank, match, accept(match, prediction, self._acceptance))
+
+    def _attempt_lost(
+        self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int
+    ) -> Outcome:
+        match = self._lost_matcher.match(live, live_id, candidate.node, None)
+        spread = partial(self._lost_matcher.spread, live, live_id, candidate.node, match)
+        return Outcome(
+            candidate,
+            rank,
+            match,
+            accept_lost(match, spread, self._acceptance),
+            plausible(match, spread, self._acceptance),
+        )
 
     def foresee(
         self, live: Frame, live_id: NodeId, candidates: Iterable[Candidate]

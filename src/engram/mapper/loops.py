@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Self
 
 import numpy as np
@@ -22,7 +23,14 @@ from engram.experience.graph import ExperienceGraph
 from engram.experience.model import Edge, EdgeKind, Node, NodeId
 from engram.frontend import Frame
 from engram.geometry import SE3
-from engram.localiser import AcceptanceConfig, Matcher, PlaceBook, accept, best_places, spread
+from engram.localiser import (
+    AcceptanceConfig,
+    Matcher,
+    PlaceBook,
+    accept_lost,
+    best_places,
+    spread,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +174,8 @@ class LoopSearch:
         match = self._matcher.match(question.frame, question.node, known, None)
         if match.reference_from_live is None or match.covariance is None:
             return None
-        seen = self._matcher.spread(question.frame, question.node, known, match)
-        if not accept(match, None, self._acceptance, seen):
+        over = partial(self._matcher.spread, question.frame, question.node, known, match)
+        if not accept_lost(match, over, self._acceptance):
             return None
         edge = Edge(
             known, question.node, EdgeKind.MATCH, match.reference_from_live, match.covariance

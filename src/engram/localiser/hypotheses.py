@@ -1,0 +1,123 @@
+"""Where a lost robot may be by matches that are too weak to be believed one by one.
+
+A weak match may be right, and it may be two cars that stand alike in two streets. Right ones agree
+with each other while the robot drives on: the position of the first, carried on by odometry,
+predicts where the second is found. So a weak match waits, the nodes near it are attempted with the
+frames to come, and when another match some way on agrees, that one is believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from engram.experience.graph import ExperienceGraph
+from engram.experience.neighbourhood import Neighbourhood
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
+from engram.localiser.attempts import Outcome
+from engram.localiser.localisation import Position
+from engram.odometry import OdometryStep
+
+# What is seen from places this far apart is not the same pair of parked cars, seen alike.
+_BASE_LINE_M = 2.0
+# By then what a weak match saw is out of sight, and odometry has drifted.
+_FORGOTTEN_AFTER_M = 15.0
+# So many wait at a time; the oldest goes.
+_MOST = 8
+
+
+@dataclass(slots=True)
+class _Hypothesis:
+    position: Position
+    driven_m: float = 0.0
+
+
+class Hypotheses:
+    """Weak matches that wait for a second one.
+
+    Args:
+        graph: the experience graph.
+        search: its `neighbourhood`, with what does not change filled in: the nodes near a position.
+        acceptance: when two positions agree.
+    """
+
+    def __init__(
+        self,
+        graph: ExperienceGraph,
+        search: Callable[[Position], Neighbourhood],
+        acceptance: AcceptanceConfig,
+    ) -> None:
+        self._graph = graph
+        self._search = search
+        self._acceptance = acceptance
+        self._waiting: list[_Hypothesis] = []
+
+    def forget(self) -> None:
+        """The robot was found, or nobody knows how it moved."""
+        self._waiting.clear()
+
+    def carry_on(self, odometry: OdometryStep) -> None:
+        """The robot moved on."""
+        motion, covariance = odometry.prev_from_curr, odometry.covariance
+        if motion is None or covariance is None:
+            self.forget()
+            return
+        for one in self._waiting:
+            one.position = one.position.carried_on(motion, covariance)
+            one.driven_m += motion.distance_m
+        self._waiting = [one for one in self._waiting if one.driven_m <= _FORGOTTEN_AFTER_M]
+
+    def nodes_near(self, count: int) -> list[int]:
+        """Nodes, by dense index, that could confirm one of them, the nearest first."""
+        nodes: list[int] = []
+        for one in reversed(self._waiting):
+            near = self._search(one.position)
+            order = np.argsort(near.distance_m, kind="stable")[:count]
+            nodes += [node for node in near.nodes[order].tolist() if node not in nodes]
+        return nodes
+
+    def judge(self, outcomes: list[Outcome]) -> list[Outcome]:
+        """Accepts the plausible matches with which an earlier one agrees; the others wait.
+
+        Args:
+            outcomes: of this frame's attempts; where one was accepted already, nothing is to do.
+
+        Returns:
+            The same outcomes, in their order.
+        """
+        found = [outcome for outcome in outcomes if outcome.plausible]
+        if not found or any(outcome.accepted for outcome in outcomes):
+            return outcomes
+        expected = [(one, self._predictions(one.position)) for one in self._waiting]
+        confirmed = []
+        for outcome in found:
+            agreeing = [one for one, near in expected if self._agree(outcome, near)]
+            if any(one.driven_m >= _BASE_LINE_M for one in agreeing):
+                confirmed.append(outcome)
+            elif not agreeing:
+                new = _Hypothesis(_position_of(outcome))
+                expected.append((new, self._predictions(new.position)))
+                self._waiting = [*self._waiting, new][-_MOST:]
+        return [
+            replace(outcome, accepted=True) if outcome in confirmed else outcome
+            for outcome in outcomes
+        ]
+
+    def _predictions(self, position: Position) -> dict[int, Prediction]:
+        near = self._search(position)
+        return {node: Prediction.of(near, row) for row, node in enumerate(near.nodes.tolist())}
+
+    def _agree(self, outcome: Outcome, predictions: dict[int, Prediction]) -> bool:
+        prediction = predictions.get(outcome.candidate.index)
+        pose = outcome.match.reference_from_live
+        assert pose is not None
+        return prediction is not None and agrees(pose, prediction, self._acceptance)
+
+
+def _position_of(outcome: Outcome) -> Position:
+    pose, covariance = outcome.match.reference_from_live, outcome.match.covariance
+    assert pose is not None
+    assert covariance is not None
+    return Position(outcome.candidate.node, pose, covariance)

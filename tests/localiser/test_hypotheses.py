@@ -1,0 +1,124 @@
+"""Weak matches of a lost robot wait until another one agrees."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from uuid import UUID
+
+import numpy as np
+import pytest
+
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import Edge, EdgeKind, Node, NodeId, SessionId
+from engram.experience.neighbourhood import Neighbourhood
+from engram.frontend.matching import Match
+from engram.geometry import SE3, CameraId
+from engram.localiser import AcceptanceConfig, Position
+from engram.localiser.attempts import Candidate, Outcome
+from engram.localiser.hypotheses import Hypotheses
+from engram.odometry import OdometryStatus, OdometryStep
+
+SESSION = SessionId(UUID(int=1))
+SURE = 1e-6 * np.eye(6)
+NOTHING = np.zeros(0, np.int32)
+
+
+def ahead(metres: float) -> SE3:
+    return SE3(np.eye(3), np.array([0.0, 0.0, metres]))
+
+
+def road(nodes: int) -> ExperienceGraph:
+    """Nodes along a straight road, one every metre."""
+    graph = ExperienceGraph()
+    for at in range(nodes):
+        graph.add_node(Node(NodeId(UUID(int=100 + at)), SESSION, at, CameraId("c"), float(at)))
+    for a, b in zip(graph.nodes[:-1], graph.nodes[1:], strict=True):
+        graph.add_edge(Edge(a.id, b.id, EdgeKind.ODOMETRY, ahead(1.0), SURE))
+    return graph
+
+
+GRAPH = road(60)
+
+
+def near(position: Position) -> Neighbourhood:
+    return GRAPH.neighbourhood(
+        GRAPH.index(position.node),
+        position.node_from_live,
+        position.covariance,
+        radius_m=8.0,
+        view_gate_rad=1.0,
+    )
+
+
+def waiting() -> Hypotheses:
+    return Hypotheses(GRAPH, near, AcceptanceConfig())
+
+
+def seen_from(node: int, metres: float, rank: int = 0) -> Outcome:
+    """A plausible match with a node, from so far beyond it."""
+    candidate = Candidate(node, GRAPH.node(node).id, None, guided=False, row=None)
+    match = Match(ahead(metres), SURE, 40, NOTHING, NOTHING)
+    return Outcome(candidate, rank, match, accepted=False, plausible=True)
+
+
+def drive(hypotheses: Hypotheses, metres: float) -> None:
+    hypotheses.carry_on(OdometryStep(OdometryStatus.OK, ahead(metres), SURE))
+
+
+def accepted(outcomes: Sequence[Outcome]) -> list[int]:
+    return [outcome.candidate.index for outcome in outcomes if outcome.accepted]
+
+
+def test_one_weak_match_is_not_believed_and_a_second_one_further_on_is() -> None:
+    hypotheses = waiting()
+    assert accepted(hypotheses.judge([seen_from(10, 0.5)])) == []
+    drive(hypotheses, 3.0)
+    assert accepted(hypotheses.judge([seen_from(12, 1.4), seen_from(40, 0.0, rank=1)])) == [12]
+
+
+def test_what_is_seen_from_the_same_spot_confirms_nothing() -> None:
+    hypotheses = waiting()
+    hypotheses.judge([seen_from(10, 0.5), seen_from(11, -0.5, rank=1)])
+    drive(hypotheses, 1.0)
+    assert accepted(hypotheses.judge([seen_from(11, 0.5)])) == []
+    drive(hypotheses, 1.5)
+    assert accepted(hypotheses.judge([seen_from(12, 1.0)])) == [12]
+
+
+@pytest.mark.parametrize("node", [12, 40], ids=["too far along", "elsewhere"])
+def test_a_match_that_disagrees_waits_itself(node: int) -> None:
+    hypotheses = waiting()
+    hypotheses.judge([seen_from(10, 0.5)])
+    drive(hypotheses, 3.0)
+    assert accepted(hypotheses.judge([seen_from(node, 3.9)])) == []
+    drive(hypotheses, 3.0)
+    assert accepted(hypotheses.judge([seen_from(node + 6, 0.9)])) == [node + 6]
+
+
+def test_the_nodes_that_would_confirm_it_are_told_nearest_first() -> None:
+    hypotheses = waiting()
+    assert hypotheses.nodes_near(3) == []
+    hypotheses.judge([seen_from(10, 0.2)])
+    drive(hypotheses, 3.0)
+    assert hypotheses.nodes_near(3) == [13, 14, 12]
+
+
+def test_it_ends_where_nobody_knows_how_the_robot_moved() -> None:
+    hypotheses = waiting()
+    hypotheses.judge([seen_from(10, 0.5)])
+    hypotheses.carry_on(OdometryStep(OdometryStatus.NO_CONSENSUS))
+    drive(hypotheses, 3.0)
+    assert accepted(hypotheses.judge([seen_from(13, 0.5)])) == []
+
+
+def test_it_is_forgotten_in_time() -> None:
+    hypotheses = waiting()
+    hypotheses.judge([seen_from(10, 0.5)])
+    for _ in range(20):
+        drive(hypotheses, 1.0)
+    assert hypotheses.nodes_near(3) == []
+    assert accepted(hypotheses.judge([seen_from(30, 0.5)])) == []
+
+
+def test_where_a_match_was_accepted_by_itself_nothing_is_to_do() -> None:
+    outcomes = [replace(seen_from(10, 0.5), accepted=True), seen_from(40, 0.0, rank=1)]
+    assert waiting().judge(outcomes) is outcomes
