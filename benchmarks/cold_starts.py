@@ -1,7 +1,7 @@
 """Cold starts anywhere: how often a robot that was just switched on finds itself in a large map.
 
 Four folds of a rendered campaign are mapped, in the order of time. On the drives of the fifth a new
-robot is switched on again and again, one start every few frames, and driven on for up to 10 m until
+robot is switched on again and again, all along the drive, and driven on for up to 10 m until
 it is found. Where it was found is judged by the simulator's truth; where it was not, all nodes that
 stand near by truth are matched with every frame of those 10 m, which tells whether it could have
 been found at all (exhaustive matching). A sample of frames is matched with every node of the map,
@@ -236,12 +236,14 @@ def cold_start(
     return Start(drive.name, first, status, at - first + 1, driven_m, attempts, 0, float("nan"))
 
 
-def starts_of(drive: LiveDrive, step: int) -> list[int]:
-    """First frames, each with 10 m to drive behind it."""
+def starts_of(drive: LiveDrive, count: int) -> list[int]:
+    """So many first frames, evenly spread, each with 10 m to drive behind it; all if fewer."""
     steps = [entry.odometry.prev_from_curr for entry in drive.frames]
     lengths = [0.0 if step_ is None else step_.distance_m for step_ in steps]
     left_m = np.cumsum(lengths[::-1])[::-1]
-    return [at for at in range(0, len(drive.frames), step) if left_m[at] >= WITHIN_M]
+    able = np.flatnonzero(left_m >= WITHIN_M)
+    rows = np.linspace(0, len(able) - 1, min(count, len(able))).round().astype(int)
+    return [int(at) for at in able[rows]]
 
 
 def summarise(starts: Sequence[Start], sampled: Sequence[tuple[bool, bool]]) -> str:
@@ -306,7 +308,7 @@ def run_starts(
     town: Town,
     drives: Iterator[LiveDrive],
     file: Path,
-    step: int,
+    count: int,
     relocaliser: Relocaliser,
     budget: Budget,
 ) -> list[Start]:
@@ -319,7 +321,7 @@ def run_starts(
         writer.writeheader()
         writer.writerows(asdict(one) for one in starts)
         for drive in drives:
-            firsts = starts_of(drive, step)
+            firsts = starts_of(drive, count)
             with progress(drive.name, len(firsts)) as advance:
                 for first in firsts:
                     if (drive.name, first) not in done:
@@ -348,7 +350,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, help="folder for the map and the results")
     parser.add_argument("--fold", type=int, default=0, choices=range(FOLDS))
     parser.add_argument("--seed", type=int, default=0, help="of the folds")
-    parser.add_argument("--step", type=int, default=2, help="frames from one start to the next")
+    parser.add_argument("--starts", type=int, default=640, help="of each drive, evenly spread")
     parser.add_argument("--relocaliser", default="fabmap")
     parser.add_argument("--lanes", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=Budget().lost_rounds)
@@ -376,7 +378,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         relocaliser = opened.relocaliser(asked.relocaliser, settings.frontend.descriptor)
         file = asked.out / f"{name}-{asked.relocaliser}.csv"
         budget = Budget(asked.lanes, lost_rounds=asked.rounds)
-        starts = run_starts(town, drives(), file, asked.step, relocaliser, budget)
+        starts = run_starts(town, drives(), file, asked.starts, relocaliser, budget)
         sampled = sample_exhaustively(town, drives(), asked.sample)
     about = f"map of {len(mapped)} sessions, {len(town.world_from_node)} nodes; {asked.relocaliser}"
     text = f"{about}\n{summarise(starts, sampled)}\n"

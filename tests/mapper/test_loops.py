@@ -1,13 +1,16 @@
 """Large loops close although odometry has drifted beyond the search radius."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from engram.drive import OpenMap
+from engram.errors import MapCorruptError
 from engram.experience.model import Edge, EdgeKind
 from engram.geometry import SE3
+from engram.localiser import FrameMatcher
 from engram.store import MapStore
 from mapping_rig import Mapped, map_simulated
 from synthetic_world import World, drive
@@ -85,3 +88,18 @@ def test_a_loop_that_closes_at_the_very_end_is_kept(path: Path) -> None:
     mapped = map_simulated(path, drive(RING, places, look, drift=DRIFT), closes_loops=True)
     assert "localised" not in mapped.statuses
     assert len(loop_edges(path, mapped)) == 1
+
+
+def test_places_that_cannot_be_read_close_no_loop(path: Path, monkeypatch) -> None:
+    readable = FrameMatcher.match
+
+    def match(self, live, live_id, node, guide):
+        if threading.current_thread().name.startswith("engram-loops"):
+            raise MapCorruptError(f"node {node}: does not match its checksum")
+        return readable(self, live, live_id, node, guide)
+
+    monkeypatch.setattr(FrameMatcher, "match", match)
+    places = np.arange(0.0, LAP_M + 20.0, 0.7)
+    mapped = map_simulated(path, drive(RING, places, drift=DRIFT), closes_loops=True)
+    assert len(mapped.steps) == len(places)
+    assert loop_edges(path, mapped) == []

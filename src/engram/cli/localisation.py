@@ -136,6 +136,10 @@ def localise(
 
 
 def _print(summary: dict[str, Any]) -> None:
+    from engram.drive.results import damage_warning
+
+    if summary["damaged_nodes"]:
+        typer.echo(damage_warning(summary["damaged_nodes"]), err=True)
     typer.echo(
         f"{summary['frames']} frames over {summary['driven_m']:.1f} m: "
         f"{summary['share_localised']:.1%} localised, "

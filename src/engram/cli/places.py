@@ -117,6 +117,7 @@ def relocalise(
     from engram.cli.progress import progress
     from engram.drive import load_settings, open_drive
     from engram.drive.relocalising import relocalise_drive, summarise_cold_starts
+    from engram.drive.results import damage_warning
     from engram.localiser import Budget
 
     sequence = open_drive(
@@ -136,6 +137,8 @@ def relocalise(
     if as_json:
         print(json.dumps({"summary": summary, "frames": [one.to_dict() for one in starts]}))
         return
+    if summary["damaged_nodes"]:
+        typer.echo(damage_warning(summary["damaged_nodes"]), err=True)
     typer.echo(
         f"{summary['found']} of {summary['frames']} frames found at once, "
         f"{summary['unknown']} not found, {summary['new_place']} new for an empty map, "

@@ -83,7 +83,7 @@ def find_lookalikes(
                 found.append(Lookalike(ids[index], ids[like], float(similarity[like])))
             advance("")
     found.sort(key=lambda pair: -pair.similarity)
-    return Confusion(tuple(found), np.array(rows, np.float32).reshape(len(rows), -1))
+    return Confusion(tuple(found), np.array(rows, np.float32).reshape(len(rows), len(shown)))
 
 
 def write_confusion_picture(file: Path, confusion: Confusion) -> None:

@@ -17,7 +17,7 @@ from engram.config import to_dict
 from engram.drive.live import LiveFrame, ignore, live_frames
 from engram.drive.opened_map import OpenMap
 from engram.drive.place_words import keep_missing_words
-from engram.drive.results import FrameResult, summarise
+from engram.drive.results import FrameResult, damage_warning, summarise
 from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
 from engram.experience.model import PathEntryKind, Session
@@ -109,6 +109,8 @@ class MapReport:
         )
         if self.skipped:
             line += f", {self.skipped} pairs skipped"
+        if summary["damaged_nodes"]:
+            line = f"{damage_warning(summary['damaged_nodes'])}\n{line}"
         if self.interrupted:
             return f"{line}\ninterrupted: what was done is saved; give the same command to resume"
         return f"{line}, revision {self.revision}"

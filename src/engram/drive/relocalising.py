@@ -42,6 +42,7 @@ class ColdStart:
         attempts: match attempts made.
         new_place: probability of a new place before matching; None where the relocaliser cannot
             tell. Not to be relied on.
+        damaged: nodes that were to be attempted and whose landmarks cannot be read.
     """
 
     stamp_ns: int
@@ -50,6 +51,7 @@ class ColdStart:
     inliers: int
     attempts: int
     new_place: float | None
+    damaged: tuple[NodeId, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -60,6 +62,7 @@ class ColdStart:
             "inliers": self.inliers,
             "attempts": self.attempts,
             "new_place": self.new_place,
+            "damaged": [str(node) for node in self.damaged],
         }
 
 
@@ -112,6 +115,7 @@ def summarise_cold_starts(starts: list[ColdStart]) -> dict[str, Any]:
         "frames": len(starts),
         **{status.value: counts[status] for status in PlaceStatus},
         "attempts": sum(start.attempts for start in starts),
+        "damaged_nodes": sorted({str(node) for start in starts for node in start.damaged}),
     }
 
 
@@ -127,12 +131,13 @@ def _cold_start(
     ]
     live_id = node_id(UNNAMED_LIVE_SESSION, frame.stamp_ns)
     outcomes = attempter.run(frame, live_id, candidates, None)
+    damaged = tuple(outcome.candidate.node for outcome in outcomes if outcome.damaged)
     success = best_success(outcomes)
     if success is None:
         # Where nothing can be tried all is new. Elsewhere the probability does not decide: under
         # another light it cannot tell known places from new ones (docs/places.md).
         status = PlaceStatus.UNKNOWN if proposed else PlaceStatus.NEW_PLACE
-        return ColdStart(frame.stamp_ns, status, None, 0, len(outcomes), finder.new_place)
+        return ColdStart(frame.stamp_ns, status, None, 0, len(outcomes), finder.new_place, damaged)
     return ColdStart(
         frame.stamp_ns,
         PlaceStatus.FOUND,
@@ -140,4 +145,5 @@ def _cold_start(
         success.match.inliers,
         len(outcomes),
         finder.new_place,
+        damaged,
     )

@@ -59,6 +59,7 @@ class FrameResult:
             "attempts": found.attempts,
             "candidates": found.candidates,
             "open_loop_m": found.open_loop_m,
+            "damaged": [str(node) for node in found.damaged],
             "ms": self.ms,
         }
 
@@ -81,8 +82,17 @@ def summarise(results: Sequence[FrameResult]) -> dict[str, Any]:
         "route_not_localised": route_not_localised([drive]),
         "longest_gap_m": longest_gap_m([drive]),
         "late_frames": sum(result.late for result in results),
+        "damaged_nodes": sorted({str(n) for r in results for n in r.localisation.damaged}),
         "stages_ms": stage_statistics([result.stage_ms for result in results]),
     }
+
+
+def damage_warning(damaged: Sequence[str]) -> str:
+    """What people are told of the nodes that could not be read; needs at least one."""
+    return (
+        f"warning: {len(damaged)} damaged nodes of the map were passed over, such as "
+        f"{damaged[0]}: engram check tells more"
+    )
 
 
 def stage_statistics(stage_ms: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:

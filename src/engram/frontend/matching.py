@@ -140,6 +140,9 @@ class Match:
     live_rows: NDArray[np.int32]
 
 
+NO_MATCH = Match(None, None, 0, np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32))
+
+
 def match_frames(
     reference: Frame,
     live: Frame,
@@ -182,8 +185,7 @@ def match_frames(
         None if predicted_covariance is None else np.ascontiguousarray(predicted_covariance),
     )
     if found is None:
-        nothing = np.empty(0, dtype=np.int32)
-        return Match(None, None, 0, nothing, nothing)
+        return NO_MATCH
     matrix, covariance, reference_rows, live_rows = found
     # Refinement multiplies many small updates in single precision: 1e-6 of skew.
     pose = SE3(matrix[:3, :3], matrix[:3, 3]).renormalised()

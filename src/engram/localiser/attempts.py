@@ -11,9 +11,10 @@ from typing import Protocol, Self
 
 import numpy as np
 
+from engram.errors import MapCorruptError
 from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
-from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
+from engram.frontend.matching import NO_MATCH, Match, MatcherConfig, match_frames, pair_seed
 from engram.localiser.acceptance import (
     AcceptanceConfig,
     Prediction,
@@ -54,6 +55,7 @@ class Outcome:
         match: with what it has in common with the live frame.
         accepted: whether that is a localisation.
         plausible: whether it would be one if another frame agreed; only where nothing was expected.
+        damaged: whether the node's landmarks could not be read, so that there is nothing to match.
     """
 
     candidate: Candidate
@@ -61,6 +63,7 @@ class Outcome:
     match: Match
     accepted: bool
     plausible: bool = False
+    damaged: bool = False
 
 
 class Matcher(Protocol):
@@ -164,6 +167,9 @@ class Attempter:
     ) -> list[Outcome]:
         """Attempts in ranked order; stops after the first round with a success.
 
+        A node whose landmarks are damaged is passed over, and its outcome says so: a robot can do
+        without one node of its map.
+
         Args:
             live: the live frame.
             live_id: its UUID, which with the node's seeds the matcher.
@@ -187,7 +193,10 @@ class Attempter:
         self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate], ranks: range
     ) -> list[Outcome]:
         def attempt(rank: int) -> Outcome:
-            return self._attempt(live, live_id, candidates[rank], rank)
+            try:
+                return self._attempt(live, live_id, candidates[rank], rank)
+            except MapCorruptError:
+                return Outcome(candidates[rank], rank, NO_MATCH, accepted=False, damaged=True)
 
         if self._pool is None or len(ranks) == 1:
             return [attempt(rank) for rank in ranks]

@@ -112,6 +112,8 @@ class Localisation:
             no estimate.
         new_place: probability, before matching, that the frame shows nothing of the map; None
             where no relocaliser was asked, or it cannot tell. What a match says counts more.
+        damaged: nodes that were to be attempted and whose landmarks cannot be read, each told once;
+            the localiser passes them over from then on. ``engram check`` tells more.
         stage_ms: time of each stage of this call.
     """
 
@@ -127,6 +129,7 @@ class Localisation:
     inliers: int = 0
     position: Position | None = None
     new_place: float | None = None
+    damaged: tuple[NodeId, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -190,6 +190,8 @@ class Localiser:
         self._attempts: list[Attempt] = []
         self._outcomes: list[Outcome] = []
         self._new_place: float | None = None
+        self._damaged: set[int] = set()
+        self._new_damaged: tuple[NodeId, ...] = ()
 
     def __enter__(self) -> Self:
         return self
@@ -277,13 +279,13 @@ class Localiser:
 
         Raises:
             IncompatibleError: the map was made with another kind of descriptor.
-            MapCorruptError: a node's landmarks do not match their hash.
         """
         clock = _StageClock()
         if deadline is None and self._budget.deadline_ms is not None:
             deadline = clock.started + self._budget.deadline_ms / 1e3
         self.carry_on(odometry)
         self._new_place = None
+        self._new_damaged = ()
         self._recent.begin_frame(self._driven_m)
         outcomes: list[Outcome] = []
         neighbourhood: Neighbourhood | None = None
@@ -296,7 +298,7 @@ class Localiser:
             outcomes = self._attempter.run(
                 live, node_id(self.live, live.stamp_ns), candidates, deadline
             )
-            outcomes = self._hypotheses.judge(outcomes)
+            outcomes = self._hypotheses.judge(self._without_damaged(outcomes))
             clock.lap("attempts")
             self._remember(live, neighbourhood, outcomes)
         self._outcomes = outcomes
@@ -416,7 +418,11 @@ class Localiser:
             self._attempter.prefetch(
                 [self._graph.node(int(i)).id for i in neighbourhood.nodes[order[:_PREFETCH]]]
             )
-            ranked = [self._predicted(neighbourhood, int(row)) for row in order[:budget]]
+            ranked = [
+                self._predicted(neighbourhood, int(row))
+                for row in order[: budget + len(self._damaged)]
+                if int(neighbourhood.nodes[row]) not in self._damaged
+            ][:budget]
         left_to_mapper = self.certain and not self.proposes_when_certain
         if (ranked and not self._lost) or self._relocaliser is None or left_to_mapper:
             return ranked
@@ -426,7 +432,7 @@ class Localiser:
         proposed = [
             Candidate(index, self._graph.node(index).id, None, guided=False, row=None)
             for index in dict.fromkeys(indices)
-            if index not in known
+            if index not in known | self._damaged
         ]
         return _alternate(proposed, ranked)[:budget]
 
@@ -434,7 +440,11 @@ class Localiser:
         """The relocaliser's nodes, without this session's own recent ones (SPEC §3.1)."""
         assert self._relocaliser is not None
         relocaliser = self._relocaliser
-        proposed = relocaliser.propose(live, count, lambda index: not self._is_recent_own(index))
+        proposed = relocaliser.propose(
+            live,
+            count,
+            lambda index: index not in self._damaged and not self._is_recent_own(index),
+        )
         self._new_place = relocaliser.new_place
         return proposed
 
@@ -453,6 +463,13 @@ class Localiser:
             and prediction.sigma_yaw_rad < self.config.guide_below_rad
         )
         return Candidate(index, self._graph.node(index).id, prediction, guided, row)
+
+    def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
+        """Those of nodes that can be read; the others are told, and not attempted again."""
+        damaged = [outcome.candidate for outcome in outcomes if outcome.damaged]
+        self._new_damaged = tuple(candidate.node for candidate in damaged)
+        self._damaged.update(candidate.index for candidate in damaged)
+        return [outcome for outcome in outcomes if not outcome.damaged]
 
     def _remember(
         self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
@@ -533,6 +550,7 @@ class Localiser:
             open_loop_m=self._open_loop_m,
             position=self.position,
             new_place=self._new_place,
+            damaged=self._new_damaged,
             stage_ms=stage_ms,
         )
         if success is None:

@@ -102,6 +102,6 @@ class PlaceBook:
         try:
             return self.words_of(self._frames.frame(node))
         except MapCorruptError:
-            # Whoever needs this very node meets the error; the others can be found without it.
+            # The others can be found without it; `engram check` names it.
             self.unreadable.add(index)
             return np.zeros(0, np.int32)

@@ -51,7 +51,6 @@ class Relocaliser(Protocol):
 
         Raises:
             IncompatibleError: the frame has another kind of descriptor than the map.
-            MapCorruptError: a node's landmarks do not match their hash.
         """
         ...
 

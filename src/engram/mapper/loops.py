@@ -18,7 +18,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import ConfigError
+from engram.errors import ConfigError, MapCorruptError
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import Edge, EdgeKind, Node, NodeId
 from engram.frontend import Frame
@@ -119,9 +119,6 @@ class LoopSearch:
         """The loops that are closed by now, each from the known node to the new one.
 
         Call it once per live frame.
-
-        Raises:
-            MapCorruptError: the landmarks of a likely place do not match their hash.
         """
         self._frames += 1
         return self._answers_to(self._frames - self.config.answer_after_frames)
@@ -171,7 +168,11 @@ class LoopSearch:
     def _matched(self, question: _Question, place: int) -> tuple[int, Edge] | None:
         """Inliers and the edge, if the place is matched."""
         known = self._graph.node(place).id
-        match = self._matcher.match(question.frame, question.node, known, None)
+        try:
+            match = self._matcher.match(question.frame, question.node, known, None)
+        except MapCorruptError:
+            self._book.unreadable.add(place)  # not to be proposed again; `engram check` names it
+            return None
         if match.reference_from_live is None or match.covariance is None:
             return None
         over = partial(self._matcher.spread, question.frame, question.node, known, match)
