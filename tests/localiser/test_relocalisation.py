@@ -126,6 +126,13 @@ def test_what_failed_gives_way_to_places_further_down_the_list() -> None:
     assert len({node for nodes in proposed for node in nodes}) == 20
 
 
+def test_many_attempts_a_frame_go_through_the_whole_map_before_any_is_repeated() -> None:
+    one_look = SimpleNamespace(frame=lambda node: MAPPED.frames[0])
+    relocaliser = RELOCALISERS["fabmap"](Searched(_Nodes(600), one_look, brief))
+    proposed = [propose_in_vain(relocaliser, 64) for _ in range(9)]
+    assert len({node for nodes in proposed for node in nodes}) == 9 * 64
+
+
 def test_after_it_was_found_the_best_places_come_first_again() -> None:
     relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
     first, second = (propose_in_vain(relocaliser) for _ in range(2))
@@ -133,8 +140,8 @@ def test_after_it_was_found_the_best_places_come_first_again() -> None:
     assert relocaliser.propose(LIVE.frames[7], 4, anywhere) == first != second
 
 
-def propose_in_vain(relocaliser: Relocaliser) -> list[int]:
-    proposed = relocaliser.propose(LIVE.frames[7], 4, anywhere)
+def propose_in_vain(relocaliser: Relocaliser, count: int = 4) -> list[int]:
+    proposed = relocaliser.propose(LIVE.frames[7], count, anywhere)
     relocaliser.failed(proposed)
     return proposed
 

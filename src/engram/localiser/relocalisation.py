@@ -21,8 +21,6 @@ from engram.places import RECOGNISERS, PlaceRecogniser, Vocabulary
 _NEIGHBOURS = 3
 # A node that failed is not tried again for so many frames, unless nothing else is left.
 _PATIENCE = 10
-# Places of which those to attempt are chosen.
-_SHORTLIST = 256
 
 
 class Relocaliser(Protocol):
@@ -136,16 +134,18 @@ class ByAppearance:
         self.new_place = compared.new_place
         self._frames_seen += 1
         likely = self._belief.observe(compared.evidence)
-        places = [place for place in best_places(self.book, likely) if allowed(place)]
+        # All that were tried lately may stand in front.
+        most = (_PATIENCE + 2) * count
+        places = [place for place in best_places(self.book, likely, most) if allowed(place)]
         fresh = [
             place
             for place in places
             if self._frames_seen - self._tried.get(place, -_PATIENCE) >= _PATIENCE
         ]
         proposed = spread(fresh, count)
-        return (
-            proposed + [place for place in places if place not in proposed][: count - len(proposed)]
-        )
+        chosen = set(proposed)
+        tried = [place for place in places if place not in chosen]
+        return proposed + tried[: count - len(proposed)]
 
     def carry_on(self, motion: SE3 | None) -> None:
         """See `Relocaliser`."""
@@ -162,20 +162,24 @@ class ByAppearance:
         self._tried.clear()
 
 
-def best_places(book: PlaceBook, likely: NDArray[np.float64]) -> list[int]:
+def best_places(book: PlaceBook, likely: NDArray[np.float64], most: int) -> list[int]:
     """The most likely nodes, best first, without those whose words nobody could read."""
-    best = _core.best_scores(likely, _SHORTLIST)
+    best = _core.best_scores(likely, most)
     return [int(place) for place in best if int(place) not in book.unreadable]
 
 
 def spread(places: list[int], count: int) -> list[int]:
     """The first `count` places of which no two are neighbours, then the rest in order."""
     apart: list[int] = []
+    near: set[int] = set()
     for place in places:
-        if len(apart) < count and all(abs(place - other) > _NEIGHBOURS for other in apart):
+        if len(apart) == count:
+            return apart
+        if place not in near:
             apart.append(place)
-    rest = [place for place in places if place not in apart]
-    return (apart + rest)[:count]
+            near.update(range(place - _NEIGHBOURS, place + _NEIGHBOURS + 1))
+    chosen = set(apart)
+    return (apart + [place for place in places if place not in chosen])[:count]
 
 
 def van_der_corput_order(count: int) -> list[int]:

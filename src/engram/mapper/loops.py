@@ -32,6 +32,9 @@ from engram.localiser import (
     spread,
 )
 
+# Places of which those to attempt are chosen, apart from each other.
+_SHORTLIST = 256
+
 
 @dataclass(frozen=True, slots=True)
 class LoopConfig:
@@ -159,7 +162,8 @@ class LoopSearch:
         compared = self._book.compare(self._book.words_of(question.frame))
         evidence = compared.evidence[: len(question.news)]
         likely = np.where(question.news, evidence, -np.inf)
-        places = [place for place in best_places(self._book, likely) if question.news[place]]
+        likeliest = best_places(self._book, likely, _SHORTLIST)
+        places = [place for place in likeliest if question.news[place]]
         matches = [self._matched(question, place) for place in spread(places, self.config.attempts)]
         believed = [found for found in matches if found is not None]
         best = max(believed, key=lambda found: found[0], default=None)
