@@ -6,6 +6,7 @@ from engram.localiser.acceptance import (
     Spread,
     accept,
     accept_lost,
+    agrees,
     plausible,
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
@@ -47,6 +48,7 @@ __all__ = [
     "Walk",
     "accept",
     "accept_lost",
+    "agrees",
     "best_places",
     "plausible",
     "spread",

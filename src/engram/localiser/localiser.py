@@ -182,6 +182,7 @@ class Localiser:
         self._run = RunLog()
         self.walk = Walk(path_id(self.live))
         self.proposes_when_certain = True
+        self.proposes_own_when_certain = True
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
@@ -437,23 +438,29 @@ class Localiser:
         return _alternate(proposed, ranked)[:budget]
 
     def _proposals(self, live: Frame, count: int) -> list[int]:
-        """The relocaliser's nodes, without this session's own recent ones (SPEC §3.1)."""
+        """The relocaliser's nodes, without those of this session that say nothing new."""
         assert self._relocaliser is not None
         relocaliser = self._relocaliser
         proposed = relocaliser.propose(
             live,
             count,
-            lambda index: index not in self._damaged and not self._is_recent_own(index),
+            lambda index: index not in self._damaged and not self._is_known_own(index),
         )
         self._new_place = relocaliser.new_place
         return proposed
 
-    def _is_recent_own(self, index: int) -> bool:
+    def _is_known_own(self, index: int) -> bool:
+        """Whether a node is this session's own, and was just saved or is for the mapper to find.
+
+        Nodes saved a moment ago are no candidates (SPEC §3.1). While every motion is measured the
+        robot knows how it stands to its own nodes, but for drift: a match with one of them is a
+        loop, or a look-alike. A mapper that closes loops asks for a second witness.
+        """
         node = self._graph.node(index)
-        return (
-            node.session == self._own_session
-            and node.driven_m > self._driven_m - self.config.own_exclusion_m
-        )
+        if node.session != self._own_session:
+            return False
+        left_to_mapper = self.certain and not self.proposes_own_when_certain
+        return left_to_mapper or node.driven_m > self._driven_m - self.config.own_exclusion_m
 
     def _predicted(self, neighbourhood: Neighbourhood, row: int) -> Candidate:
         index = int(neighbourhood.nodes[row])

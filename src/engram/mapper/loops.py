@@ -5,6 +5,9 @@ its search radius. So the frame of every saved node is looked up among all place
 likely ones are matched with it. That happens on a thread of its own, off the path of the live
 frames, and the answer is taken some frames later, always the same number: what comes of it depends
 on the drive alone, not on the speed of the machine.
+
+One match closes no loop: a wrong edge would spoil the map for good, and two streets may show the
+same parked cars. It waits until another one, some way on, agrees with it.
 """
 
 from __future__ import annotations
@@ -27,7 +30,10 @@ from engram.localiser import (
     AcceptanceConfig,
     Matcher,
     PlaceBook,
+    Position,
+    Prediction,
     accept_lost,
+    agrees,
     best_places,
     spread,
 )
@@ -49,18 +55,24 @@ class LoopConfig:
             the search radius.
         own_exclusion_m: own nodes saved within the last so many metres close no loop. Source:
             SPEC §3.1.
+        confirm_after_m: two matches confirm each other when they were made at least this far apart.
+            What stands beside one of them is then out of the other's sight, or far ahead: half of
+            all landmarks of a street are within 10 m.
+        confirm_within_m: a match that nothing confirmed within this distance is dropped.
     """
 
     attempts: int = 8
     answer_after_frames: int = 5
     near_m: float = 8.0
     own_exclusion_m: float = 30.0
+    confirm_after_m: float = 8.0
+    confirm_within_m: float = 30.0
 
     def __post_init__(self) -> None:
         for name in ("attempts", "answer_after_frames"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 1")
-        for name in ("near_m", "own_exclusion_m"):
+        for name in ("near_m", "own_exclusion_m", "confirm_after_m", "confirm_within_m"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 0")
 
@@ -100,6 +112,7 @@ class LoopSearch:
         self._acceptance = acceptance
         self._frames = 0
         self._asked: deque[tuple[int, Future[Edge | None]]] = deque()
+        self._waiting: list[Edge] = []
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="engram-loops")
 
     def __enter__(self) -> Self:
@@ -135,8 +148,48 @@ class LoopSearch:
         while self._asked and self._asked[0][0] <= frame:
             edge = self._asked.popleft()[1].result()
             if edge is not None:
-                edges.append(edge)
+                edges += self._confirmed(edge)
         return edges
+
+    def _confirmed(self, edge: Edge) -> list[Edge]:
+        """The match and those that waited for it; or none, and it waits itself."""
+        here_m = self._driven_m(edge)
+        self._waiting = [
+            one
+            for one in self._waiting
+            if here_m - self._driven_m(one) <= self.config.confirm_within_m
+        ]
+        agreeing = [
+            one
+            for one in self._waiting
+            if here_m - self._driven_m(one) >= self.config.confirm_after_m
+            and self._agree(one, edge)
+        ]
+        if not agreeing:
+            self._waiting.append(edge)
+            return []
+        self._waiting = [one for one in self._waiting if one not in agreeing]
+        return [*agreeing, edge]
+
+    def _driven_m(self, edge: Edge) -> float:
+        """How far the robot had come when it saved the new node."""
+        return float(self._graph.driven_m[self._graph.index(edge.b)])
+
+    def _agree(self, first: Edge, second: Edge) -> bool:
+        """Whether two matches put the robot where it drove from one to the other."""
+        graph = self._graph
+        driven = graph.predict(graph.index(first.b), graph.index(second.b))
+        known = graph.predict(graph.index(first.a), graph.index(second.a))
+        if driven is None or known is None:
+            return False
+        carried = Position(first.a, first.a_from_b, first.covariance).carried_on(*driven)
+        covariance = carried.covariance + known[1]
+        sigma_m = Position(first.a, carried.node_from_live, covariance).sigma_m
+        sigma_yaw_rad = float(np.sqrt(covariance[4, 4]))
+        prediction = Prediction(carried.node_from_live, sigma_m, sigma_yaw_rad)
+        # Places that a long chain joins would agree with anything.
+        certain = sigma_m <= self._acceptance.slack_m
+        return certain and agrees(known[0] @ second.a_from_b, prediction, self._acceptance)
 
     def _news(self, node: Node) -> NDArray[np.bool_]:
         """Nodes that are neither near the node, by all that is known, nor just saved."""

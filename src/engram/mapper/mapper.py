@@ -86,6 +86,7 @@ class Mapper:
         self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
         self._graph = graph
         self._localiser = localiser
+        localiser.proposes_own_when_certain = loops is None
         self._saver = saver
         self._session = session
         # The last saved node and the motion since, while that is known.
