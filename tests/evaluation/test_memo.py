@@ -111,4 +111,4 @@ def test_the_spread_of_inliers_is_known_too(frames: Frames, tmp_path: Path) -> N
     kept = memo.match(live, live_id, node, None)
     spread = matcher.spread(live, live_id, node, match)
     assert memo.spread(live, live_id, node, kept) == spread
-    assert min(spread.image, spread.height_m) > 0
+    assert min(spread.image, spread.height) > 0
