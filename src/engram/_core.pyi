@@ -263,6 +263,26 @@ def path_scores(
     excluded: int = -1,
 ) -> NDArray[np.float64]: ...
 
+def path_order(
+    known: ObservedPaths,
+    bits: NDArray[np.uint64],
+    path_count: int,
+    candidates: NDArray[np.int32],
+    along_m: NDArray[np.float64],
+    across_m: NDArray[np.float64],
+    distance_m: NDArray[np.float64],
+    uuid_words: NDArray[np.uint64],
+    basin_rates: NDArray[np.float64],
+    bin_m: float,
+    level: float,
+    observed: NDArray[np.int32],
+    outcomes: NDArray[np.bool_],
+    reference: int,
+    alpha: float,
+    gamma: float,
+    excluded: int = -1,
+) -> NDArray[np.int64]: ...
+
 # --- places: vocabularies of binary words, and which places show them
 
 class WordTree:

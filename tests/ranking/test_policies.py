@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from tests.worlds import make_context, neighbourhood_of, path_uuid
 
 from engram.errors import ConfigError
+from engram.experience.basin import BASIN_LEVEL
 from engram.ranking import POLICIES, Foreseen, RankingContext, policy_named
+from engram.ranking.context import order_by
 
 
 @st.composite
@@ -190,6 +192,31 @@ def test_path_ranks_beyond_the_basin_by_distance_where_the_literal_formula_does_
     assert policy_named("path").rank(context).tolist() == [1, 2, 0]
     # A longer lens sees farther: the basin then holds the companion 6 m away.
     assert policy_named("path").rank(make_context(**situation, focal_px=707.0))[0] == 0
+
+
+@given(context=contexts())
+@settings(max_examples=60, deadline=None)
+def test_path_is_the_formula_within_the_basin_and_distance_beyond(context) -> None:
+    near, seen = context.neighbourhood, context.observations
+    beyond = context.success_rates() < BASIN_LEVEL
+    scores = context.path_memory.scores(
+        near.nodes, seen.nodes, seen.succeeded, context.reference, excluded=context.own_path
+    )
+    scores[beyond] = 0
+    expected = order_by(context, beyond, -scores)
+    np.testing.assert_array_equal(policy_named("path").rank(context), expected)
+
+
+def test_path_refuses_arrays_that_do_not_fit() -> None:
+    context = make_context(paths=[[0, 1]], candidates=[0, 1])
+    near = context.neighbourhood
+    for broken in (
+        dataclasses.replace(near, nodes=np.array([0, 99], np.int32)),
+        dataclasses.replace(near, distance_m=near.distance_m[:1]),
+        dataclasses.replace(near, along_m=near.along_m[:1]),
+    ):
+        with pytest.raises(ValueError, match=r"node 99|one offset and one distance"):
+            policy_named("path").rank(dataclasses.replace(context, neighbourhood=broken))
 
 
 def test_random_depends_on_seed_and_stamp() -> None:

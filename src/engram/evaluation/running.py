@@ -179,10 +179,17 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
     if workers < 1:
         raise ConfigError(f"workers is {workers}, must be >= 1")
     with _executor(workers) as executor:
-        pending: dict[Future[None], Fold | None] = {
-            executor.submit(_build, plan, fold): fold for fold in plan.folds
-        }
+        to_build = list(plan.folds)
+        pending: dict[Future[None], Fold | None] = {}
+
+        def build_next() -> None:
+            if to_build:
+                fold = to_build.pop(0)
+                pending[executor.submit(_build, plan, fold)] = fold
+
         try:
+            for _ in range(workers):
+                build_next()
             while pending:
                 done, _ = wait(pending, return_when=FIRST_COMPLETED)
                 for future in done:
@@ -190,8 +197,10 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
                     future.result()
                     advance("run" if fold is None else "built")
                     if fold is not None:
+                        # Sessions before the next map: what is done of a fold can be looked at.
                         for session in fold.held_out:
                             pending[executor.submit(_run_session, plan, fold, session)] = None
+                        build_next()
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise

@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
+from engram.experience.basin import BIN_M, MatchBasin
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import PathEntry, PathEntryKind, PathId
+from engram.experience.neighbourhood import Neighbourhood
 
 ALL_KINDS = frozenset(PathEntryKind)
 # [L15 §IV]'s text records matches only (SPEC §4).
@@ -127,6 +129,51 @@ class PathMemory:
             self._bits,
             len(self._paths),
             candidates,
+            observed,
+            outcomes,
+            -1 if reference is None else reference,
+            alpha,
+            gamma,
+            self._excluded(excluded),
+        )
+
+    def order(
+        self,
+        neighbourhood: Neighbourhood,
+        basin: MatchBasin,
+        level: float,
+        observed: NDArray[np.int32],
+        outcomes: NDArray[np.bool_],
+        reference: int | None,
+        *,
+        excluded: PathId | None = None,
+        alpha: float = 1.0,
+        gamma: float = 1.0,
+    ) -> NDArray[np.int64]:
+        """(Y,) int64: rows by `scores` where g >= `level`, then the others, by distance.
+
+        Ties break by distance, then by UUID. One call to the core, where ranking by the parts
+        takes a handful.
+
+        Args:
+            neighbourhood: the candidates Y.
+            basin: gives g.
+            level: of g.
+            observed, outcomes, reference, excluded, alpha, gamma: see `scores`.
+        """
+        self._make_room()
+        return _core.path_order(
+            self._observed,
+            self._bits,
+            len(self._paths),
+            neighbourhood.nodes,
+            neighbourhood.along_m,
+            neighbourhood.across_m,
+            neighbourhood.distance_m,
+            self._graph.uuid_words,
+            basin.rates,
+            BIN_M,
+            level,
             observed,
             outcomes,
             -1 if reference is None else reference,

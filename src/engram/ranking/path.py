@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.experience.basin import BASIN_LEVEL
-from engram.ranking.context import RankingContext, order_by
+from engram.ranking.context import RankingContext
 from engram.ranking.path_literal import PathLiteralPolicy
 from engram.ranking.reasons import Reasons
 
@@ -22,19 +22,22 @@ class PathPolicy:
     name = "path"
 
     def __init__(self, alpha: float = 1.0, gamma: float = 1.0) -> None:
-        self._formula = PathLiteralPolicy(alpha, gamma)
+        self._alpha, self._gamma = alpha, gamma
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`; candidates with g below 0.6 stand behind, by distance."""
-        return self._formula.reasons(context)
+        return PathLiteralPolicy(self._alpha, self._gamma).reasons(context)
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        neighbourhood = context.neighbourhood
-        rates = context.basin.success_rate(neighbourhood.along_m, neighbourhood.across_m)
-        within = rates >= BASIN_LEVEL
-        if np.count_nonzero(within) == len(within):
-            return self._formula.rank(context)
-        scores = np.zeros(len(neighbourhood))
-        scores[within] = self._formula.scores(context, neighbourhood.nodes[within])
-        return order_by(context, ~within, -scores)
+        return context.path_memory.order(
+            context.neighbourhood,
+            context.basin,
+            BASIN_LEVEL,
+            context.observations.nodes,
+            context.observations.succeeded,
+            context.reference,
+            excluded=context.own_path,
+            alpha=self._alpha,
+            gamma=self._gamma,
+        )
