@@ -48,6 +48,7 @@ class MapOptions:
         relocaliser: key of `RELOCALISERS`.
         author: who maps; None for the robot.
         rate_hz: replay in real time; None for as fast as it goes.
+        threads: whether the lanes run on threads; without a deadline the map is the same.
     """
 
     policy: str = "path"
@@ -57,6 +58,7 @@ class MapOptions:
     relocaliser: str | None = "fabmap"
     author: str | None = None
     rate_hz: float | None = None
+    threads: bool = True
 
 
 @dataclass(slots=True)
@@ -233,6 +235,9 @@ def _map_frames(
         relocaliser=options.relocaliser,
         live=writer.session.id,
         saves=True,
+        matcher=FrameMatcher(
+            opened.store.frames, settings.localiser.matcher, threads=options.threads
+        ),
         clock=writer.session,
     )
     if start is not None:

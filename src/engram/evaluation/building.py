@@ -20,7 +20,8 @@ from engram.localiser import Position
 from engram.sequences import FrameLog
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
-GENEROUS = MapOptions(policy="path", lanes=4, rounds=8, relocaliser="fabmap")
+# Folds are built beside each other, one thread each.
+GENEROUS = MapOptions(policy="path", lanes=4, rounds=8, relocaliser="fabmap", threads=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.drive import OpenMap
 from engram.evaluation.drives import Truth
+from engram.experience.graph import ExperienceGraph
 from engram.experience.model import NodeId, SessionId, node_id
 from engram.frontend import FrameStatus
 from engram.geometry import SE3
@@ -37,6 +39,7 @@ class TrueNodes:
             if pose is not None:
                 self._poses[node.id] = pose
         self._ids = list(self._poses)
+        self._in_main = _in_largest_component(opened.graph, self._ids)
         poses = list(self._poses.values())
         self._positions = np.array([pose.translation for pose in poses]).reshape(-1, 3)
         self._headings = np.array([pose.rotation[:, 2] for pose in poses]).reshape(-1, 3)
@@ -52,15 +55,27 @@ class TrueNodes:
         return {self._ids[k] for k in np.flatnonzero((apart_m <= radius_m) & alike)}
 
     def start(self, world_from_live: SE3) -> Position | None:
-        """The position seen from the nearest node that looks the same way; None without nodes."""
+        """The position seen from the nearest node that looks the same way; None without nodes.
+
+        Of those that hang together: what a drive saved where its odometry had lost track, in heavy
+        rain, may be joined to nothing, and a robot set down there would find no other node all day.
+        """
         if not self._ids:
             return None
         distance_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
         away = self._headings @ world_from_live.rotation[:, 2] < np.cos(_VIEW_GATE_RAD)
         # Nodes that look another way only where there are no others.
-        node = self._ids[int(np.lexsort((distance_m, away))[0])]
+        node = self._ids[int(np.lexsort((distance_m, away, ~self._in_main))[0])]
         covariance = np.diag([_SIGMA_M**2] * 3 + [_SIGMA_RAD**2] * 3)
         return Position(node, self._poses[node].inverse() @ world_from_live, covariance)
+
+
+def _in_largest_component(graph: ExperienceGraph, nodes: Sequence[NodeId]) -> NDArray[np.bool_]:
+    """(N,) whether each node is in the part of the graph that hangs together and is largest."""
+    labels = graph.components()
+    largest = np.argmax(np.bincount(labels)) if len(labels) else -1
+    rows = np.array([graph.index(node) for node in nodes], np.int64)
+    return np.asarray(labels[rows] == largest)
 
 
 def start_by_matching(

@@ -88,13 +88,26 @@ class Matcher(Protocol):
 
 
 class FrameMatcher:
-    """Matches with the landmarks that a source holds: what runs on a robot."""
+    """Matches with the landmarks that a source holds: what runs on a robot.
 
-    threads = True
+    Args:
+        frames: the landmarks.
+        config: settings.
+        threads: whether attempts run on threads of their own. Not where processes share the
+            cores anyway: every hand-over waits for its turn there.
+    """
 
-    def __init__(self, frames: LandmarkSource, config: MatcherConfig) -> None:
+    def __init__(
+        self, frames: LandmarkSource, config: MatcherConfig, *, threads: bool = True
+    ) -> None:
         self._frames = frames
         self._config = config
+        self._threads = threads
+
+    @property
+    def threads(self) -> bool:
+        """See `Matcher`."""
+        return self._threads
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
         """See `Matcher`; seeded by both UUIDs."""
