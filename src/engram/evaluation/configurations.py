@@ -124,7 +124,8 @@ def sweep(
     few = FEW_LANES if FEW_LANES in lanes else lanes[0]
     for policy in policies:
         add(Configuration(policy, np, rounds[0]) for np in lanes)
-    add([EVERYTHING])
+    if UNLIMITED in lanes or "oracle" in policies:
+        add([EVERYTHING])  # every match is made anyway, which is most of the time all this takes
     for nr in rounds[1:]:
         limited = [np for np in lanes if np != UNLIMITED]
         add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)
