@@ -262,7 +262,6 @@ def path_scores(
     gamma: float,
     excluded: int = -1,
 ) -> NDArray[np.float64]: ...
-
 def path_order(
     known: ObservedPaths,
     bits: NDArray[np.uint64],

@@ -23,7 +23,7 @@ from engram.drive.settings import Settings
 from engram.experience.model import PathEntryKind, Session
 from engram.frontend import Frame, Frontend
 from engram.geometry import StereoCamera
-from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Position
+from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Matcher, Position
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
 from engram.places import RECOGNISERS, hash_of
 from engram.ranking import check_for_robot
@@ -125,6 +125,7 @@ def map_drive(
     options: MapOptions,
     advance: Callable[[str], None] = ignore,
     start: Position | None = None,
+    vet: Callable[[OpenMap, Matcher], Matcher] | None = None,
 ) -> MapReport:
     """Adds a drive to a map, which is made if there is none.
 
@@ -138,6 +139,7 @@ def map_drive(
         options: how it is mapped.
         advance: called once per frame with a word on how it went.
         start: where the robot stands before its first frame, if that is known.
+        vet: puts another matcher before the map's own; for evaluations, which know the truth.
 
     Raises:
         ConfigError: the policy is unknown, or looks ahead.
@@ -161,6 +163,9 @@ def map_drive(
         opened = OpenMap(store)
         opened.times.add(session)
         words = _node_words(opened, store, settings, options)
+        matcher: Matcher = FrameMatcher(
+            store.frames, settings.localiser.matcher, threads=options.threads
+        )
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             if report.resumed:
                 start = None
@@ -175,6 +180,7 @@ def map_drive(
                 advance,
                 start,
                 words,
+                matcher if vet is None else vet(opened, matcher),
             )
     report.skipped = sequence.skipped
     return report
@@ -224,6 +230,7 @@ def _map_frames(
     advance: Callable[[str], None],
     start: Position | None,
     words: NodeWords | None,
+    matcher: Matcher,
 ) -> None:
     """Feeds the mapper; commits at the end, or leaves the session to be resumed."""
     saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every, words)
@@ -235,9 +242,7 @@ def _map_frames(
         relocaliser=options.relocaliser,
         live=writer.session.id,
         saves=True,
-        matcher=FrameMatcher(
-            opened.store.frames, settings.localiser.matcher, threads=options.threads
-        ),
+        matcher=matcher,
         clock=writer.session,
     )
     if start is not None:
@@ -245,7 +250,7 @@ def _map_frames(
     stored = writer.stored
     if stored.last_entry is not None:
         localiser.resume_walk(stored.last_entry.node, stored.next_sequence, stored.next_iteration)
-    with localiser, loop_search(opened, localiser, settings) as loops:
+    with localiser, loop_search(opened, localiser, settings, matcher) as loops:
         mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper, loops)
         try:
             for live in _from_where_it_stopped(frames, stored, mapper, advance):
@@ -291,7 +296,7 @@ def _node_words(
 
 
 def loop_search(
-    opened: OpenMap, localiser: Localiser, settings: Settings
+    opened: OpenMap, localiser: Localiser, settings: Settings, matcher: Matcher
 ) -> AbstractContextManager[LoopSearch | None]:
     """Looks for loops by the words that the relocaliser knows; None where it knows none."""
     finder = localiser.relocaliser
@@ -301,7 +306,7 @@ def loop_search(
     return LoopSearch(
         opened.graph,
         finder.book,
-        FrameMatcher(opened.store.frames, matching.matcher),
+        matcher,
         matching.acceptance,
         LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
     )

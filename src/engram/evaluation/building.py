@@ -16,15 +16,13 @@ from engram.drive import MapOptions, OpenMap, Settings, map_drive, open_map
 from engram.drive.live import ignore
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.starting import TrueNodes
+from engram.evaluation.vetting import Vetting
 from engram.localiser import Position
 from engram.sequences import FrameLog
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
-# Folds are built beside each other, one thread each. No relocaliser, and so no search for loops:
-# streets of a made-up town look alike, and in `village` 12 of the 16 loops that the first drive
-# closed were wrong; a few such edges spoil the whole map for every policy. Drives start where they
-# truly are, and what they lose they find again by dead reckoning.
-GENEROUS = MapOptions(policy="path", lanes=4, rounds=8, relocaliser=None, threads=False)
+# Folds are built beside each other, one thread each.
+GENEROUS = MapOptions(policy="path", lanes=4, rounds=8, relocaliser="fabmap", threads=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +35,7 @@ class BuiltSession:
         nodes: of the map with it.
         share_localised: of its frames.
         seconds: it took.
+        refused: matches that were refused as false; see `Vetting`.
     """
 
     name: str
@@ -44,6 +43,7 @@ class BuiltSession:
     nodes: int
     share_localised: float
     seconds: float
+    refused: int = 0
 
 
 @dataclass(slots=True)
@@ -88,9 +88,17 @@ def build_map(
         _remove(draft)
         if built.sessions:
             shutil.copyfile(path, draft)
-        log = FrameLog(drive.path)
+        log, vetting = FrameLog(drive.path), Vetting(drive, drives)
         try:
-            report = map_drive(draft, log, settings, options, ignore, _start(draft, drive, drives))
+            report = map_drive(
+                draft,
+                log,
+                settings,
+                options,
+                ignore,
+                _start(draft, drive, drives),
+                vetting.matcher if drive.has_truth else None,
+            )
         finally:
             log.close()
         if report.interrupted or report.revision is None:
@@ -105,6 +113,7 @@ def build_map(
                 nodes,
                 summary["share_localised"],
                 round(time.perf_counter() - started, 3),
+                len(vetting.refused),
             )
         )
         # The record first: where a run is killed between the two it is ahead of the map, and what
