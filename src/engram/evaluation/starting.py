@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from engram.drive import OpenMap
 from engram.evaluation.drives import Truth
+from engram.experience.basin import DEFAULT_RADIUS_M
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import NodeId, SessionId, node_id
 from engram.frontend import FrameStatus
@@ -57,15 +58,17 @@ class TrueNodes:
     def start(self, world_from_live: SE3) -> Position | None:
         """The position seen from the nearest node that looks the same way; None without nodes.
 
-        Of those that hang together: what a drive saved where its odometry had lost track, in heavy
-        rain, may be joined to nothing, and a robot set down there would find no other node all day.
+        Rather of those that hang together: what a drive saved where its odometry had lost track,
+        in heavy rain, may be joined to nothing, and a robot set down there would find no other
+        node all day.
         """
         if not self._ids:
             return None
         distance_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
         away = self._headings @ world_from_live.rotation[:, 2] < np.cos(_VIEW_GATE_RAD)
+        apart = ~self._in_main | (distance_m > DEFAULT_RADIUS_M)
         # Nodes that look another way only where there are no others.
-        node = self._ids[int(np.lexsort((distance_m, away, ~self._in_main))[0])]
+        node = self._ids[int(np.lexsort((distance_m, apart, away))[0])]
         covariance = np.diag([_SIGMA_M**2] * 3 + [_SIGMA_RAD**2] * 3)
         return Position(node, self._poses[node].inverse() @ world_from_live, covariance)
 
