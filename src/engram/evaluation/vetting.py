@@ -13,7 +13,7 @@ from engram.experience.model import NodeId
 from engram.frontend import Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
-from engram.localiser import Matcher, Prediction
+from engram.localiser import Matcher, Prediction, Spread
 from engram.measures.accuracy import FALSE_BEYOND_M, FALSE_BEYOND_RAD
 
 _NO_ROWS = np.empty(0, dtype=np.int32)
@@ -77,7 +77,7 @@ class _Vetted:
         self._vetting.refused.add((live.stamp_ns, node))
         return _NO_MATCH
 
-    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> float:
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
         return self._matcher.spread(live, live_id, node, match)
 
