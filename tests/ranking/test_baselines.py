@@ -166,11 +166,13 @@ class TestCollaborative:
 def test_run_log_forgets_what_lies_two_hundred_metres_back() -> None:
     log = RunLog()
     for metre in range(500):
-        log.add(float(metre), metre, 0.5, accepted=True, inliers=30, landmarks=90)
+        log.add(float(metre), [metre, 7], np.array([0.5, np.nan]), [True, False], [30, 0], 90)
     run = log.attempts(499.0)
-    assert run.nodes.tolist() == list(range(299, 500))
+    assert run.nodes[::2].tolist() == list(range(299, 500))
+    assert set(run.nodes[1::2].tolist()) == {7}
+    assert run.accepted[:2].tolist() == [True, False]
     assert run.driven_m == 499.0
-    assert set(run.inliers.tolist()) == {30}
+    assert set(run.inliers.tolist()) == {30, 0}
 
 
 def test_no_policy_but_the_oracle_needs_foresight() -> None:

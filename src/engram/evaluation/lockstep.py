@@ -177,7 +177,6 @@ def run_in_step(
                 started, made = clock(), cost_so_far()
                 found = localiser.localise(logged.frame, odometry)
                 seconds = clock() - started - (cost_so_far() - made)
-                localiser.take_attempts()
                 runs.step_ms[row] += 1e3 * seconds
                 runs.matched[row, number] = found.node is not None
                 runs.attempts[row, number] = found.attempts
@@ -251,6 +250,7 @@ def _localisers(
                 search=search,
                 clock=situation.drive.session,
             )
+            localiser.keeps_attempts = False  # nothing is written
             localisers.append(stack.enter_context(localiser))
         yield localisers
 

@@ -194,6 +194,7 @@ def node_id(session: SessionId, stamp_ns: int) -> NodeId:
     return NodeId(uuid5(session, f"node:{stamp_ns}"))
 
 
+@lru_cache(maxsize=4096)  # policies ask for the paths of all sessions on every frame
 def path_id(session: SessionId) -> PathId:
     """A session has one path through experience space."""
     return PathId(uuid5(session, "path"))

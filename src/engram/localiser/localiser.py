@@ -183,6 +183,7 @@ class Localiser:
         self.walk = Walk(path_id(self.live))
         self.proposes_when_certain = True
         self.proposes_own_when_certain = True
+        self.keeps_attempts = True
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
@@ -487,9 +488,11 @@ class Localiser:
             [outcome.accepted for outcome in outcomes],
         )
         self._log(live, neighbourhood, outcomes)
+        if not self.keeps_attempts or neighbourhood is None or self.position is None:
+            return
         for outcome in outcomes:
             row = outcome.candidate.row
-            if neighbourhood is None or row is None or self.position is None:
+            if row is None:
                 continue
             attempt = Attempt(
                 iteration=self._recent.iteration,
@@ -518,15 +521,14 @@ class Localiser:
             rates[known] = self._basin.success_rate(
                 neighbourhood.along_m[near], neighbourhood.across_m[near]
             )
-        for outcome, rate in zip(outcomes, rates.tolist(), strict=True):
-            self._run.add(
-                self._driven_m,
-                outcome.candidate.index,
-                rate,
-                accepted=outcome.accepted,
-                inliers=outcome.match.inliers,
-                landmarks=len(live.landmarks),
-            )
+        self._run.add(
+            self._driven_m,
+            [one.candidate.index for one in outcomes],
+            rates,
+            [one.accepted for one in outcomes],
+            [one.match.inliers for one in outcomes],
+            len(live.landmarks),
+        )
 
     def _settle(self, success: Outcome, stamp_ns: int) -> None:
         """The position becomes (n, ``T_n_q``), the open loop 0 (SPEC §3.3)."""

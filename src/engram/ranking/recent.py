@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import takewhile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,8 +76,8 @@ class RecentAttempts:
 
     def __init__(self, config: RecentConfig | None = None, first_iteration: int = 0) -> None:
         self._config = RecentConfig() if config is None else config
-        self._iterations: deque[dict[int, bool]] = deque(maxlen=self._config.T)
-        self._current: dict[int, bool] = {}
+        # By node, least recent first: twice the iteration of its latest attempt, plus its outcome.
+        self._latest: dict[int, int] = {}
         self._began_m: float | None = None
         self._number = first_iteration - 1
 
@@ -95,29 +95,30 @@ class RecentAttempts:
             and driven_m - self._began_m < self._config.iteration_m
         ):
             return self._number
-        if self._began_m is not None:
-            self._iterations.append(self._current)
-        self._current, self._began_m = {}, driven_m
+        self._began_m = driven_m
         self._number += 1
+        self._forget()
         return self._number
 
     def add(self, nodes: Iterable[int], succeeded: Iterable[bool]) -> None:
         """Remember attempts of the frame: dense indices and whether each was accepted."""
         for node, outcome in zip(nodes, succeeded, strict=True):
-            self._current.pop(node, None)
-            self._current[int(node)] = bool(outcome)
+            self._latest.pop(node, None)
+            self._latest[int(node)] = 2 * self._number + bool(outcome)
 
     @property
     def observations(self) -> Observations:
         """W and z now."""
         if self._config.T == 0:
             return Observations.none()
-        latest: dict[int, bool] = {}
-        for attempts in (*self._iterations, self._current):
-            for node, outcome in attempts.items():
-                latest.pop(node, None)
-                latest[node] = outcome
+        count = len(self._latest)
+        outcomes = np.fromiter(self._latest.values(), np.int64, count) & 1
         return Observations(
-            np.fromiter(latest.keys(), np.int32, len(latest)),
-            np.fromiter(latest.values(), np.bool_, len(latest)),
+            np.fromiter(self._latest.keys(), np.int32, count), outcomes.astype(np.bool_)
         )
+
+    def _forget(self) -> None:
+        """Drops what was last attempted before the last T iterations."""
+        oldest = 2 * (self._number - self._config.T)
+        for node in list(takewhile(lambda node: self._latest[node] < oldest, self._latest)):
+            del self._latest[node]

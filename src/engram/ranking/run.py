@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,49 +84,53 @@ class RunLog:
     """Collects the attempts of one session as it drives."""
 
     def __init__(self) -> None:
-        self._dtype = np.dtype(
-            [
-                ("at_m", "f8"),
-                ("nodes", "i4"),
-                ("rates", "f8"),
-                ("accepted", "?"),
-                ("inliers", "i8"),
-                ("landmarks", "i8"),
-            ]
-        )
-        self._rows = np.zeros(64, self._dtype)
+        self._columns = _columns(64)
         self._start = self._end = 0
 
     def add(
         self,
         driven_m: float,
-        node: int,
-        rate: float,
-        *,
-        accepted: bool,
-        inliers: int,
+        nodes: Sequence[int],
+        rates: NDArray[np.float64],
+        accepted: Sequence[bool],
+        inliers: Sequence[int],
         landmarks: int,
     ) -> None:
-        """Remember one attempt; see `RunAttempts` for what the arguments mean."""
-        if self._end == len(self._rows):
-            self._make_room(driven_m)
-        self._rows[self._end] = (driven_m, node, rate, accepted, inliers, landmarks)
-        self._end += 1
+        """Remember the attempts of one frame; see `RunAttempts` for what the arguments mean."""
+        count = len(nodes)
+        if self._end + count > len(self._columns[0]):
+            self._make_room(driven_m, count)
+        place = slice(self._end, self._end + count)
+        values = (driven_m, nodes, rates, accepted, inliers, landmarks)
+        for column, value in zip(self._columns, values, strict=True):
+            column[place] = value
+        self._end += count
 
     def attempts(self, driven_m: float) -> RunAttempts:
-        """What is remembered after `driven_m` metres of the session."""
+        """What is remembered after `driven_m` metres of the session.
+
+        Views: what is behind them is written once and never changed.
+        """
         self._forget(driven_m)
-        rows = self._rows[self._start : self._end]
-        columns = (np.ascontiguousarray(rows[name]) for name in self._dtype.names or ())
-        return RunAttempts(driven_m, *columns)
+        at_m, nodes, rates, accepted, inliers, landmarks = (
+            column[self._start : self._end] for column in self._columns
+        )
+        return RunAttempts(driven_m, at_m, nodes, rates, accepted, inliers, landmarks)
 
     def _forget(self, driven_m: float) -> None:
-        rows = self._rows["at_m"][self._start : self._end]
-        self._start += int(np.searchsorted(rows, driven_m - _REMEMBERED_M))
+        at_m = self._columns[0][self._start : self._end]
+        self._start += int(np.searchsorted(at_m, driven_m - _REMEMBERED_M))
 
-    def _make_room(self, driven_m: float) -> None:
+    def _make_room(self, driven_m: float, count: int) -> None:
         self._forget(driven_m)
-        kept = self._rows[self._start : self._end]
-        rows = np.zeros(max(64, 2 * len(kept)), self._dtype)
-        rows[: len(kept)] = kept
-        self._rows, self._start, self._end = rows, 0, len(kept)
+        kept = [column[self._start : self._end] for column in self._columns]
+        self._start, self._end = 0, len(kept[0])
+        self._columns = _columns(2 * (self._end + count))
+        for column, values in zip(self._columns, kept, strict=True):
+            column[: self._end] = values
+
+
+def _columns(rows: int) -> list[NDArray[Any]]:
+    """Empty columns in the order of `RunAttempts`."""
+    kinds = (np.float64, np.int32, np.float64, np.bool_, np.int64, np.int64)
+    return [np.empty(rows, kind) for kind in kinds]
