@@ -1,4 +1,4 @@
-"""Maps for evaluations: what is refused while they are built, and where drives start in them."""
+"""Maps for evaluations, and where drives start in them."""
 
 from pathlib import Path
 
@@ -12,9 +12,6 @@ from engram.evaluation.building import build_map, true_nodes
 from engram.evaluation.configurations import EVERYTHING, UNLIMITED, sweep
 from engram.evaluation.starting import TrueNodes
 from engram.experience.graph import ExperienceGraph
-from engram.experience.model import EdgeKind
-from engram.geometry import SE3
-from engram.sequences.trajectories import Trajectory, read_truth, write_tum
 
 OPTIONS: MapOptions = few_options().build
 
@@ -22,43 +19,6 @@ OPTIONS: MapOptions = few_options().build
 @pytest.fixture
 def campaign(tmp_path: Path) -> DriveSet:
     return write_campaign(tmp_path / "campaign", (0, 0))
-
-
-def edges(path: Path, drives: DriveSet) -> list[tuple[EdgeKind, float]]:
-    """Kind of each edge, and how far it is from the truth."""
-    with open_map(path) as opened:
-        nodes = true_nodes(opened, drives.drives)
-        found = []
-        for edge in opened.graph.edges:
-            a, b = nodes.pose(edge.a), nodes.pose(edge.b)
-            assert a is not None
-            assert b is not None
-            error = np.linalg.norm((a.inverse() @ b).translation - edge.a_from_b.translation)
-            found.append((edge.kind, float(error)))
-        return found
-
-
-def test_right_matches_are_kept(campaign: DriveSet, tmp_path: Path) -> None:
-    built = build_map(tmp_path / "town.engram", campaign.drives, Settings(), OPTIONS)
-    assert built.sessions[1].refused == 0
-    assert built.sessions[1].share_localised > 0.9
-
-
-def test_matches_that_truth_contradicts_are_refused_and_make_no_edges(
-    tmp_path: Path,
-) -> None:
-    # The second drive says that it is 5 m further along than what it sees.
-    campaign = write_campaign(tmp_path / "campaign", (0, 0))
-    path = campaign.drives[1].path.with_suffix(".truth.txt")
-    known = read_truth(campaign.drives[1].path)
-    assert known is not None
-    ahead = SE3(np.eye(3), np.array([0.0, 0.0, 5.0]))
-    write_tum(path, Trajectory(known.stamps_ns, [pose @ ahead for pose in known.world_from_cam]))
-    built = build_map(tmp_path / "town.engram", campaign.drives, Settings(), OPTIONS)
-    assert built.sessions[1].refused > 0
-    assert built.sessions[1].share_localised == 0
-    kinds = [kind for kind, _ in edges(tmp_path / "town.engram", campaign)]
-    assert EdgeKind.MATCH not in kinds
 
 
 class FakeMap:

@@ -125,7 +125,6 @@ def map_drive(
     options: MapOptions,
     advance: Callable[[str], None] = ignore,
     start: Position | None = None,
-    vet: Callable[[OpenMap, Matcher], Matcher] | None = None,
 ) -> MapReport:
     """Adds a drive to a map, which is made if there is none.
 
@@ -139,7 +138,6 @@ def map_drive(
         options: how it is mapped.
         advance: called once per frame with a word on how it went.
         start: where the robot stands before its first frame, if that is known.
-        vet: puts another matcher before the map's own; for evaluations, which know the truth.
 
     Raises:
         ConfigError: the policy is unknown, or looks ahead.
@@ -163,9 +161,7 @@ def map_drive(
         opened = OpenMap(store)
         opened.times.add(session)
         words = _node_words(opened, store, settings, options)
-        matcher: Matcher = FrameMatcher(
-            store.frames, settings.localiser.matcher, threads=options.threads
-        )
+        matcher = FrameMatcher(store.frames, settings.localiser.matcher, threads=options.threads)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             if report.resumed:
                 start = None
@@ -180,7 +176,7 @@ def map_drive(
                 advance,
                 start,
                 words,
-                matcher if vet is None else vet(opened, matcher),
+                matcher,
             )
     report.skipped = sequence.skipped
     return report

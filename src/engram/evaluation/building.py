@@ -16,7 +16,6 @@ from engram.drive import MapOptions, OpenMap, Settings, map_drive, open_map
 from engram.drive.live import ignore
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.starting import TrueNodes
-from engram.evaluation.vetting import Vetting
 from engram.localiser import Position
 from engram.sequences import FrameLog
 
@@ -35,7 +34,6 @@ class BuiltSession:
         nodes: of the map with it.
         share_localised: of its frames.
         seconds: it took.
-        refused: matches that were refused as false; see `Vetting`.
     """
 
     name: str
@@ -43,7 +41,6 @@ class BuiltSession:
     nodes: int
     share_localised: float
     seconds: float
-    refused: int = 0
 
 
 @dataclass(slots=True)
@@ -88,17 +85,9 @@ def build_map(
         _remove(draft)
         if built.sessions:
             shutil.copyfile(path, draft)
-        log, vetting = FrameLog(drive.path), Vetting(drive, drives)
+        log = FrameLog(drive.path)
         try:
-            report = map_drive(
-                draft,
-                log,
-                settings,
-                options,
-                ignore,
-                _start(draft, drive, drives),
-                vetting.matcher if drive.has_truth else None,
-            )
+            report = map_drive(draft, log, settings, options, ignore, _start(draft, drive, drives))
         finally:
             log.close()
         if report.interrupted or report.revision is None:
@@ -113,7 +102,6 @@ def build_map(
                 nodes,
                 summary["share_localised"],
                 round(time.perf_counter() - started, 3),
-                len(vetting.refused),
             )
         )
         # The record first: where a run is killed between the two it is ahead of the map, and what
