@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from uuid import UUID
@@ -21,7 +22,8 @@ from engram.evaluation import (
 )
 from engram.evaluation.configurations import map_sizes, sweep
 from engram.evaluation.lockstep import Runs
-from engram.evaluation.store import write_runs
+from engram.evaluation.store import only, read_runs, write_runs
+from engram.evaluation.summary import collect
 from engram.experience.model import Clock, Session, SessionId
 from engram.frontend import DescriptorKind
 from synthetic_world import CAMERA
@@ -203,3 +205,19 @@ def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path) -> None:
     files = {path.name for path in write_report(tmp_path / "out", [bare])}
     assert "fig11_lanes.png" in files
     assert not {"fig09_map_size.png", "fig10_candidates.png", "fig13_T.png"} & files
+
+
+def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    shutil.copytree(plan.work, work)
+    begun = replace(plan, work=work)
+    path = begun.runs_path(plan.folds[0].held_out[0], "memo")
+    runs = read_runs(path)
+    assert runs is not None
+    unfinished = Configuration("distance", 4)
+    write_runs(path, only(runs, set(runs.configurations) - {unfinished}))
+    found = collect(begun)
+    assert unfinished not in found.memo
+    assert found.memo.keys() == collect(plan).memo.keys() - {unfinished}
+    assert {len(one.sessions) for one in found.memo.values()} == {SESSIONS}
+    write_report(tmp_path / "out", [begun])

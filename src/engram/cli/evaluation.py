@@ -70,6 +70,10 @@ def ranking(
         typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again."),
     ] = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
+    report_only: Annotated[
+        bool,
+        typer.Option("--report-only", help="Run nothing: tables and figures of what was run."),
+    ] = False,
     campaigns: Annotated[
         Path | None,
         typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
@@ -127,6 +131,8 @@ def ranking(
         for one in _drive_sets(drives, size, campaigns)
     ]
     for plan in plans:
+        if report_only:
+            continue
         if redo:
             forget(plan, redo.split(","))
         with progress(f"evaluate {plan.drives.name}", task_count(plan)) as advance:

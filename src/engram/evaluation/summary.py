@@ -224,7 +224,11 @@ class Lap:
 
 
 def collect(plan: Plan) -> CampaignResult:
-    """Reads what was run of a plan; what the folder holds beyond what the plan asks is left out."""
+    """Reads what was run of a plan; what the folder holds beyond what the plan asks is left out.
+
+    So is, while a plan is not done, what was not run in all sessions that were begun: every table
+    compares configurations on the same sessions.
+    """
     options = plan.options
     wanted = set(sweep(options.policies, options.lanes, options.rounds))
     for fold in plan.folds:
@@ -248,7 +252,11 @@ def collect(plan: Plan) -> CampaignResult:
                 if lap is None and mode == "memo":
                     lap = _lap(runs, plan.drives.drives[session].name)
     memo, live = (
-        {one: ConfigurationResult(one, sessions) for one, sessions in found.items()}
+        {
+            one: ConfigurationResult(one, sessions)
+            for one, sessions in found.items()
+            if len(sessions) == max(map(len, found.values()))
+        }
         for found in by_mode.values()
     )
     return CampaignResult(
