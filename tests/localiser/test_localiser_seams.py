@@ -1,5 +1,6 @@
 """The seams of the localiser: who matches, who searches, what the oracle foresees."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,3 +96,48 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
             assert [one.accepted for one in made] == foreseen.accepted[order].tolist()
             assert [one.match.inliers for one in made] == foreseen.inliers[order].tolist()
     assert policy.seen[-1][0].accepted.any()
+
+
+class _All:
+    """Proposes nodes in their order, and remembers how many were asked for."""
+
+    name = "all"
+    new_place = None
+
+    def __init__(self) -> None:
+        self.asked = []
+
+    def propose(self, live, count, allowed):
+        self.asked.append(count)
+        return [index for index in range(count) if allowed(index)]
+
+    def carry_on(self, motion) -> None: ...
+    def failed(self, nodes) -> None: ...
+    def forget(self) -> None: ...
+
+
+def test_a_lost_robot_has_a_budget_of_its_own_and_a_matcher_that_gives_up_sooner(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
+    relocaliser = _All()
+    with (
+        OpenMap(MapStore.open(path)) as opened,
+        opened.localiser(
+            live[0].frame.camera,
+            Settings(),
+            budget=Budget(2, 1, lost_rounds=5),
+            relocaliser=relocaliser,
+        ) as localiser,
+    ):
+        found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+    assert relocaliser.asked == [10]
+    assert found[0].node is not None
+    assert all(one.attempts <= 2 for one in found[1:])
+    config = Settings().localiser
+    assert config.lost_matcher.max_hypotheses < config.matcher.max_hypotheses
+    assert replace(config, matcher=replace(config.matcher, max_hypotheses=7)).lost_matcher == (
+        replace(config.lost_matcher, max_hypotheses=7)
+    )

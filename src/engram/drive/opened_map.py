@@ -141,7 +141,7 @@ class OpenMap:
         """
         if name not in RELOCALISERS:
             raise ConfigError(
-                f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}, none"
+                f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}"
             )
         return RELOCALISERS[name](
             Searched(
