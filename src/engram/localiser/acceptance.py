@@ -26,7 +26,7 @@ class AcceptanceConfig:
     Attributes:
         min_inliers: fewest inliers. Source: SPEC §3, 20.
         min_inliers_lost: fewest inliers where no prediction speaks for the match: a wrong place
-            must not pass. The best wrong match that passes the two tests below had 42.
+            must not pass. The best wrong match that passes the two tests below had 46.
         min_inliers_plausible: fewest inliers of a lost robot's match that is believed once a second
             one, some way on, agrees with it (`Hypotheses`).
         min_spread_lost: least share of the image over which the inliers spread where no prediction
