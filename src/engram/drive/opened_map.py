@@ -140,9 +140,7 @@ class OpenMap:
             MapCorruptError: the vocabulary or a node's landmarks are damaged.
         """
         if name not in RELOCALISERS:
-            raise ConfigError(
-                f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}"
-            )
+            raise ConfigError(f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}")
         return RELOCALISERS[name](
             Searched(
                 self.graph,
