@@ -23,7 +23,7 @@ from engram.drive.settings import Settings
 from engram.experience.model import PathEntryKind, Session
 from engram.frontend import Frame, Frontend
 from engram.geometry import StereoCamera
-from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Matcher, Position
+from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Position
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
 from engram.places import RECOGNISERS, hash_of
 from engram.ranking import check_for_robot
@@ -161,7 +161,6 @@ def map_drive(
         opened = OpenMap(store)
         opened.times.add(session)
         words = _node_words(opened, store, settings, options)
-        matcher = FrameMatcher(store.frames, settings.localiser.matcher, threads=options.threads)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             if report.resumed:
                 start = None
@@ -176,7 +175,6 @@ def map_drive(
                 advance,
                 start,
                 words,
-                matcher,
             )
     report.skipped = sequence.skipped
     return report
@@ -226,7 +224,6 @@ def _map_frames(
     advance: Callable[[str], None],
     start: Position | None,
     words: NodeWords | None,
-    matcher: Matcher,
 ) -> None:
     """Feeds the mapper; commits at the end, or leaves the session to be resumed."""
     saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every, words)
@@ -238,7 +235,7 @@ def _map_frames(
         relocaliser=options.relocaliser,
         live=writer.session.id,
         saves=True,
-        matcher=matcher,
+        threads=options.threads,
         clock=writer.session,
     )
     if start is not None:
@@ -246,7 +243,7 @@ def _map_frames(
     stored = writer.stored
     if stored.last_entry is not None:
         localiser.resume_walk(stored.last_entry.node, stored.next_sequence, stored.next_iteration)
-    with localiser, loop_search(opened, localiser, settings, matcher) as loops:
+    with localiser, loop_search(opened, localiser, settings) as loops:
         mapper = Mapper(opened.graph, localiser, saver, writer.session, settings.mapper, loops)
         try:
             for live in _from_where_it_stopped(frames, stored, mapper, advance):
@@ -292,7 +289,7 @@ def _node_words(
 
 
 def loop_search(
-    opened: OpenMap, localiser: Localiser, settings: Settings, matcher: Matcher
+    opened: OpenMap, localiser: Localiser, settings: Settings
 ) -> AbstractContextManager[LoopSearch | None]:
     """Looks for loops by the words that the relocaliser knows; None where it knows none."""
     finder = localiser.relocaliser
@@ -302,7 +299,7 @@ def loop_search(
     return LoopSearch(
         opened.graph,
         finder.book,
-        matcher,
+        FrameMatcher(opened.store.frames, matching.matcher),
         matching.acceptance,
         LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
     )

@@ -179,6 +179,7 @@ class OpenMap:
         live: SessionId = UNNAMED_LIVE_SESSION,
         saves: bool = False,
         matcher: Matcher | None = None,
+        threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
         clock: Clocked | None = None,
     ) -> Localiser:
@@ -192,6 +193,7 @@ class OpenMap:
             relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
             live: the live session.
             saves: whether it is being mapped.
+            threads: whether lanes run on threads.
             matcher, search: in place of the map's own; see `Localiser`.
             clock: what its stamps mean, and where it is; None if unknown.
 
@@ -212,6 +214,7 @@ class OpenMap:
             saves=saves,
             config=settings.localiser,
             matcher=matcher,
+            threads=threads,
             search=search,
             background=self._background(camera.fx, settings.frontend.descriptor),
             clock=clock,

@@ -135,6 +135,7 @@ class Localiser:
         saves: whether the session is being mapped: then its own recent nodes are no candidates.
         config: settings.
         matcher: the first half of an attempt; None matches with the landmarks of `frames`.
+        threads: whether lanes run on threads; a `matcher` that is given says so itself.
         search: finds the candidates; None for the graph's own `neighbourhood`. Localisers in step
             with each other, in a graph that does not grow, may share one that remembers.
         background: what policies may know of the map beyond its graph and paths.
@@ -155,6 +156,7 @@ class Localiser:
         saves: bool = False,
         config: LocaliserConfig | None = None,
         matcher: Matcher | None = None,
+        threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
         background: Background | None = None,
         clock: Clocked | None = None,
@@ -172,8 +174,8 @@ class Localiser:
         self._basin = basin
         self._search = graph.neighbourhood if search is None else search
         self._attempter = Attempter(
-            matcher or FrameMatcher(frames, self.config.matcher),
-            matcher or FrameMatcher(frames, self.config.lost_matcher),
+            matcher or FrameMatcher(frames, self.config.matcher, threads=threads),
+            matcher or FrameMatcher(frames, self.config.lost_matcher, threads=threads),
             budget.lanes,
             self.config.acceptance,
         )
