@@ -133,6 +133,7 @@ class MergeReport:
         taken, omitted: nodes.
         edges, path_entries, attempts: how many were added.
         match_attempts: match attempts of the replay, what the merge costs.
+        lookups: frames of the replay for which the relocaliser was asked.
         seconds: wall time.
         components: connected components of the centre afterwards.
         segments: one report each, in the order of replay.
@@ -155,6 +156,7 @@ class MergeReport:
     path_entries: int = 0
     attempts: int = 0
     match_attempts: int = 0
+    lookups: int = 0
     seconds: float = 0.0
     components: int = 0
     segments: list[SegmentReport] = field(default_factory=list)

@@ -114,7 +114,7 @@ class Localisation:
             where no relocaliser was asked, or it cannot tell. What a match says counts more.
         damaged: nodes that were to be attempted and whose landmarks cannot be read, each told once;
             the localiser passes them over from then on. ``engram check`` tells more.
-        stage_ms: time of each stage of this call.
+        stage_ms: time of each stage of this call; "places" only where the relocaliser was asked.
     """
 
     stamp_ns: int

@@ -298,7 +298,7 @@ class Localiser:
             clock.lap("neighbourhood")
             order = self._rank(live, neighbourhood)
             clock.lap("rank")
-            candidates = self._candidates(live, neighbourhood, order)
+            candidates = self._candidates(live, neighbourhood, order, clock)
             outcomes = self._attempter.run(
                 live, node_id(self.live, live.stamp_ns), candidates, deadline
             )
@@ -409,7 +409,11 @@ class Localiser:
         return None if words is None else partial(words.of_frame, live)
 
     def _candidates(
-        self, live: Frame, neighbourhood: Neighbourhood | None, order: NDArray[np.int64]
+        self,
+        live: Frame,
+        neighbourhood: Neighbourhood | None,
+        order: NDArray[np.int64],
+        clock: _StageClock,
     ) -> list[Candidate]:
         """What to attempt, best first.
 
@@ -438,6 +442,7 @@ class Localiser:
             for index in dict.fromkeys(indices)
             if index not in known | self._damaged
         ]
+        clock.lap("places")
         return _alternate(proposed, ranked)[:budget]
 
     def _proposals(self, live: Frame, count: int) -> list[int]:
