@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from engram.drive.place_words import keep_missing_words, stored_words
 from engram.errors import ConfigError, InputError, NotAMapError, RevisionError
 from engram.experience.model import EdgeKind, path_id
 from engram.fleet import DownloadOptions, DownloadReport, download, silent
+from engram.frontend import DescriptorKind
+from engram.places import default_vocabulary
 from engram.store import MapStore
 from mapping_rig import localise_simulated, map_simulated
 from synthetic_world import drive
@@ -125,6 +128,24 @@ def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
         assert theirs.log()[0].committed_ns == ours.log()[-1].committed_ns
         assert theirs.log()[0].configuration["download"]["source"] == ours.content_hash()
     assert (report.bridges, report.expected_missed) == (0, report.copy_missed)
+
+
+def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
+    vocabulary = default_vocabulary(DescriptorKind.BRIEF)
+    sent(centre, tmp_path / "before.engram", "tod", start_h=9.0)
+    keeping = tmp_path / "keeping.engram"
+    MapStore.copy(centre, keeping)
+    with MapStore.open_for_writing(keeping) as store:
+        nodes = [node.id for node in store.load().nodes]
+        assert not stored_words(store, vocabulary)
+        keep_missing_words(store, vocabulary, nodes)
+        kept = stored_words(store, vocabulary)
+    sent(keeping, tmp_path / "after.engram", "tod", start_h=9.0)
+    with MapStore.open(tmp_path / "after.engram") as store:
+        went = stored_words(store, vocabulary)
+    assert set(went) == node_ids(tmp_path / "after.engram")
+    assert all(np.array_equal(words, kept[node]) for node, words in went.items())
+    assert (tmp_path / "before.engram").read_bytes() == (tmp_path / "after.engram").read_bytes()
 
 
 def test_tod_sends_what_was_saved_near_that_hour_over_midnight_too(centre, tmp_path):

@@ -55,7 +55,7 @@ def keep_missing_words(
     known = stored_words(store, vocabulary)
     missing = [node for node in nodes if node not in known]
     name = hash_of(vocabulary)
-    found = _worked_out(store, vocabulary, missing)
+    found = worked_out_words(store, vocabulary, missing)
     count = 0
     while batch := dict(islice(found, _BATCH)):
         store.put_words(name, batch)
@@ -64,9 +64,10 @@ def keep_missing_words(
     return count
 
 
-def _worked_out(
+def worked_out_words(
     store: MapStore, vocabulary: Vocabulary, nodes: Sequence[NodeId]
 ) -> Iterator[tuple[NodeId, Words]]:
+    """The words of nodes by a vocabulary, from their landmarks; damaged nodes are left out."""
     for node in nodes:
         try:
             frame = store.frames.frame(node)

@@ -218,6 +218,7 @@ def _write_draft(
     ):
         _write(writer, stock, selection.sent, bridges, options, advance)
         writer.commit()
+        stock.words.give(draft, [stock.node_ids[at] for at in np.flatnonzero(selection.sent)])
     return _Sent(selection, bridges)
 
 

@@ -12,6 +12,7 @@ from engram.experience.basin import BasinCounts, count_attempts
 from engram.experience.clock import hour_of_day
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
+from engram.fleet.words import CentreWords
 from engram.store import AttemptArrays, MapStore
 
 Array = NDArray[np.float64]
@@ -67,6 +68,11 @@ class Stock:
     def content_hash(self) -> str:
         """Of the centre at this revision."""
         return self.store.content_hash()
+
+    @cached_property
+    def words(self) -> CentreWords:
+        """Words of the nodes."""
+        return CentreWords(self.store)
 
     @cached_property
     def node_ids(self) -> list[NodeId]:
