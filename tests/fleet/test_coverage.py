@@ -46,19 +46,19 @@ def random_coverage(seed: int, places: int = 6, sessions: int = 4, nodes: int = 
 
 
 def missed_by_definition(coverage: Coverage, chosen: set[int]) -> float:
-    """Σ w Π_e (1 − a·max g) / Σ w, written out."""
+    """Σ w Π_e (1 − a·(1 − Π_n (1 − g))) / Σ w, written out."""
     total = 0.0
     for place, session in np.ndindex(coverage.demand.weight.shape):
-        best: dict[int, float] = {}
+        fails: dict[int, float] = {}
         for node in chosen:
             reached, rates = coverage._reached.get(node, (np.zeros(0, int), np.zeros(0)))
             for at, rate in zip(reached, rates, strict=True):
                 if at == place:
                     other = int(coverage._session_of[node])
-                    best[other] = max(best.get(other, 0.0), rate)
+                    fails[other] = fails.get(other, 1.0) * (1 - rate)
         missed = coverage.demand.weight[place, session]
-        for other, rate in best.items():
-            missed *= 1 - coverage._affinity[session, other] * rate
+        for other, failing in fails.items():
+            missed *= 1 - coverage._affinity[session, other] * (1 - failing)
         total += missed
     return total / coverage.demand.total
 
@@ -110,11 +110,11 @@ def test_lazy_takes_what_looking_at_all_would_take(seed):
     size = np.random.default_rng(seed).uniform(1, 3, 20)
     order = greedy_order(coverage, size, np.arange(20)).tolist()
     coverage.clear()
-    for taken in order:
-        ratios = [coverage.gain(node) / size[node] for node in range(20)]
-        if max(ratios) <= 1e-9:
+    for place, taken in enumerate(order):
+        ratios = {node: coverage.gain(node) / size[node] for node in order[place:]}
+        if max(ratios.values()) <= 1e-9:
             break
-        assert ratios[taken] == pytest.approx(max(ratios), rel=1e-12)
+        assert ratios[taken] == pytest.approx(max(ratios.values()), rel=1e-12)
         coverage.add(taken)
 
 
@@ -158,7 +158,7 @@ def test_a_mission_asks_for_the_map_of_its_own_hour(stock):
         everything = expected_missed(coverage, stock.everything())
         assert everything <= missed[own]
         order = greedy_order(coverage, np.ones(len(stock)), np.arange(len(stock)))
-        assert np.mean(robots[order[:10]] == own) >= 0.8
+        assert (robots[order[:6]] == own).all()
 
 
 def test_elsewhere_asks_for_nothing(stock):

@@ -1,21 +1,25 @@
 """What a subset of a map promises to a mission: the expected share of its way with a match.
 
 Past drives stand for the drive to come. Each went along places of the map and was, at each, in the
-light and weather of its own day. Whether a node would match there is
+light and weather of its own day. Whether a node would match there is told by two things: whether
+its session looks alike there at all, with probability a(s, e) for the past session s and the
+session e that saved the node; and, if so, whether this very attempt succeeds, with probability
+g(d) at the node's distance d. Nodes of one session look alike or do not together; given that they
+do, each is an attempt of its own; sessions are taken as independent:
 
-    p = a(s, e) · g(d),
+    P(match) = 1 − Π_e (1 − a(s, e) · (1 − Π_{n of e} (1 − g(d_n)))).
 
-where g is the match basin at the node's distance d, and a(s, e) says how well session s gets on
-with what session e saved: s's remembered successes on e over what g alone would have given, held
-to the average for their difference in hour of day where little is known. Nodes of one session look
-alike, so only the nearest of them counts; sessions are taken as independent:
+Past drives count by how near in time of day they are to the mission, each with the places that it
+itself came past: a place that one drive alone came past counts as little as that drive.
 
-    P(match) = 1 − Π_e (1 − a(s, e) · max g).
+a is learnt from remembered attempts: successes of s on nodes of e over what g alone would have
+given, held to the average for their difference in hour of day, and that to how others got on with
+e. g has the shape of the shipped basin. The one learnt from the map's attempts will not do here:
+far nodes are attempted where near ones have failed, so that it falls off a cliff.
 
-Each place counts alike, whoever came there; at a place past drives count by how near in time of
-day they are to the mission. Adding a node never lowers P, and helps the less the more is there
-already (monotone and submodular), so taking the best node per byte again and again comes close to
-the best subset there is (Leskovec et al., "Cost-effective outbreak detection in networks", 2007).
+Adding a node never lowers P, and helps the less the more is there already (monotone and
+submodular), so taking the best node per byte again and again comes close to the best subset there
+is (Leskovec et al., "Cost-effective outbreak detection in networks", 2007).
 """
 
 from __future__ import annotations
@@ -47,10 +51,16 @@ _HOUR_BINS = 13
 # So many attempts' worth of belief in the average, before a pair of sessions speaks for itself.
 _PAIR_PRIOR = 4.0
 _HOUR_PRIOR = 20.0
+_WORTH_PRIOR = 20.0
 _UNKNOWN_AFFINITY = 0.5
-# A drive an hour and a half away counts 60 % of one at the same hour; any counts a little.
-_MISSION_H = 1.5
-_LEAST_WEIGHT = 0.02
+_OWN_AFFINITY = 0.5
+# A drive three hours away counts 60 % of one at the same hour, any a little: the hour does not tell
+# the weather. Chosen on one fold of `village` among 1.5 and 3 h, 0.02, 0.1 and 0.3.
+_MISSION_H = 3.0
+_LEAST_WEIGHT = 0.1
+# Attempts on nodes of one session that looks alike fail together oftener than by chance: P(second
+# matches | first did not) was 0.2 to 0.3 where g says 0.5 (`village`, 12 drives with all nodes).
+_APART = 0.6
 _MOST = 0.98
 _LEAST_GAIN = 1e-9
 
@@ -61,8 +71,8 @@ class Demand:
 
     Attributes:
         places: (L,) dense indices of the nodes that stand for places.
-        weight: (L, S) how much being there as session s counts; rows sum to 1 where anybody came
-            by and the mission may come, else to 0.
+        weight: (L, S) how much being there as session s counts: the same at all places that the
+            session came past and the mission may come to, 0 elsewhere.
     """
 
     places: NDArray[np.int64]
@@ -70,7 +80,7 @@ class Demand:
 
     @property
     def total(self) -> float:
-        """Number of places that the mission may come to."""
+        """What there is to miss."""
         return float(self.weight.sum())
 
     @staticmethod
@@ -87,11 +97,10 @@ class Demand:
         for at, session in enumerate(stock.sessions):
             nodes = stock.on_path.get(path_id(session.id), np.zeros(0, np.int64))
             hour = hour_of_day(session, session.start_ns)
-            np.add.at(weight[:, at], place_of[nodes], _importance(hour, options))
+            weight[np.unique(place_of[nodes]), at] = _importance(hour, options)
         if where is not None:
             weight[~np.isin(np.arange(len(places)), place_of[where])] = 0.0
-        totals = weight.sum(axis=1, keepdims=True)
-        return Demand(places, np.divide(weight, totals, out=weight, where=totals > 0))
+        return Demand(places, weight)
 
 
 def _importance(hour: float | None, options: DownloadOptions) -> float:
@@ -130,7 +139,9 @@ def _places(stock: Stock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def affinities(stock: Stock, basin: MatchBasin) -> Array:
     """(S, S) a(s, e): how well what session e saved serves one like session s, in (0, 1).
 
-    From remembered attempts, and from the matches on a path where no attempts were kept.
+    From remembered attempts, and from the matches on a path where no attempts were kept. What a
+    pair lacks is taken from the average for its difference in hours, and from how the others got
+    on with e: drives in rain or at night, with which nobody ever matched, serve nobody.
     """
     count = len(stock.sessions)
     won, expected = _tallies(stock, basin)
@@ -139,11 +150,19 @@ def affinities(stock: Stock, basin: MatchBasin) -> Array:
     by_hour = _by_hour(won, expected, apart, others)
     known = np.isfinite(apart)
     bins = np.where(known, np.nan_to_num(apart), 0).round().astype(np.int64)
-    prior = np.where(known, by_hour[bins], _overall(won, expected, others))
+    average = np.where(known, by_hour[bins], _overall(won, expected, others))
+    prior = np.minimum(average * _worth(won, expected * average, others), _MOST)
     found = (won + _PAIR_PRIOR * prior) / (expected + _PAIR_PRIOR)
-    # What a session saved itself says nothing about the next drive in its light.
-    found[~others] = prior[~others]
+    # What a session saved itself says little about the next drive in its light.
+    found[~others] = _OWN_AFFINITY
     return np.asarray(np.clip(found, 1.0 - _MOST, _MOST))
+
+
+def _worth(won: Array, expected: Array, others: Mask) -> Array:
+    """(S,) how well what each session saved served the others, over the average of such pairs."""
+    wins = np.where(others, won, 0.0).sum(axis=0)
+    tries = np.where(others, expected, 0.0).sum(axis=0)
+    return np.asarray((wins + _WORTH_PRIOR * _UNKNOWN_AFFINITY) / (tries + _WORTH_PRIOR))
 
 
 def _tallies(stock: Stock, basin: MatchBasin) -> tuple[Array, Array]:
@@ -212,7 +231,7 @@ class Coverage:
     def __init__(self, stock: Stock, demand: Demand) -> None:
         self.demand = demand
         focal_px = float(np.median([camera.fx for camera in stock.contents.cameras.values()] or 1))
-        basin = MatchBasin.of(focal_px, stock.basin_counts)
+        basin = MatchBasin.of(focal_px)
         self._affinity = affinities(stock, basin)
         self._session_of = stock.session_of
         self._reached = self._reach(stock, basin)
@@ -222,8 +241,8 @@ class Coverage:
         """No node is sent any more."""
         # (L, S): weight × the chance of no match so far.
         self._missed = self.demand.weight.copy()
-        # (L, S_e): the highest g among the nodes of session e that were added.
-        self._best = np.zeros(self.demand.weight.shape)
+        # (L, S_e): the chance that a node of session e that was added matches, if they look alike.
+        self._alike = np.zeros(self.demand.weight.shape)
 
     def _reach(self, stock: Stock, basin: MatchBasin) -> dict[int, tuple[NDArray[np.int64], Array]]:
         """For each node the places that it may be matched at, and g there."""
@@ -235,7 +254,7 @@ class Coverage:
                 radius_m=max(_REACH * basin.basin_m, _PLACE_M), view_gate_rad=_GATE_RAD,
                 slack_sigmas=0.0, slack_m=0.0,
             )  # fmt: skip
-            rates = basin.success_rate(near.along_m, near.across_m)
+            rates = _APART * basin.success_rate(near.along_m, near.across_m)
             for node, rate in zip(near.nodes.tolist(), rates.tolist(), strict=True):
                 found[node][0].append(place)
                 found[node][1].append(rate)
@@ -246,27 +265,26 @@ class Coverage:
         if node not in self._reached:
             return 0.0
         places, rates, before = self._state(node)
-        affinity = self._affinity[:, self._session_of[node]]
-        now = np.maximum(rates, before)
         missed = self._missed[places]
-        less = (1 - affinity * now[:, None]) / (1 - affinity * before[:, None])
-        return float((missed * (1 - less)).sum())
+        return float((missed * (1 - self._less(node, rates, before))).sum())
 
     def add(self, node: int) -> None:
         """The node is sent."""
         if node not in self._reached:
             return
         places, rates, before = self._state(node)
-        session = self._session_of[node]
-        affinity = self._affinity[:, session]
-        now = np.maximum(rates, before)
-        less = (1 - affinity * now[:, None]) / (1 - affinity * before[:, None])
-        self._missed[places] *= less
-        self._best[places, session] = now
+        self._missed[places] *= self._less(node, rates, before)
+        self._alike[places, self._session_of[node]] = _either(rates, before)
+
+    def _less(self, node: int, rates: Array, before: Array) -> Array:
+        """(K, S) by what factor the chance of no match falls at the places that a node reaches."""
+        affinity = self._affinity[:, self._session_of[node]]
+        now = _either(rates, before)
+        return np.asarray((1 - affinity * now[:, None]) / (1 - affinity * before[:, None]))
 
     def _state(self, node: int) -> tuple[NDArray[np.int64], Array, Array]:
         places, rates = self._reached[node]
-        return places, rates, self._best[places, self._session_of[node]]
+        return places, rates, self._alike[places, self._session_of[node]]
 
     @property
     def expected_missed(self) -> float:
@@ -275,6 +293,11 @@ class Coverage:
         1 where the mission has no way at all.
         """
         return float(self._missed.sum() / self.demand.total) if self.demand.total else 1.0
+
+
+def _either(first: Array, second: Array) -> Array:
+    """The chance that one of two things happens."""
+    return 1 - (1 - first) * (1 - second)
 
 
 def expected_missed(coverage: Coverage, sent: Mask) -> float:
