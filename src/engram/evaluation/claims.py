@@ -8,7 +8,8 @@ import numpy as np
 
 from engram.evaluation.configurations import EVERYTHING, UNLIMITED, PathKinds, Radius
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
-from engram.measures import Interval, beats, difference, excess_ratio, ratio
+from engram.evaluation.wording import Row, against, percent, table, times
+from engram.measures import beats, difference, excess_ratio, ratio
 
 # Shares as low as this differ by less than anyone would notice: added to both sides of ratios to
 # the oracle.
@@ -54,12 +55,12 @@ def _policies(campaign: CampaignResult) -> list[str]:
         rows.append(
             (
                 result.configuration.label,
-                _percent(resamples.interval(result.failure(10.0))),
+                percent(resamples.interval(result.failure(10.0))),
                 f"{100 * result.failure(5.0).value:.2f} %",
-                _percent(resamples.interval(missed)),
+                percent(resamples.interval(missed)),
                 "–"
                 if bound is None
-                else _percent(resamples.interval(difference(missed, bound.not_localised))),
+                else percent(resamples.interval(difference(missed, bound.not_localised))),
                 f"{result.longest_gap_m:.0f} m",
                 f"{result.attempts_per_frame:.2f}",
                 f"{live[policy].step_ms:.1f}" if policy in live and plain else "–",
@@ -76,7 +77,7 @@ def _policies(campaign: CampaignResult) -> list[str]:
         f"Np = {campaign.few_lanes}, Nr = 1, T = 10; {count} held-out sessions, "
         f"{driven / 1e3:.1f} km, unguided, no relocalisation"
     )
-    return [title, "", *_table(head, rows)]
+    return [title, "", *table(head, rows)]
 
 
 def _few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
@@ -94,10 +95,7 @@ def _claims(campaign: CampaignResult) -> list[str]:
     rows = [*_path_claims(campaign), *_many_lanes(campaign), *_memory(campaign), *_recall(campaign)]
     rows += [*_growth(campaign), *_errors(campaign), *_seen(campaign)]
     rows += [*_order(campaign)]
-    return _table(("what", "paper", "must", "aim", "measured"), rows)
-
-
-Row = tuple[str, str, str, str, str]
+    return table(("what", "paper", "must", "aim", "measured"), rows)
 
 
 def _path_claims(campaign: CampaignResult) -> Iterable[Row]:
@@ -118,9 +116,9 @@ def _path_claims(campaign: CampaignResult) -> Iterable[Row]:
             "5×" if main else "–",
             "3×, low end > 1.5×" if main else "reported",
             "5×" if main else "",
-            f"{_times(campaign.resamples.interval(excess))}; raw "
-            f"{_times(campaign.resamples.interval(raw))}; P(> 10 m) "
-            f"{_times(campaign.resamples.interval(far))}",
+            f"{times(campaign.resamples.interval(excess))}; raw "
+            f"{times(campaign.resamples.interval(raw))}; P(> 10 m) "
+            f"{times(campaign.resamples.interval(far))}",
         )
 
 
@@ -186,7 +184,7 @@ def _recall(campaign: CampaignResult) -> Iterable[Row]:
         "–",
         "≤ 1.6",
         "≤ 1.2",
-        _times(campaign.resamples.interval(to_bound)),
+        times(campaign.resamples.interval(to_bound)),
     )
     for other in ("path", "distance", "bandit"):
         result = campaign.get(other)
@@ -221,7 +219,7 @@ def _growth(campaign: CampaignResult) -> Iterable[Row]:
             paper,
             must,
             "" if policy == "distance" else "4×",
-            _times(campaign.resamples.interval(fall)),
+            times(campaign.resamples.interval(fall)),
         )
 
 
@@ -275,28 +273,7 @@ def _order(campaign: CampaignResult) -> Iterable[Row]:
 
 
 def _against(campaign: CampaignResult, a: ConfigurationResult, b: ConfigurationResult) -> str:
-    gap = campaign.resamples.interval(difference(a.not_localised, b.not_localised))
-    ours, theirs = (f"{100 * one.not_localised.value:.2f} %" for one in (a, b))
-    low, high = f"{100 * gap.low:+.2f}", f"{100 * gap.high:+.2f}"
-    points = f"{100 * gap.estimate:+.2f} ({low} … {high}) points"
-    return f"{ours} against {theirs}, difference {points}"
-
-
-def _percent(interval: Interval) -> str:
-    if np.isnan(interval.estimate):
-        return "–"
-    low, high = 100 * interval.low, 100 * interval.high
-    return f"{100 * interval.estimate:.2f} % ({low:.2f} … {high:.2f})"
-
-
-def _times(interval: Interval) -> str:
-    if np.isnan(interval.estimate):
-        return "– (0 ÷ 0)"
-    return f"{_number(interval.estimate)}× ({_number(interval.low)} … {_number(interval.high)})"
-
-
-def _number(value: float) -> str:
-    return "∞" if np.isinf(value) else f"{value:.2f}"
+    return against(campaign.resamples, a.not_localised, b.not_localised)
 
 
 def _false(result: ConfigurationResult) -> str:
@@ -310,11 +287,3 @@ def _error(result: ConfigurationResult) -> str:
         return "–"
     degrees = float(np.rad2deg(np.median(errors.turn_rad)))
     return f"{100 * float(np.median(errors.offset_m)):.1f} cm, {degrees:.2f}°"
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    return [
-        "| " + " | ".join(head) + " |",
-        "| " + " | ".join("---" for _ in head) + " |",
-        *("| " + " | ".join(row) + " |" for row in rows),
-    ]

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import platform
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
-
-import cv2
 
 from engram import __version__
 from engram.config import config_hash, to_dict
@@ -25,7 +20,6 @@ from engram.evaluation.building import (
     build_map,
     read_built_map,
     read_record,
-    true_nodes,
     write_json,
 )
 from engram.evaluation.configurations import (
@@ -37,13 +31,15 @@ from engram.evaluation.configurations import (
 )
 from engram.evaluation.drives import DriveSet
 from engram.evaluation.folds import Fold, split
-from engram.evaluation.lockstep import Runs, Situation, run_in_step
+from engram.evaluation.held_out import localise_held_out
+from engram.evaluation.lockstep import Runs
 from engram.evaluation.memo import MatchMemo
-from engram.evaluation.starting import start_by_matching
 from engram.evaluation.store import joined, missing, only, read_runs, write_runs
+from engram.evaluation.tasks import Task, run_tasks
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher, Matcher
 from engram.ranking import POLICIES
+from engram.sequences import LoggedFrame
 from engram.store import MapStore
 
 # Policies that cannot run without knowing the outcomes.
@@ -154,7 +150,7 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
         matcher_hash(settings.localiser.matcher),
         __version__,
     )
-    folder = work / f"{_file_name(drives.name)}-{config_hash(depends)}"
+    folder = work / f"{file_name(drives.name)}-{config_hash(depends)}"
     folder.mkdir(parents=True, exist_ok=True)
     plan = Plan(drives, settings, options, folder)
     write_json(folder / "configuration.json", plan.configuration())
@@ -176,41 +172,27 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
         MapError: a map cannot be written.
         SequenceError: a drive cannot be read.
     """
-    if workers < 1:
-        raise ConfigError(f"workers is {workers}, must be >= 1")
-    with _executor(workers) as executor:
-        to_build = list(plan.folds)
-        pending: dict[Future[None], Fold | None] = {}
+    try:
+        run_tasks(_tasks(plan), workers, advance)
+    finally:
+        _earlier_maps.close()
 
-        def build_next() -> None:
-            if to_build:
-                fold = to_build.pop(0)
-                pending[executor.submit(_build, plan, fold)] = fold
 
-        try:
-            for _ in range(workers):
-                build_next()
-            while pending:
-                done, _ = wait(pending, return_when=FIRST_COMPLETED)
-                for future in done:
-                    fold = pending.pop(future)
-                    future.result()
-                    advance("run" if fold is None else "built")
-                    if fold is not None:
-                        # Sessions before the next map: what is done of a fold can be looked at.
-                        for session in fold.held_out:
-                            pending[executor.submit(_run_session, plan, fold, session)] = None
-                        build_next()
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
-        finally:
-            _earlier_maps.close()
-    # Alone on the machine, and in order: these runs are timed.
+def _tasks(plan: Plan) -> list[Task]:
+    """Fold by fold: sessions before the next map, so that what is done can be looked at."""
+    tasks = []
+    for fold in plan.folds:
+        built = f"build {fold.number}"
+        tasks.append(Task(built, partial(_build, plan, fold), word="built"))
+        tasks += [
+            Task(f"run {session}", partial(_run_session, plan, fold, session), (built,), "run")
+            for session in fold.held_out
+        ]
     for fold in plan.folds[: plan.options.live_folds]:
         for session in fold.held_out:
-            _run_live(plan, fold, session)
-            advance("timed")
+            work = partial(_run_live, plan, fold, session)
+            tasks.append(Task(f"time {session}", work, (), "timed", alone=True))
+    return tasks
 
 
 def forget(plan: Plan, policies: Sequence[str]) -> None:
@@ -226,28 +208,7 @@ def forget(plan: Plan, policies: Sequence[str]) -> None:
 
 def task_count(plan: Plan) -> int:
     """How often `run` will call `advance`."""
-    timed = sum(len(fold.held_out) for fold in plan.folds[: plan.options.live_folds])
-    return len(plan.folds) + len(plan.drives.drives) + timed
-
-
-class _Here(Executor):
-    """Runs everything at once, in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
-
-
-@contextmanager
-def _executor(workers: int) -> Iterator[Executor]:
-    if workers == 1:
-        yield _Here()
-        return
-    # Started afresh: a forked child would share the parent's threads half way through.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, partial(cv2.setNumThreads, 1)) as pool:
-        yield pool
+    return len(_tasks(plan))
 
 
 def _build(plan: Plan, fold: Fold) -> None:
@@ -342,36 +303,26 @@ def _run_in(
     plan: Plan,
     fold: Fold,
     session: int,
-    frames: Sequence[Any],
+    frames: Sequence[LoggedFrame],
     matcher: Matcher | None,
     opened: OpenMap,
     configurations: Sequence[Configuration],
 ) -> Runs:
     """One session in one map."""
-    drive = plan.drives.drives[session]
-    training = [plan.drives.drives[number] for number in fold.training]
-    nodes, truth = true_nodes(opened, training), drive.truth()
-    first = None if truth is None else truth.at(frames[0].frame.stamp_ns)
-    if first is not None:
-        position = nodes.start(first)
-        start = None if position is None else (0, position)
-    else:
-        config = plan.settings.localiser
-        start = start_by_matching(
-            opened,
-            frames,
-            drive.session.id,
-            FrameMatcher(opened.store.frames, config.matcher) if matcher is None else matcher,
-            config.acceptance,
-        )
-    situation = Situation(opened, drive, frames, start, nodes, truth)
-    cost = (lambda: matcher.seconds) if isinstance(matcher, MatchMemo) else (lambda: 0.0)
-    return run_in_step(
-        situation, configurations, plan.settings, matcher, plan.options.relocaliser, cost
+    return localise_held_out(
+        opened,
+        plan.drives.drives[session],
+        frames,
+        [plan.drives.drives[number] for number in fold.training],
+        configurations,
+        plan.settings,
+        matcher,
+        plan.options.relocaliser,
     )
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
+    """A name without what file systems do not like."""
     return "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
 
 

@@ -27,6 +27,7 @@ from engram.measures import (
     SessionSums,
     failure_sums,
     longest_gap_m,
+    not_localised_sums,
 )
 
 Array = NDArray[np.float64]
@@ -84,8 +85,7 @@ class ConfigurationResult:
     @cached_property
     def not_localised(self) -> SessionSums:
         """Route not localised: metres of steps without a match ÷ metres (SPEC §8)."""
-        missed = [float(one.step_m[~one.matched].sum()) for one in self.drives]
-        return SessionSums(np.array(missed), self.driven_m)
+        return not_localised_sums(self.drives)
 
     @cached_property
     def driven_m(self) -> Array:
@@ -247,7 +247,7 @@ def collect(plan: Plan) -> CampaignResult:
                         continue
                     count = len(fold.training) if one.sessions is None else one.sessions
                     nodes = built.sessions[count - 1].nodes
-                    result = _session_result(runs, row, session, fold.number, nodes)
+                    result = session_result(runs, row, session, fold.number, nodes)
                     found.setdefault(one, []).append(result)
                 if lap is None and mode == "memo":
                     lap = _lap(runs, plan.drives.drives[session].name)
@@ -264,7 +264,8 @@ def collect(plan: Plan) -> CampaignResult:
     )
 
 
-def _session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) -> SessionResult:
+def session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) -> SessionResult:
+    """One configuration's row of what was run of a session."""
     known = np.isfinite(runs.offset_m[row])
     return SessionResult(
         session=session,

@@ -22,6 +22,7 @@ from engram.measures.failure import (
     failure_sums,
     gaps,
     longest_gap_m,
+    not_localised_sums,
     route_m,
     route_not_localised,
 )
@@ -45,6 +46,7 @@ __all__ = [
     "failure_sums",
     "gaps",
     "longest_gap_m",
+    "not_localised_sums",
     "pose_errors",
     "ratio",
     "route_m",

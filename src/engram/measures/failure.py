@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
+from engram.measures.bootstrap import SessionSums
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,6 +148,13 @@ def route_not_localised(drives: Sequence[Drive]) -> float:
     length_m = route_m(drives)
     missed_m = sum(float(drive.step_m[~drive.matched].sum()) for drive in drives)
     return missed_m / length_m if length_m else 0.0
+
+
+def not_localised_sums(drives: Sequence[Drive]) -> SessionSums:
+    """`route_not_localised` by its parts: metres without a match and metres driven, by session."""
+    missed_m = [float(one.step_m[~one.matched].sum()) for one in drives]
+    driven_m = [float(one.step_m.sum()) for one in drives]
+    return SessionSums(np.array(missed_m, np.float64), np.array(driven_m, np.float64))
 
 
 def longest_gap_m(drives: Sequence[Drive]) -> float:

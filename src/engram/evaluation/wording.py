@@ -1,0 +1,51 @@
+"""How results are worded in Markdown: tables, shares and ratios with their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+
+from engram.measures import Interval, Resamples, SessionSums, difference
+
+# What a page of claims sets side by side: what, paper, must, aim, measured.
+Row: TypeAlias = tuple[str, str, str, str, str]
+CLAIM_COLUMNS: Row = ("what", "paper", "must", "aim", "measured")
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table."""
+    return [
+        "| " + " | ".join(head) + " |",
+        "| " + " | ".join("---" for _ in head) + " |",
+        *("| " + " | ".join(row) + " |" for row in rows),
+    ]
+
+
+def percent(interval: Interval) -> str:
+    """A share and its interval."""
+    if np.isnan(interval.estimate):
+        return "–"
+    low, high = 100 * interval.low, 100 * interval.high
+    return f"{100 * interval.estimate:.2f} % ({low:.2f} … {high:.2f})"
+
+
+def times(interval: Interval) -> str:
+    """A ratio and its interval."""
+    if np.isnan(interval.estimate):
+        return "– (0 ÷ 0)"
+    return f"{_number(interval.estimate)}× ({_number(interval.low)} … {_number(interval.high)})"
+
+
+def against(resamples: Resamples, a: SessionSums, b: SessionSums) -> str:
+    """Two shares and their paired difference with its interval."""
+    gap = resamples.interval(difference(a, b))
+    ours, theirs = (f"{100 * one.value:.2f} %" for one in (a, b))
+    low, high = f"{100 * gap.low:+.2f}", f"{100 * gap.high:+.2f}"
+    points = f"{100 * gap.estimate:+.2f} ({low} … {high}) points"
+    return f"{ours} against {theirs}, difference {points}"
+
+
+def _number(value: float) -> str:
+    return "∞" if np.isinf(value) else f"{value:.2f}"
