@@ -137,8 +137,116 @@ def ranking(
             forget(plan, redo.split(","))
         with progress(f"evaluate {plan.drives.name}", task_count(plan)) as advance:
             run(plan, workers, advance)
-    files = write_report(out, plans)
-    seconds = time.perf_counter() - started
+    _tell_files(write_report(out, plans), time.perf_counter() - started, as_json=as_json)
+
+
+@evaluate.command("fleet")
+def fleet(
+    drives: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="CAMPAIGN|LOG…",
+            help="Rendered campaigns (begbroke24h, or village@2 for another town seed), or frame "
+            "logs of your own, which form one campaign.",
+        ),
+    ],
+    *,
+    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard",
+    arms: Annotated[
+        str,
+        typer.Option(
+            "--arms",
+            metavar="X,X…",
+            help="A: distance, 8 attempts a frame; B: recall, 8 attempts; C: all candidates.",
+        ),
+    ] = "A,B,C",
+    experiments: Annotated[
+        str,
+        typer.Option("--experiments", metavar="N,N…", help="Figures of Checkout My Map."),
+    ] = "7,8,9,10",
+    folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5,
+    groups: Annotated[
+        str,
+        typer.Option(
+            "--groups", metavar="N,N…", help="Of the parallel build; further ones on one fold."
+        ),
+    ] = "4,2,8",
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
+    ] = 0,
+    tried: Annotated[
+        int | None,
+        typer.Option(
+            "--tried", min=1, metavar="N", help="Held-out drives a fold for downloads [all]."
+        ),
+    ] = None,
+    relocaliser: Annotated[
+        str, typer.Option("--relocaliser", help="What finds the lost; none leaves them.")
+    ] = "fabmap",
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 1,
+    report_only: Annotated[
+        bool,
+        typer.Option("--report-only", help="Run nothing: tables and figures of what is there."),
+    ] = False,
+    campaigns: Annotated[
+        Path | None,
+        typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
+    ] = None,
+    work: Annotated[
+        Path | None,
+        typer.Option("--work", metavar="DIR", help="Maps and results [default: user's cache]."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
+        "results/fleet"
+    ),
+    config: options.Settings = None,
+    as_json: options.Json = False,
+) -> None:
+    """Measure merging, sharing and downloads as Gadd and Newman did, by cross-validation.
+
+    A run that was stopped goes on when it is given again, map by map and drive by drive.
+
+    \b
+    Examples:
+      engram evaluate fleet village --arms A --experiments 7,9
+      engram evaluate fleet begbroke24h --out results/fleet
+      engram evaluate fleet begbroke24h --report-only
+    """
+    from engram.cli.progress import progress
+    from engram.drive import load_settings
+    from engram.evaluation.fleet import (
+        FleetOptions,
+        fleet_tasks,
+        make_fleet_plan,
+        write_fleet_report,
+    )
+    from engram.evaluation.tasks import run_tasks
+
+    counts = _numbers(groups, "--groups")
+    asked = FleetOptions(
+        arms=tuple(arms.split(",")),
+        experiments=_numbers(experiments, "--experiments"),
+        folds=folds,
+        seed=seed,
+        groups=counts[0],
+        more_groups=counts[1:],
+        tried=tried,
+        relocaliser=None if relocaliser == "none" else relocaliser,
+    )
+    started = time.perf_counter()
+    settings = load_settings(config)
+    plans = [
+        make_fleet_plan(one, settings, asked, work or _work_folder())
+        for one in _drive_sets(drives, size, campaigns)
+    ]
+    for plan in [] if report_only else plans:
+        tasks = fleet_tasks(plan)
+        with progress(f"evaluate {plan.drives.name}", len(tasks)) as advance:
+            run_tasks(tasks, workers, advance)
+    _tell_files(write_fleet_report(out, plans), time.perf_counter() - started, as_json=as_json)
+
+
+def _tell_files(files: list[Path], seconds: float, *, as_json: bool) -> None:
     if as_json:
         print(json.dumps({"files": [str(one) for one in files], "seconds": round(seconds, 1)}))
     else:

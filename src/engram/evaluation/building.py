@@ -6,18 +6,19 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from engram.config import to_dict
-from engram.drive import MapOptions, OpenMap, Settings, map_drive, open_map
+from engram.drive import MapOptions, MapReport, OpenMap, Settings, map_drive, open_map
 from engram.drive.live import ignore
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.starting import TrueNodes
 from engram.localiser import Position
 from engram.sequences import FrameLog
+from engram.store import MapStore
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
 # Folds are built beside each other, one thread each.
@@ -34,6 +35,8 @@ class BuiltSession:
         nodes: of the map with it.
         share_localised: of its frames.
         seconds: it took.
+        frames, attempts, lookups: how many frames, match attempts, and frames for which the
+            relocaliser was asked: what it took, on whatever machine.
     """
 
     name: str
@@ -41,6 +44,9 @@ class BuiltSession:
     nodes: int
     share_localised: float
     seconds: float
+    frames: int = 0
+    attempts: int = 0
+    lookups: int = 0
 
 
 @dataclass(slots=True)
@@ -61,7 +67,14 @@ class BuiltMap:
 
 
 def build_map(
-    path: Path, drives: Sequence[EvaluatedDrive], settings: Settings, options: MapOptions
+    path: Path,
+    drives: Sequence[EvaluatedDrive],
+    settings: Settings,
+    options: MapOptions,
+    *,
+    base: Path | None = None,
+    known: Sequence[EvaluatedDrive] = (),
+    look_at: Callable[[EvaluatedDrive, MapReport], None] | None = None,
 ) -> BuiltMap:
     """Maps the drives one after another; goes on where an earlier run stopped.
 
@@ -73,6 +86,9 @@ def build_map(
         drives: the training sessions, in the order of time.
         settings: the resolved configuration.
         options: the budget of the build.
+        base: the map to which the drives are added; None for an empty one.
+        known: the drives that the base was built from.
+        look_at: is shown how each drive went, before it counts as done.
 
     Raises:
         MapError: the map cannot be written.
@@ -83,27 +99,21 @@ def build_map(
         started = time.perf_counter()
         draft = path.with_name(f"{path.stem}.draft{path.suffix}")
         _remove(draft)
-        if built.sessions:
-            shutil.copyfile(path, draft)
+        before = path if built.sessions else base
+        if before is not None:
+            shutil.copyfile(before, draft)
+        start = _start(draft, drive, (*drives, *known))
         log = FrameLog(drive.path)
         try:
-            report = map_drive(draft, log, settings, options, ignore, _start(draft, drive, drives))
+            report = map_drive(draft, log, settings, options, ignore, start)
         finally:
             log.close()
         if report.interrupted or report.revision is None:
             raise KeyboardInterrupt
-        summary = report.to_dict()
-        with open_map(draft) as opened:
-            nodes = len(opened.graph)
-        built.sessions.append(
-            BuiltSession(
-                drive.name,
-                report.revision,
-                nodes,
-                summary["share_localised"],
-                round(time.perf_counter() - started, 3),
-            )
-        )
+        seconds = time.perf_counter() - started
+        if look_at is not None:
+            look_at(drive, report)
+        built.sessions.append(_built_session(draft, drive, report, seconds))
         # The record first: where a run is killed between the two it is ahead of the map, and what
         # it is ahead by is done again.
         write_json(path.with_suffix(".json"), {"sessions": to_dict(built.sessions)})
@@ -112,13 +122,32 @@ def build_map(
     return built
 
 
+def _built_session(
+    draft: Path, drive: EvaluatedDrive, report: MapReport, seconds: float
+) -> BuiltSession:
+    assert report.revision is not None
+    localisations = [one.localisation for one in report.results]
+    with MapStore.open(draft) as store:
+        nodes = store.info().nodes
+    return BuiltSession(
+        drive.name,
+        report.revision,
+        nodes,
+        sum(one.localised for one in report.results) / max(len(report.results), 1),
+        round(seconds, 3),
+        frames=len(localisations),
+        attempts=sum(one.attempts for one in localisations),
+        lookups=sum("places" in one.stage_ms for one in localisations),
+    )
+
+
 def read_built_map(path: Path) -> BuiltMap:
     """How far a fold's map is; nothing where it was not begun."""
     recorded = read_record(path)
     if not (recorded.sessions and path.exists()):
         return BuiltMap(path)
-    with open_map(path) as opened:
-        newest = opened.store.info().revision
+    with MapStore.open(path) as store:
+        newest = store.revision
     return BuiltMap(path, [one for one in recorded.sessions if one.revision <= newest])
 
 

@@ -1,6 +1,12 @@
 """The fleet: many robots, one centre (SPEC §7): merging, downloading, building."""
 
-from engram.fleet.best_order import BestOrder, JudgeOptions, OrderResult, order_costs
+from engram.fleet.best_order import (
+    BestOrder,
+    JudgeOptions,
+    OrderResult,
+    find_best_order,
+    order_costs,
+)
 from engram.fleet.building import BuildOptions, BuildReport, build_map
 from engram.fleet.docking import merge_maps
 from engram.fleet.downloading import DownloadReport, download
@@ -44,6 +50,7 @@ __all__ = [
     "build_map",
     "bytes_from_text",
     "download",
+    "find_best_order",
     "group_drives",
     "hour_from_text",
     "map_group",

@@ -8,25 +8,29 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from engram.drive import OpenMap, Settings, open_drive
+from engram.drive import DriveSequence, OpenMap, Settings, open_drive
 from engram.errors import ConfigError
 from engram.fleet.docking import merge_maps
 from engram.fleet.gate import GateOptions, localise_drive
 from engram.fleet.merging import Progress
 from engram.fleet.replay import MergeOptions
-from engram.measures import failure_route
+from engram.measures import Drive, failure_curve, failure_route, route_not_localised
 from engram.store import MapStore
 
 # [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
 _AREA_TO_M = 50.0
 _AREA_STEP_M = 0.5
 _SPREAD_AT_M = (5.0, 10.0, 20.0)
+_REPORTED_AT_M = np.arange(0.0, _AREA_TO_M + _AREA_STEP_M / 2, _AREA_STEP_M)
 # 5,040 orders of 7 groups are a matter of days.
 _MOST_GROUPS = 6
+
+
+Localise: TypeAlias = Callable[[OpenMap, DriveSequence, Settings, GateOptions], Drive]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +42,16 @@ class JudgeOptions:
         judge_at_m: distance x that the operator can bear on dead reckoning: the order with the
             lowest P(X ≥ x) is best.
         localising: policy and budget of the validation.
+        reported: further sessions, which choose nothing: how they fare tells how good the chosen
+            order is.
+        localise: how a drive is localised in a map; None for `localise_drive`.
     """
 
     drives: Sequence[Path]
     judge_at_m: float = 10.0
     localising: GateOptions = field(default_factory=GateOptions)
+    reported: Sequence[Path] = ()
+    localise: Localise | None = None
 
     def __post_init__(self) -> None:
         if not self.drives:
@@ -62,6 +71,9 @@ class OrderResult:
         at_m: P(X ≥ x) at 5, 10 and 20 m, by distance.
         nodes: of the map.
         content_hash: of the map.
+        reported: P(X ≥ x) of the sessions that choose nothing, every half metre from 0 to 50;
+            empty where there are none.
+        reported_missed: share of their way without a match.
     """
 
     order: tuple[int, ...]
@@ -70,6 +82,8 @@ class OrderResult:
     at_m: dict[str, float]
     nodes: int
     content_hash: str
+    reported: list[float] = field(default_factory=list)
+    reported_missed: float = 0.0
 
     @property
     def rank(self) -> tuple[float, float, tuple[int, ...]]:
@@ -86,6 +100,8 @@ class BestOrder:
         judge_at_m: what they were judged by.
         merges, copies: made in this search.
         merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
+        replayed, attempts, lookups: nodes that were replayed in merging, match attempts, and
+            nodes for which the relocaliser was asked.
     """
 
     results: list[OrderResult] = field(default_factory=list)
@@ -95,6 +111,9 @@ class BestOrder:
     merge_s: float = 0.0
     copy_s: float = 0.0
     judge_s: float = 0.0
+    replayed: int = 0
+    attempts: int = 0
+    lookups: int = 0
 
     @property
     def order(self) -> tuple[int, ...]:
@@ -126,6 +145,9 @@ class BestOrder:
             "merge_s": self.merge_s,
             "copy_s": self.copy_s,
             "judge_s": self.judge_s,
+            "replayed": self.replayed,
+            "attempts": self.attempts,
+            "lookups": self.lookups,
         }
 
     def text(self) -> str:
@@ -201,7 +223,9 @@ class _Search:
         self._settings = settings
         self._merging = merging
         self._judge = judge
+        self._localise = judge.localise or localise_drive
         self._sequences = [open_drive(path) for path in judge.drives]
+        self._reported = [open_drive(path) for path in judge.reported]
 
     def below(
         self, prefix: tuple[int, ...], merged: Path | None, advance: Callable[[str], None]
@@ -238,15 +262,21 @@ class _Search:
         if report.interrupted:
             raise KeyboardInterrupt
         self.found.merges += 1
+        self.found.replayed += sum(one.taken + one.omitted for one in report.segments)
+        self.found.attempts += report.match_attempts
+        self.found.lookups += report.lookups
         self.found.merge_s += time.perf_counter() - copied
 
     def _judged(self, order: tuple[int, ...], place: Path) -> OrderResult:
         started = time.perf_counter()
         with OpenMap(MapStore.open(place)) as opened:
-            drives = [
-                localise_drive(opened, one, self._settings, self._judge.localising)
-                for one in self._sequences
-            ]
+            drives, reported = (
+                [
+                    self._localise(opened, one, self._settings, self._judge.localising)
+                    for one in sequences
+                ]
+                for sequences in (self._sequences, self._reported)
+            )
             nodes, content_hash = len(opened.graph), opened.store.content_hash()
         steps = np.arange(0.0, _AREA_TO_M, _AREA_STEP_M) + _AREA_STEP_M / 2
         area_m = sum(failure_route(drives, float(at)) for at in steps) * _AREA_STEP_M
@@ -258,6 +288,8 @@ class _Search:
             {f"{at:g}": failure_route(drives, at) for at in _SPREAD_AT_M},
             nodes,
             content_hash,
+            failure_curve(reported, _REPORTED_AT_M).tolist() if reported else [],
+            route_not_localised(reported),
         )
 
     def _keep(self, result: OrderResult) -> None:

@@ -7,6 +7,7 @@ Source: [G16] Fig. 9 (nodes, time per localisation, failure); SPEC §7 (the fore
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,13 +20,16 @@ from engram.drive import (
     FrameResult,
     LocaliseOptions,
     LocaliseRun,
+    OpenMap,
     Settings,
     session_of_drive,
 )
 from engram.experience.clock import hour_of_day
+from engram.experience.model import SessionId
 from engram.fleet.downloading import DownloadReport, download
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
+from engram.localiser import Position
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 
 OpenDrive = Callable[[], DriveSequence]
@@ -45,6 +49,9 @@ class Trial:
         steps: of the drive: distances and matches.
         ms_per_frame: mean time of localising a frame, relocalisation included, without front-end
             and odometry.
+        lookup_ms_per_frame: of that, asking the relocaliser.
+        lookups: frames for which it was asked.
+        nodes_of: how many nodes of each session were sent.
     """
 
     name: str
@@ -53,6 +60,9 @@ class Trial:
     report: DownloadReport
     steps: Drive
     ms_per_frame: float
+    lookup_ms_per_frame: float
+    lookups: int
+    nodes_of: Mapping[SessionId, int]
 
     @property
     def missed(self) -> float:
@@ -105,6 +115,7 @@ def try_downloads(
     progress: Progress,
     *,
     at: int | str | None = None,
+    start: Callable[[OpenMap], Position | None] = lambda _: None,
 ) -> list[Trial]:
     """Download for each drive in each way, and localise it there without writing anything.
 
@@ -116,6 +127,7 @@ def try_downloads(
         localise: policy and budget.
         progress: shows how it goes.
         at: revision of the centre; None for the newest.
+        start: where a drive begins in a download; None if nobody knows: it begins lost.
 
     Raises:
         InputError: a drive's options fit nothing.
@@ -130,9 +142,26 @@ def try_downloads(
                 options = asked if hour is None else replace(asked, start_h=hour, end_h=hour)
                 out = Path(folder) / f"{session.id}-{number}.engram"
                 report = download(centre, out, options, at=at, progress=progress)
-                results = _localised(out, open_drive(), settings, localise, progress)
+                sequence = open_drive()
+                with LocaliseRun(out, sequence, settings, localise) as run:
+                    position = start(run.opened)
+                    if position is not None:
+                        run.localiser.start_at(position)
+                    results = _localised(run, len(sequence), progress)
+                    nodes_of = Counter(node.session for node in run.opened.graph.nodes)
+                lookups = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
                 trials.append(
-                    Trial(name, str(session.id), hour, report, _steps(results), _ms(results))
+                    Trial(
+                        name=name,
+                        drive=str(session.id),
+                        start_h=hour,
+                        report=report,
+                        steps=_steps(results),
+                        ms_per_frame=_ms(results),
+                        lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
+                        lookups=len(lookups),
+                        nodes_of=nodes_of,
+                    )
                 )
                 out.unlink()
     return trials
@@ -178,17 +207,8 @@ def trial_dict(trial: Trial) -> dict[str, Any]:
     }
 
 
-def _localised(
-    out: Path,
-    sequence: DriveSequence,
-    settings: Settings,
-    localise: LocaliseOptions,
-    progress: Progress,
-) -> list[FrameResult]:
-    with (
-        LocaliseRun(out, sequence, settings, localise) as run,
-        progress("localise", len(sequence)) as advance,
-    ):
+def _localised(run: LocaliseRun, frames: int, progress: Progress) -> list[FrameResult]:
+    with progress("localise", frames) as advance:
         results = []
         for _, result in run:
             results.append(result)

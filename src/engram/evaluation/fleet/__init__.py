@@ -1,0 +1,17 @@
+"""[G16]'s experiments: building in parallel, sharing, downloads, orders of merging (SPEC §8)."""
+
+from engram.evaluation.fleet.arms import ARMS, Arm
+from engram.evaluation.fleet.experiments import fleet_tasks
+from engram.evaluation.fleet.plan import FleetOptions, FleetPlan, Protocol, make_fleet_plan
+from engram.evaluation.fleet.report import write_fleet_report
+
+__all__ = [
+    "ARMS",
+    "Arm",
+    "FleetOptions",
+    "FleetPlan",
+    "Protocol",
+    "fleet_tasks",
+    "make_fleet_plan",
+    "write_fleet_report",
+]

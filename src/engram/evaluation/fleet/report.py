@@ -1,0 +1,46 @@
+"""Everything that a fleet study leaves in its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from engram.evaluation.building import write_json
+from engram.evaluation.fleet.claims import fleet_claims_page
+from engram.evaluation.fleet.figures import draw_fleet_figures
+from engram.evaluation.fleet.plan import FleetPlan
+from engram.evaluation.fleet.records import read_json
+from engram.evaluation.fleet.results import ArmResult
+from engram.evaluation.fleet.stages import stages_path
+from engram.evaluation.fleet.tables import fleet_rows, order_rows
+from engram.evaluation.tables import write_csv
+
+
+def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
+    """Tables, figures, claims and the resolved configuration, from what was run so far.
+
+    Args:
+        out: the folder; made if need be, files in it are replaced.
+        plans: one per campaign.
+
+    Returns:
+        The files written.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed; the tables are written by then.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    arms = [ArmResult(plan, arm) for plan in plans for arm in plan.arms]
+    write_csv(out / "summary.csv", [row for arm in arms for row in fleet_rows(arm)])
+    write_csv(out / "orders.csv", [row for arm in arms for row in order_rows(arm)])
+    write_json(out / "configuration.json", [_configuration(plan) for plan in plans])
+    (out / "claims.md").write_text(fleet_claims_page(arms), encoding="utf-8")
+    names = ("summary.csv", "orders.csv", "configuration.json", "claims.md")
+    return [out / name for name in names] + draw_fleet_figures(out, arms)
+
+
+def _configuration(plan: FleetPlan) -> dict[str, object]:
+    """With the medians that counts are turned into times by."""
+    paths = {arm.letter: stages_path(plan, arm) for arm in plan.arms}
+    stages = {letter: read_json(path) for letter, path in paths.items() if path.exists()}
+    return {**plan.configuration(), "stages_ms": stages}

@@ -1,0 +1,213 @@
+"""The fleet study end to end, on a tiny synthetic campaign."""
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.evaluation.campaigns import write_campaign
+
+from engram.drive import Settings, open_map
+from engram.errors import ConfigError
+from engram.evaluation import DriveSet
+from engram.evaluation.fleet import (
+    FleetOptions,
+    FleetPlan,
+    Protocol,
+    fleet_tasks,
+    make_fleet_plan,
+    write_fleet_report,
+)
+from engram.evaluation.fleet.experiments import pair_merges
+from engram.evaluation.fleet.results import ArmResult
+from engram.evaluation.tasks import run_tasks
+from engram.store import MapStore
+
+OPTIONS = FleetOptions(
+    arms=("A",),
+    folds=2,
+    groups=2,
+    more_groups=(),
+    order_groups=2,
+    tried=1,
+    relocaliser="exhaustive",
+)
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory) -> DriveSet:
+    folder = tmp_path_factory.mktemp("campaign")
+    return write_campaign(folder, (0, 1) * 4, road=np.arange(0.0, 9.0, 0.9))
+
+
+def run(plan: FleetPlan, workers: int = 1) -> list[str]:
+    words: list[str] = []
+    run_tasks(fleet_tasks(plan), workers, words.append)
+    return words
+
+
+@pytest.fixture(scope="module")
+def plan(campaign, tmp_path_factory) -> FleetPlan:
+    plan = make_fleet_plan(campaign, Settings(), OPTIONS, tmp_path_factory.mktemp("work"))
+    run(plan)
+    return plan
+
+
+@pytest.fixture(scope="module")
+def report(plan, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    write_fleet_report(out, [plan])
+    return out
+
+
+def rows(report: Path) -> list[dict[str, str]]:
+    with (report / "summary.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_every_experiment_arm_and_fold_has_its_rows(report: Path) -> None:
+    found = {(row["experiment"], row["fold"]) for row in rows(report)}
+    every_fold = {(one, fold) for one in ("7", "9") for fold in ("0", "1", "all")}
+    assert found == every_fold | {("8", "0"), ("10", "0")}
+
+
+def test_figures_and_claims_are_written(report: Path) -> None:
+    names = {path.name for path in report.iterdir()}
+    assert {f"fig{one}.png" for one in ("07_nodes", "07_failure", "08_failure", "09_nodes")} < names
+    assert {"fig09_time.png", "fig09_failure.png", "fig10_orders.png", "orders.csv"} < names
+    claims = (report / "claims.md").read_text()
+    for words in ("29.36 %", "67.57 %", "22.44 %", "held-out drives in the shared map", "`tod`"):
+        assert words in claims
+
+
+def test_the_merged_map_holds_the_training_drives_and_no_others(plan: FleetPlan) -> None:
+    for fold in plan.folds:
+        wanted = {one.session.id for one in plan.training(fold)}
+        for name in ("single", "merged2-1"):
+            with open_map(plan.folder(plan.arms[0], fold) / f"{name}.engram") as opened:
+                assert set(opened.sessions) == wanted
+
+
+def test_merging_omits_what_the_other_group_saw_alike(plan: FleetPlan) -> None:
+    arm = ArmResult(plan, plan.arms[0])
+    for fold in arm.folds:
+        built = fold.parallel(2)
+        assert built is not None
+        assert built.nodes < sum(group[-1].nodes for group in built.groups)
+
+
+def test_times_are_counts_times_medians(plan: FleetPlan) -> None:
+    arm = ArmResult(plan, plan.arms[0])
+    assert arm.stages is not None
+    (fold, _) = arm.folds
+    single = fold.single()
+    assert single is not None
+    frames, attempts = sum(x.frames for x in single), sum(x.attempts for x in single)
+    lookups = sum(x.lookups for x in single)
+    expected_ms = (
+        frames * arm.stages.frame_ms
+        + attempts * arm.stages.attempt_ms
+        + lookups * arm.stages.lookup_ms
+    )
+    assert fold.time_of(single).counted_s == pytest.approx(expected_ms / 1e3)
+    assert frames == sum(len(drive.frames()) for drive in plan.training(fold.fold))
+
+
+def test_a_finished_study_does_nothing_again(plan: FleetPlan) -> None:
+    before = {path: path.stat().st_mtime_ns for path in plan.work.rglob("*.engram")}
+    run(plan)
+    assert {path: path.stat().st_mtime_ns for path in plan.work.rglob("*.engram")} == before
+
+
+def test_a_study_that_was_stopped_comes_to_the_same_maps(campaign, plan, tmp_path) -> None:
+    class StoppedError(Exception):
+        pass
+
+    def stop_after(steps: int) -> Callable[[str], None]:
+        words: list[str] = []
+
+        def advance(word: str) -> None:
+            words.append(word)
+            if len(words) == steps:
+                raise StoppedError
+
+        return advance
+
+    other = make_fleet_plan(campaign, Settings(), replace(OPTIONS, experiments=(7,)), tmp_path)
+    tasks = fleet_tasks(other)
+    for steps in range(3, len(tasks), 7):
+        with pytest.raises(StoppedError):
+            run_tasks(tasks, 1, stop_after(steps))
+    run_tasks(tasks, 1, lambda _: None)
+    (arm,) = plan.arms
+    for name in ("single", "merged2-1", "pairs2-0-0"):
+        for fold in plan.folds:
+            hashes = []
+            for one in (plan, other):
+                with MapStore.open(one.folder(arm, fold) / f"{name}.engram") as store:
+                    hashes.append(store.content_hash())
+            assert hashes[0] == hashes[1]
+
+
+def test_downloads_are_tried_for_as_many_held_out_drives_as_asked_for(plan: FleetPlan) -> None:
+    for fold in plan.folds:
+        assert len(list(plan.folder(plan.arms[0], fold).glob("downloads-*.json"))) == 1
+        for drive in plan.held_out(fold)[:1]:
+            path = plan.folder(plan.arms[0], fold) / f"downloads-{drive.name}.json"
+            kept = json.loads(path.read_text())
+            names = [one["name"] for one in kept["tried"]]
+            assert names[:3] == ["copy", "tod", "tod+paths"]
+            assert {*names, *kept["refused"]} >= {"budget 1/4", "budget 1/10", "budget as tod"}
+            for one in kept["tried"]:
+                assert one["nodes"] <= one["united"] <= one["of_nodes"]
+
+
+def test_held_out_validation_and_groups_of_the_orders_are_apart(plan: FleetPlan) -> None:
+    for fold in plan.folds:
+        grouped = [one.path for group in plan.order_groups(fold) for one in group]
+        parts = [
+            grouped,
+            *([x.path for x in some] for some in (plan.validation(fold), plan.held_out(fold))),
+        ]
+        together = [path for part in parts for path in part]
+        assert len(together) == len(set(together))
+
+
+def test_robots_drive_different_logs_in_the_order_of_time(plan: FleetPlan) -> None:
+    (fold, _) = plan.folds
+    forays = plan.forays(fold)
+    starts = {r: [d.session.start_ns for foray in two for d in foray] for r, two in forays.items()}
+    assert all(one == sorted(one) for one in starts.values())
+    assert not set(starts["r1"]) & set(starts["r2"])
+
+
+@pytest.mark.parametrize(
+    ("training", "expected"), [(64, (7, 9, 8)), (32, (7, 7, 4)), (19, (4, 4, 2)), (5, (1, 1, 1))]
+)
+def test_protocols_are_scaled_to_the_drives_there_are(training: int, expected) -> None:
+    found = Protocol.of(training)
+    assert (found.foray, found.group, found.validation) == expected
+
+
+def test_too_few_drives_are_refused() -> None:
+    with pytest.raises(ConfigError, match="too few"):
+        Protocol.of(4)
+
+
+def test_unknown_arms_and_experiments_are_refused() -> None:
+    with pytest.raises(ConfigError, match="arms"):
+        FleetOptions(arms=("Z",))
+    with pytest.raises(ConfigError, match="experiments"):
+        FleetOptions(experiments=(6,))
+
+
+def test_the_pairwise_tree_takes_one_merge_fewer_than_there_are_groups() -> None:
+    for groups in range(2, 9):
+        merges = pair_merges(groups)
+        assert len(merges) == groups - 1
+        used = [name for one in merges for name in (one.centre, one.robot)]
+        assert len(used) == len(set(used))
+        assert {f"group{groups}-{k}" for k in range(groups)} <= set(used)
