@@ -83,6 +83,7 @@ def test_images_in_kitti_layout_read_back_as_rendered(short: Campaign, tmp_path:
     np.testing.assert_allclose(truth.world_from_cam[2].translation, expected, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_drive_read_twice_is_one_session_and_two_towns_are_two_robots(short: Campaign) -> None:
     def identity(campaign: Campaign) -> object:
         sequence = SimulatedSequence(campaign, 0)

@@ -41,6 +41,7 @@ def test_laps_that_look_alike_are_saved_once_and_fail_nowhere(tmp_path: Path) ->
     assert found.can_succeed > 0.2
 
 
+@pytest.mark.long
 def test_laps_that_all_look_different_are_all_saved_and_fail_everywhere(tmp_path: Path) -> None:
     drives = write_campaign(tmp_path, looks=(0, 1, 2, 3, 4)).drives
     found = measure_laps([drive.path for drive in drives], tmp_path / "work")

@@ -186,6 +186,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
     assert "`distance` ÷ `path`, Np = 2" in text
 
 
+@pytest.mark.long
 def test_logs_without_truth_are_localised_and_have_no_errors(tmp_path: Path) -> None:
     looks = (0, 0, 1, 0)
     bare = write_campaign(tmp_path / "logs", looks, truth=False)

@@ -43,7 +43,7 @@ def drive_fleet(length_m: float, sessions: int, odometry, seed: int) -> list[Tal
 @pytest.mark.parametrize(
     ("length_m", "sessions", "odometry", "seed", "median_sigma_m"),
     [
-        (600.0, 6, GOOD_ODOMETRY, 0, 0.5),
+        pytest.param(600.0, 6, GOOD_ODOMETRY, 0, 0.5, marks=pytest.mark.long),
         (500.0, 5, POOR_ODOMETRY, 1, 4.0),
         pytest.param(1000.0, 8, GOOD_ODOMETRY, 2, 1.0, marks=pytest.mark.long),
         # A kilometre without a match is beyond this odometry: it is 44 m vague by then, where

@@ -89,6 +89,7 @@ def test_a_worker_that_dies_is_replaced_and_the_map_is_the_same(tmp_path, logs, 
     assert report.content_hash == built[1].content_hash
 
 
+@pytest.mark.long
 def test_a_group_that_kills_every_worker_is_given_up(tmp_path, logs):
     def killing(what, total):
         @contextmanager
@@ -152,6 +153,7 @@ def test_a_drive_that_cannot_be_read_is_named(tmp_path, logs):
         build_map(tmp_path / "c.engram", ["memory://nowhere.framelog"], Settings(), options())
 
 
+@pytest.mark.long
 def test_all_orders_are_tried_over_a_prefix_tree_and_the_best_is_kept(tmp_path, logs):
     centre = tmp_path / "centre.engram"
     judge = JudgeOptions(

@@ -70,7 +70,14 @@ class Problem:
             setattr(self, name, getattr(self, name)[~lost])
 
 
-@pytest.mark.parametrize(("seed", "gross", "partly"), [(0, 0, False), (1, 6, False), (2, 0, True)])
+@pytest.mark.parametrize(
+    ("seed", "gross", "partly"),
+    [
+        pytest.param(0, 0, False, marks=pytest.mark.long),
+        (1, 6, False),
+        pytest.param(2, 0, True, marks=pytest.mark.long),
+    ],
+)
 def test_agrees_with_the_plain_twin(seed: int, gross: int, partly: bool) -> None:
     problem = Problem(frames=4, points=25, seed=seed, gross=gross)
     if partly:  # tracks of 2, 3 and 4 frames that begin and end anywhere, with gaps

@@ -27,6 +27,7 @@ def seen() -> Appearance:
     return appearance(Places(1, every_m=30.0), visits=visits)
 
 
+@pytest.mark.long
 def test_light_costs_inliers_as_it_was_calibrated_to(seen: Appearance) -> None:
     means = {name: counts.mean() for name, counts in seen.inliers.items()}
     # Five places scatter by a fifth around the table of all; a knob that is turned shows.

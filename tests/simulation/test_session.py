@@ -33,6 +33,7 @@ def test_the_same_drive_twice_gives_the_same_pictures(hamlet: Campaign) -> None:
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.long
 def test_two_drives_read_in_turns_do_not_mix(hamlet: Campaign) -> None:
     alone = [p.left for p in islice(small(SimulatedDrive(hamlet, 2)), 2)]
     day, other = small(SimulatedDrive(hamlet, 0)), small(SimulatedDrive(hamlet, 2))
