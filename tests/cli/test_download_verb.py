@@ -43,7 +43,8 @@ def test_a_promise_is_held_against_a_drive(
     assert (mine["name"], whole["name"]) == ("tod", "copy")
     # The very drive of which the map was made.
     assert mine["missed"] == whole["missed"] == 0.0
-    assert 0.0 <= mine["expected_missed"] < 0.5
+    # One drive says little of the next: what it saved is believed to serve it half of the time.
+    assert 0.3 < mine["expected_missed"] < 0.7
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def test_twenty_inliers_where_it_was_expected(inliers: int, accepted: bool) -> N
 
 @pytest.mark.parametrize(
     ("inliers", "accepted", "waits"),
-    [(34, False, False), (35, False, True), (49, False, True), (50, True, True)],
+    [(34, False, False), (35, False, True), (59, False, True), (60, True, True)],
 )
 def test_a_lost_robot_asks_for_more(inliers: int, accepted: bool, waits: bool) -> None:
     found = match(SE3.identity(), inliers)

@@ -71,8 +71,8 @@ def accepted(outcomes: Sequence[Outcome]) -> list[int]:
 def test_one_weak_match_is_not_believed_and_a_second_one_further_on_is() -> None:
     hypotheses = waiting()
     assert accepted(hypotheses.judge([seen_from(10, 0.5)])) == []
-    drive(hypotheses, 3.0)
-    assert accepted(hypotheses.judge([seen_from(12, 1.4), seen_from(40, 0.0, rank=1)])) == [12]
+    drive(hypotheses, 5.0)
+    assert accepted(hypotheses.judge([seen_from(14, 1.4), seen_from(40, 0.0, rank=1)])) == [14]
 
 
 def test_what_is_seen_from_the_same_spot_confirms_nothing() -> None:
@@ -80,18 +80,18 @@ def test_what_is_seen_from_the_same_spot_confirms_nothing() -> None:
     hypotheses.judge([seen_from(10, 0.5), seen_from(11, -0.5, rank=1)])
     drive(hypotheses, 1.0)
     assert accepted(hypotheses.judge([seen_from(11, 0.5)])) == []
-    drive(hypotheses, 1.5)
-    assert accepted(hypotheses.judge([seen_from(12, 1.0)])) == [12]
+    drive(hypotheses, 3.5)
+    assert accepted(hypotheses.judge([seen_from(14, 1.0)])) == [14]
 
 
 @pytest.mark.parametrize("node", [12, 40], ids=["too far along", "elsewhere"])
 def test_a_match_that_disagrees_waits_itself(node: int) -> None:
     hypotheses = waiting()
     hypotheses.judge([seen_from(10, 0.5)])
-    drive(hypotheses, 3.0)
-    assert accepted(hypotheses.judge([seen_from(node, 3.9)])) == []
-    drive(hypotheses, 3.0)
-    assert accepted(hypotheses.judge([seen_from(node + 6, 0.9)])) == [node + 6]
+    drive(hypotheses, 5.0)
+    assert accepted(hypotheses.judge([seen_from(node + 2, 3.9)])) == []
+    drive(hypotheses, 5.0)
+    assert accepted(hypotheses.judge([seen_from(node + 10, 0.9)])) == [node + 10]
 
 
 def test_the_nodes_that_would_confirm_it_are_told_nearest_first() -> None:
@@ -106,8 +106,8 @@ def test_it_ends_where_nobody_knows_how_the_robot_moved() -> None:
     hypotheses = waiting()
     hypotheses.judge([seen_from(10, 0.5)])
     hypotheses.carry_on(OdometryStep(OdometryStatus.NO_CONSENSUS))
-    drive(hypotheses, 3.0)
-    assert accepted(hypotheses.judge([seen_from(13, 0.5)])) == []
+    drive(hypotheses, 5.0)
+    assert accepted(hypotheses.judge([seen_from(15, 0.5)])) == []
 
 
 def test_it_is_forgotten_in_time() -> None:

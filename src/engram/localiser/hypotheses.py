@@ -20,8 +20,8 @@ from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import Position
 from engram.odometry import OdometryStep
 
-# What is seen from places this far apart is not the same pair of parked cars, seen alike.
-_BASE_LINE_M = 2.0
+# From places this far apart not the same two parked cars are seen alike; 2 m were not enough.
+_BASE_LINE_M = 4.0
 # By then what a weak match saw is out of sight, and odometry has drifted.
 _FORGOTTEN_AFTER_M = 15.0
 # So many wait at a time; the oldest goes.
