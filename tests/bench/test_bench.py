@@ -7,7 +7,7 @@ import pytest
 
 from engram.bench import STAGES, BenchReport, run_bench, runner
 from engram.bench.data import BenchData, load_bench_data, scale_and_crop, synthetic_drive
-from engram.bench.places import DenseTable, made_up_vocabulary
+from engram.bench.places import made_up_vocabulary
 from engram.bench.plain import load_plain_pipeline
 from engram.bench.ranking import PlainFormula
 from engram.bench.report import Machine, Side, StageResult
@@ -15,7 +15,7 @@ from engram.bench.stages import prepare_attempt, prepare_frontend_odometry
 from engram.errors import ConfigError
 from engram.frontend import Frontend
 from engram.odometry import Odometry
-from engram.places import FabMap
+from engram.places import DenseTable, FabMap
 from engram.ranking import policy_named
 from engram.ranking.synthetic import SyntheticPlace
 

@@ -7,7 +7,6 @@ Source: [G16] Fig. 9 (nodes, time per localisation, failure); SPEC §7 (the fore
 from __future__ import annotations
 
 import tempfile
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from engram.drive import (
     session_of_drive,
 )
 from engram.experience.clock import hour_of_day
-from engram.experience.model import SessionId
+from engram.experience.model import Node
 from engram.fleet.downloading import DownloadReport, download
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
@@ -51,7 +50,7 @@ class Trial:
             and odometry.
         lookup_ms_per_frame: of that, asking the relocaliser.
         lookups: frames for which it was asked.
-        nodes_of: how many nodes of each session were sent.
+        nodes: that were sent.
     """
 
     name: str
@@ -62,7 +61,7 @@ class Trial:
     ms_per_frame: float
     lookup_ms_per_frame: float
     lookups: int
-    nodes_of: Mapping[SessionId, int]
+    nodes: Sequence[Node]
 
     @property
     def missed(self) -> float:
@@ -148,7 +147,7 @@ def try_downloads(
                     if position is not None:
                         run.localiser.start_at(position)
                     results = _localised(run, len(sequence), progress)
-                    nodes_of = Counter(node.session for node in run.opened.graph.nodes)
+                    nodes = list(run.opened.graph.nodes)
                 lookups = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
                 trials.append(
                     Trial(
@@ -160,7 +159,7 @@ def try_downloads(
                         ms_per_frame=_ms(results),
                         lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
                         lookups=len(lookups),
-                        nodes_of=nodes_of,
+                        nodes=nodes,
                     )
                 )
                 out.unlink()

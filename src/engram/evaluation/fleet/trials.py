@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.drive import OpenMap
+from engram.drive.place_words import stored_words
 from engram.errors import InputError
 from engram.evaluation.building import true_nodes, write_json
 from engram.evaluation.drives import EvaluatedDrive
@@ -20,11 +24,19 @@ from engram.evaluation.fleet.records import read_json
 from engram.evaluation.fleet.steps import map_path
 from engram.evaluation.folds import Fold
 from engram.experience.clock import hour_of_day
-from engram.experience.model import SessionId
+from engram.experience.model import Node, SessionId
 from engram.fleet import DownloadOptions, Trial, silent, try_downloads
 from engram.localiser import Position
 from engram.measures import Drive
+from engram.places import (
+    DenseTable,
+    FabMap,
+    FabMapConfig,
+    decode_vocabulary,
+    default_vocabulary,
+)
 from engram.sequences import FrameLog
+from engram.store import MapStore
 
 COPY = "copy"
 TOD = "tod"
@@ -34,6 +46,9 @@ TENTH = "budget 1/10"
 AS_TOD = "budget as tod"
 AS_TOD_PATHS = "budget as tod+paths"
 _BY_HOUR = (TOD, TOD_PATHS)
+_QUERIES = 50  # frames of the drive
+_BEST = 10  # places that are asked for
+_NO_WORDS = np.zeros(0, np.int32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +65,8 @@ class TriedDownload:
         ms: mean time of localising a frame.
         lookup_ms: of that, asking the relocaliser.
         lookups: frames for which it was asked.
+        query_ms, dense_ms: median of asking FAB-MAP, by the inverted index that the product has,
+            and by a row for every place.
     """
 
     name: str
@@ -62,6 +79,8 @@ class TriedDownload:
     ms: float
     lookup_ms: float
     lookups: int
+    query_ms: float
+    dense_ms: float
 
 
 def trials_path(plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive) -> Path:
@@ -107,9 +126,15 @@ def try_downloads_for(
         {one.session.id for foray in forays for one in foray}
         for forays in plan.forays(fold).values()
     ]
-    whole = found[0].nodes_of
+    queries = _Queries(centre, drive)
     tried = [
-        _plain(one, float(np.mean([_united(one, whole, mine) for mine in own]))) for one in found
+        {
+            **_plain(one),
+            "united": float(np.mean([_united(one, found[0].nodes, mine) for mine in own])),
+            "query_ms": queries.ms(one.nodes),
+            "dense_ms": queries.dense_ms(one.nodes),
+        }
+        for one in found
     ]
     write_json(path, {"refused": refused, "tried": tried})
 
@@ -141,18 +166,58 @@ def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: OpenMap) 
     return None if first is None else true_nodes(opened, plan.training(fold)).start(first)
 
 
-def _united(trial: Trial, whole: Mapping[SessionId, int], own: Collection[SessionId]) -> int:
+class _Queries:
+    """What asking FAB-MAP where a drive is costs in parts of a map."""
+
+    def __init__(self, centre: Path, drive: EvaluatedDrive) -> None:
+        with MapStore.open(centre) as store:
+            body = store.vocabulary()
+            self._vocabulary = (
+                default_vocabulary(drive.descriptor) if body is None else decode_vocabulary(body)
+            )
+            self._words = stored_words(store, self._vocabulary)
+        log = FrameLog(drive.path)
+        every = max(len(log) // _QUERIES, 1)
+        frames = [one.frame for one in islice(log, 0, None, every)]
+        log.close()
+        self._asked = [
+            self._vocabulary.words_of(one.landmarks.descriptors, one.descriptor) for one in frames
+        ]
+
+    def ms(self, nodes: Sequence[Node]) -> float:
+        """Median of a query by the inverted index."""
+        places = FabMap(self._vocabulary)
+        for node in nodes:
+            places.add(self._words.get(node.id, _NO_WORDS))
+        return self._median(lambda words: places.recognise(words, _BEST))
+
+    def dense_ms(self, nodes: Sequence[Node]) -> float:
+        """Median of a query by a row for every place."""
+        places = DenseTable(self._vocabulary, FabMapConfig(), len(nodes))
+        for node in nodes:
+            places.add(self._words.get(node.id, _NO_WORDS))
+        return self._median(lambda words: places.best(words, min(_BEST, len(nodes))))
+
+    def _median(self, ask: Callable[[NDArray[np.int32]], object]) -> float:
+        times = []
+        for words in self._asked:
+            started = perf_counter()
+            ask(words)
+            times.append(perf_counter() - started)
+        return 1e3 * float(np.median(times))
+
+
+def _united(trial: Trial, whole: Sequence[Node], own: Collection[SessionId]) -> int:
     """Nodes on a robot that keeps all it saved itself beside what was sent."""
-    mine = sum(count for session, count in whole.items() if session in own)
-    return mine + sum(count for session, count in trial.nodes_of.items() if session not in own)
+    mine = sum(node.session in own for node in whole)
+    return mine + sum(node.session not in own for node in trial.nodes)
 
 
-def _plain(trial: Trial, united: float) -> dict[str, Any]:
+def _plain(trial: Trial) -> dict[str, Any]:
     return {
         "name": trial.name,
         "nodes": trial.report.nodes,
         "of_nodes": trial.report.of_nodes,
-        "united": united,
         "size_bytes": trial.report.size_bytes,
         "expected_missed": trial.report.expected_missed,
         "drive": [trial.steps.step_m.tolist(), trial.steps.matched.tolist()],
