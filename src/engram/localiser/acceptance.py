@@ -35,9 +35,8 @@ class AcceptanceConfig:
             place. 0.5 % of the right matches have less than 0.28.
         min_height_lost: least share over which they spread there of the height over which all
             landmarks of the frame do. Parked cars of one make, and the texture of a road, are found
-            in many streets, and are low. Of 1,370 right matches of 35 to 80 inliers 4 % have less
-            than 0.4; of the wrong ones of 50 and more none passed both tests there. A share, since
-            indoors everything is low.
+            in many streets, and are low. Of 1,233 other right matches of 35 to 80 inliers 2.4 %
+            have less than 0.4. A share, since indoors everything is low.
         reach_m: how far from a node a robot without a prediction may be found. A straight road is
             recognised from 30 m away, but a robot found there is outside the neighbourhood of the
             node, and would be lost again. Source: SPEC §3, search radius 8 m.

@@ -22,7 +22,7 @@ class Budget:
         rounds: Nr, how often that many are started for one frame.
         lost_rounds: the same for a robot that does not know where it is: most of what it tries is
             another place, which costs a quarter of a match (0.27 ms), and it has nothing else to
-            do. With two lanes that is 9 ms a frame.
+            do.
         deadline_ms: no attempt starts later than this after the frame was handed in; None for
             no limit. The last attempt may overrun it, never more than one per lane.
     """
