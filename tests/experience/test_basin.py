@@ -93,6 +93,8 @@ def test_search_radius_grows_with_basin_and_uncertainty() -> None:
     narrow, wide = MatchBasin.of(256.0), MatchBasin.of(707.0)
     assert narrow.search_radius_m(0.5) == 8.0
     assert wide.search_radius_m(1.0) == pytest.approx(wide.basin_m + 2.0)
+    assert narrow.search_radius_m(50.0, most_m=30.0) == pytest.approx(30.0)
+    assert wide.search_radius_m(50.0, most_m=1.0) == pytest.approx(max(8.0, wide.basin_m))
 
 
 def test_senseless_focal_length_is_refused() -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from engram.drive import OpenMap, Settings
-from engram.localiser import Budget, FrameMatcher, Position
+from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
+from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
 from engram.store import MapStore
 from mapping_rig import map_simulated
@@ -69,6 +70,38 @@ def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candida
     assert all(one.node is not None for one in found)
     assert matcher.calls == sum(one.attempts for one in found) > 0
     assert len(searched) == len(live)
+
+
+def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_radius(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
+    elsewhere = drive(World(30.0, seed=9), ROAD, seed=2, start_ns=10**15)
+    blind = OdometryStep(OdometryStatus.TOO_FEW_MATCHES)
+    radii_m = []
+    with OpenMap(MapStore.open(path)) as opened:
+
+        def search(*args, **options):
+            radii_m.append(options["radius_m"])
+            return opened.graph.neighbourhood(*args, **options)
+
+        settings = Settings()
+        with opened.localiser(
+            live[0].frame.camera, settings, policy="distance", relocaliser=None, search=search
+        ) as localiser:
+            localiser.start_at(Position.at(opened.graph.node(0).id))
+            known = [localiser.localise(seen.frame, seen.odometry) for seen in live[:10]]
+            lost = [localiser.localise(seen.frame, blind) for seen in elsewhere[10:16] * 20]
+    assert known[-1].status is LocalisationStatus.LOCALISED
+    assert all(one.node is None for one in lost)
+    before, after = known[-1].position, lost[5].position
+    assert after.node == before.node
+    driven = before.node_from_live.inverse() @ after.node_from_live
+    # Six steps of 0.7 m, each as long as the last measured one, which is good to a few per cent.
+    np.testing.assert_allclose(driven.translation, [0.0, 0.0, 4.2], atol=0.2)
+    assert radii_m[0] < 10.0 < max(radii_m) == settings.localiser.max_search_radius_m
 
 
 def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) -> None:

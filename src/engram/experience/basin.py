@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -131,9 +132,14 @@ class MatchBasin:
         share = (rates[first - 1] - BASIN_LEVEL) / (rates[first - 1] - rates[first])
         return float(_BIN_CENTRES_M[first - 1] + share * BIN_M)
 
-    def search_radius_m(self, sigma_m: float, least_m: float = DEFAULT_RADIUS_M) -> float:
-        """Radius of the neighbourhood search for a position with this standard deviation."""
-        return max(least_m, self.basin_m + 2 * sigma_m)
+    def search_radius_m(
+        self, sigma_m: float, least_m: float = DEFAULT_RADIUS_M, most_m: float = math.inf
+    ) -> float:
+        """Radius of the neighbourhood search for a position with this standard deviation.
+
+        Never less than the basin, nor than `least_m`, whatever `most_m` says.
+        """
+        return max(least_m, self.basin_m + min(2 * sigma_m, max(most_m - self.basin_m, 0.0)))
 
 
 def count_attempts(attempts: Sequence[Attempt], experiences: NDArray[np.int32]) -> BasinCounts:

@@ -71,6 +71,8 @@ class LocaliserConfig:
 
     Attributes:
         search_radius_m: least radius of the neighbourhood. Source: SPEC §3, 8 m.
+        max_search_radius_m: largest, however uncertain the position; the match basin where that is
+            wider. Past it a robot is found by its relocaliser, not by trying everything around.
         view_gate_rad: largest difference of heading to a candidate. Source: SPEC §3, 60°.
         own_exclusion_m: own nodes saved within the last so many metres are no candidates.
             Source: SPEC §3.1, 30 m.
@@ -86,6 +88,7 @@ class LocaliserConfig:
     """
 
     search_radius_m: float = 8.0
+    max_search_radius_m: float = 30.0
     view_gate_rad: float = float(np.deg2rad(60.0))
     own_exclusion_m: float = 30.0
     lost_after_m: float = 10.0
@@ -189,7 +192,7 @@ class Localiser:
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
-        self._last_step_m = 0.0
+        self._last_step = SE3.identity()
         self._adrift = False
         self._attempts: list[Attempt] = []
         self._outcomes: list[Outcome] = []
@@ -333,16 +336,14 @@ class Localiser:
             self._relocaliser.carry_on(odometry.prev_from_curr)
         self._hypotheses.carry_on(odometry)
         if odometry.prev_from_curr is None or odometry.covariance is None:
-            self._open_loop_m += self._last_step_m
+            self._open_loop_m += self._last_step.distance_m
             self._adrift = True
             if self.position is not None:
-                unknown_m, unknown_rad = 2 * self._last_step_m + 0.1, np.deg2rad(5.0)
-                growth = np.diag([unknown_m**2] * 3 + [unknown_rad**2] * 3)
-                self.position = self.position.carried_on(SE3.identity(), growth)
+                self.position = self.position.carried_on(*_unmeasured(self._last_step))
             return
-        self._last_step_m = odometry.prev_from_curr.distance_m
-        self._driven_m += self._last_step_m
-        self._open_loop_m += self._last_step_m
+        self._last_step = odometry.prev_from_curr
+        self._driven_m += self._last_step.distance_m
+        self._open_loop_m += self._last_step.distance_m
         if self.position is not None:
             self.position = self.position.carried_on(odometry.prev_from_curr, odometry.covariance)
 
@@ -362,7 +363,9 @@ class Localiser:
         return self._near(position)
 
     def _near(self, position: Position) -> Neighbourhood:
-        radius_m = self._basin.search_radius_m(position.sigma_m, self.config.search_radius_m)
+        radius_m = self._basin.search_radius_m(
+            position.sigma_m, self.config.search_radius_m, self.config.max_search_radius_m
+        )
         return self._search(
             self._graph.index(position.node),
             position.node_from_live,
@@ -599,6 +602,17 @@ class _StageClock:
         now = perf_counter()
         self.stage_ms[stage] = (now - self._last) * 1e3
         self._last = now
+
+
+def _unmeasured(last_step: SE3) -> tuple[SE3, NDArray[np.float64]]:
+    """A motion that odometry did not see, and its (6, 6) covariance.
+
+    Straight on at the last speed: a robot taken as standing still would lag behind itself by every
+    frame that is lost. It may as well have braked or turned, which the covariance covers.
+    """
+    unknown_m, unknown_rad = 2 * last_step.distance_m + 0.1, np.deg2rad(5.0)
+    covariance = np.diag([unknown_m**2] * 3 + [unknown_rad**2] * 3)
+    return SE3(np.eye(3), last_step.translation), covariance
 
 
 def _alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:
