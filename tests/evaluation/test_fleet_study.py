@@ -74,6 +74,17 @@ def test_every_experiment_arm_and_fold_has_its_rows(report: Path) -> None:
     assert found == every_fold | {("8", "0"), ("10", "0")}
 
 
+def test_folds_may_be_run_one_after_another(plan: FleetPlan) -> None:
+    def names(only: tuple[int, ...]) -> list[str]:
+        options = replace(OPTIONS, only_folds=only)
+        return [task.name for task in fleet_tasks(replace(plan, options=options))]
+
+    assert all(name.startswith("A1 ") for name in names((1,)))
+    assert names((0,)) + names((1,)) == names(())
+    with pytest.raises(ConfigError, match="numbered from 0 to 1"):
+        replace(OPTIONS, only_folds=(2,))
+
+
 def test_figures_and_claims_are_written(report: Path) -> None:
     names = {path.name for path in report.iterdir()}
     assert {f"fig{one}.png" for one in ("07_nodes", "07_failure", "08_failure", "09_nodes")} < names

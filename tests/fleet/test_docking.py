@@ -19,6 +19,7 @@ from engram.errors import IncompatibleError, InputError, MapError, NotAMapError,
 from engram.experience.model import Clock
 from engram.fleet import MergeOptions, merge_maps
 from engram.fleet.gate import what_is_worse
+from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.frontend import DescriptorKind
 from engram.measures import Drive
 from engram.store import MapStore
@@ -39,6 +40,11 @@ def centre(tmp_path, fleet):
 def hash_of(path: Path) -> str:
     with MapStore.open(path) as store:
         return store.content_hash()
+
+
+def nodes_in(path: Path) -> int:
+    with MapStore.open(path) as store:
+        return store.info().nodes
 
 
 def rewritten(source: Path, target: Path, *, session=None, node=None, descriptor=None) -> Path:
@@ -135,6 +141,26 @@ class TestReported:
         assert report.omitted == 0
         assert any("no node of it was found" in note for note in report.notes)
 
+    def test_another_town_is_told_even_where_its_drives_found_each_other(
+        self, tmp_path, centre, fleet
+    ):
+        again, town = tmp_path / "again.engram", tmp_path / "town.engram"
+        robot_map(again, np.arange(0, 24, 0.8), 1, name="r5", day=5)
+        apart = MergeOptions(relocaliser=None)
+        merge_maps(town, [fleet["other"][0], again], Settings(), apart)
+        (report,) = merged(centre, town)
+        assert report.omitted
+        assert report.taken
+        assert any("no node of it was found" in note for note in report.notes)
+
+    def test_a_drive_of_which_a_part_was_not_found(self, tmp_path, centre, fleet):
+        mixed = tmp_path / "mixed.engram"
+        apart = MergeOptions(relocaliser=None)
+        merge_maps(mixed, [fleet["other"][0], fleet["longer"][0]], Settings(), apart)
+        (report,) = merged(centre, mixed)
+        (note,) = [note for note in report.notes if "hang together with nothing" in note]
+        assert note.startswith(f"{nodes_in(fleet['other'][0])} of")
+
     def test_two_robots_of_one_name(self, tmp_path, fleet):
         maps = []
         for name in ("same", "other"):
@@ -185,6 +211,19 @@ class TestReported:
         (segment,) = values["segments"]
         assert segment["taken"] == values["taken"] == sum(run["nodes"] for run in segment["runs"])
         assert segment["runs"][-1]["reason"] == "no_place"
+
+    def test_a_drive_in_many_segments_takes_one_line(self):
+        segments = [
+            SegmentReport("5621beba-1", "r1", stamp, Seed.NONE, 1, 0, [RunReport(stamp, 1)])
+            for stamp in range(50)
+        ]
+        segments.append(SegmentReport("5621beba-1", "r1", 60, Seed.NEIGHBOUR, omitted=4))
+        for one in segments[:-1]:
+            one.runs[0].reasons[Reason.NOTHING_NEAR] += 1
+        report = MergeReport("r1.engram", "", ["r1"], revision=2, taken=50, segments=segments)
+        (line,) = [line for line in report.text().splitlines() if "5621beba" in line]
+        assert "50 taken, 4 omitted, in 51 segments, 50 not found" in line
+        assert "nothing known is near (50)" in line
 
 
 def test_a_dry_run_says_what_would_be_and_leaves_the_centre_alone(tmp_path, centre, fleet):

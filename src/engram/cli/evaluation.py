@@ -165,6 +165,10 @@ def fleet(
         typer.Option("--experiments", metavar="N,N…", help="Figures of Checkout My Map."),
     ] = "7,8,9,10",
     folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5,
+    only_folds: Annotated[
+        str | None,
+        typer.Option("--only-folds", metavar="N,N…", help="Run these now, numbered from 0 [all]."),
+    ] = None,
     groups: Annotated[
         str,
         typer.Option(
@@ -210,6 +214,7 @@ def fleet(
     Examples:
       engram evaluate fleet village --arms A --experiments 7,9
       engram evaluate fleet begbroke24h --out results/fleet
+      engram evaluate fleet begbroke24h --arms A --experiments 7,9 --only-folds 0
       engram evaluate fleet begbroke24h --report-only
     """
     from engram.cli.progress import progress
@@ -232,6 +237,7 @@ def fleet(
         more_groups=counts[1:],
         tried=tried,
         relocaliser=None if relocaliser == "none" else relocaliser,
+        only_folds=() if only_folds is None else _numbers(only_folds, "--only-folds"),
     )
     started = time.perf_counter()
     settings = load_settings(config)

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram import __version__
 from engram.config import to_dict
@@ -90,13 +91,30 @@ def merge_map(
             report.revision = writer.commit().number
         if options.relocaliser in _BY_WORDS:
             keep_words(store, centre, robot, settings.frontend.descriptor)
-    if report.taken and not report.omitted and centre_nodes and not report.known:
-        report.notes.append(
-            "no node of it was found in the centre: another town, or another look of this one"
-        )
-    report.components = int(centre.graph.components().max(initial=-1)) + 1
+    labels = centre.graph.components()
+    report.components = int(labels.max(initial=-1)) + 1
+    if report.taken and centre_nodes:
+        apart = ~np.isin(labels[centre_nodes:], labels[:centre_nodes])
+        report.notes += _parts_apart(apart, report)
     report.content_hash = store.content_hash()
     return report
+
+
+def _parts_apart(apart: NDArray[np.bool_], report: MergeReport) -> list[str]:
+    """Says so where what was taken hangs together with nothing that the centre had.
+
+    Args:
+        apart: (taken,) whether each new node lies in a part of the map that is new altogether.
+        report: counts so far.
+    """
+    if not apart.any():
+        return []
+    if apart.all() and not report.known:
+        return ["no node of it was found in the centre: another town, or another look of this one"]
+    return [
+        f"{int(apart.sum())} of the nodes taken hang together with nothing that the centre had: "
+        "their way there was not found, or odometry had lost track on it"
+    ]
 
 
 def _about(robot: HandedIn, settings: Settings, options: MergeOptions) -> dict[str, Any]:

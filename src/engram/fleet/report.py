@@ -10,8 +10,8 @@ from typing import Any
 
 from engram.config import to_dict
 
-# Lines of segments that people are shown; JSON has all.
-_SHOWN_SEGMENTS = 12
+# Lines of drives that people are shown; JSON has all, segment by segment.
+_SHOWN_DRIVES = 12
 
 
 class Seed(StrEnum):
@@ -103,17 +103,24 @@ class SegmentReport:
             "runs": [run.to_dict() for run in self.runs],
         }
 
-    def text(self) -> str:
-        """For people."""
-        line = f"  {self.robot} {self.session[:8]}: {self.taken} taken, {self.omitted} omitted"
-        line += {Seed.NEIGHBOUR: "", Seed.PLACE: ", found by its looks", Seed.NONE: ", not found"}[
-            self.seed
-        ]
-        reasons = Counter[Reason]()
-        for run in self.runs:
+
+def _drive_text(segments: Sequence[SegmentReport]) -> str:
+    """One line for all segments of a drive: lost odometry leaves hundreds of a node each."""
+    first = segments[0]
+    taken, omitted = sum(one.taken for one in segments), sum(one.omitted for one in segments)
+    line = f"  {first.robot} {first.session[:8]}: {taken} taken, {omitted} omitted"
+    if len(segments) > 1:
+        line += f", in {len(segments)} segments"
+    seeds = Counter(one.seed for one in segments)
+    for seed, words in ((Seed.PLACE, "found by looks"), (Seed.NONE, "not found")):
+        if seeds[seed]:
+            line += f", {words}" if len(segments) == 1 else f", {seeds[seed]} {words}"
+    reasons = Counter[Reason]()
+    for one in segments:
+        for run in one.runs:
             reasons[run.reason] += run.nodes
-        told = [f"{_WORDS[reason]} ({count})" for reason, count in reasons.most_common()]
-        return f"{line}: {'; '.join(told)}" if told else line
+    told = [f"{_WORDS[reason]} ({count})" for reason, count in reasons.most_common()]
+    return f"{line}: {'; '.join(told)}" if told else line
 
 
 @dataclass(slots=True)
@@ -190,11 +197,19 @@ class MergeReport:
                 f"{self.known_omissions} omitted before; {self.sessions} new sessions, "
                 f"{self.path_entries} path entries, {self.attempts} attempts carried over"
             )
-            lines += [one.text() for one in self.segments[:_SHOWN_SEGMENTS]]
-            if len(self.segments) > _SHOWN_SEGMENTS:
-                lines.append(f"  … and {len(self.segments) - _SHOWN_SEGMENTS} more segments")
+            drives = self._drives()
+            lines += [_drive_text(one) for one in drives[:_SHOWN_DRIVES]]
+            if len(drives) > _SHOWN_DRIVES:
+                lines.append(f"  … and {len(drives) - _SHOWN_DRIVES} more drives")
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
+
+    def _drives(self) -> list[list[SegmentReport]]:
+        """The segments of each drive, in the order of replay."""
+        found: dict[str, list[SegmentReport]] = {}
+        for one in self.segments:
+            found.setdefault(one.session, []).append(one)
+        return list(found.values())
 
     def _outcome(self) -> str:
         if self.interrupted:
@@ -202,4 +217,5 @@ class MergeReport:
         if not self.changed:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"
-        return f"{made}, content {self.content_hash}, {self.components} components"
+        parts = "1 component" if self.components == 1 else f"{self.components} components"
+        return f"{made}, content {self.content_hash}, {parts}"

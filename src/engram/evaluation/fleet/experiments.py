@@ -37,7 +37,7 @@ def fleet_tasks(plan: FleetPlan) -> list[Task]:
     """All that a study runs: arm by arm, fold by fold."""
     tasks: list[Task] = []
     for arm in plan.arms:
-        for fold in plan.folds:
+        for fold in plan.run_folds:
             tasks += _Tasks(plan, arm, fold).all()
     return tasks
 

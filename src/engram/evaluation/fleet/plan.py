@@ -45,6 +45,8 @@ class FleetOptions:
         order_groups: how many groups are merged in all orders. 4: [G16] §VI-E.
         tried: held-out drives of each fold that downloads are tried out on; None for all.
         relocaliser: key of `RELOCALISERS`; None for none.
+        only_folds: numbers of the folds that are run; empty for all. What is run of the others
+            later joins it.
     """
 
     arms: tuple[str, ...] = ("A", "B", "C")
@@ -56,6 +58,7 @@ class FleetOptions:
     order_groups: int = 4
     tried: int | None = None
     relocaliser: str | None = "fabmap"
+    only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name, given, known in (
@@ -70,6 +73,12 @@ class FleetOptions:
         if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
             raise ConfigError(
                 f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+            )
+        strange_folds = [one for one in self.only_folds if not 0 <= one < self.folds]
+        if strange_folds:
+            raise ConfigError(
+                f"folds {strange_folds} are asked for; {self.folds} folds are numbered from 0 to "
+                f"{self.folds - 1}"
             )
         if min(self.groups, *self.more_groups, self.order_groups) < 2:
             raise ConfigError(
@@ -133,6 +142,12 @@ class FleetPlan:
     def folds(self) -> tuple[Fold, ...]:
         """The divisions of the drives."""
         return split(len(self.drives.drives), self.options.folds, self.options.seed)
+
+    @property
+    def run_folds(self) -> tuple[Fold, ...]:
+        """Those that are run now."""
+        wanted = self.options.only_folds or range(self.options.folds)
+        return tuple(self.folds[number] for number in wanted)
 
     @property
     def arms(self) -> tuple[Arm, ...]:
