@@ -20,6 +20,28 @@ evaluate = typer.Typer(
     no_args_is_help=True,
 )
 
+# What both studies take.
+_Size = Annotated[str, typer.Option("--size", help="standard or full.")]
+_Folds = Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")]
+_Seed = Annotated[
+    int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
+]
+_Relocaliser = Annotated[
+    str, typer.Option("--relocaliser", help="What finds the lost; none leaves them.")
+]
+_Workers = Annotated[int, typer.Option("--workers", min=1, help="Processes.")]
+_ReportOnly = Annotated[
+    bool, typer.Option("--report-only", help="Run nothing: tables and figures of what was run.")
+]
+_Campaigns = Annotated[
+    Path | None, typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered.")
+]
+_Work = Annotated[
+    Path | None,
+    typer.Option("--work", metavar="DIR", help="Maps and results [default: the user's cache]."),
+]
+_Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")]
+
 
 @evaluate.command("ranking")
 def ranking(
@@ -32,7 +54,7 @@ def ranking(
         ),
     ],
     *,
-    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard",
+    size: _Size = "standard",
     policies: Annotated[
         str | None,
         typer.Option("--policies", metavar="NAME,NAME…", help="Only these [default: all]."),
@@ -48,10 +70,8 @@ def ranking(
     rounds: Annotated[
         str, typer.Option("--rounds", metavar="N,N…", help="Nr; the first for all policies.")
     ] = "1,2",
-    folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5,
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
-    ] = 0,
+    folds: _Folds = 5,
+    seed: _Seed = 0,
     map_sizes: Annotated[
         bool,
         typer.Option("--map-sizes/--no-map-sizes", help="Run earlier revisions too (Fig. 9)."),
@@ -62,31 +82,16 @@ def ranking(
             "--live-folds", min=0, help="Folds that are also run guided and without memo, timed."
         ),
     ] = 1,
-    relocaliser: Annotated[
-        str, typer.Option("--relocaliser", help="What finds the lost; none leaves them.")
-    ] = "none",
+    relocaliser: _Relocaliser = "none",
     redo: Annotated[
         str | None,
         typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again."),
     ] = None,
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
-    report_only: Annotated[
-        bool,
-        typer.Option("--report-only", help="Run nothing: tables and figures of what was run."),
-    ] = False,
-    campaigns: Annotated[
-        Path | None,
-        typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
-    ] = None,
-    work: Annotated[
-        Path | None,
-        typer.Option(
-            "--work", metavar="DIR", help="Maps, memos, results [default: the user's cache]."
-        ),
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
-        "results/ranking"
-    ),
+    workers: _Workers = 2,
+    report_only: _ReportOnly = False,
+    campaigns: _Campaigns = None,
+    work: _Work = None,
+    out: _Out = Path("results/ranking"),
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
@@ -151,7 +156,7 @@ def fleet(
         ),
     ],
     *,
-    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard",
+    size: _Size = "standard",
     arms: Annotated[
         str,
         typer.Option(
@@ -164,7 +169,7 @@ def fleet(
         str,
         typer.Option("--experiments", metavar="N,N…", help="Figures of Checkout My Map."),
     ] = "7,8,9,10",
-    folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5,
+    folds: _Folds = 5,
     only_folds: Annotated[
         str | None,
         typer.Option("--only-folds", metavar="N,N…", help="Run these now, numbered from 0 [all]."),
@@ -175,34 +180,19 @@ def fleet(
             "--groups", metavar="N,N…", help="Of the parallel build; further ones on one fold."
         ),
     ] = "4,2,8",
-    seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
-    ] = 0,
+    seed: _Seed = 0,
     tried: Annotated[
         int | None,
         typer.Option(
             "--tried", min=1, metavar="N", help="Held-out drives a fold for downloads [all]."
         ),
     ] = None,
-    relocaliser: Annotated[
-        str, typer.Option("--relocaliser", help="What finds the lost; none leaves them.")
-    ] = "fabmap",
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 1,
-    report_only: Annotated[
-        bool,
-        typer.Option("--report-only", help="Run nothing: tables and figures of what is there."),
-    ] = False,
-    campaigns: Annotated[
-        Path | None,
-        typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
-    ] = None,
-    work: Annotated[
-        Path | None,
-        typer.Option("--work", metavar="DIR", help="Maps and results [default: user's cache]."),
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
-        "results/fleet"
-    ),
+    relocaliser: _Relocaliser = "fabmap",
+    workers: _Workers = 1,
+    report_only: _ReportOnly = False,
+    campaigns: _Campaigns = None,
+    work: _Work = None,
+    out: _Out = Path("results/fleet"),
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
