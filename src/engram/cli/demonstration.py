@@ -11,6 +11,8 @@ import typer
 from engram.cli import options
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from engram.demo import DemoReport
 
 
@@ -39,6 +41,26 @@ def demo(
         _tell(report)
 
 
+def _found(report: DemoReport) -> Table:
+    """How the last drive was localised, by policy and budget."""
+    from rich.table import Table
+
+    table = Table(title=f"Then: {report.conditions[-1]}")
+    columns = ("policy", "attempts allowed", "made a frame", "localised", "longest gap, m")
+    for column in columns:
+        table.add_column(column, justify="left" if column == "policy" else "right")
+    for policy, summaries in report.localised.items():
+        for most, summary in summaries.items():
+            table.add_row(
+                policy,
+                str(most),
+                f"{summary['attempts_per_frame']:.2f}",
+                f"{summary['share_localised']:.0%}",
+                f"{summary['longest_gap_m']:.1f}",
+            )
+    return table
+
+
 def _tell(report: DemoReport) -> None:
     from rich.console import Console
     from rich.table import Table
@@ -51,19 +73,9 @@ def _tell(report: DemoReport) -> None:
         share = mapped.to_dict()["share_localised"]
         grown.add_row(condition, f"{share:.0%}", str(mapped.saved))
     console.print(grown)
-    found = Table(title=f"Then: {report.conditions[-1]}, up to four attempts a frame")
-    for column in ("policy", "localised", "attempts a frame", "longest gap, m"):
-        found.add_column(column, justify="left" if column == "policy" else "right")
-    for policy, summary in report.localised.items():
-        found.add_row(
-            policy,
-            f"{summary['share_localised']:.0%}",
-            f"{summary['attempts_per_frame']:.2f}",
-            f"{summary['longest_gap_m']:.1f}",
-        )
-    console.print(found)
+    console.print(_found(report))
     console.print(
-        f"In {report.out}: one_place.png, the same place in six conditions; matches_path/, live "
+        f"In {report.out}: one_place.png, the same place in six conditions; matches_path_4/, live "
         "image and node side by side with their inliers joined; map_from_above.png, experiences "
         "in colour; attempts.png, what each frame cost until it matched. `distance` tries the "
         "nearest node first, `path` one that went together in earlier drives with those that "
