@@ -141,12 +141,22 @@ def test_unusable_frames_are_neither_saved_nor_matched(path: Path) -> None:
     assert len(set(graph_of(path).experiences.tolist())) == 1
 
 
-def test_lost_track_breaks_the_chain_instead_of_inventing_motion(path: Path) -> None:
+@pytest.mark.parametrize(("lost", "components"), [(1, 1), (3, 1), (12, 2)])
+def test_a_chain_bears_short_gaps_of_odometry_and_breaks_at_long_ones(
+    path: Path, lost: int, components: int
+) -> None:
     seen = drive(WORLD, ROAD)
     lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
-    seen[20] = dataclasses.replace(seen[20], odometry=lost_track)
+    for i in range(20, 20 + lost):
+        seen[i] = dataclasses.replace(seen[i], odometry=lost_track)
     map_simulated(path, seen)
-    assert len(set(graph_of(path).components().tolist())) == 2
+    graph = graph_of(path)
+    assert len(set(graph.components().tolist())) == components
+    vague = [edge for edge in graph.edges if edge.covariance[0, 0] > 0.1]
+    assert vague
+    for edge in vague:  # the robot went on straight, as was guessed
+        assert edge.a_from_b.distance_m < 3.0
+        assert abs(edge.a_from_b.translation[0]) < 0.5
 
 
 def test_the_same_input_gives_the_same_map(tmp_path: Path) -> None:

@@ -322,7 +322,7 @@ def _from_where_it_stopped(
             yield live
             continue
         advance("resuming")
-        mapper.follow(live.odometry)
+        mapper.follow(live.odometry, stamp_ns)
         if stored.nodes and stamp_ns == stored.nodes[-1].stamp_ns:
             mapper.resume_in(stored.nodes[-1].id)
         entry = stored.last_entry

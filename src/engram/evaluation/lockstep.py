@@ -164,11 +164,11 @@ def run_in_step(
             odometry = logged.odometry
             if situation.start is None or number < situation.start[0]:
                 for localiser in localisers:
-                    localiser.carry_on(odometry)
+                    localiser.carry_on(odometry, logged.frame.stamp_ns)
                 continue
             if number == situation.start[0]:
                 for localiser in localisers:
-                    localiser.carry_on(odometry)
+                    localiser.carry_on(odometry, logged.frame.stamp_ns)
                     localiser.start_at(situation.start[1])
                 odometry = OdometryStep(OdometryStatus.FIRST)
             search.next_frame()

@@ -186,7 +186,7 @@ class Replay:
         known = self._known_neighbour(node, _MEASURED, self._run[0]) if self._run else None
         if known is None:
             return localiser.localise(frame, odometry)
-        localiser.carry_on(odometry)
+        localiser.carry_on(odometry, frame.stamp_ns)
         localiser.start_at(known)
         return localiser.localise(frame, OdometryStep(OdometryStatus.FIRST))
 

@@ -40,6 +40,7 @@ from engram.localiser.attempts import (
     Outcome,
     best_success,
 )
+from engram.localiser.gaps import GapFiller, Motion
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.relocalisation import Relocaliser
@@ -77,6 +78,9 @@ class LocaliserConfig:
         own_exclusion_m: own nodes saved within the last so many metres are no candidates.
             Source: SPEC §3.1, 30 m.
         lost_after_m: open loop distance past which the robot is lost. Source: SPEC §3.4, 10 m.
+        greatest_gap_m: largest standard deviation of motion that odometry did not measure. Past it
+            since the last match or saved node the robot is lost; past it at a stretch an
+            experience ends.
         guide_below_m, guide_below_rad: an attempt is guided by the prediction where its standard
             deviations lie below both; 0 turns guidance off.
         lost_max_samples, lost_max_hypotheses: bounds of the matcher's for the attempts of a lost
@@ -92,6 +96,7 @@ class LocaliserConfig:
     view_gate_rad: float = float(np.deg2rad(60.0))
     own_exclusion_m: float = 30.0
     lost_after_m: float = 10.0
+    greatest_gap_m: float = 3.0
     guide_below_m: float = 0.3
     guide_below_rad: float = float(np.deg2rad(3.0))
     lost_max_samples: int = 500
@@ -192,8 +197,10 @@ class Localiser:
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
-        self._last_step = SE3.identity()
-        self._adrift = False
+        self._gaps = GapFiller()
+        self._motion: Motion | None = None
+        # Variance of the motion guessed since the robot last knew where it was, m².
+        self._guessed_m2 = 0.0
         self._attempts: list[Attempt] = []
         self._outcomes: list[Outcome] = []
         self._new_place: float | None = None
@@ -234,7 +241,7 @@ class Localiser:
         """Tells a robot where it is, as an operator or another localiser would."""
         self.position = position
         self._open_loop_m = 0.0
-        self._adrift = False
+        self._guessed_m2 = 0.0
 
     def resume_walk(self, node: NodeId, next_sequence: int, next_iteration: int) -> None:
         """Goes on with the path and the attempts of a session that was interrupted in `node`."""
@@ -259,18 +266,18 @@ class Localiser:
     def resume_in(self, node: NodeId) -> None:
         """The live frame had been saved as `node`."""
         self.position = Position.at(node)
-        self._adrift = False
+        self._guessed_m2 = 0.0
 
     def resume_near(self, node: NodeId) -> None:
         """The live frame had been matched with `node`, nobody knows from where exactly."""
         spread = np.diag([_RESUMED_SIGMA_M**2] * 3 + [_RESUMED_SIGMA_RAD**2] * 3)
         self.start_at(Position(node, SE3.identity(), spread))
-        self._adrift = True
+        self._guessed_m2 = np.inf
 
     def settle_in(self, node: NodeId, stamp_ns: int) -> None:
         """The live frame was saved as `node`: the robot is in it by construction (SPEC §4)."""
         self.position = Position.at(node)
-        self._adrift = False
+        self._guessed_m2 = 0.0
         self.walk.visit(node, PathEntryKind.SAVED, stamp_ns)
 
     def localise(
@@ -290,7 +297,7 @@ class Localiser:
         clock = _StageClock()
         if deadline is None and self._budget.deadline_ms is not None:
             deadline = clock.started + self._budget.deadline_ms / 1e3
-        self.carry_on(odometry)
+        self.carry_on(odometry, live.stamp_ns)
         self._new_place = None
         self._new_damaged = ()
         self._recent.begin_frame(self._driven_m)
@@ -323,34 +330,41 @@ class Localiser:
         clock.lap("remember")
         return self._result(live, odometry, success, neighbourhood, clock.stage_ms)
 
-    def carry_on(self, odometry: OdometryStep) -> None:
+    def carry_on(self, odometry: OdometryStep, stamp_ns: int) -> None:
         """Propagates the position by odometry (SPEC §3).
 
         A frame that odometry could not use changes nothing: the next usable one brings the motion
-        since the last. Where odometry lost track the motion is unknown: the estimate stays, and
-        its uncertainty grows by as much as the robot may have moved, judged by its last step.
+        since the last. Where odometry lost track the motion is guessed (`GapFiller`), and past
+        `LocaliserConfig.greatest_gap_m` of uncertainty the robot is lost.
+
+        Args:
+            odometry: the step that ends in the frame.
+            stamp_ns: stamp of the frame.
         """
-        if odometry.status in {OdometryStatus.FIRST, OdometryStatus.UNUSABLE_FRAME}:
+        self._motion = motion = self._gaps.motion(odometry, stamp_ns)
+        if motion is None:
             return
         if self._relocaliser is not None:
             self._relocaliser.carry_on(odometry.prev_from_curr)
         self._hypotheses.carry_on(odometry)
-        if odometry.prev_from_curr is None or odometry.covariance is None:
-            self._open_loop_m += self._last_step.distance_m
-            self._adrift = True
-            if self.position is not None:
-                self.position = self.position.carried_on(*_unmeasured(self._last_step))
-            return
-        self._last_step = odometry.prev_from_curr
-        self._driven_m += self._last_step.distance_m
-        self._open_loop_m += self._last_step.distance_m
+        moved_m = motion.prev_from_curr.distance_m
+        self._open_loop_m += moved_m
+        if motion.guessed_m:
+            self._guessed_m2 += motion.guessed_m**2
+        else:
+            self._driven_m += moved_m
         if self.position is not None:
-            self.position = self.position.carried_on(odometry.prev_from_curr, odometry.covariance)
+            self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
+
+    @property
+    def motion(self) -> Motion | None:
+        """How the robot moved up to the last frame; None where the next one will tell."""
+        return self._motion
 
     @property
     def certain(self) -> bool:
-        """Whether the position is known: every motion since the last match was measured."""
-        return self.position is not None and not self._adrift
+        """Whether the position is known: motion since the last match was measured, but for gaps."""
+        return self.position is not None and self._guessed_m2 <= self.config.greatest_gap_m**2
 
     @property
     def _lost(self) -> bool:
@@ -547,7 +561,7 @@ class Localiser:
         assert covariance is not None
         self.position = Position(success.candidate.node, node_from_live, covariance)
         self._open_loop_m = 0.0
-        self._adrift = False
+        self._guessed_m2 = 0.0
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
@@ -602,17 +616,6 @@ class _StageClock:
         now = perf_counter()
         self.stage_ms[stage] = (now - self._last) * 1e3
         self._last = now
-
-
-def _unmeasured(last_step: SE3) -> tuple[SE3, NDArray[np.float64]]:
-    """A motion that odometry did not see, and its (6, 6) covariance.
-
-    Straight on at the last speed: a robot taken as standing still would lag behind itself by every
-    frame that is lost. It may as well have braked or turned, which the covariance covers.
-    """
-    unknown_m, unknown_rad = 2 * last_step.distance_m + 0.1, np.deg2rad(5.0)
-    covariance = np.diag([unknown_m**2] * 3 + [unknown_rad**2] * 3)
-    return SE3(np.eye(3), last_step.translation), covariance
 
 
 def _alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:

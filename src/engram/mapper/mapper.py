@@ -16,7 +16,7 @@ from engram.localiser import Localisation, LocalisationStatus, Localiser, Positi
 from engram.localiser.attempts import Outcome
 from engram.mapper.loops import LoopSearch
 from engram.mapper.saver import Records, Saver
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import OdometryStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,8 @@ class Mapper:
         self._session = session
         # The last saved node and the motion since, while that is known.
         self._since_saved: Position | None = None
+        # Variance of the motion guessed since odometry last measured one, m².
+        self._gap_m2 = 0.0
         # The experience being saved, first node first; empty while localisation succeeds.
         self._experience: list[NodeId] = []
 
@@ -107,8 +109,7 @@ class Mapper:
         # are looked for beside the drive.
         self._localiser.proposes_when_certain = self._loops is None or not self._joined
         localisation = self._localiser.localise(live, odometry, deadline)
-        if self._since_saved is not None:
-            self._since_saved = _carried_on(self._since_saved, odometry)
+        self._move_on()
         saved: Node | None = None
         if localisation.status is LocalisationStatus.LOCALISED:
             self._joined = True
@@ -142,11 +143,10 @@ class Mapper:
         if edges:
             self._saver.put(Records(edges=edges))
 
-    def follow(self, odometry: OdometryStep) -> None:
+    def follow(self, odometry: OdometryStep, stamp_ns: int) -> None:
         """Carries on over a frame that an interrupted run of this session had mapped already."""
-        self._localiser.carry_on(odometry)
-        if self._since_saved is not None:
-            self._since_saved = _carried_on(self._since_saved, odometry)
+        self._localiser.carry_on(odometry, stamp_ns)
+        self._move_on()
 
     def resume_in(self, saved: NodeId) -> None:
         """The frame just followed is the last that this session had saved as a node."""
@@ -159,12 +159,29 @@ class Mapper:
         self._experience = []
         self._localiser.resume_near(matched)
 
+    def _move_on(self) -> None:
+        """Carries the last saved node on as the robot moved; None after too long a gap."""
+        motion = self._localiser.motion
+        if motion is None or self._since_saved is None:
+            return
+        self._gap_m2 = self._gap_m2 + motion.guessed_m**2 if motion.guessed_m else 0.0
+        if self._gap_m2 > self._localiser.config.greatest_gap_m**2:
+            self._since_saved = None
+        else:
+            self._since_saved = self._since_saved.carried_on(
+                motion.prev_from_curr, motion.covariance
+            )
+
     def _worth_saving(self, live: Frame) -> bool:
-        """A usable frame, far enough from the last saved one (SPEC §5)."""
+        """A usable frame, far enough from the last saved one (SPEC §5).
+
+        In the midst of a long gap of odometry none is: a node that hangs on nothing serves nobody.
+        """
         if live.status is not FrameStatus.OK:
             return False
         if self._since_saved is None:
-            return True
+            motion = self._localiser.motion
+            return motion is None or not motion.guessed_m
         moved = self._since_saved.node_from_live
         return (
             moved.distance_m >= self.config.save_every_m
@@ -257,12 +274,3 @@ def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
 def _edge(position: Position, node: NodeId, kind: EdgeKind) -> Edge:
     """The edge to the node that the live frame was saved as."""
     return Edge(position.node, node, kind, position.node_from_live, position.covariance)
-
-
-def _carried_on(position: Position, odometry: OdometryStep) -> Position | None:
-    """After one more step; None once the motion is unknown."""
-    if odometry.status in {OdometryStatus.FIRST, OdometryStatus.UNUSABLE_FRAME}:
-        return position  # the next usable frame brings the motion since the last
-    if odometry.prev_from_curr is None or odometry.covariance is None:
-        return None
-    return position.carried_on(odometry.prev_from_curr, odometry.covariance)

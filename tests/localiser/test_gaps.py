@@ -1,0 +1,63 @@
+"""Motion over the frames at which odometry fails."""
+
+import numpy as np
+import pytest
+
+from engram.geometry import SE3
+from engram.localiser.gaps import GapFiller
+from engram.odometry import OdometryStatus, OdometryStep
+
+FIRST = OdometryStep(OdometryStatus.FIRST)
+BLIND = OdometryStep(OdometryStatus.NO_CONSENSUS)
+DARK = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+MS = 1_000_000
+
+
+def ahead(metres: float) -> OdometryStep:
+    pose = SE3(np.eye(3), np.array([0.0, 0.0, metres]))
+    return OdometryStep(OdometryStatus.OK, pose, np.eye(6) * 1e-6, 100)
+
+
+def test_what_was_measured_passes_through() -> None:
+    gaps = GapFiller()
+    assert gaps.motion(FIRST, 0) is None
+    step = ahead(0.5)
+    motion = gaps.motion(step, 100 * MS)
+    assert motion.prev_from_curr is step.prev_from_curr
+    assert motion.covariance is step.covariance
+    assert motion.guessed_m == 0
+
+
+def test_a_missing_step_goes_on_at_the_last_speed_for_as_long_as_it_took() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    gaps.motion(ahead(0.5), 100 * MS)
+    guess = gaps.motion(BLIND, 300 * MS)
+    np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 1.0])
+    assert guess.guessed_m == pytest.approx(2.1)
+    np.testing.assert_allclose(np.diag(guess.covariance)[:3], 2.1**2)
+    again = gaps.motion(BLIND, 400 * MS)
+    np.testing.assert_allclose(again.prev_from_curr.translation, [0, 0, 0.5])
+
+
+def test_an_unusable_frame_says_nothing_and_the_next_step_spans_it() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    gaps.motion(ahead(0.5), 100 * MS)
+    assert gaps.motion(DARK, 200 * MS) is None
+    gaps.motion(ahead(1.0), 300 * MS)  # spans both: still 5 m/s
+    guess = gaps.motion(BLIND, 400 * MS)
+    np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 0.5])
+
+
+@pytest.mark.parametrize("stamp_ns", [-5 * MS, 100 * MS])
+def test_nothing_is_guessed_without_a_speed_or_by_a_clock_that_does_not_go_on(
+    stamp_ns: int,
+) -> None:
+    fresh = GapFiller()
+    fresh.motion(FIRST, 0)
+    assert fresh.motion(BLIND, 100 * MS).guessed_m == np.inf
+    backwards = GapFiller()
+    backwards.motion(FIRST, 0)
+    backwards.motion(ahead(0.5), 100 * MS)
+    assert backwards.motion(BLIND, stamp_ns).guessed_m == np.inf
