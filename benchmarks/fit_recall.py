@@ -1,17 +1,16 @@
-"""Fits the constants of Γ(recall) by replaying the sessions of a town, each left out in turn.
-
-One map is built from all drives of the campaigns given; then each drive is localised again in that
-map as if it had never been there: its nodes are no candidates, its path and attempts teach nothing.
-Now and then every candidate is attempted, to see which would have matched. A logistic regression
-gives the factors, a coarse search over what memories are long and whom to trust gives the rest.
-
-Constants are fitted on towns that nothing is judged on:
+"""Fits the constants of Γ(recall) on towns that nothing is judged on.
 
     engram simulate village --seed 2
     python benchmarks/fit_recall.py village@2 --work fit --json fit/recall.json
 
-Prints the constants as they stand in `engram.ranking.recall`, and how often two attempts would
-have been enough, by sessions left out of the fit, beside other policies on the same frames.
+A map is built from the drives of each campaign given, one after another; each drive is localised
+in the map of all before it, attempting every candidate of every frame, to see which would match.
+Then any policy can be replayed in seconds: it sees the outcomes of its own picks alone. Constants
+are searched, one after another, for the least share of the route on which something would have
+matched and the first picks do not; the two that give chances come from a logistic regression.
+
+Prints that share for the constants as they ship, for those found, with each drive left out of the
+search that it is judged by, and for other policies; and what each value of each constant costs.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,71 +31,76 @@ from engram.drive import OpenMap, Settings, open_map
 from engram.evaluation.building import GENEROUS, build_map, true_nodes
 from engram.evaluation.drives import EvaluatedDrive, campaign_logs, drives_of
 from engram.evaluation.memo import MatchMemo
-from engram.experience.neighbourhood import Neighbourhood
 from engram.frontend.matching import matcher_hash
 from engram.localiser import Budget, FrameMatcher
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.ranking import POLICIES, RankingContext, RankingPolicy, policy_named
+from engram.ranking import (
+    Foreseen,
+    RankingContext,
+    RankingPolicy,
+    RecentAttempts,
+    RunLog,
+    policy_named,
+)
 from engram.ranking.recall import RECALL, RecallConstants, RecallPolicy
 from engram.simulation import campaign_named
 
-FACTORS = ("bias", "offset", "company", "own", "node", "hour")
-TERMS = ("bias", "distance", "company", "this run", "this node", "hour")
-# Candidates so far away that hardly any matches say nothing about appearance.
-LEAST_RATE = 0.02
-RIDGE = 1.0
 SEARCHED: dict[str, tuple[float, ...]] = {
-    "own_m": (3.0, 5.0, 8.0, 12.0),
-    "node_m": (2.0, 3.0, 6.0),
-    "viewers_m": (8.0, 15.0, 30.0, 60.0),
-    "trust": (0.1, 0.2, 0.35, 0.5, 0.8),
-    "viewer_hour": (0.0, -0.1, -0.2, -0.4),
+    "distance": (0.4, 0.7, 1.1, 1.5, 2.2),
+    "lessons": (0.0, 0.25, 0.5, 1.0),
+    "level": (-0.5, 0.0, 0.5, 1.0),
+    "prior_weight": (0.25, 0.5, 1.0, 2.0),
+    "memory_m": (2.0, 4.0, 8.0, 16.0),
+    "failed": (-3.0, -2.3, -1.4, -0.7),
 }
-AS_SHIPPED = ("recall", "recall-no-clock", "bandit", "path", "distance", "time-of-day")
-# Of equals the first is taken: where it does not matter, picks are diverse.
-REGRETS = (1.0, 0.5, 0.25, 0.0)
+CHANCES = ("bias", "steepness")
+OTHERS = ("bandit", "path", "distance", "time-of-day")
+# A robot that has so many candidates does not know where it is; to match all takes long.
+MOST_CANDIDATES = 200
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame's situation, and which candidates would have matched."""
+    """A frame's situation but for the policy's own attempts, and which candidates would match."""
 
-    session: int
     context: RankingContext
-    accepted: NDArray[np.bool_]
+    foreseen: Foreseen
+    driven_m: float
+    step_m: float
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """One drive, every frame of it."""
+
+    name: str
+    frames: tuple[Seen, ...]
+    length_m: float
 
 
 @dataclass
 class Recording:
-    """Ranks as another policy does, and looks at what would have matched every few frames."""
+    """Ranks as the oracle does and keeps what it sees."""
 
-    policy: RankingPolicy
-    session: int
-    every: int
     name: str = "recording"
-    frames: int = 0
-    seen: list[Seen] = field(default_factory=list)
+    oracle: RankingPolicy = field(default_factory=lambda: policy_named("oracle"))
+    seen: list[tuple[RankingContext, Foreseen]] = field(default_factory=list)
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        if self.frames % self.every == 0 and context.foresee is not None:
-            foreseen = context.foresee()
-            kept = dataclasses.replace(context, foresee=None, live_words=None)
-            self.seen.append(Seen(self.session, kept, foreseen.accepted))
-        self.frames += 1
-        return self.policy.rank(context)
+        if len(context.neighbourhood) > MOST_CANDIDATES or context.foresee is None:
+            return policy_named("distance").rank(context)
+        foreseen = context.foresee()
+        kept = dataclasses.replace(context, foresee=None, live_words=None)
+        self.seen.append((kept, foreseen))
+        return self.oracle.rank(dataclasses.replace(context, foresee=lambda: foreseen))
 
 
-def replay(
-    opened: OpenMap,
-    drives: Sequence[EvaluatedDrive],
-    left_out: int,
-    policy: RankingPolicy,
-    work: Path,
-    every: int,
-) -> list[Seen]:
-    """Localises one drive in the map without what it left there itself; Np = 2, Nr = 1."""
-    drive, settings = drives[left_out], Settings()
+def record(
+    opened: OpenMap, drive: EvaluatedDrive, known: Sequence[EvaluatedDrive], work: Path
+) -> Recorded:
+    """Localises a drive that the map does not hold, attempting everything."""
+    settings = Settings()
     settings = dataclasses.replace(
         settings, localiser=dataclasses.replace(settings.localiser, guide_below_m=0.0)
     )
@@ -106,131 +110,122 @@ def replay(
         work / f"memo-{drive.name}.npz",
         matcher_hash(matcher),
     )
-    own = opened.graph.session_number(drive.session.id)
-
-    def search(*args: object, **options: object) -> Neighbourhood:
-        found = opened.graph.neighbourhood(*args, **options)
-        return found.rows(np.flatnonzero(opened.graph.sessions[found.nodes] != own))
-
-    others = [one for number, one in enumerate(drives) if number != left_out]
-    recording = Recording(policy, left_out, every)
-    truth, frames = drive.truth(), drive.frames()
-    start = None if truth is None else truth.at(frames[0].frame.stamp_ns)
-    begin = None if start is None else true_nodes(opened, others).start(start)
-    if begin is None:
-        return []
-    POLICIES[recording.name] = lambda: recording
+    recording, truth, logged = Recording(), drive.truth(), drive.frames()
+    first = None if truth is None else truth.at(logged[0].frame.stamp_ns)
+    start = None if first is None else true_nodes(opened, known).start(first)
+    frames, length_m = [], 0.0
+    if start is None:
+        return Recorded(drive.name, (), 0.0)
     with opened.localiser(
         drive.camera,
         settings,
-        policy=recording.name,
+        policy=recording,
         budget=Budget(2, 1),
         relocaliser=None,
         live=drive.session.id,
         matcher=memo,
-        search=search,
         clock=drive.session,
     ) as localiser:
-        localiser.start_at(begin)
-        for number, logged in enumerate(frames):
-            first = OdometryStep(OdometryStatus.FIRST)
-            localiser.localise(logged.frame, logged.odometry if number else first)
+        localiser.start_at(start)
+        for number, one in enumerate(logged):
+            odometry = one.odometry if number else OdometryStep(OdometryStatus.FIRST)
+            motion = odometry.prev_from_curr
+            step_m = 0.0 if motion is None else motion.distance_m
+            length_m += step_m
+            before = len(recording.seen)
+            localiser.localise(one.frame, odometry)
+            frames += [Seen(*seen, localiser.driven_m, step_m) for seen in recording.seen[before:]]
     memo.save()
-    return recording.seen
+    return Recorded(drive.name, tuple(frames), length_m)
 
 
-def features(
-    seen: Sequence[Seen], structure: RecallConstants, *, clock: bool
-) -> NDArray[np.float64]:
-    """(C, F) what the factors multiply, of all candidates that `worth` keeps."""
-    plain = dataclasses.replace(structure, **dict.fromkeys(FACTORS, 1.0))
-    policy = RecallPolicy(clock=clock, constants=plain)
-    rows = []
-    for one in seen:
-        terms = policy.judge(one.context).terms
-        nothing = np.zeros(len(one.accepted))
-        columns = [terms.get(name, nothing) for name in TERMS]
-        rows.append(np.stack(columns, axis=1)[worth(one)])
-    return np.concatenate(rows)
+def replay(
+    drive: Recorded, policy: RankingPolicy, lanes: int = 2
+) -> Iterator[tuple[Seen, RankingContext, NDArray[np.int64]]]:
+    """Each frame with what the policy got to see and what it picked, as if it had driven."""
+    recent, run = RecentAttempts(), RunLog()
+    reference = drive.frames[0].context.reference if drive.frames else None
+    for seen in drive.frames:
+        recent.begin_frame(seen.driven_m)
+        context = dataclasses.replace(
+            seen.context,
+            observations=recent.observations,
+            run=run.attempts(seen.driven_m),
+            reference=reference,
+        )
+        picks = policy.rank(context)[:lanes]
+        near, accepted = context.neighbourhood, seen.foreseen.accepted[picks]
+        nodes, inliers = near.nodes[picks].tolist(), seen.foreseen.inliers[picks]
+        rates = context.success_rates()[picks]
+        recent.add(nodes, accepted.tolist())
+        run.add(
+            seen.driven_m, nodes, near.distance_m[picks], rates, accepted.tolist(), list(inliers), 0
+        )
+        if accepted.any():
+            reference = nodes[int(np.argmax(np.where(accepted, inliers, -1)))]
+        yield seen, context, picks
 
 
-def worth(seen: Seen) -> NDArray[np.bool_]:
-    """Candidates near enough to learn from."""
-    return seen.context.success_rates() >= LEAST_RATE
-
-
-def fit(x: NDArray[np.float64], y: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Logistic regression with a small ridge on all factors but the bias."""
-    ridge = np.array([0.0] + [RIDGE] * (x.shape[1] - 1))
-
-    def loss(b: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        z = x @ b
-        value = np.logaddexp(0, z).sum() - z[y].sum() + (ridge * b**2).sum()
-        return float(value), x.T @ (1 / (1 + np.exp(-z)) - y) + 2 * ridge * b
-
-    return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True, method="L-BFGS-B").x)
-
-
-def log_loss(x: NDArray[np.float64], y: NDArray[np.bool_], b: NDArray[np.float64]) -> float:
-    """Mean negative log likelihood, nats."""
-    z = x @ b
-    return float((np.logaddexp(0, z).sum() - z[y].sum()) / len(y))
-
-
-def search_structure(seen: Sequence[Seen], *, clock: bool) -> RecallConstants:
-    """One setting after another, twice round, by log loss; then how much a pick regrets."""
-    best = RECALL
-    y = np.concatenate([one.accepted[worth(one)] for one in seen])
-
-    def loss(structure: RecallConstants) -> float:
-        x = features(seen, structure, clock=clock)
-        return log_loss(x, y, fit(x, y))
-
-    known: dict[RecallConstants, float] = {}
-    for _ in range(2):
-        for name, values in SEARCHED.items():
-            if name == "viewer_hour" and not clock:
-                continue
-            tried = [dataclasses.replace(best, **{name: value}) for value in values]
-            for one in tried:
-                if one not in known:
-                    known[one] = loss(one)
-            best = min(tried, key=lambda one: known[one])
-    return with_factors(seen, best, clock=clock)
-
-
-def with_factors(
-    seen: Sequence[Seen], structure: RecallConstants, *, clock: bool
-) -> RecallConstants:
-    """The structure with factors by regression and the regret that leaves fewest frames lost."""
-    y = np.concatenate([one.accepted[worth(one)] for one in seen])
-    b = fit(features(seen, structure, clock=clock), y)
-    factors = dict(zip(FACTORS, (round(float(value), 3) for value in b), strict=True))
-    fitted = dataclasses.replace(structure, **factors)
-    tried = [dataclasses.replace(fitted, regret=regret) for regret in REGRETS]
-    return min(tried, key=lambda one: missed(seen, RecallPolicy(clock=clock, constants=one)).mean())
-
-
-def missed(seen: Sequence[Seen], policy: RankingPolicy, lanes: int = 2) -> NDArray[np.bool_]:
-    """For each frame where something would have matched, whether all of the first picks fail."""
-    return np.array(
-        [
-            not one.accepted[policy.rank(one.context)[:lanes]].any()
-            for one in seen
-            if one.accepted.any()
-        ]
+def missed(drive: Recorded, policy: RankingPolicy, lanes: int = 2) -> float:
+    """Share of the route on which something would match and none of the first picks does."""
+    lost_m = sum(
+        seen.step_m
+        for seen, _, picks in replay(drive, policy, lanes)
+        if seen.foreseen.accepted.any() and not seen.foreseen.accepted[picks].any()
     )
+    return lost_m / max(drive.length_m, 1e-9)
 
 
-def left_out_misses(seen: Sequence[Seen], structure: RecallConstants, *, clock: bool) -> float:
-    """Share of frames missed by constants whose factors were fitted on the other sessions."""
-    parts = []
-    for session in sorted({one.session for one in seen}):
-        others = [one for one in seen if one.session != session]
-        fitted = with_factors(others, structure, clock=clock)
-        own = [one for one in seen if one.session == session]
-        parts.append(missed(own, RecallPolicy(clock=clock, constants=fitted)))
-    return float(np.concatenate(parts).mean())
+class Costs:
+    """What constants cost on each drive; worked out once."""
+
+    def __init__(self, drives: Sequence[Recorded]) -> None:
+        self._drives = drives
+        self._known: dict[RecallConstants, NDArray[np.float64]] = {}
+
+    def __call__(self, constants: RecallConstants) -> NDArray[np.float64]:
+        """(D,) share missed of each drive."""
+        if constants not in self._known:
+            policy = RecallPolicy(constants)
+            self._known[constants] = np.array([missed(one, policy) for one in self._drives])
+        return self._known[constants]
+
+
+def search(
+    cost: Callable[[RecallConstants], float], start: RecallConstants = RECALL
+) -> RecallConstants:
+    """One constant after another, until none gets better; of equals the first is taken."""
+    best, before = start, None
+    while best != before:
+        before = best
+        for name, values in SEARCHED.items():
+            tried = [best, *(dataclasses.replace(best, **{name: value}) for value in values)]
+            best = min(tried, key=cost)
+    return best
+
+
+def with_chances(drives: Sequence[Recorded], constants: RecallConstants) -> RecallConstants:
+    """The constants with bias and steepness by logistic regression on all candidates."""
+    policy = RecallPolicy(constants)
+    margins, outcomes = [], []
+    for drive in drives:
+        for number, (seen, context, _) in enumerate(replay(drive, policy)):
+            if number % 5 == 0:
+                margins.append(sum(policy.judge(context).terms.values()))
+                outcomes.append(seen.foreseen.accepted)
+    bias, steepness = logistic(np.concatenate(margins), np.concatenate(outcomes))
+    return dataclasses.replace(constants, bias=round(bias, 1), steepness=round(steepness, 1))
+
+
+def logistic(x: NDArray[np.float64], y: NDArray[np.bool_]) -> tuple[float, float]:
+    """Log odds of y at x = 0, and per x."""
+
+    def loss(b: NDArray[np.float64]) -> float:
+        z = b[0] + b[1] * x
+        return float(np.logaddexp(0, z).sum() - z[y].sum())
+
+    bias, slope = minimize(loss, np.array([0.0, 1.0])).x
+    return float(bias), float(slope)
 
 
 def rendered(name: str, campaigns: Path) -> tuple[EvaluatedDrive, ...]:
@@ -241,20 +236,19 @@ def rendered(name: str, campaigns: Path) -> tuple[EvaluatedDrive, ...]:
     return drives_of([log for log in logs if log.with_suffix(".truth.txt").exists()])
 
 
-def recorded(
-    names: Sequence[str], campaigns: Path, work: Path, every: int, policy: RankingPolicy
-) -> Iterator[Seen]:
-    """All campaigns' drives, each left out in turn."""
+def recorded(names: Sequence[str], campaigns: Path, work: Path) -> Iterator[Recorded]:
+    """All campaigns' drives but the first, each in the map of those before it."""
     for name in names:
         drives = rendered(name, campaigns)
         folder = work / name.replace("@", "-seed")
         folder.mkdir(parents=True, exist_ok=True)
         built = build_map(folder / "all.engram", drives, Settings(), GENEROUS)
-        with open_map(built.path) as opened:
-            for left_out, drive in enumerate(drives):
-                found = replay(opened, drives, left_out, policy, folder, every)
-                print(f"{name} {drive.name}: {len(found)} frames", flush=True)
-                yield from found
+        for number, drive in enumerate(drives[1:], start=1):
+            with open_map(built.path, at=built.revision_after(number)) as opened:
+                one = record(opened, drive, drives, folder)
+            print(f"{name} {drive.name}: {len(one.frames)} frames", flush=True)
+            if one.frames:
+                yield one
 
 
 def main() -> None:
@@ -264,27 +258,30 @@ def main() -> None:
     parser.add_argument("towns", nargs="+", help="rendered campaigns, NAME@SEED")
     parser.add_argument("--campaigns", type=Path, default=campaigns_folder())
     parser.add_argument("--work", type=Path, required=True, help="for the map and the matches")
-    parser.add_argument(
-        "--every", type=int, default=3, help="frames from one looked at to the next"
-    )
-    parser.add_argument("--rounds", type=int, default=2, help="of recording and fitting")
+    parser.add_argument("--only-compare", action="store_true", help="search nothing")
     parser.add_argument("--json", type=Path, help="write the constants")
     options = parser.parse_args()
-    policy: RankingPolicy = policy_named("recall")
-    found: dict[str, RecallConstants] = {}
-    for number in range(options.rounds):
-        seen = list(recorded(options.towns, options.campaigns, options.work, options.every, policy))
-        for name, clock in (("recall", True), ("recall-no-clock", False)):
-            found[name] = search_structure(seen, clock=clock)
-            share = left_out_misses(seen, found[name], clock=clock)
-            print(f"round {number}: {name} misses {share:.2%}, sessions left out\n  {found[name]}")
-        for name in AS_SHIPPED:
-            share = float(missed(seen, policy_named(name)).mean())
-            print(f"round {number}: {name} as it ships misses {share:.2%}")
-        policy = RecallPolicy(constants=found["recall"])
+    drives = list(recorded(options.towns, options.campaigns, options.work))
+    costs = Costs(drives)
+    print(f"recall as it ships misses {costs(RECALL).mean():.2%} of the route")
+    for name in OTHERS:
+        policy = policy_named(name)
+        print(f"{name} misses {np.mean([missed(one, policy) for one in drives]):.2%}", flush=True)
+    if options.only_compare:
+        return
+    for name, values in SEARCHED.items():
+        around = [costs(dataclasses.replace(RECALL, **{name: value})).mean() for value in values]
+        told = (f"{value:g}: {cost:.2%}" for value, cost in zip(values, around, strict=True))
+        print(f"  {name} = {', '.join(told)}", flush=True)
+    found = with_chances(drives, search(lambda one: float(costs(one).mean())))
+    left_out = [
+        costs(search(lambda one, k=k: float(np.delete(costs(one), k).mean())))[k]  # type: ignore[misc]
+        for k in range(len(drives))
+    ]
+    print(f"found {found}\n  misses {costs(found).mean():.2%}, left out {np.mean(left_out):.2%}")
     if options.json:
-        plain = {name: dataclasses.asdict(one) for name, one in found.items()}
-        options.json.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+        text = json.dumps(dataclasses.asdict(found), indent=1)
+        options.json.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -189,52 +189,22 @@ def success_rates(
 
 # --- recall
 
-class RecallLessons:
-    def __init__(
-        self,
-        starts: NDArray[np.int64],
-        viewers: NDArray[np.int32],
-        rates: NDArray[np.float32],
-        on_success: NDArray[np.float32],
-        on_failure: NDArray[np.float32],
-        base: NDArray[np.float64],
-        viewer_count: int,
-    ) -> None: ...
-
 def recall_order(
-    lessons: RecallLessons,
     run_nodes: NDArray[np.int32],
     run_ago_m: NDArray[np.float64],
-    run_rates: NDArray[np.float64],
-    run_accepted: NDArray[np.bool_],
-    prior: NDArray[np.float64],
+    run_margins: NDArray[np.float64],
     nodes: NDArray[np.int32],
-    rates: NDArray[np.float64],
-    fixed: NDArray[np.float64],
+    costs: NDArray[np.float64],
+    prior: NDArray[np.float64],
     sessions: NDArray[np.int32],
     session_count: int,
     *,
-    company: float,
-    own: float,
-    node: float,
-    own_m: float,
-    node_m: float,
-    viewers_m: float,
-    trust: float,
-    nobody: float,
-    unknown_base: float,
-    pseudo: float,
-    regret: float,
+    memory_m: float,
+    prior_weight: float,
+    failed: float,
     picks: int,
     shortlist: int,
-) -> tuple[
-    NDArray[np.int64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]: ...
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]: ...
 
 # --- path memory
 

@@ -45,7 +45,7 @@ def test_text_names_terms_and_outcomes(engram, street: Path, town: Path) -> None
     ran = engram("explain", town, street, "--frame", 6, "--policy", "recall", "--top", 3)
     assert ran.status == 0
     assert "frame 6: localised" in ran.out
-    assert "company: how past drives" in ran.out
+    assert "past drives: how past drives fared" in ran.out
     assert "matched," in ran.out
     assert "more; --top lists them" in ran.out
 

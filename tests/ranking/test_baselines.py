@@ -166,7 +166,8 @@ class TestCollaborative:
 def test_run_log_forgets_what_lies_two_hundred_metres_back() -> None:
     log = RunLog()
     for metre in range(500):
-        log.add(float(metre), [metre, 7], np.array([0.5, np.nan]), [True, False], [30, 0], 90)
+        unknown = np.array([0.5, np.nan])
+        log.add(float(metre), [metre, 7], unknown, unknown, [True, False], [30, 0], 90)
     run = log.attempts(499.0)
     assert run.nodes[::2].tolist() == list(range(299, 500))
     assert set(run.nodes[1::2].tolist()) == {7}

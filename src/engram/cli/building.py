@@ -50,7 +50,7 @@ def build(
     keep: Annotated[
         bool, typer.Option("--keep", help="Leave the groups' maps in CENTRE.build.")
     ] = False,
-    policy: options.Policy = "path",
+    policy: options.Policy = "recall",
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 4,
     relocaliser: Annotated[

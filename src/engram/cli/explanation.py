@@ -18,7 +18,7 @@ def explain(
     path: options.DrivePath,
     *,
     frame: Annotated[int, typer.Option("--frame", min=0, help="Which frame of the drive.")],
-    policy: options.Policy = "path",
+    policy: options.Policy = "recall",
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 2,
     top: Annotated[int, typer.Option("--top", min=1, help="How many candidates to list.")] = 20,

@@ -13,7 +13,7 @@ def map_(
     map_path: options.MapPath,
     path: options.DrivePath,
     *,
-    policy: options.Policy = "path",
+    policy: options.Policy = "recall",
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 2,
     deadline: options.Deadline = None,

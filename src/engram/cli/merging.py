@@ -34,7 +34,7 @@ def merge(
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw the centre before and after."),
     ] = None,
-    policy: options.Policy = "path",
+    policy: options.Policy = "recall",
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 4,
     relocaliser: Annotated[

@@ -63,8 +63,8 @@ Policy: TypeAlias = Annotated[
     str,
     typer.Option(
         "--policy",
-        help="Ranking: path, recall, recall-no-clock, distance, bandit, bag-of-words, "
-        "time-of-day, collaborative, nearest-of-each, path-literal or random.",
+        help="Ranking: recall, path, distance, bandit, bag-of-words, time-of-day, "
+        "collaborative, nearest-of-each, path-literal or random.",
     ),
 ]
 ThereAndBack: TypeAlias = Annotated[

@@ -42,7 +42,7 @@ class ExplainOptions:
     """
 
     frame: int
-    policy: str = "path"
+    policy: str = "recall"
     lanes: int = 2
     rounds: int = 2
     relocaliser: str | None = "fabmap"

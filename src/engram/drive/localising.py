@@ -32,7 +32,7 @@ class LocaliseOptions:
         preload: decode all images before the first frame.
     """
 
-    policy: str = "path"
+    policy: str = "recall"
     lanes: int = 2
     rounds: int = 2
     deadline_ms: float | None = None

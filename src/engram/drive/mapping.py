@@ -51,7 +51,7 @@ class MapOptions:
         threads: whether the lanes run on threads; without a deadline the map is the same.
     """
 
-    policy: str = "path"
+    policy: str = "recall"
     lanes: int = 2
     rounds: int = 2
     deadline_ms: float | None = None

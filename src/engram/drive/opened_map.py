@@ -15,7 +15,7 @@ from engram.drive.place_words import stored_words
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
 from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
-from engram.experience.clock import Clocked, hour_of_day
+from engram.experience.clock import Clocked
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import PathEntryKind, SessionId, path_id
 from engram.experience.neighbourhood import Neighbourhood
@@ -158,12 +158,10 @@ class OpenMap:
             attempts = PastAttempts(
                 made.session, made.node, basin.success_rate(along_m, across_m), made.accepted
             )
-            hours = [hour_of_day(session, session.start_ns) for session in self.sessions.values()]
             self._lessons[focal_px] = Lessons.learnt(
                 self.graph,
                 self.path_memory,
-                [path_id(session.id) for session in self.sessions.values()],
-                np.array([np.nan if hour is None else hour for hour in hours], np.float64),
+                [path_id(session) for session in self.sessions],
                 attempts,
             )
         return self._lessons[focal_px]
@@ -173,7 +171,7 @@ class OpenMap:
         camera: StereoCamera,
         settings: Settings,
         *,
-        policy: str | RankingPolicy = "path",
+        policy: str | RankingPolicy = "recall",
         budget: Budget | None = None,
         relocaliser: str | Relocaliser | None = "fabmap",
         live: SessionId = UNNAMED_LIVE_SESSION,
@@ -236,7 +234,7 @@ class OpenMap:
         camera: StereoCamera,
         settings: Settings | None = None,
         *,
-        policy: str = "path",
+        policy: str = "recall",
         lanes: int = 2,
         rounds: int = 2,
         relocaliser: str | None = "fabmap",

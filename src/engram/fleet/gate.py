@@ -34,7 +34,7 @@ class GateOptions:
         relocaliser: key of `RELOCALISERS`; drives begin lost.
     """
 
-    policy: str = "path"
+    policy: str = "recall"
     lanes: int = 2
     rounds: int = 2
     relocaliser: str | None = "fabmap"

@@ -60,7 +60,7 @@ class MergeOptions:
         author: who merges; None for the robots whose drives are handed in.
     """
 
-    policy: str = "path"
+    policy: str = "recall"
     lanes: int = 2
     rounds: int = 4
     relocaliser: str | None = "fabmap"

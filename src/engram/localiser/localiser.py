@@ -538,16 +538,18 @@ class Localiser:
         self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
     ) -> None:
         """What policies learn from while driving."""
-        rates = np.full(len(outcomes), np.nan)
+        distance_m, rates = np.full((2, len(outcomes)), np.nan)
         rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
         if neighbourhood is not None and (known := rows >= 0).any():
             near = rows[known]
+            distance_m[known] = neighbourhood.distance_m[near]
             rates[known] = self._basin.success_rate(
                 neighbourhood.along_m[near], neighbourhood.across_m[near]
             )
         self._run.add(
             self._driven_m,
             [one.candidate.index for one in outcomes],
+            distance_m,
             rates,
             [one.accepted for one in outcomes],
             [one.match.inliers for one in outcomes],

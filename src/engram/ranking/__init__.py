@@ -6,7 +6,6 @@ Every policy is one file and stands in `POLICIES`.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 from engram.errors import ConfigError
 from engram.ranking.background import Background
@@ -41,7 +40,6 @@ POLICIES: dict[str, Callable[[], RankingPolicy]] = {
     "nearest-of-each": NearestOfEachPolicy,
     "bandit": BanditPolicy,
     "recall": RecallPolicy,
-    "recall-no-clock": partial(RecallPolicy, clock=False),
 }
 
 

@@ -1,4 +1,4 @@
-"""What past drives learnt at each node: who matched it, and who tried and failed."""
+"""What past drives learnt at each node: how often it matched, and how often in vain."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
-from engram import _core
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import PathId, path_id
 from engram.experience.path_memory import PathMemory
@@ -20,13 +19,9 @@ _POOL_M, _POOL_REACH_M = 3.0, 4.0
 _POOL_NODES = 8
 # The drive that saved a node would have matched it with certainty.
 _SAVING_COUNTS = 2.0
-# Drives remembered at each node, the newest: more cost time on every frame.
-_MOST_VIEWERS = 64
 # How likely anybody matches a node of which nothing is known, and how many attempts that is worth.
 UNKNOWN_BASE = 0.4
 _BASE_ATTEMPTS = 2.0
-# What a drive did at a node, against what others did, with that many attempts of theirs.
-_OWN_ATTEMPTS = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,65 +49,32 @@ class PastAttempts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lessons:
-    """How likely each past drive matches each node: a sparse table, a row of entries per node.
+    """How likely each node is matched where offsets do not prevent it.
 
     Attributes:
-        viewers: the drives by number, oldest first, each named by its path.
-        hours: (V,) float64, hour of day at which each began; NaN where unknown.
-        starts: (N + 1,) int64, the entries of node n are ``starts[n]`` up to ``starts[n + 1]``.
-        entry_viewers: (E,) int32, drive of each entry, rising within a row.
-        rates: (E,) float32, how likely the drive matches the node where offsets do not prevent it.
-        base: (N,) float64, how likely anybody does.
-        table: the same for the core.
+        base: (N,) float64, by all past drives; nodes saved since the map was opened are missing.
     """
 
-    viewers: tuple[PathId, ...]
-    hours: NDArray[np.float64]
-    starts: NDArray[np.int64]
-    entry_viewers: NDArray[np.int32]
-    rates: NDArray[np.float32]
     base: NDArray[np.float64]
-    table: _core.RecallLessons = field(init=False, repr=False)
-    _numbers: dict[PathId, int] = field(init=False, repr=False)
+    _and_unknown: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        of_all = np.repeat(self.base, np.diff(self.starts))
-        rates = self.rates.astype(np.float64)
-        table = _core.RecallLessons(
-            self.starts,
-            self.entry_viewers,
-            self.rates,
-            np.log(rates / of_all).astype(np.float32),
-            np.log((1 - rates) / (1 - of_all)).astype(np.float32),
-            self.base,
-            len(self.viewers),
-        )
-        object.__setattr__(self, "table", table)
-        numbers = {viewer: number for number, viewer in enumerate(self.viewers)}
-        object.__setattr__(self, "_numbers", numbers)
-
-    def number(self, viewer: PathId | None) -> int | None:
-        """Number of a drive; None if it taught nothing."""
-        return None if viewer is None else self._numbers.get(viewer)
+        object.__setattr__(self, "_and_unknown", np.append(self.base, UNKNOWN_BASE))
 
     @staticmethod
     def none() -> Lessons:
         """Of an empty map."""
-        return Lessons(
-            (),
-            np.zeros(0),
-            np.zeros(1, np.int64),
-            np.zeros(0, np.int32),
-            np.zeros(0, np.float32),
-            np.zeros(0),
-        )
+        return Lessons(np.zeros(0))
+
+    def of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(Y,) the base of some nodes; 0.4 where it is missing."""
+        return self._and_unknown[np.minimum(nodes, len(self.base))]
 
     @staticmethod
     def learnt(
         graph: ExperienceGraph,
         path_memory: PathMemory,
         viewers: Sequence[PathId],
-        hours: NDArray[np.float64],
         attempts: PastAttempts,
     ) -> Lessons:
         """What the drives of a map teach.
@@ -124,15 +86,12 @@ class Lessons:
         Args:
             graph: the nodes.
             path_memory: the paths.
-            viewers: (V,) the drives, oldest first.
-            hours: (V,) their hours of day; NaN where unknown.
+            viewers: (V,) the drives.
             attempts: what they attempted.
         """
-        successes, failures = _counts(graph, path_memory, viewers, attempts)
         sharing = _sharing(graph)
-        a, b = sharing @ successes, sharing @ failures
-        base = _of_all(a, b)
-        return _table(tuple(viewers), np.asarray(hours, np.float64), a, b, base)
+        good, bad = (sharing @ counts for counts in _counts(graph, path_memory, viewers, attempts))
+        return Lessons((good + _BASE_ATTEMPTS * UNKNOWN_BASE) / (good + bad + _BASE_ATTEMPTS))
 
 
 def _counts(
@@ -140,36 +99,20 @@ def _counts(
     path_memory: PathMemory,
     viewers: Sequence[PathId],
     attempts: PastAttempts,
-) -> tuple[csr_matrix, csr_matrix]:
-    """Successes and weighted failures (N, V) by node and drive."""
-    shape = (len(graph), len(viewers))
-    number = {viewer: at for at, viewer in enumerate(viewers)}
-    silent = set(range(len(viewers))) - set(np.unique(attempts.viewers).tolist())
-    walked = [
-        (graph.index(entry.node), at)
-        for at in sorted(silent)
-        for entry in path_memory.entries(viewers[at])
-    ]
-    saver_of = np.array([number.get(path, -1) for path in _saving_paths(graph)], np.int64)
-    savers = saver_of[graph.sessions] if len(graph) else np.zeros(0, np.int64)
-    saved = np.flatnonzero(savers >= 0)
-    walked_nodes, walkers = np.array(walked, np.int64).reshape(-1, 2).T
-    nodes = np.concatenate([attempts.nodes, walked_nodes, saved])
-    drives = np.concatenate([attempts.viewers, walkers, savers[saved]])
-    good = np.concatenate(
-        [attempts.accepted, np.ones(len(walkers)), np.full(len(saved), _SAVING_COUNTS)]
-    )
-    bad = np.zeros(len(nodes))
-    bad[: len(attempts.nodes)] = np.where(attempts.accepted, 0.0, attempts.rates)
-    return (
-        coo_matrix((good.astype(np.float64), (nodes, drives)), shape).tocsr(),
-        coo_matrix((bad, (nodes, drives)), shape).tocsr(),
-    )
-
-
-def _saving_paths(graph: ExperienceGraph) -> list[PathId]:
-    """The path of each session of the graph, by number."""
-    return [path_id(graph.session(number)) for number in range(graph.session_count)]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N,) successes and weighted failures of each node."""
+    count = len(graph)
+    good, bad = np.zeros((2, count))
+    np.add.at(good, attempts.nodes, attempts.accepted)
+    np.add.at(bad, attempts.nodes, np.where(attempts.accepted, 0.0, attempts.rates))
+    spoke = set(np.unique(attempts.viewers).tolist())
+    silent = [viewer for number, viewer in enumerate(viewers) if number not in spoke]
+    walked = [graph.index(one.node) for path in silent for one in path_memory.entries(path)]
+    np.add.at(good, np.array(walked, np.int64), 1.0)
+    known = set(viewers)
+    saved = [path_id(graph.session(number)) in known for number in range(graph.session_count)]
+    good += _SAVING_COUNTS * np.array(saved, np.bool_)[graph.sessions]
+    return good, bad
 
 
 def _sharing(graph: ExperienceGraph) -> csr_matrix:
@@ -190,34 +133,3 @@ def _sharing(graph: ExperienceGraph) -> csr_matrix:
         weights += [weight, weight]
     at = (np.concatenate(rows), np.concatenate(columns))
     return coo_matrix((np.concatenate(weights), at), (count, count)).tocsr()
-
-
-def _of_all(a: csr_matrix, b: csr_matrix) -> NDArray[np.float64]:
-    """(N,) how likely anybody matches each node."""
-    good, bad = (np.asarray(counts.sum(axis=1)).reshape(-1) for counts in (a, b))
-    return np.asarray((good + _BASE_ATTEMPTS * UNKNOWN_BASE) / (good + bad + _BASE_ATTEMPTS))
-
-
-def _table(
-    viewers: tuple[PathId, ...],
-    hours: NDArray[np.float64],
-    a: csr_matrix,
-    b: csr_matrix,
-    base: NDArray[np.float64],
-) -> Lessons:
-    total = (a + b).tocsr()
-    total.sort_indices()
-    nodes = np.repeat(np.arange(len(base)), np.diff(total.indptr))
-    newest = np.arange(total.nnz) >= total.indptr[nodes + 1] - _MOST_VIEWERS
-    nodes, drives = nodes[newest], total.indices[newest]
-    good = np.asarray(a[nodes, drives]).reshape(-1)
-    rates = (good + _OWN_ATTEMPTS * base[nodes]) / (total.data[newest] + _OWN_ATTEMPTS)
-    kept = np.bincount(nodes, minlength=len(base))
-    return Lessons(
-        viewers,
-        hours,
-        np.concatenate([[0], np.cumsum(kept)]).astype(np.int64),
-        drives.astype(np.int32),
-        np.clip(rates, 1e-3, 1 - 1e-3).astype(np.float32),
-        base,
-    )

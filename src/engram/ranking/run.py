@@ -21,8 +21,10 @@ class RunAttempts:
         driven_m: odometry distance of the live session now.
         at_m: (R,) float64, that distance when each was made.
         nodes: (R,) int32, dense indices of the nodes attempted.
+        distance_m: (R,) float64, from the node to where the robot was expected. NaN where there
+            was no prediction (relocalisation).
         rates: (R,) float64, g at the predicted offset: how likely a match was, had the appearance
-            been compatible. NaN where there was no prediction (relocalisation).
+            been compatible. NaN likewise.
         accepted: (R,) bool.
         inliers: (R,) int64.
         landmarks: (R,) int64, landmarks of the live frame.
@@ -31,6 +33,7 @@ class RunAttempts:
     driven_m: float
     at_m: NDArray[np.float64]
     nodes: NDArray[np.int32]
+    distance_m: NDArray[np.float64]
     rates: NDArray[np.float64]
     accepted: NDArray[np.bool_]
     inliers: NDArray[np.int64]
@@ -44,6 +47,7 @@ class RunAttempts:
             0.0,
             nothing,
             np.zeros(0, np.int32),
+            nothing,
             nothing,
             np.zeros(0, np.bool_),
             np.zeros(0, np.int64),
@@ -62,6 +66,7 @@ class RunAttempts:
             self.driven_m,
             self.at_m[last],
             self.nodes[last],
+            self.distance_m[last],
             self.rates[last],
             self.accepted[last],
             self.inliers[last],
@@ -91,6 +96,7 @@ class RunLog:
         self,
         driven_m: float,
         nodes: Sequence[int],
+        distance_m: NDArray[np.float64],
         rates: NDArray[np.float64],
         accepted: Sequence[bool],
         inliers: Sequence[int],
@@ -101,7 +107,7 @@ class RunLog:
         if self._end + count > len(self._columns[0]):
             self._make_room(driven_m, count)
         place = slice(self._end, self._end + count)
-        values = (driven_m, nodes, rates, accepted, inliers, landmarks)
+        values = (driven_m, nodes, distance_m, rates, accepted, inliers, landmarks)
         for column, value in zip(self._columns, values, strict=True):
             column[place] = value
         self._end += count
@@ -112,10 +118,7 @@ class RunLog:
         Views: what is behind them is written once and never changed.
         """
         self._forget(driven_m)
-        at_m, nodes, rates, accepted, inliers, landmarks = (
-            column[self._start : self._end] for column in self._columns
-        )
-        return RunAttempts(driven_m, at_m, nodes, rates, accepted, inliers, landmarks)
+        return RunAttempts(driven_m, *(column[self._start : self._end] for column in self._columns))
 
     def _forget(self, driven_m: float) -> None:
         at_m = self._columns[0][self._start : self._end]
@@ -132,5 +135,5 @@ class RunLog:
 
 def _columns(rows: int) -> list[NDArray[Any]]:
     """Empty columns in the order of `RunAttempts`."""
-    kinds = (np.float64, np.int32, np.float64, np.bool_, np.int64, np.int64)
+    kinds = (np.float64, np.int32, np.float64, np.float64, np.bool_, np.int64, np.int64)
     return [np.empty(rows, kind) for kind in kinds]

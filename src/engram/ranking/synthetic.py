@@ -56,8 +56,7 @@ class SyntheticPlace:
         paths = [PathId(UUID(int=(1 << 100) + path)) for path in range(path_count)]
         for path in paths:
             self._add_path(path)
-        hours = self._rng.uniform(6, 20, path_count)
-        lessons = Lessons.learnt(self.graph, self.memory, paths, hours, PastAttempts.none())
+        lessons = Lessons.learnt(self.graph, self.memory, paths, PastAttempts.none())
         self._basin = MatchBasin.of(_FOCAL_PX)
         self._background = Background(lessons=lessons)
 
@@ -98,7 +97,10 @@ class SyntheticPlace:
         at_m = -0.7 * (np.arange(count)[::-1] // 4).astype(np.float64)
         rates = self._rng.uniform(0.2, 0.95, count)
         landmarks = np.full(count, 300)
-        return RunAttempts(0.0, at_m, attempted, rates, succeeded, 90 * succeeded, landmarks)
+        distance_m = self._rng.uniform(0, 7.5, count)
+        return RunAttempts(
+            0.0, at_m, attempted, distance_m, rates, succeeded, 90 * succeeded, landmarks
+        )
 
     def _neighbourhood(self, nodes: NDArray[np.int32]) -> Neighbourhood:
         along = self._rng.uniform(-7.5, 7.5, len(nodes))
