@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from engram.geometry import SE3
+from engram.localiser import driven_steps_m
 from engram.localiser.gaps import GapFiller
 from engram.odometry import OdometryStatus, OdometryStep
 
@@ -61,3 +62,9 @@ def test_nothing_is_guessed_without_a_speed_or_by_a_clock_that_does_not_go_on(
     backwards.motion(FIRST, 0)
     backwards.motion(ahead(0.5), 100 * MS)
     assert backwards.motion(BLIND, stamp_ns).guessed_m == np.inf
+
+
+def test_what_was_driven_blindly_counts() -> None:
+    odometry = [FIRST, ahead(0.5), BLIND, DARK, ahead(1.0)]
+    stamps_ns = [0, 100 * MS, 200 * MS, 300 * MS, 400 * MS]
+    np.testing.assert_allclose(driven_steps_m(odometry, stamps_ns), [0.0, 0.5, 0.5, 0.0, 1.0])

@@ -36,8 +36,12 @@ class FrameResult:
 
     @property
     def step_m(self) -> float:
-        """Distance driven since the frame before, as far as it was measured."""
-        return 0.0 if self.prev_from_curr is None else self.prev_from_curr.distance_m
+        """Distance driven since the frame before; guessed where odometry failed.
+
+        What is lost with the motion is driven all the same: without it the worst stretches of a
+        drive would count as nothing.
+        """
+        return self.localisation.moved_m
 
     @property
     def localised(self) -> bool:

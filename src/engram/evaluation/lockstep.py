@@ -20,7 +20,7 @@ from engram.experience.model import NodeId
 from engram.experience.neighbourhood import Neighbourhood
 from engram.frontend import Frame
 from engram.geometry import SE3
-from engram.localiser import Localiser, Matcher, Position
+from engram.localiser import Localiser, Matcher, Position, driven_steps_m
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.sequences import LoggedFrame
 
@@ -68,7 +68,8 @@ class Runs:
 
     Attributes:
         configurations: the C configurations.
-        step_m: (F,) float64, odometry distance of the step that ends in the frame.
+        step_m: (F,) float64, distance of the step that ends in the frame: by odometry, guessed
+            where that failed.
         matched: (C, F) bool, whether the frame was localised.
         attempts: (C, F) int32, match attempts.
         candidates: (C, F) int32, |Y|.
@@ -155,7 +156,10 @@ def run_in_step(
     # With a memo everything runs on this thread, beside other workers on a busy machine; as on a
     # robot, on several threads, the time until the answer counts.
     clock = perf_counter if matcher is None else thread_time
-    runs = Runs.empty(configurations, np.array([_step_m(one.odometry) for one in frames]))
+    step_m = driven_steps_m(
+        (one.odometry for one in frames), (one.frame.stamp_ns for one in frames)
+    )
+    runs = Runs.empty(configurations, step_m)
     search = SharedSearch(situation.opened.graph.neighbourhood)
     with _localisers(
         situation, configurations, settings, matcher, search, relocaliser
@@ -263,7 +267,3 @@ def _settings_for(settings: Settings, configuration: Configuration, *, guided: b
     if not guided:
         changed = replace(changed, guide_below_m=0.0)
     return replace(settings, localiser=changed)
-
-
-def _step_m(odometry: OdometryStep) -> float:
-    return 0.0 if odometry.prev_from_curr is None else odometry.prev_from_curr.distance_m

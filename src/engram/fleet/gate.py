@@ -110,8 +110,7 @@ def localise_drive(
     with localiser, closing(live_frames(sequence, settings)) as frames:
         for live in frames:
             found = localiser.localise(live.frame, live.odometry)
-            motion = live.odometry.prev_from_curr
-            step_m.append(0.0 if motion is None else motion.distance_m)
+            step_m.append(found.moved_m)
             matched.append(found.status is LocalisationStatus.LOCALISED)
             advance(found.status.value)
     return Drive(np.array(step_m, np.float64), np.array(matched, np.bool_))

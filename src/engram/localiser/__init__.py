@@ -11,6 +11,7 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
+from engram.localiser.gaps import driven_steps_m
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
 from engram.localiser.place_book import PlaceBook, Searched
@@ -50,6 +51,7 @@ __all__ = [
     "accept_lost",
     "agrees",
     "best_places",
+    "driven_steps_m",
     "plausible",
     "spread",
 ]

@@ -9,6 +9,7 @@ use, and the robot counts as lost.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,20 @@ class Motion:
     prev_from_curr: SE3
     covariance: NDArray[np.float64]
     guessed_m: float = 0.0
+
+
+def driven_steps_m(
+    odometry: Iterable[OdometryStep], stamps_ns: Iterable[int]
+) -> NDArray[np.float64]:
+    """Distance of each step of a drive, (F,) metres, guessed where odometry failed.
+
+    Args:
+        odometry: (F) steps, each ending in one frame.
+        stamps_ns: (F) stamps of these frames.
+    """
+    gaps = GapFiller()
+    motions = (gaps.motion(step, stamp) for step, stamp in zip(odometry, stamps_ns, strict=True))
+    return np.array([0.0 if one is None else one.prev_from_curr.distance_m for one in motions])
 
 
 class GapFiller:

@@ -108,6 +108,7 @@ class Localisation:
         attempts: match attempts made for this frame.
         candidates: nodes that could have been tried.
         open_loop_m: distance driven on odometry alone since the last match.
+        moved_m: distance since the usable frame before; guessed where odometry failed.
         position: the best estimate, measured or carried on by odometry; None while `LOST` with
             no estimate.
         new_place: probability, before matching, that the frame shows nothing of the map; None
@@ -122,6 +123,7 @@ class Localisation:
     attempts: int
     candidates: int
     open_loop_m: float
+    moved_m: float = 0.0
     node: NodeId | None = None
     node_stamp_ns: int | None = None
     node_from_live: SE3 | None = None

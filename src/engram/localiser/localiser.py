@@ -582,6 +582,7 @@ class Localiser:
             status=self._status_without_match(odometry),
             attempts=len(self._outcomes),
             candidates=0 if neighbourhood is None else len(neighbourhood),
+            moved_m=0.0 if self._motion is None else self._motion.prev_from_curr.distance_m,
             open_loop_m=self._open_loop_m,
             position=self.position,
             new_place=self._new_place,
