@@ -35,10 +35,21 @@ def test_a_missing_step_goes_on_at_the_last_speed_for_as_long_as_it_took() -> No
     gaps.motion(ahead(0.5), 100 * MS)
     guess = gaps.motion(BLIND, 300 * MS)
     np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 1.0])
-    assert guess.guessed_m == pytest.approx(2.1)
-    np.testing.assert_allclose(np.diag(guess.covariance)[:3], 2.1**2)
+    assert guess.guessed_m == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose(np.diag(guess.covariance)[:3], guess.guessed_m**2)
     again = gaps.motion(BLIND, 400 * MS)
     np.testing.assert_allclose(again.prev_from_curr.translation, [0, 0, 0.5])
+    # Errors of one gap add up: half of its 1.5 m.
+    assert np.hypot(guess.guessed_m, again.guessed_m) == pytest.approx(0.75, abs=0.01)
+
+
+def test_a_bend_goes_on_as_a_bend() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    step = SE3.exp([0.0, 0.0, 0.5, 0.0, 0.1, 0.0])
+    gaps.motion(OdometryStep(OdometryStatus.OK, step, np.eye(6) * 1e-6, 100), 100 * MS)
+    guess = gaps.motion(BLIND, 300 * MS)
+    np.testing.assert_allclose(guess.prev_from_curr.matrix(), (step @ step).matrix(), atol=1e-12)
 
 
 def test_an_unusable_frame_says_nothing_and_the_next_step_spans_it() -> None:

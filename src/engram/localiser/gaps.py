@@ -2,9 +2,9 @@
 
 A drop on the lens, a flash, a bus that fills the view: for a frame or two odometry finds no motion.
 The robot has hardly changed its speed meanwhile, and to give up all that is known about where it is
-would tear maps and localisation to pieces in every shower. So the last speed is kept, straight on,
-with a covariance that allows for braking and turning. Over longer gaps that covariance grows past
-use, and the robot counts as lost.
+would tear maps and localisation to pieces in every shower. So it is taken to go on as it did, with
+a covariance that allows for braking and turning. Over longer gaps that covariance grows past use,
+and the robot counts as lost.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ from engram.geometry import SE3
 from engram.odometry import OdometryStatus, OdometryStep
 
 _NS_PER_S = 1e9
-# A guessed step is uncertain by twice its length and this, in metres.
-_LEAST_SIGMA_M = 0.1
-# Nothing is known of a turn but that it goes on at most about as the last one.
-_LEAST_SIGMA_RAD = float(np.deg2rad(5.0))
+# How wrong a guess is grows with the distance of the gap: 68 % of the guesses lie within half of it
+# and within 1 to 2.6 degrees a metre. Source: 263 gaps of six drives of `village` in rain and
+# showers, of one to twelve frames; two thirds of the long ones are in bends.
+_SIGMA_PER_M = 0.5
+_SIGMA_RAD_PER_M = float(np.deg2rad(2.5))
+# Of a robot that stood still, too.
+_LEAST_SIGMA_M = 0.05
+_LEAST_SIGMA_RAD = float(np.deg2rad(0.5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +42,9 @@ class Motion:
     prev_from_curr: SE3
     covariance: NDArray[np.float64]
     guessed_m: float = 0.0
+
+
+_ANY_MOTION = Motion(SE3.identity(), np.eye(6) * np.pi**2, guessed_m=np.inf)
 
 
 def driven_steps_m(
@@ -58,9 +65,10 @@ class GapFiller:
     """Takes the steps of odometry one after another, and guesses the missing ones."""
 
     def __init__(self) -> None:
-        self._velocity_m_s: NDArray[np.float64] | None = None
-        self._turn_rad_s = 0.0
+        self._twist_per_s: NDArray[np.float64] | None = None
         self._stamp_ns: int | None = None
+        # Distance of the gap so far.
+        self._gap_m = 0.0
 
     def motion(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
         """The motion since the usable frame before; None where the next one will tell.
@@ -78,17 +86,20 @@ class GapFiller:
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         if measured is None or covariance is None:
             return self._guess(seconds)
+        self._gap_m = 0.0
         if seconds > 0:
-            self._velocity_m_s = measured.translation / seconds
-            self._turn_rad_s = measured.angle_rad / seconds
+            self._twist_per_s = measured.log() / seconds
         return Motion(measured, covariance)
 
     def _guess(self, seconds: float) -> Motion:
-        """Straight on at the last speed; where that is not known, any motion whatever."""
-        if self._velocity_m_s is None or seconds <= 0:
-            return Motion(SE3.identity(), np.eye(6) * np.pi**2, guessed_m=np.inf)
-        moved = self._velocity_m_s * seconds
-        sigma_m = 2 * float(np.linalg.norm(moved)) + _LEAST_SIGMA_M
-        sigma_rad = min(_LEAST_SIGMA_RAD + self._turn_rad_s * seconds, np.pi)
+        """On at the last speed and turn; where these are not known, any motion whatever."""
+        if self._twist_per_s is None or seconds <= 0:
+            return _ANY_MOTION
+        guess = SE3.exp(self._twist_per_s * seconds)
+        before_m, self._gap_m = self._gap_m, self._gap_m + guess.distance_m
+        # The steps of a gap are wrong in the same way: their errors add up, not their variances.
+        growth_m2 = self._gap_m**2 - before_m**2
+        sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_M))
+        sigma_rad = float(np.hypot(_SIGMA_RAD_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_RAD))
         covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
-        return Motion(SE3(np.eye(3), moved), covariance, sigma_m)
+        return Motion(guess, covariance, sigma_m)
