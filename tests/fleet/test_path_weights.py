@@ -109,6 +109,12 @@ def test_a_mission_without_data_is_told_where_there_is_some(start, end):
         mission_epochs(only_noon, start, end)
 
 
+def test_every_stretch_of_the_day_with_data_is_told():
+    words = "some from 8:00 to 11:00, 14:00 to 15:00, 23:00 to 24:00: give"
+    with pytest.raises(InputError, match=words):
+        mission_epochs(counts(), 11.5, 13.0)
+
+
 def test_a_start_after_all_data_with_an_open_end_has_none():
     only_noon = count_paths({P1: np.array([0])}, np.array([14.5]), 60.0)
     with pytest.raises(InputError, match="from 16:00 to the last"):

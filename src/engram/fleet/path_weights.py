@@ -120,9 +120,7 @@ def mission_epochs(
     if not found:
         raise InputError(
             f"no epoch from {_told(start_h, 'first')} to {_told(end_h, 'last')} has data; there "
-            f"is some from "
-            f"{_epoch_text(int(filled[0]), counts.epoch_min)} to "
-            f"{_epoch_text(int(filled[-1]) + 1, counts.epoch_min)}: give other times or a "
+            f"is some from {_spans(filled.tolist(), counts.epoch_min)}: give other times or a "
             "--buffer in minutes"
         )
     return found
@@ -169,6 +167,19 @@ def _epoch_at(hour: float | None, shift_min: float, epoch_min: float) -> int | N
 
 def _told(hour: float | None, otherwise: str) -> str:
     return f"the {otherwise}" if hour is None else _clock(hour * 60)
+
+
+def _spans(epochs: list[int], epoch_min: float) -> str:
+    """Stretches of epochs, one after another: "8:00 to 9:00, 16:00 to 18:00"."""
+    breaks = [at for at in range(1, len(epochs)) if epochs[at] > epochs[at - 1] + 1]
+    stretches = [
+        (epochs[begin], epochs[end - 1])
+        for begin, end in zip([0, *breaks], [*breaks, len(epochs)], strict=True)
+    ]
+    return ", ".join(
+        f"{_epoch_text(first, epoch_min)} to {_epoch_text(last + 1, epoch_min)}"
+        for first, last in stretches
+    )
 
 
 def _epoch_text(epoch: int, epoch_min: float) -> str:
