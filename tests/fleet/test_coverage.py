@@ -10,13 +10,8 @@ import pytest
 
 from engram.experience.basin import MatchBasin
 from engram.fleet import DownloadOptions
-from engram.fleet.coverage import (
-    Coverage,
-    Demand,
-    affinities,
-    expected_missed,
-    greedy_order,
-)
+from engram.fleet.affinity import affinities
+from engram.fleet.coverage import Coverage, Demand, expected_missed, greedy_order
 from engram.fleet.selections import coverage_for
 from engram.fleet.stock import Stock
 from engram.store import MapStore

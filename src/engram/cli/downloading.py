@@ -28,6 +28,16 @@ def download(
     end: Annotated[
         str | None, typer.Option("--end", metavar="H:MM", help="When the mission ends.")
     ] = None,
+    date: Annotated[
+        str | None,
+        typer.Option(
+            "--date", metavar="DAY", help="Of the mission: 2026-11-17 [default: newest drive's]."
+        ),
+    ] = None,
+    latitude: Annotated[
+        float | None,
+        typer.Option("--latitude", metavar="DEG", help="For the sun [default: learnt]."),
+    ] = None,
     window: Annotated[
         float, typer.Option("--window", metavar="MIN", help="tod: how far from the start.")
     ] = 180.0,
@@ -97,6 +107,8 @@ def download(
         policy=policy,
         start_h=hour_from_text(start, "start"),
         end_h=hour_from_text(end, "end"),
+        day=date,
+        latitude_deg=latitude,
         window_min=window,
         epoch_min=epoch,
         best_percent=best,

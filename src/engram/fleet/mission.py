@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from datetime import date
 
 import numpy as np
 
@@ -23,6 +24,10 @@ class DownloadOptions:
     Attributes:
         policy: key of `SELECTIONS`.
         start_h, end_h: the mission's hours of day, in [0, 24); None for not said.
+        day: the mission's date, "2026-11-17"; None for that of the centre's newest drive. It tells
+            how high the sun stands at those hours.
+        latitude_deg: where the fleet drives, north positive; None to learn it from what got on with
+            what.
         window_min: `tod`: how far a node's time of day may be from the mission's start, minutes.
             180: [G16] §VI-D.
         epoch_min: `paths`: length Δt of an epoch, minutes. 60: SPEC §7.
@@ -39,6 +44,8 @@ class DownloadOptions:
     policy: str = "copy"
     start_h: float | None = None
     end_h: float | None = None
+    day: str | None = None
+    latitude_deg: float | None = None
     window_min: float = 180.0
     epoch_min: float = 60.0
     best_percent: float = 50.0
@@ -58,6 +65,10 @@ class DownloadOptions:
         for name, hour in (("start", self.start_h), ("end", self.end_h)):
             if hour is not None and not 0 <= hour < _HOURS:
                 raise ConfigError(f"{name} is {hour} h, must be from 0:00 to 23:59")
+        if self.day is not None:
+            _check_day(self.day)
+        if self.latitude_deg is not None:
+            _check(self.latitude_deg, "latitude", "degrees", -90.0, 90.0)
         if self.budget_bytes is not None and self.budget_bytes <= 0:
             raise ConfigError(f"budget is {self.budget_bytes} bytes, must be > 0")
 
@@ -94,6 +105,13 @@ def bytes_from_text(text: str | None) -> int | None:
     if found is None or unit not in _UNITS:
         raise ConfigError(f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096")
     return int(float(found["number"]) * _UNITS[unit])
+
+
+def _check_day(text: str) -> None:
+    try:
+        date.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(f"date is {text!r}, must be a day such as 2026-11-17") from None
 
 
 def _check(value: float, name: str, unit: str, least: float, most: float) -> None:

@@ -1,6 +1,6 @@
 """Downloads tried out: what they promised beside what then happened on held-out drives.
 
-The mission of each trial is that of the drive itself: it begins at the drive's hour of day.
+The mission of each trial is that of the drive itself: its date and its hour of day.
 Source: [G16] Fig. 9 (nodes, time per localisation, failure); SPEC §7 (the forecast).
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from engram.drive import (
     session_of_drive,
 )
 from engram.experience.clock import hour_of_day
-from engram.experience.model import Node
+from engram.experience.model import Node, Session
 from engram.fleet.downloading import DownloadReport, download
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
@@ -138,7 +139,7 @@ def try_downloads(
             session = session_of_drive(open_drive())
             hour = hour_of_day(session, session.start_ns)
             for number, (name, asked) in enumerate(wanted.items()):
-                options = asked if hour is None else replace(asked, start_h=hour, end_h=hour)
+                options = asked if hour is None else replace(asked, **_when(session, hour))
                 out = Path(folder) / f"{session.id}-{number}.engram"
                 report = download(centre, out, options, at=at, progress=progress)
                 sequence = open_drive()
@@ -164,6 +165,12 @@ def try_downloads(
                 )
                 out.unlink()
     return trials
+
+
+def _when(session: Session, hour: float) -> dict[str, Any]:
+    """The mission is the drive itself."""
+    day = datetime.fromtimestamp(session.start_ns / 1e9, UTC).date().isoformat()
+    return {"start_h": hour, "end_h": hour, "day": day}
 
 
 def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
