@@ -47,11 +47,11 @@ from engram.simulation import campaign_named
 
 SEARCHED: dict[str, tuple[float, ...]] = {
     "distance": (0.4, 0.7, 1.1, 1.5, 2.2),
-    "lessons": (0.0, 0.25, 0.5, 1.0),
+    "lessons": (0.0, 0.15, 0.3, 0.6),
     "level": (-0.5, 0.0, 0.5, 1.0),
     "prior_weight": (0.25, 0.5, 1.0, 2.0),
     "memory_m": (2.0, 4.0, 8.0, 16.0),
-    "failed": (-3.0, -2.3, -1.4, -0.7),
+    "regret": (0.0, 1.0, 2.0, 4.0),
 }
 CHANCES = ("bias", "steepness")
 OTHERS = ("bandit", "path", "distance", "time-of-day")

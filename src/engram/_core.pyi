@@ -202,6 +202,7 @@ def recall_order(
     memory_m: float,
     prior_weight: float,
     failed: float,
+    regret: float,
     picks: int,
     shortlist: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]: ...

@@ -149,11 +149,18 @@ class TestLearning:
         assert far == [1, 0]
 
     def test_a_failure_far_away_teaches_next_to_nothing(self) -> None:
-        situation = {"candidates": [0, 1], "along_m": [0.0, 1.0], "sessions": 2}
+        situation = {"candidates": [0, 1], "along_m": [0.0, 2.0], "sessions": 2}
         far = make_context(**situation, run=[(-1.0, 0, 0.01, False)] * 5)
         near = make_context(**situation, run=[(-1.0, 0, 0.9, False)] * 5)
         assert nodes_of(far) == [0, 1]
         assert nodes_of(near) == [1, 0]
+
+    def test_where_nobody_was_expected_to_match_a_failure_teaches_nothing(self) -> None:
+        context = make_context(candidates=[0, 1], sessions=2, run=[(-1.0, 0, 0.9, False)] * 5)
+        beyond = dataclasses.replace(context.run, distance_m=np.full(5, 8.0))
+        judged = RecallPolicy().judge(dataclasses.replace(context, run=beyond))
+        assert judged.terms["this run"].tolist() == [0.0, 0.0]
+        assert RecallPolicy().judge(context).terms["this run"][0] < -1
 
     def test_evidence_is_shared_along_an_experience_only(self) -> None:
         graph = flat_graph(12, sessions=2)
@@ -226,6 +233,7 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         "memory_m": 1.0,
         "prior_weight": 1.0,
         "failed": -1.0,
+        "regret": 1.0,
         "picks": 1,
         "shortlist": 1,
     }
@@ -240,6 +248,7 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
         ("sessions", np.ones(1, np.int32)),
         ("memory_m", 0.0),
         ("prior_weight", 0.0),
+        ("regret", -1.0),
         ("picks", -1),
     ):
         with pytest.raises(ValueError, match="recall_order"):

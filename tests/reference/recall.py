@@ -41,14 +41,14 @@ def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(mar
         distance = run.distance_m[k]
         if math.isnan(distance) and not run.accepted[k]:
             continue
-        if run.accepted[k]:
+        if run.accepted[k] or run.inliers[k] in range(1, NEEDED):
             margin = math.log(run.inliers[k] / NEEDED)
-        elif run.inliers[k] in range(1, NEEDED):
-            margin = max(math.log(run.inliers[k] / NEEDED), c.failed)
         else:
-            margin = c.failed
+            margin = math.log(1 / NEEDED)
         if not math.isnan(distance):
             margin += c.distance * distance / basin_m
+        if margin > c.level and not run.accepted[k]:
+            continue
         told.append((node, math.exp((run.at_m[k] - run.driven_m) / c.memory_m), margin))
     left = sorted(
         range(len(near)), key=lambda r: (near.distance_m[r], graph.node(int(near.nodes[r])).id)
@@ -68,12 +68,12 @@ def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(mar
                 total += counts * margin * (int(same) + int(other == node))
             for session, margin in supposed:
                 if session == graph.sessions[node]:
-                    weight += 1
-                    total += margin
+                    weight += c.regret
+                    total += c.regret * margin
             margins.append(total / weight - c.distance * near.distance_m[row] / basin_m)
         best = left.pop(int(choose(margins, left)))
         picked.append(best)
         if len(picked) < PICKS:
             cost = c.distance * near.distance_m[best] / basin_m
-            supposed.append((graph.sessions[near.nodes[best]], c.failed + cost))
+            supposed.append((graph.sessions[near.nodes[best]], math.log(1 / NEEDED) + cost))
     return picked

@@ -34,7 +34,8 @@ auto recall_order(const Input<int32_t, 1> &run_nodes, const Input<double, 1> &ru
                   const Input<double, 1> &run_margins, const Input<int32_t, 1> &nodes,
                   const Input<double, 1> &costs, const Input<double, 1> &prior,
                   const Input<int32_t, 1> &sessions, int64_t session_count, double memory_m,
-                  double prior_weight, double failed, int64_t picks, int64_t shortlist) {
+                  double prior_weight, double failed, double regret, int64_t picks,
+                  int64_t shortlist) {
   const size_t count = nodes.shape(0), attempts = run_nodes.shape(0);
   check_nodes(nodes, sessions, session_count);
   check_nodes(run_nodes, sessions, session_count);
@@ -43,6 +44,7 @@ auto recall_order(const Input<int32_t, 1> &run_nodes, const Input<double, 1> &ru
   require_length(costs, count);
   require_length(prior, count);
   require(memory_m > 0 && prior_weight > 0, "memory and prior weight must be positive");
+  require(regret >= 0, "regret must not be negative");
   require(picks >= 0 && shortlist >= 0, "picks and shortlist must not be negative");
   engram::RecallJudgement judged;
   {
@@ -56,7 +58,8 @@ auto recall_order(const Input<int32_t, 1> &run_nodes, const Input<double, 1> &ru
                                               sessions.data(),
                                               static_cast<int64_t>(sessions.shape(0)),
                                               session_count};
-    const engram::RecallConstants constants{memory_m, prior_weight, failed, picks, shortlist};
+    const engram::RecallConstants constants{memory_m, prior_weight, failed,
+                                            regret,   picks,        shortlist};
     judged = ENGRAM_CALL(recall_order, run, candidates, constants);
   }
   return nb::make_tuple(engram::to_numpy(std::move(judged.order), {count}),
@@ -69,6 +72,6 @@ auto recall_order(const Input<int32_t, 1> &run_nodes, const Input<double, 1> &ru
 void bind_recall(nb::module_ &module) {
   module.def("recall_order", &recall_order, "run_nodes"_a, "run_ago_m"_a, "run_margins"_a,
              "nodes"_a, "costs"_a, "prior"_a, "sessions"_a, "session_count"_a, nb::kw_only(),
-             "memory_m"_a, "prior_weight"_a, "failed"_a, "picks"_a, "shortlist"_a,
+             "memory_m"_a, "prior_weight"_a, "failed"_a, "regret"_a, "picks"_a, "shortlist"_a,
              "Rows (Y,) int64 best first; by row (Y,) the margin as picked, and at first.");
 }

@@ -92,7 +92,7 @@ private:
 
   void suppose_failure(int64_t picked, int64_t from, int64_t to) {
     const size_t same = session(candidates_.nodes[picked]);
-    of_sessions_[same].add(1, constants_.failed + candidates_.costs[picked]);
+    of_sessions_[same].add(constants_.regret, constants_.failed + candidates_.costs[picked]);
     for (int64_t place = from; place < to; ++place) {
       const int64_t other = judged.order[at(place)];
       if (session(candidates_.nodes[other]) == same)

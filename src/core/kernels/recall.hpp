@@ -30,6 +30,7 @@ struct RecallConstants {
   double memory_m;     // of this run's attempts
   double prior_weight; // how many attempts of this very moment the prior is worth
   double failed;       // margin of a pick that is supposed to have failed
+  double regret;       // how many attempts of this very moment such a pick counts as
   int64_t picks;       // how many picks are made greedily
   int64_t shortlist;   // among how many
 };

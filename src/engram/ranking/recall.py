@@ -28,7 +28,7 @@ class RecallConstants:
         level: margin at no distance of a node that every other past drive matched.
         prior_weight: how many attempts of this very moment all that past drives say is worth.
         memory_m: metres driven over which an attempt of this run comes to weigh e times less.
-        failed: margin of an attempt that came to nothing.
+        regret: how many attempts of this very moment a pick counts as, supposed to have failed.
         steepness: log odds of a success per margin.
         bias: log odds of a success at margin 0.
     """
@@ -38,7 +38,7 @@ class RecallConstants:
     level: float
     prior_weight: float
     memory_m: float
-    failed: float
+    regret: float
     steepness: float
     bias: float
 
@@ -47,11 +47,11 @@ class RecallConstants:
 # what is lost depends little on any of them but the distance.
 RECALL = RecallConstants(
     distance=1.1,
-    lessons=0.5,
-    level=0.0,
+    lessons=0.3,
+    level=0.5,
     prior_weight=0.5,
     memory_m=4.0,
-    failed=-2.3,
+    regret=2.0,
     steepness=1.8,
     bias=0.6,
 )
@@ -62,8 +62,9 @@ _MEANING = {
     "past drives": "how past drives fared with the node, as far as this run has not spoken",
     "this run": "how this run fared with the node's drive and the node, over the last metres",
 }
-# Fewest inliers of a match: SPEC §3.
+# Fewest inliers of a match: SPEC §3. An attempt that came to nothing counts as one.
 _NEEDED = 20
+_NOTHING = float(np.log(1 / _NEEDED))
 _PICKS = 8
 _SHORTLIST = 32
 # The newest of this run's attempts are enough: 20 m at four attempts every 0.7 m.
@@ -158,7 +159,8 @@ class RecallPolicy:
             graph.session_count,
             memory_m=c.memory_m,
             prior_weight=c.prior_weight,
-            failed=c.failed,
+            failed=_NOTHING,
+            regret=c.regret,
             picks=_PICKS,
             shortlist=_SHORTLIST,
         )
@@ -169,11 +171,13 @@ class RecallPolicy:
         A match that is refused though it has inliers enough is one of something else. Without a
         prediction a failure tells nothing, and a success as much as if it had been made here.
         """
-        c = self._constants
         told = np.log(np.maximum(run.inliers, 1) / _NEEDED)
-        in_vain = np.where(run.inliers < _NEEDED, np.maximum(told, c.failed), c.failed)
-        margins = np.where(run.accepted, told, in_vain)
-        costs = self._cost(context, run.distance_m)
+        refused = ~run.accepted & (run.inliers >= _NEEDED)
+        margins = np.where(refused, _NOTHING, told)
+        c, costs = self._constants, self._cost(context, run.distance_m)
         unknown = np.isnan(run.distance_m)
         costs[unknown] = np.where(run.accepted[unknown], 0.0, np.nan)
-        return np.asarray(margins + costs)
+        margins = margins + costs
+        # From so far away nobody was expected to match.
+        margins[~run.accepted & (margins > c.level)] = np.nan
+        return np.asarray(margins)
