@@ -74,10 +74,11 @@ def rewritten(source: Path, target: Path, *, session=None, node=None, descriptor
 
 class TestRefused:
     def refuses(self, centre: Path, robot: Path, error: type[Exception], *words: str) -> None:
-        before = hash_of(centre)
+        before, content = hash_of(centre), centre.read_bytes()
         with pytest.raises(error) as raised:
             merged(centre, robot)
         assert all(word in str(raised.value) for word in words), raised.value
+        assert centre.read_bytes() == content
         assert hash_of(centre) == before
         assert MapStore.check(centre).problems == ()
 
