@@ -82,6 +82,7 @@ def merge_map(
     report.known_omissions = sum(centre.has_omitted(node) for node in robot.nodes)
     report.known = len(robot.nodes) - len(new) - report.known_omissions
     if new or _has_more(centre, robot):
+        _check_readable(robot, new)
         with store.begin_revision(**_about(robot, settings, options)) as writer:
             merging = _Merging(centre, robot, writer, settings, options, report)
             merging.take_over(new, progress)
@@ -98,6 +99,16 @@ def merge_map(
         report.notes += _parts_apart(apart, report)
     report.content_hash = store.content_hash()
     return report
+
+
+def _check_readable(robot: HandedIn, new: list[Node]) -> None:
+    """Reads everything that may be taken once, before a byte of the centre is written.
+
+    Raises:
+        MapError: something of it was damaged on the way.
+    """
+    for _ in robot.store.frames.stored(new):
+        pass
 
 
 def _parts_apart(apart: NDArray[np.bool_], report: MergeReport) -> list[str]:
