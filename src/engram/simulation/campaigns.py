@@ -15,7 +15,7 @@ from engram.simulation.conditions import OXFORD, Place
 from engram.simulation.streets import Route, StreetPlan, crossing_loops, loop_of_length
 
 # Raised whenever a frame of any campaign changes: rendered data is kept by it.
-WORLD_VERSION = 3
+WORLD_VERSION = 4
 
 
 _SUMMER_TIME = timedelta(hours=1)
