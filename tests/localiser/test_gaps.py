@@ -75,6 +75,16 @@ def test_nothing_is_guessed_without_a_speed_or_by_a_clock_that_does_not_go_on(
     assert backwards.motion(BLIND, stamp_ns).guessed_m == np.inf
 
 
+def test_one_wrong_step_before_a_gap_does_not_carry_the_robot_away() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    for i in range(1, 5):
+        gaps.motion(ahead(0.5), i * 100 * MS)
+    gaps.motion(ahead(3.0), 500 * MS)
+    guess = gaps.motion(BLIND, 600 * MS)
+    np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 0.5])
+
+
 def test_what_was_driven_blindly_counts() -> None:
     odometry = [FIRST, ahead(0.5), BLIND, DARK, ahead(1.0)]
     stamps_ns = [0, 100 * MS, 200 * MS, 300 * MS, 400 * MS]

@@ -9,6 +9,7 @@ and the robot counts as lost.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -19,11 +20,14 @@ from engram.geometry import SE3
 from engram.odometry import OdometryStatus, OdometryStep
 
 _NS_PER_S = 1e9
-# How wrong a guess is grows with the distance of the gap: 68 % of the guesses lie within half of it
-# and within 1 to 2.6 degrees a metre. Source: 263 gaps of six drives of `village` in rain and
-# showers, of one to twelve frames; two thirds of the long ones are in bends.
+# How wrong a guess is grows with the distance of the gap: of 428 gaps of wet drives of `village`,
+# one to twelve frames long, 68 % lie within 0.17 to 0.6 m and 0.9 to 3 degrees a metre; the long
+# ones are in bends.
 _SIGMA_PER_M = 0.5
 _SIGMA_RAD_PER_M = float(np.deg2rad(2.5))
+# The speed is the median of so many steps: before odometry fails it is often wrong already. The
+# turn is that of the last step, for a bend is short.
+_STEPS = 5
 # Of a robot that stood still, too.
 _LEAST_SIGMA_M = 0.05
 _LEAST_SIGMA_RAD = float(np.deg2rad(0.5))
@@ -65,7 +69,9 @@ class GapFiller:
     """Takes the steps of odometry one after another, and guesses the missing ones."""
 
     def __init__(self) -> None:
-        self._twist_per_s: NDArray[np.float64] | None = None
+        # (3,) m/s each, in the camera that they begin in; the newest last.
+        self._velocities: deque[NDArray[np.float64]] = deque(maxlen=_STEPS)
+        self._turn_per_s = np.zeros(3)
         self._stamp_ns: int | None = None
         # Distance of the gap so far.
         self._gap_m = 0.0
@@ -88,14 +94,17 @@ class GapFiller:
             return self._guess(seconds)
         self._gap_m = 0.0
         if seconds > 0:
-            self._twist_per_s = measured.log() / seconds
+            twist_per_s = measured.log() / seconds
+            self._velocities.append(twist_per_s[:3])
+            self._turn_per_s = twist_per_s[3:]
         return Motion(measured, covariance)
 
     def _guess(self, seconds: float) -> Motion:
         """On at the last speed and turn; where these are not known, any motion whatever."""
-        if self._twist_per_s is None or seconds <= 0:
+        if not self._velocities or seconds <= 0:
             return _ANY_MOTION
-        guess = SE3.exp(self._twist_per_s * seconds)
+        velocity = np.median(self._velocities, axis=0)
+        guess = SE3.exp(np.r_[velocity, self._turn_per_s] * seconds)
         before_m, self._gap_m = self._gap_m, self._gap_m + guess.distance_m
         # The steps of a gap are wrong in the same way: their errors add up, not their variances.
         growth_m2 = self._gap_m**2 - before_m**2
