@@ -85,6 +85,32 @@ def test_one_wrong_step_before_a_gap_does_not_carry_the_robot_away() -> None:
     np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 0.5])
 
 
+def test_a_measurement_that_is_vaguer_than_the_guess_is_none() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    gaps.motion(ahead(0.5), 100 * MS)
+    pose = SE3(np.eye(3), np.array([0.0, 0.0, 14.0]))
+    wild = OdometryStep(OdometryStatus.OK, pose, np.eye(6) * 2.0**2, 12)
+    motion = gaps.motion(wild, 200 * MS)
+    np.testing.assert_allclose(motion.prev_from_curr.translation, [0, 0, 0.5])
+    assert motion.guessed_m > 0
+    assert gaps.motion(ahead(0.6), 300 * MS).guessed_m == 0
+
+
+def test_a_robot_that_sets_off_is_believed_in_the_end() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    for i in range(1, 6):
+        gaps.motion(ahead(0.0), i * 100 * MS)
+    vague = OdometryStep(
+        OdometryStatus.OK, SE3(np.eye(3), np.array([0.0, 0.0, 0.5])), np.eye(6) * 0.1**2, 12
+    )
+    motions = [gaps.motion(vague, i * 100 * MS) for i in range(6, 20)]
+    assert [one.guessed_m > 0 for one in motions[:5]] == [True] * 5
+    assert motions[5].guessed_m == 0
+    assert all(one.guessed_m == 0 for one in motions[8:])
+
+
 def test_what_was_driven_blindly_counts() -> None:
     odometry = [FIRST, ahead(0.5), BLIND, DARK, ahead(1.0)]
     stamps_ns = [0, 100 * MS, 200 * MS, 300 * MS, 400 * MS]

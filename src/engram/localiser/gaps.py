@@ -1,4 +1,4 @@
-"""Motion over the frames at which odometry fails.
+"""Motion over the frames at which odometry fails, or knows less than a guess.
 
 A drop on the lens, a flash, a bus that fills the view: for a frame or two odometry finds no motion.
 The robot has hardly changed its speed meanwhile, and to give up all that is known about where it is
@@ -66,7 +66,12 @@ def driven_steps_m(
 
 
 class GapFiller:
-    """Takes the steps of odometry one after another, and guesses the missing ones."""
+    """Takes the steps of odometry one after another, and guesses the missing ones.
+
+    A measurement that is vaguer than the guess counts as missing: in hard rain steps of ten metres
+    in a tenth of a second are measured, with a covariance that says what they are worth. Not for
+    long, though: a robot may have changed its speed.
+    """
 
     def __init__(self) -> None:
         # (3,) m/s each, in the camera that they begin in; the newest last.
@@ -75,6 +80,8 @@ class GapFiller:
         self._stamp_ns: int | None = None
         # Distance of the gap so far.
         self._gap_m = 0.0
+        # Measurements at a stretch that were vaguer than a guess.
+        self._vague = 0
 
     def motion(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
         """The motion since the usable frame before; None where the next one will tell.
@@ -90,8 +97,10 @@ class GapFiller:
             return None
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
-        if measured is None or covariance is None:
-            return self._guess(seconds)
+        guess = self._guess(seconds)
+        if measured is None or covariance is None or self._too_vague(covariance, guess):
+            self._gap_m += guess.prev_from_curr.distance_m
+            return guess
         self._gap_m = 0.0
         if seconds > 0:
             twist_per_s = measured.log() / seconds
@@ -99,16 +108,25 @@ class GapFiller:
             self._turn_per_s = twist_per_s[3:]
         return Motion(measured, covariance)
 
+    def _too_vague(self, covariance: NDArray[np.float64], guess: Motion) -> bool:
+        vague = _sigma_m(covariance) > guess.guessed_m
+        self._vague = self._vague + 1 if vague else 0
+        return vague and self._vague <= _STEPS
+
     def _guess(self, seconds: float) -> Motion:
         """On at the last speed and turn; where these are not known, any motion whatever."""
         if not self._velocities or seconds <= 0:
             return _ANY_MOTION
         velocity = np.median(self._velocities, axis=0)
         guess = SE3.exp(np.r_[velocity, self._turn_per_s] * seconds)
-        before_m, self._gap_m = self._gap_m, self._gap_m + guess.distance_m
         # The steps of a gap are wrong in the same way: their errors add up, not their variances.
-        growth_m2 = self._gap_m**2 - before_m**2
+        growth_m2 = (self._gap_m + guess.distance_m) ** 2 - self._gap_m**2
         sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_M))
         sigma_rad = float(np.hypot(_SIGMA_RAD_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_RAD))
         covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
         return Motion(guess, covariance, sigma_m)
+
+
+def _sigma_m(covariance: NDArray[np.float64]) -> float:
+    """Standard deviation along the least certain axis."""
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))

@@ -344,15 +344,16 @@ class Localiser:
         self._motion = motion = self._gaps.motion(odometry, stamp_ns)
         if motion is None:
             return
-        if self._relocaliser is not None:
-            self._relocaliser.carry_on(odometry.prev_from_curr)
-        self._hypotheses.carry_on(odometry)
         moved_m = motion.prev_from_curr.distance_m
         self._open_loop_m += moved_m
         if motion.guessed_m:
             self._guessed_m2 += motion.guessed_m**2
+            self._hypotheses.forget()
         else:
             self._driven_m += moved_m
+            self._hypotheses.carry_on(odometry)
+        if self._relocaliser is not None:
+            self._relocaliser.carry_on(None if motion.guessed_m else motion.prev_from_curr)
         if self.position is not None:
             self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
 
