@@ -274,10 +274,11 @@ def main() -> None:
         told = (f"{value:g}: {cost:.2%}" for value, cost in zip(values, around, strict=True))
         print(f"  {name} = {', '.join(told)}", flush=True)
     found = with_chances(drives, search(lambda one: float(costs(one).mean())))
-    left_out = [
-        costs(search(lambda one, k=k: float(np.delete(costs(one), k).mean())))[k]  # type: ignore[misc]
-        for k in range(len(drives))
-    ]
+
+    def without(k: int) -> Callable[[RecallConstants], float]:
+        return lambda one: float(np.delete(costs(one), k).mean())
+
+    left_out = [costs(search(without(k)))[k] for k in range(len(drives))]
     print(f"found {found}\n  misses {costs(found).mean():.2%}, left out {np.mean(left_out):.2%}")
     if options.json:
         text = json.dumps(dataclasses.asdict(found), indent=1)

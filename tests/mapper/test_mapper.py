@@ -159,6 +159,15 @@ def test_a_chain_bears_short_gaps_of_odometry_and_breaks_at_long_ones(
         assert abs(edge.a_from_b.translation[0]) < 0.5
 
 
+def test_a_short_gap_after_a_long_one_is_borne_again(path: Path) -> None:
+    seen = drive(WORLD, ROAD)
+    lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
+    for i in (*range(20, 32), 33):  # 32 is measured, and saved as a new beginning
+        seen[i] = dataclasses.replace(seen[i], odometry=lost_track)
+    map_simulated(path, seen)
+    assert len(set(graph_of(path).components().tolist())) == 2
+
+
 def test_the_same_input_gives_the_same_map(tmp_path: Path) -> None:
     hashes = []
     for name in ("one", "two"):

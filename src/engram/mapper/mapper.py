@@ -162,9 +162,11 @@ class Mapper:
     def _move_on(self) -> None:
         """Carries the last saved node on as the robot moved; None after too long a gap."""
         motion = self._localiser.motion
-        if motion is None or self._since_saved is None:
+        if motion is None:
             return
         self._gap_m2 = self._gap_m2 + motion.guessed_m**2 if motion.guessed_m else 0.0
+        if self._since_saved is None:
+            return
         if self._gap_m2 > self._localiser.config.greatest_gap_m**2:
             self._since_saved = None
         else:

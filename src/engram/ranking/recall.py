@@ -43,8 +43,8 @@ class RecallConstants:
     bias: float
 
 
-# Found by `benchmarks/fit_recall.py` on `village@2`, a town that nothing is judged on, and rounded:
-# what is lost depends little on any of them but the distance.
+# Found on `village@2`, a town that nothing is judged on, as `benchmarks/fit_recall.py` does it, and
+# rounded: what is lost depends little on any of them but the distance.
 RECALL = RecallConstants(
     distance=1.1,
     lessons=0.3,
