@@ -13,9 +13,9 @@ CONFIG = AcceptanceConfig()
 WIDE = Spread(0.5, 0.9)
 
 
-def match(pose: SE3 | None, inliers: int) -> Match:
+def match(pose: SE3 | None, inliers: int, variance: float = 1e-4) -> Match:
     rows = np.arange(inliers, dtype=np.int32)
-    return Match(pose, np.eye(6) * 1e-4 if pose else None, inliers, rows, rows)
+    return Match(pose, np.eye(6) * variance if pose else None, inliers, rows, rows)
 
 
 def prediction(sigma_m: float = 0.0, sigma_yaw_rad: float = 0.0) -> Prediction:
@@ -50,6 +50,14 @@ def test_a_lost_robot_asks_for_more(inliers: int, accepted: bool, waits: bool) -
 def test_position_must_agree_within_a_metre_and_three_sigma(offset_m, sigma_m, accepted) -> None:
     found = match(SE3.exp([offset_m, 0, 5, 0, 0, 0]), 100)
     assert accept(found, prediction(sigma_m), CONFIG) is accepted
+
+
+@pytest.mark.parametrize(("sigma_m", "accepted"), [(0.49, True), (0.51, False)])
+def test_a_match_that_does_not_know_where_it_is_is_none(sigma_m: float, accepted: bool) -> None:
+    found = match(SE3.exp([0, 0, 5, 0, 0, 0]), 100, variance=sigma_m**2 / 3)
+    assert accept(found, prediction(10.0), CONFIG) is accepted
+    assert accept_lost(found, lambda: WIDE, CONFIG) is accepted
+    assert plausible(found, lambda: WIDE, CONFIG) is accepted
 
 
 @pytest.mark.parametrize(
