@@ -108,24 +108,29 @@ def test_a_group_that_kills_every_worker_is_given_up(tmp_path, logs):
     assert not centre.exists()
 
 
-def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, built):
+def interrupting(frames):
+    """A progress bar that presses Ctrl-C after so many steps."""
     count = 0
 
-    def interrupting(what, total):
+    def progress(what, total):
         @contextmanager
         def shown():
             def advance(word):
                 nonlocal count
                 count += 1
-                if count == 25:
+                if count == frames:
                     signal.raise_signal(signal.SIGINT)
 
             yield advance
 
         return shown()
 
+    return progress
+
+
+def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, built):
     centre = tmp_path / "centre.engram"
-    report = build(centre, logs, progress=interrupting)
+    report = build(centre, logs, progress=interrupting(25))
     assert report.interrupted
     assert "go on" in report.text()
     with pytest.raises(ConfigError, match="another build"):
@@ -140,9 +145,33 @@ def test_a_centre_that_exists_takes_in_all_groups(tmp_path, logs):
     build(centre, logs, names="a", groups=1)
     report = build(centre, logs, names="bc")
     assert [one.revision for one in report.merges] == [2, 3]
-    again = build(centre, logs, names="bc")
-    assert [one.revision for one in again.merges] == [None, None]
-    assert again.content_hash == report.content_hash
+    assert report.left_out == []
+
+
+def test_drives_that_the_centre_has_are_not_mapped_again(tmp_path, logs):
+    centre = tmp_path / "centre.engram"
+    first = build(centre, logs, names="ab", groups=1)
+    again = build(centre, logs, names="ab")
+    assert again.left_out == ["a.framelog", "b.framelog"]
+    assert (again.groups, again.mapped, again.merges) == ([], [], [])
+    assert again.content_hash == first.content_hash
+    assert "nothing new" in again.text()
+    more = build(centre, logs, names="abc")
+    assert more.left_out == ["a.framelog", "b.framelog"]
+    assert more.groups == [["c.framelog"]]
+    assert "left out" in more.text()
+    with MapStore.open(centre) as store:
+        assert len(store.load().sessions) == 3
+
+
+def test_what_a_build_leaves_out_does_not_change_when_it_goes_on(tmp_path, logs):
+    centre = tmp_path / "centre.engram"
+    build(centre, logs, names="a", groups=1)
+    interrupted = build(centre, logs, names="abc", progress=interrupting(25))
+    assert interrupted.interrupted
+    report = build(centre, logs, names="abc")
+    assert report.left_out == ["a.framelog"]
+    assert report.groups == [["b.framelog"], ["c.framelog"]]
 
 
 def test_a_drive_that_cannot_be_read_is_named(tmp_path, logs):

@@ -65,7 +65,8 @@ def build(
     """Build a map from many drives: groups mapped side by side, then merged.
 
     What was done is kept in CENTRE.build until the build is complete; the same command goes on
-    after an interruption or a crash. Equal drives and options give an equal map.
+    after an interruption or a crash. Equal drives and options give an equal map. Drives that
+    CENTRE has already are left out.
 
     \b
     Examples:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 from engram.config import config_hash, to_dict
 from engram.drive import MapOptions, Settings
 from engram.drive.interruption import deferred_interrupt
 from engram.errors import ConfigError
+from engram.experience.model import SessionId, path_id
 from engram.fleet.best_order import BestOrder, JudgeOptions, find_best_order, order_costs
 from engram.fleet.cluster import map_groups_on_cluster
 from engram.fleet.docking import merge_maps
@@ -64,6 +66,7 @@ class BuildReport:
 
     Attributes:
         centre: the map.
+        left_out: names of the drives that the centre had before.
         groups: names of the drives of each group, in the order of merging.
         mapped: what mapping each group came to.
         merges: one report per merge; the first group's map becomes a centre that is new.
@@ -74,6 +77,7 @@ class BuildReport:
     """
 
     centre: str
+    left_out: list[str] = field(default_factory=list)
     groups: list[list[str]] = field(default_factory=list)
     mapped: list[GroupResult] = field(default_factory=list)
     merges: list[MergeReport] = field(default_factory=list)
@@ -86,6 +90,7 @@ class BuildReport:
         """What ``build --json`` prints."""
         return {
             "centre": self.centre,
+            "left_out": self.left_out,
             "groups": self.groups,
             "mapped": [one.to_dict() for one in self.mapped],
             "merges": [one.to_dict() for one in self.merges],
@@ -107,6 +112,11 @@ class BuildReport:
         if self.interrupted:
             return "interrupted: what was done is kept; give the same command to go on"
         lines = []
+        if self.left_out:
+            known = ", ".join(self.left_out)
+            lines.append(f"left out, since {self.centre} has them already: {known}")
+        if not self.groups:
+            return "\n".join([*lines, f"{self.centre}: nothing new; content {self.content_hash}"])
         for names, one in zip(self.groups, self.mapped, strict=True):
             saved = sum(session["nodes_saved"] for session in one.sessions)
             died = f", {one.retries} workers died" if one.retries else ""
@@ -156,7 +166,8 @@ def build_map(
 
     Intermediate maps lie in ``CENTRE.build`` beside the centre until the build is complete: the
     same call after an interruption goes on from there, and comes to the same map. A centre that
-    exists takes in all groups; one that does not begins as the first group's map.
+    exists takes in all groups, and the drives that it has whole are left out; one that does not
+    exist begins as the first group's map.
 
     Args:
         centre: NAME.engram.
@@ -172,13 +183,17 @@ def build_map(
         EngramError: a drive or a map cannot be used.
     """
     started = time.perf_counter()
-    report = BuildReport(str(centre))
-    grouped = group_drives(_look_at(drives), options.grouping, options.groups, options.seed)
-    with _scratch(centre, grouped, settings, options, keep=keep) as scratch:
+    looked_at = _look_at(drives)
+    known = _known_sessions(centre)
+    grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
+    report = BuildReport(
+        str(centre), left_out=[drive.name for drive in looked_at if drive.session.id in known]
+    )
+    with _scratch(centre, grouped, known, settings, options, keep=keep) as scratch:
         try:
             report.mapped = _map(scratch, grouped, settings, options, progress)
             order = list(range(len(grouped)))
-            if options.judge is not None:
+            if options.judge is not None and grouped:
                 maps = [scratch.group(number) for number in order]
                 report.best = find_best_order(
                     maps, scratch.orders, settings, options.merging, options.judge, progress
@@ -208,6 +223,24 @@ def _look_at(sources: Sequence[str]) -> list[Drive]:
             absolute = source if "://" in source else str(path.absolute())
             drives.append(look_at_drive(path, absolute))
     return drives
+
+
+def _known_sessions(centre: Path) -> frozenset[SessionId]:
+    """The drives that the centre had whole when the build began."""
+    begun = _folder(centre) / "build.json"
+    if begun.exists():
+        earlier = json.loads(begun.read_text()).get("known", [])
+        return frozenset(SessionId(UUID(one)) for one in earlier)
+    if not centre.exists():
+        return frozenset()
+    with MapStore.open(centre) as store:
+        partial = store.partial_paths()
+        return frozenset(one for one in store.frontends() if path_id(one) not in partial)
+
+
+def _folder(centre: Path) -> Path:
+    """Where the intermediate maps of a build lie."""
+    return centre.with_name(f"{centre.name}.build")
 
 
 def _map(
@@ -285,15 +318,17 @@ class _Scratch:
 def _scratch(
     centre: Path,
     grouped: Sequence[Sequence[Drive]],
+    left_out: Collection[SessionId],
     settings: Settings,
     options: BuildOptions,
     *,
     keep: bool,
 ) -> Iterator[_Scratch]:
     """The folder of a build: new, or that of an earlier run of the same build."""
-    folder = centre.with_name(f"{centre.name}.build")
+    folder = _folder(centre)
     plan = {
         "groups": [[str(drive.session.id) for drive in group] for group in grouped],
+        "known": sorted(str(session) for session in left_out),
         "settings": config_hash(settings),
         "mapping": to_dict(options.mapping),
         "merging": to_dict(options.merging),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -11,7 +11,7 @@ from random import Random
 from engram.drive import open_drive, session_of_drive
 from engram.errors import ConfigError
 from engram.experience.clock import hour_of_day
-from engram.experience.model import Session
+from engram.experience.model import Session, SessionId
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +49,20 @@ def look_at_drive(path: Path, source: str) -> Drive:
 
 
 def group_drives(
-    drives: Sequence[Drive], grouping: str, groups: int, seed: int
+    drives: Sequence[Drive],
+    grouping: str,
+    groups: int,
+    seed: int,
+    leave_out: Collection[SessionId] = (),
 ) -> list[list[Drive]]:
-    """Groups of drives, each in chronological order.
+    """Groups of drives, each in chronological order; none is empty.
 
     Args:
         drives: all of them, each once.
         grouping: key of `GROUPINGS`, or path of a file of groups (`read_groups`).
         groups: how many; of no account where a file says so.
         seed: of `random`.
+        leave_out: sessions that go into no group; fewer drives than groups get one each.
 
     Raises:
         ConfigError: more groups than drives, a drive twice, or a file that does not fit.
@@ -65,12 +70,17 @@ def group_drives(
     known = {drive.session.id for drive in drives}
     if len(known) < len(drives):
         raise ConfigError("a drive is given twice; give each once")
+    wanted = [drive for drive in drives if drive.session.id not in leave_out]
     if grouping not in GROUPINGS:
-        return [_chronological(group) for group in read_groups(Path(grouping), drives)]
+        named = read_groups(Path(grouping), drives)
+        grouped = [[drive for drive in group if drive in wanted] for group in named]
+        return [_chronological(group) for group in grouped if group]
     if not 1 <= groups <= len(drives):
         raise ConfigError(f"{groups} groups of {len(drives)} drives: must be 1 to {len(drives)}")
-    ordered = GROUPINGS[grouping](_chronological(drives), seed)
-    return [_chronological(group) for group in _split(ordered, groups)]
+    if not wanted:
+        return []
+    ordered = GROUPINGS[grouping](_chronological(wanted), seed)
+    return [_chronological(group) for group in _split(ordered, min(groups, len(wanted)))]
 
 
 def read_groups(path: Path, drives: Sequence[Drive]) -> list[list[Drive]]:
