@@ -135,6 +135,18 @@ def test_more_policies_later_cost_only_what_is_new(plan: Plan, tmp_path: Path) -
     assert all(path.read_bytes() == bytes_ for path, bytes_ in before.items())
 
 
+def test_folds_may_be_run_one_after_another(campaign, plan: Plan, tmp_path: Path) -> None:
+    first = make_plan(campaign, Settings(), few_options(only_folds=(1,)), tmp_path)
+    run(first)
+    held_out = {session for session, _ in results(first)}
+    assert held_out == set(first.folds[1].held_out)
+    assert write_report(tmp_path / "part", [first])
+    run(make_plan(campaign, Settings(), few_options(), tmp_path))
+    assert results(first) == results(plan)
+    with pytest.raises(ConfigError, match="numbered from 0"):
+        few_options(only_folds=(9,))
+
+
 def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)

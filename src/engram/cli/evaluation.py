@@ -23,6 +23,10 @@ evaluate = typer.Typer(
 # What both studies take.
 _Size = Annotated[str, typer.Option("--size", help="standard or full.")]
 _Folds = Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")]
+_OnlyFolds = Annotated[
+    str | None,
+    typer.Option("--only-folds", metavar="N,N…", help="Run these now, numbered from 0 [all]."),
+]
 _Seed = Annotated[
     int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
 ]
@@ -71,6 +75,7 @@ def ranking(
         str, typer.Option("--rounds", metavar="N,N…", help="Nr; the first for all policies.")
     ] = "1,2",
     folds: _Folds = 5,
+    only_folds: _OnlyFolds = None,
     seed: _Seed = 0,
     map_sizes: Annotated[
         bool,
@@ -104,6 +109,7 @@ def ranking(
     Examples:
       engram evaluate ranking hamlet --policies distance,path --lanes 1,2 --folds 3
       engram evaluate ranking begbroke keble oxford --out results/ranking
+      engram evaluate ranking begbroke --policies distance,path,recall --only-folds 0
       engram evaluate ranking monday.framelog tuesday.framelog … --out results/mine
     """
     from engram.cli.progress import progress
@@ -128,6 +134,7 @@ def ranking(
         map_sizes=map_sizes,
         live_folds=live_folds,
         relocaliser=None if relocaliser == "none" else relocaliser,
+        only_folds=_only(only_folds),
     )
     started = time.perf_counter()
     settings = load_settings(config)
@@ -170,10 +177,7 @@ def fleet(
         typer.Option("--experiments", metavar="N,N…", help="Figures of Checkout My Map."),
     ] = "7,8,9,10",
     folds: _Folds = 5,
-    only_folds: Annotated[
-        str | None,
-        typer.Option("--only-folds", metavar="N,N…", help="Run these now, numbered from 0 [all]."),
-    ] = None,
+    only_folds: _OnlyFolds = None,
     groups: Annotated[
         str,
         typer.Option(
@@ -227,7 +231,7 @@ def fleet(
         more_groups=counts[1:],
         tried=tried,
         relocaliser=None if relocaliser == "none" else relocaliser,
-        only_folds=() if only_folds is None else _numbers(only_folds, "--only-folds"),
+        only_folds=_only(only_folds),
     )
     started = time.perf_counter()
     settings = load_settings(config)
@@ -268,6 +272,10 @@ def _lanes(text: str) -> tuple[int, ...]:
     from engram.evaluation import UNLIMITED
 
     return tuple(one or UNLIMITED for one in _numbers(text, "--lanes"))
+
+
+def _only(folds: str | None) -> tuple[int, ...]:
+    return () if folds is None else _numbers(folds, "--only-folds")
 
 
 def _numbers(text: str, option: str) -> tuple[int, ...]:

@@ -42,3 +42,16 @@ def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
         Fold(number, tuple(one for one in everyone if one not in part), part)
         for number, part in enumerate(parts)
     )
+
+
+def check_only(only: tuple[int, ...], folds: int) -> None:
+    """Whether some folds that are asked for exist.
+
+    Raises:
+        ConfigError: one does not.
+    """
+    strange = [one for one in only if not 0 <= one < folds]
+    if strange:
+        raise ConfigError(
+            f"folds {strange} are asked for; {folds} folds are numbered from 0 to {folds - 1}"
+        )

@@ -30,7 +30,7 @@ from engram.evaluation.configurations import (
     sweep,
 )
 from engram.evaluation.drives import DriveSet
-from engram.evaluation.folds import Fold, split
+from engram.evaluation.folds import Fold, check_only, split
 from engram.evaluation.held_out import localise_held_out
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.memo import MatchMemo
@@ -61,6 +61,8 @@ class RankingOptions:
             confirms the order of policies and gives milliseconds per frame.
         relocaliser: key of `RELOCALISERS`; None leaves the lost dead-reckoning (SPEC §8).
         build: how the maps are built.
+        only_folds: numbers of the folds that are run; empty for all. What is run of the others
+            later joins it.
     """
 
     policies: tuple[str, ...] = tuple(POLICIES)
@@ -72,6 +74,7 @@ class RankingOptions:
     live_folds: int = 1
     relocaliser: str | None = None
     build: MapOptions = field(default_factory=lambda: GENEROUS)
+    only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for policy in self.policies:
@@ -82,6 +85,7 @@ class RankingOptions:
         for name, values in (("lanes", self.lanes), ("rounds", self.rounds)):
             if not values or min(values) < 1:
                 raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")
+        check_only(self.only_folds, self.folds)
 
     @property
     def few_lanes(self) -> int:
@@ -109,6 +113,12 @@ class Plan:
     def folds(self) -> tuple[Fold, ...]:
         """The divisions of the drives."""
         return split(len(self.drives.drives), self.options.folds, self.options.seed)
+
+    @property
+    def run_folds(self) -> tuple[Fold, ...]:
+        """Those that are run now."""
+        wanted = self.options.only_folds or range(self.options.folds)
+        return tuple(self.folds[number] for number in wanted)
 
     def map_path(self, fold: Fold) -> Path:
         """The map built from a fold's training sessions."""
@@ -181,14 +191,14 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
 def _tasks(plan: Plan) -> list[Task]:
     """Fold by fold: sessions before the next map, so that what is done can be looked at."""
     tasks = []
-    for fold in plan.folds:
+    for fold in plan.run_folds:
         built = f"build {fold.number}"
         tasks.append(Task(built, partial(_build, plan, fold), word="built"))
         tasks += [
             Task(f"run {session}", partial(_run_session, plan, fold, session), (built,), "run")
             for session in fold.held_out
         ]
-    for fold in plan.folds[: plan.options.live_folds]:
+    for fold in plan.run_folds[: plan.options.live_folds]:
         for session in fold.held_out:
             work = partial(_run_live, plan, fold, session)
             tasks.append(Task(f"time {session}", work, (), "timed", alone=True))

@@ -17,7 +17,7 @@ from engram.errors import ConfigError
 from engram.evaluation.building import write_json
 from engram.evaluation.drives import DriveSet, EvaluatedDrive
 from engram.evaluation.fleet.arms import ARMS, Arm
-from engram.evaluation.folds import Fold, split
+from engram.evaluation.folds import Fold, check_only, split
 from engram.evaluation.running import file_name
 from engram.frontend.matching import matcher_hash
 from engram.localiser import RELOCALISERS
@@ -74,12 +74,7 @@ class FleetOptions:
             raise ConfigError(
                 f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
             )
-        strange_folds = [one for one in self.only_folds if not 0 <= one < self.folds]
-        if strange_folds:
-            raise ConfigError(
-                f"folds {strange_folds} are asked for; {self.folds} folds are numbered from 0 to "
-                f"{self.folds - 1}"
-            )
+        check_only(self.only_folds, self.folds)
         if min(self.groups, *self.more_groups, self.order_groups) < 2:
             raise ConfigError(
                 f"groups are {self.groups}, {self.more_groups} and {self.order_groups} for the "
