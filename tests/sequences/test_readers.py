@@ -405,6 +405,10 @@ class TestRecognition:
         assert drive.open().info.format == drive.layout.format
         assert drive.open(format=drive.layout.format).info.format == drive.layout.format
 
+    def test_a_map_where_a_drive_is_expected(self, tmp_path: Path) -> None:
+        with pytest.raises(SequenceError, match="the map is given first"):
+            open_sequence(tmp_path / "town.engram")
+
     def test_a_path_that_does_not_exist(self, tmp_path: Path) -> None:
         with pytest.raises(SequenceError, match="there is no such"):
             open_sequence(tmp_path / "nowhere")

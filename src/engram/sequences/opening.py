@@ -149,6 +149,8 @@ def recognise(path: Path) -> str:
     Raises:
         SequenceError: there is nothing, or nothing known, or more than one layout.
     """
+    if path.suffix == ".engram":
+        raise SequenceError(f"{path}: is the name of a map, not of a drive; the map is given first")
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
     found = [name for name, layout in SEQUENCES.items() if layout.recognises(path)]
