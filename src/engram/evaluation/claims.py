@@ -199,11 +199,19 @@ def _recall(campaign: CampaignResult) -> Iterable[Row]:
             )
     nearest = campaign.get("distance")
     if nearest is not None:
-        high = campaign.resamples.interval(ours.failure(10.0)).high
-        low = nearest.failure(10.0).value
-        share = f"{high / low:.3f}" if low > 0 else "– (both 0)" if high == 0 else "∞"
+        shares = [
+            _share(campaign.resamples.interval(one.failure(10.0)).high, nearest.failure(10.0).value)
+            for one in (ours, bound)
+        ]
+        share = f"{shares[0]} (the oracle's: {shares[1]})"
         what = f"P(> 10 m): upper end of `{_BEST_KNOWN}`'s interval ÷ `distance`'s mean"
         yield (what, "–", "≤ 0.25", "≤ 0.067", share)
+
+
+def _share(high: float, mean: float) -> str:
+    if mean > 0:
+        return f"{high / mean:.3f}"
+    return "– (both 0)" if high == 0 else "∞"
 
 
 def _growth(campaign: CampaignResult) -> Iterable[Row]:
