@@ -1,6 +1,7 @@
 """The fleet study end to end, on a tiny synthetic campaign."""
 
 import csv
+import shutil
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -83,6 +84,18 @@ def test_folds_may_be_run_one_after_another(plan: FleetPlan) -> None:
     assert names((0,)) + names((1,)) == names(())
     with pytest.raises(ConfigError, match="numbered from 0 to 1"):
         replace(OPTIONS, only_folds=(2,))
+
+
+@pytest.mark.parametrize("kept", ["single.json", "runs-single*"])
+def test_a_report_can_be_had_of_what_is_there_so_far(plan, tmp_path: Path, kept: str) -> None:
+    """What a run leaves that was stopped early: files of one kind in one fold."""
+    work = tmp_path / plan.work.name
+    for path in plan.work.rglob(f"fold0/{kept}"):
+        copy = work / path.relative_to(plan.work)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(path, copy)
+    shutil.copy(plan.work / "configuration.json", tmp_path)
+    assert write_fleet_report(tmp_path / "out", [replace(plan, work=work)])
 
 
 def test_figures_and_claims_are_written(report: Path) -> None:

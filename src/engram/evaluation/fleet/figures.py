@@ -138,12 +138,15 @@ def _times(arm: ArmResult) -> Panel:
 
 
 def _series(arm: ArmResult, policy: str) -> Array:
-    """(robots × folds, logs) ms per frame."""
-    found = [
-        [one.ms for one in fold.in_field(robot, policy)] for fold in arm.folds for robot in ROBOTS
+    """(robots × folds, logs) ms per frame; (0, 0) where no foray was driven yet."""
+    driven = [
+        times
+        for fold in arm.folds
+        for robot in ROBOTS
+        if (times := [one.ms for one in fold.in_field(robot, policy)])
     ]
-    logs = min((len(one) for one in found if one), default=0)
-    return np.array([one[:logs] for one in found if one]).reshape(-1, logs)
+    logs = min((len(one) for one in driven), default=0)
+    return np.array([one[:logs] for one in driven]).reshape(len(driven), logs)
 
 
 def _in_field(arm: ArmResult) -> Panel:
