@@ -1,8 +1,8 @@
 """The fleet study end to end, on a tiny synthetic campaign."""
 
 import csv
-import shutil
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -115,3 +115,59 @@ def test_what_was_driven_blindly_counts() -> None:
     odometry = [FIRST, ahead(0.5), BLIND, DARK, ahead(1.0)]
     stamps_ns = [0, 100 * MS, 200 * MS, 300 * MS, 400 * MS]
     np.testing.assert_allclose(driven_steps_m(odometry, stamps_ns), [0.0, 0.5, 0.5, 0.0, 1.0])
+
+
+def going(gaps: GapFiller, steps: int = 3) -> int:
+    """Five metres a second for so many tenths of a second; the stamp of the last."""
+    gaps.motion(FIRST, 0)
+    for number in range(1, steps + 1):
+        assert gaps.motion(ahead(0.5), number * 100 * MS).guessed_m == 0
+    return steps * 100 * MS
+
+
+@pytest.mark.parametrize(("metres", "believed"), [(0.41, True), (0.39, False), (0.0, False)])
+def test_a_robot_does_not_stop_from_one_frame_to_the_next(metres: float, believed: bool) -> None:
+    gaps = GapFiller()
+    now = going(gaps)
+    motion = gaps.motion(ahead(metres), now + 100 * MS)  # 10 m/s² are 0.1 m here
+    assert (motion.guessed_m == 0) is believed
+    assert motion.prev_from_curr.distance_m == pytest.approx(metres if believed else 0.5)
+
+
+def test_what_is_not_believed_at_once_is_believed_once_it_is_possible() -> None:
+    gaps = GapFiller()
+    now = going(gaps)
+    believed = [gaps.motion(ahead(0.0), now + k * 100 * MS).guessed_m == 0 for k in range(1, 8)]
+    assert believed == [False] * 4 + [True] * 3  # from 5 m/s in half a second
+
+
+def test_vague_measurements_are_given_the_benefit_of_their_doubt() -> None:
+    gaps = GapFiller()
+    now = going(gaps)
+    pose = SE3(np.eye(3), np.array([0.0, 0.0, 0.2]))
+    vague = OdometryStep(OdometryStatus.OK, pose, np.eye(6) * 0.1**2, 20)
+    assert gaps.motion(vague, now + 100 * MS).guessed_m == 0
+
+
+def test_a_speed_that_hardly_began_to_be_known_forbids_nothing() -> None:
+    gaps = GapFiller()
+    now = going(gaps, steps=2)
+    assert gaps.motion(ahead(2.0), now + 100 * MS).guessed_m == 0
+
+
+def test_steps_among_missing_ones_are_worth_less_than_odometry_says() -> None:
+    gaps = GapFiller()
+    now = going(gaps)
+    for k in (1, 2):
+        gaps.motion(BLIND, now + k * 100 * MS)
+    step = ahead(0.5)
+    doubted = gaps.motion(step, now + 300 * MS)
+    assert doubted.guessed_m == 0
+    assert doubted.prev_from_curr is step.prev_from_curr
+    # Two of ten steps are missing: one measured step in five may be wrong by all its length.
+    expected = step.covariance.diagonal()[:3] + 0.2 * 0.5**2
+    np.testing.assert_allclose(doubted.covariance.diagonal()[:3], expected)
+    assert (doubted.covariance.diagonal()[3:] > step.covariance.diagonal()[3:]).all()
+    for k in range(4, 14):
+        last = gaps.motion(step, now + k * 100 * MS)
+    assert last.covariance is step.covariance  # ten good steps later it is forgotten
