@@ -98,6 +98,7 @@ def draw_curves(panels: Sequence[Panel], path: Path, title: str) -> None:
         else:
             one.set_yscale("log", nonpositive="clip")
             one.set_ylim(panel.least_y, None)
+            one.yaxis.set_major_formatter("{x:g}")  # 100, 10, 1 rather than powers of ten
         if panel.x_ticks is not None:
             one.set_xticks([at for at, _ in panel.x_ticks], [text for _, text in panel.x_ticks])
         one.set_title(panel.title, fontsize=10)
