@@ -210,6 +210,27 @@ class TestPicking:
         # Before the robot counts as lost, though all that it knows speaks against it.
         assert driven_m < 10
 
+    @pytest.mark.parametrize(("sigma_m", "all_are_tried"), [(7.0, True), (0.2, False)])
+    def test_a_robot_that_lost_its_place_tries_every_candidate(
+        self, sigma_m: float, all_are_tried: bool
+    ) -> None:
+        """Thirty nodes over 29 m, of which none matches; two lanes, and as many frames."""
+        count, driven_m = 30, 0.0
+        run: list[tuple[float, int, float, bool]] = []
+        tried: set[int] = set()
+        for _ in range(count):
+            context = make_context(
+                candidates=range(count), along_m=np.arange(float(count)), sessions=3, run=run
+            )
+            near = dataclasses.replace(context.neighbourhood, sigma_m=np.full(count, sigma_m))
+            context = dataclasses.replace(context, neighbourhood=near, run=run_of(run, driven_m))
+            picks = nodes_of(context)
+            assert sorted(picks) == list(range(count))
+            tried |= set(picks[:2])
+            run += [(driven_m, node, 0.9, False) for node in picks[:2]]
+            driven_m += 0.7
+        assert (tried == set(range(count))) is all_are_tried
+
     def test_terms_add_up_to_the_chance_of_the_first_pick(self) -> None:
         context = SyntheticPlace(20).context(candidates=60, observed=200)
         judged = RecallPolicy().judge(context)

@@ -108,7 +108,7 @@ class RecallPolicy:
         canonical = order_by(context)
         costs, prior = self._costs_and_prior(context, canonical)
         order: NDArray[np.int64] = canonical[self._pick(context, canonical, costs, prior)[0]]
-        return order
+        return self._in_turns(context, order)
 
     def judge(self, context: RankingContext) -> RecallJudgement:
         """The ranking with its reasons."""
@@ -119,7 +119,7 @@ class RecallPolicy:
         rows[canonical] = np.arange(len(canonical))
         terms = {"distance": -costs, "past drives": prior, "this run": first + costs - prior}
         return RecallJudgement(
-            canonical[order],
+            self._in_turns(context, canonical[order]),
             1 / (1 + np.exp(-c.bias - c.steepness * margins[rows])),
             {name: values[rows] for name, values in terms.items()},
         )
@@ -128,6 +128,25 @@ class RecallPolicy:
         """See `Explains`."""
         judged = self.judge(context)
         return Reasons(judged.terms, _MEANING, judged.chances)
+
+    def _in_turns(self, context: RankingContext, order: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Every second pick goes by turns where nobody knows how far the nodes are.
+
+        A robot that has lost its place would try the same few nodes for ever, those where it
+        believes to be. Where they are expected more vaguely than a match bears, every second one is
+        of those that were tried least often of late.
+        """
+        near = context.neighbourhood
+        vague = near.sigma_m[order] > prior_basin_m(context.basin.focal_px)
+        if not vague.any():
+            return order
+        lately = context.run.newest(_MOST_ATTEMPTS).nodes
+        tried = np.bincount(lately, minlength=len(context.graph))[near.nodes[order]]
+        turns = order[np.argsort(np.where(vague, tried, 0), kind="stable")]
+        mixed = np.stack([order, turns], axis=1).ravel()
+        _, first = np.unique(mixed, return_index=True)
+        picks: NDArray[np.int64] = mixed[np.sort(first)]
+        return picks
 
     def _costs_and_prior(
         self, context: RankingContext, canonical: NDArray[np.int64]
