@@ -30,7 +30,7 @@ from engram.evaluation.configurations import (
     sweep,
 )
 from engram.evaluation.drives import DriveSet
-from engram.evaluation.folds import Fold, check_only, split
+from engram.evaluation.folds import Fold, check_only, chosen, split
 from engram.evaluation.held_out import localise_held_out
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.memo import MatchMemo
@@ -117,8 +117,7 @@ class Plan:
     @property
     def run_folds(self) -> tuple[Fold, ...]:
         """Those that are run now."""
-        wanted = self.options.only_folds or range(self.options.folds)
-        return tuple(self.folds[number] for number in wanted)
+        return chosen(self.folds, self.options.only_folds)
 
     def map_path(self, fold: Fold) -> Path:
         """The map built from a fold's training sessions."""

@@ -166,8 +166,8 @@ def build_map(
 
     Intermediate maps lie in ``CENTRE.build`` beside the centre until the build is complete: the
     same call after an interruption goes on from there, and comes to the same map. A centre that
-    exists takes in all groups, and the drives that it has whole are left out; one that does not
-    exist begins as the first group's map.
+    exists takes in all groups, and the drives that it has are left out (not those of which it has
+    a part of the path only); one that does not exist begins as the first group's map.
 
     Args:
         centre: NAME.engram.
@@ -226,7 +226,7 @@ def _look_at(sources: Sequence[str]) -> list[Drive]:
 
 
 def _known_sessions(centre: Path) -> frozenset[SessionId]:
-    """The drives that the centre had whole when the build began."""
+    """The drives that the centre had when the build began, partial paths left aside."""
     begun = _folder(centre) / "build.json"
     if begun.exists():
         earlier = json.loads(begun.read_text()).get("known", [])

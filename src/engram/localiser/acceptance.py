@@ -112,9 +112,7 @@ def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bo
     """
     if match.reference_from_live is None or match.inliers < config.min_inliers:
         return False
-    if not agrees(match.reference_from_live, prediction, config):
-        return False
-    return _certain(match, config)
+    return agrees(match.reference_from_live, prediction, config) and _certain(match, config)
 
 
 def agrees(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig) -> bool:

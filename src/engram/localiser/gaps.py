@@ -118,16 +118,16 @@ class GapFiller:
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         guess = self._guess(seconds)
-        missing = (
+        if (
             measured is None
             or covariance is None
             or self._too_vague(covariance, guess)
             or self._impossible(measured, covariance, seconds)
-        )
-        self._missing.append(missing)
-        if missing or measured is None or covariance is None:
+        ):
+            self._missing.append(True)
             self._gap_m += guess.prev_from_curr.distance_m
             return guess
+        self._missing.append(False)
         self._gap_m = 0.0
         self._believed_ns = stamp_ns
         if seconds > 0:

@@ -17,7 +17,7 @@ from engram.errors import ConfigError
 from engram.evaluation.building import write_json
 from engram.evaluation.drives import DriveSet, EvaluatedDrive
 from engram.evaluation.fleet.arms import ARMS, Arm
-from engram.evaluation.folds import Fold, check_only, split
+from engram.evaluation.folds import Fold, check_only, chosen, split
 from engram.evaluation.running import file_name
 from engram.frontend.matching import matcher_hash
 from engram.localiser import RELOCALISERS
@@ -141,8 +141,7 @@ class FleetPlan:
     @property
     def run_folds(self) -> tuple[Fold, ...]:
         """Those that are run now."""
-        wanted = self.options.only_folds or range(self.options.folds)
-        return tuple(self.folds[number] for number in wanted)
+        return chosen(self.folds, self.options.only_folds)
 
     @property
     def arms(self) -> tuple[Arm, ...]:
