@@ -171,3 +171,41 @@ def test_steps_among_missing_ones_are_worth_less_than_odometry_says() -> None:
     for k in range(4, 14):
         last = gaps.motion(step, now + k * 100 * MS)
     assert last.covariance is step.covariance  # ten good steps later it is forgotten
+
+
+def test_what_was_driven_before_the_first_measurement_is_made_up_for() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    assert [gaps.motion(BLIND, k * 100 * MS).prev_from_curr.distance_m for k in (1, 2, 3)] == [
+        0
+    ] * 3
+    motion = gaps.motion(ahead(0.5), 400 * MS)
+    np.testing.assert_allclose(motion.prev_from_curr.translation, [0, 0, 2.0], atol=1e-12)
+    assert motion.guessed_m == 0
+    # Half of the 1.5 m that nobody saw, and three missing of the last ten steps.
+    sigma_m = np.sqrt(motion.covariance[2, 2])
+    assert sigma_m > np.hypot(0.75, 0.5 * np.sqrt(0.3))
+    assert sigma_m < 1.2
+    # Once.
+    again = gaps.motion(ahead(0.5), 500 * MS)
+    np.testing.assert_allclose(again.prev_from_curr.translation, [0, 0, 0.5])
+
+
+def test_a_vague_first_measurement_makes_up_for_much_and_says_that_it_is_vague() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    gaps.motion(BLIND, 1000 * MS)
+    pose = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    vague = OdometryStep(OdometryStatus.OK, pose, np.eye(6) * 0.3**2, 12)
+    motion = gaps.motion(vague, 1100 * MS)
+    assert motion.prev_from_curr.distance_m == pytest.approx(11.0)
+    # Ten steps, each wrong in the same way as the one that was measured.
+    assert np.sqrt(motion.covariance[2, 2]) > 3.0
+
+
+def test_a_clock_that_goes_back_before_the_first_measurement_moves_nobody() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 100 * MS)
+    gaps.motion(BLIND, 0)
+    motion = gaps.motion(ahead(0.5), 100 * MS)
+    np.testing.assert_allclose(motion.prev_from_curr.translation, [0, 0, 0.5])

@@ -87,6 +87,9 @@ class GapFiller:
     covariance says two centimetres. The longer ago the speed was measured, the more is possible.
 
     And where steps are missing, those between are worth less than odometry says.
+
+    A robot that is set down moving, in a shower, has no last speed. What it moved until its first
+    measured step is made up for by that step: it had been as fast before.
     """
 
     def __init__(self) -> None:
@@ -102,6 +105,8 @@ class GapFiller:
         self._believed_ns: int | None = None
         # Whether each of the newest steps was missing.
         self._missing: deque[bool] = deque(maxlen=_NEWEST_STEPS)
+        # How long the robot has moved at a speed that is not known yet.
+        self._unknown_s = 0.0
 
     def motion(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
         """The motion since the usable frame before; None where the next one will tell.
@@ -126,6 +131,8 @@ class GapFiller:
         ):
             self._missing.append(True)
             self._gap_m += guess.prev_from_curr.distance_m
+            if guess is _ANY_MOTION:
+                self._unknown_s += max(seconds, 0.0)
             return guess
         self._missing.append(False)
         self._gap_m = 0.0
@@ -134,9 +141,25 @@ class GapFiller:
             twist_per_s = measured.log() / seconds
             self._velocities.append(twist_per_s[:3])
             self._turn_per_s = twist_per_s[3:]
-        if not any(self._missing):
-            return Motion(measured, covariance)
-        return Motion(measured, covariance + self._doubt(guess, measured))
+        if any(self._missing):
+            covariance = covariance + self._doubt(guess, measured)
+        if self._unknown_s and seconds > 0:
+            return self._made_up_for(measured, covariance, seconds)
+        return Motion(measured, covariance)
+
+    def _made_up_for(
+        self, measured: SE3, covariance: NDArray[np.float64], seconds: float
+    ) -> Motion:
+        """The first measured step, behind all that the robot moved before at its speed.
+
+        The turn is left out: over several steps it is no longer that of the last.
+        """
+        steps, self._unknown_s = self._unknown_s / seconds, 0.0
+        before = SE3(np.eye(3), measured.log()[:3] * steps)
+        wrong = np.repeat([_SIGMA_PER_M, _SIGMA_RAD_PER_M], 3) * before.distance_m
+        adjoint = before.adjoint()
+        carried = adjoint @ covariance @ adjoint.T
+        return Motion(before @ measured, carried + steps**2 * covariance + np.diag(wrong**2))
 
     def _doubt(self, guess: Motion, measured: SE3) -> NDArray[np.float64]:
         """(6, 6) what a measured step among missing ones is to be doubted by."""
