@@ -231,6 +231,21 @@ class TestPicking:
             driven_m += 0.7
         assert (tried == set(range(count))) is all_are_tried
 
+    def test_it_tells_whose_place_is_by_turn(self) -> None:
+        """Of three nodes in a row the nearest two failed, and nobody knows where the robot is."""
+        context = make_context(
+            candidates=range(3),
+            along_m=[0.0, 0.3, 0.6],
+            sessions=1,
+            run=[(-0.1, 0, 0.9, False), (-0.1, 1, 0.9, False)],
+        )
+        near = dataclasses.replace(context.neighbourhood, sigma_m=np.full(3, 7.0))
+        judged = RecallPolicy().judge(dataclasses.replace(context, neighbourhood=near))
+        assert not judged.by_turn[judged.order[0]]
+        assert judged.order[:2].tolist() == [0, 2]
+        assert judged.by_turn.tolist() == [False, False, True]
+        assert not RecallPolicy().judge(context).by_turn.any()
+
     def test_terms_add_up_to_the_chance_of_the_first_pick(self) -> None:
         context = SyntheticPlace(20).context(candidates=60, observed=200)
         judged = RecallPolicy().judge(context)

@@ -10,7 +10,7 @@ import typer
 from engram.cli import options
 
 if TYPE_CHECKING:
-    from engram.drive.explaining import Explanation
+    from engram.drive.explaining import ExplainedCandidate, Explanation
 
 
 def explain(
@@ -88,16 +88,16 @@ def _print(found: Explanation, top: int) -> None:
         typer.echo(
             f"{place:4d} {str(one.node)[:8]} {one.drive:34.34s} {one.along_m:+7.2f}"
             f"{one.across_m:+7.2f}{57.29578 * one.yaw_rad:+6.0f}{one.success_rate:6.2f}  "
-            f"{reckoned}{terms}  {_outcome(one.would_match, one.inliers, one.attempted)}"
+            f"{reckoned}{terms}  {_outcome(one)}"
         )
     if len(found.candidates) > top:
         typer.echo(f"     and {len(found.candidates) - top} more; --top lists them")
 
 
-def _outcome(would_match: bool, inliers: int, attempted: bool) -> str:
-    if attempted:
-        return f"matched, {inliers} inliers" if would_match else "failed"
-    return f"would match, {inliers} inliers" if would_match else "would fail"
+def _outcome(one: ExplainedCandidate) -> str:
+    matched, failed = ("matched", "failed") if one.attempted else ("would match", "would fail")
+    outcome = f"{matched}, {one.inliers} inliers" if one.would_match else failed
+    return f"{outcome} (its turn)" if one.by_turn else outcome
 
 
 def _width(name: str) -> int:

@@ -64,6 +64,8 @@ class ExplainedCandidate:
         distance_m, along_m, across_m, yaw_rad: where the live camera is expected from the node.
         success_rate: g, how likely a match is at that distance if the appearance is alike.
         chance: of success, as the policy reckons; None if it reckons no chances.
+        by_turn: whether it stands here because its turn has come, whatever its chance: a robot
+            that has lost its place tries others, too, than those it thinks the best.
         terms: what the policy's score is made of.
         attempted: whether the budget reached it.
         would_match: whether it matched, or would have.
@@ -79,6 +81,7 @@ class ExplainedCandidate:
     yaw_rad: float
     success_rate: float
     chance: float | None
+    by_turn: bool
     terms: dict[str, float]
     attempted: bool
     would_match: bool
@@ -96,6 +99,7 @@ class ExplainedCandidate:
             "yaw_rad": self.yaw_rad,
             "success_rate": self.success_rate,
             "chance": self.chance,
+            "by_turn": self.by_turn,
             "terms": self.terms,
             "attempted": self.attempted,
             "would_match": self.would_match,
@@ -221,6 +225,7 @@ def _explained(
                 yaw_rad=float(near.yaw_rad[row]),
                 success_rate=float(rates[row]),
                 chance=None if reasons.chances is None else float(reasons.chances[row]),
+                by_turn=reasons.by_turn is not None and bool(reasons.by_turn[row]),
                 terms={name: float(values[row]) for name, values in reasons.terms.items()},
                 attempted=int(near.nodes[row]) in attempted,
                 would_match=bool(foreseen.accepted[row]),

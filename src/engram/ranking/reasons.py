@@ -19,11 +19,14 @@ class Reasons:
         terms: name → (Y,) float64, by row of the neighbourhood.
         meaning: name → what the term says, in plain words.
         chances: (Y,) float64 of success; None where the policy reckons none.
+        by_turn: (Y,) bool, whether a candidate has its place not for its merits, but because its
+            turn has come; None where the policy has no turns.
     """
 
     terms: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     meaning: dict[str, str] = field(default_factory=dict)
     chances: NDArray[np.float64] | None = None
+    by_turn: NDArray[np.bool_] | None = None
 
 
 @runtime_checkable

@@ -79,11 +79,13 @@ class RecallJudgement:
         order: (Y,) int64, rows best first.
         chances: (Y,) of success when picked, all picked before supposed to have failed.
         terms: name → (Y,), the parts of the margin at first; they add up.
+        by_turn: (Y,) bool by row, whether it stands where it does because its turn has come.
     """
 
     order: NDArray[np.int64]
     chances: Array
     terms: dict[str, Array]
+    by_turn: NDArray[np.bool_]
 
 
 class RecallPolicy:
@@ -108,7 +110,7 @@ class RecallPolicy:
         canonical = order_by(context)
         costs, prior = self._costs_and_prior(context, canonical)
         order: NDArray[np.int64] = canonical[self._pick(context, canonical, costs, prior)[0]]
-        return self._in_turns(context, order)
+        return self._in_turns(context, order)[0]
 
     def judge(self, context: RankingContext) -> RecallJudgement:
         """The ranking with its reasons."""
@@ -118,35 +120,42 @@ class RecallPolicy:
         rows = np.empty_like(canonical)
         rows[canonical] = np.arange(len(canonical))
         terms = {"distance": -costs, "past drives": prior, "this run": first + costs - prior}
+        picks, by_turn = self._in_turns(context, canonical[order])
         return RecallJudgement(
-            self._in_turns(context, canonical[order]),
+            picks,
             1 / (1 + np.exp(-c.bias - c.steepness * margins[rows])),
             {name: values[rows] for name, values in terms.items()},
+            by_turn,
         )
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
         judged = self.judge(context)
-        return Reasons(judged.terms, _MEANING, judged.chances)
+        return Reasons(judged.terms, _MEANING, judged.chances, judged.by_turn)
 
-    def _in_turns(self, context: RankingContext, order: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _in_turns(
+        self, context: RankingContext, order: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """Every second pick goes by turns where nobody knows how far the nodes are.
 
         A robot that has lost its place would try the same few nodes for ever, those where it
         believes to be. Where they are expected more vaguely than a match bears, every second one is
-        of those that were tried least often of late.
+        of those that were tried least often of late. Tells by row, too, whose place is by turn.
         """
         near = context.neighbourhood
         vague = near.sigma_m[order] > prior_basin_m(context.basin.focal_px)
+        by_turn = np.zeros(len(order), dtype=np.bool_)
         if not vague.any():
-            return order
+            return order, by_turn
         lately = context.run.newest(_MOST_ATTEMPTS).nodes
         tried = np.bincount(lately, minlength=len(context.graph))[near.nodes[order]]
         turns = order[np.argsort(np.where(vague, tried, 0), kind="stable")]
         mixed = np.stack([order, turns], axis=1).ravel()
         _, first = np.unique(mixed, return_index=True)
-        picks: NDArray[np.int64] = mixed[np.sort(first)]
-        return picks
+        first.sort()
+        picks: NDArray[np.int64] = mixed[first]
+        by_turn[picks] = first % 2 == 1
+        return picks, by_turn
 
     def _costs_and_prior(
         self, context: RankingContext, canonical: NDArray[np.int64]
