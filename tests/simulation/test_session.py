@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -10,6 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tests.simulation.conftest import small
 
 from engram.errors import ConfigError
@@ -146,3 +149,15 @@ def test_unknown_names_and_numbers_are_refused(hamlet: Campaign) -> None:
         campaign_named("hamlet", seed=-1)
     with pytest.raises(ConfigError, match="sessions 0 to 5, not 6"):
         SimulatedDrive(hamlet, 6)
+
+
+@pytest.mark.parametrize("name", ["keble", "oxford"])
+@given(seed=st.integers(0, 2**31 - 1))
+@settings(max_examples=30)
+def test_campaigns_of_few_drives_meet_sun_and_rain(name: str, seed: int) -> None:
+    """Each weather as often as its share of the summer says, to within one drive of ten."""
+    drawn = Counter(session.weather for session in campaign_named(name, seed).sessions)
+    assert drawn["clear"] in (2, 3)
+    assert drawn["overcast"] in (1, 2)
+    assert 1 <= drawn["rain"] + drawn["showers"] + drawn["damp"] <= 3
+    assert drawn["rain"] + drawn["showers"] >= 1
