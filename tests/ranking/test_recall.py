@@ -232,19 +232,24 @@ class TestPicking:
         assert (tried == set(range(count))) is all_are_tried
 
     def test_it_tells_whose_place_is_by_turn(self) -> None:
-        """Of three nodes in a row the nearest two failed, and nobody knows where the robot is."""
+        """The nearest two of three were tried long ago, and nobody knows where the robot is."""
         context = make_context(
             candidates=range(3),
-            along_m=[0.0, 0.3, 0.6],
-            sessions=1,
-            run=[(-0.1, 0, 0.9, False), (-0.1, 1, 0.9, False)],
+            along_m=[0.0, 1.5, 3.0],
+            sessions=3,
+            run=[(-40.0, 0, 0.9, False), (-40.0, 1, 0.9, False)],
         )
-        near = dataclasses.replace(context.neighbourhood, sigma_m=np.full(3, 7.0))
+        near = dataclasses.replace(context.neighbourhood, sigma_m=np.full(3, 3.0))
         judged = RecallPolicy().judge(dataclasses.replace(context, neighbourhood=near))
-        assert not judged.by_turn[judged.order[0]]
-        assert judged.order[:2].tolist() == [0, 2]
+        assert judged.order.tolist() == [0, 2, 1]
         assert judged.by_turn.tolist() == [False, False, True]
         assert not RecallPolicy().judge(context).by_turn.any()
+
+    def test_what_is_known_vaguely_stands_behind_what_is_near(self) -> None:
+        context = make_context(candidates=[0, 1], along_m=[0.0, 1.0], sessions=2)
+        assert nodes_of(context) == [0, 1]
+        near = dataclasses.replace(context.neighbourhood, sigma_m=np.array([5.0, 0.1]))
+        assert nodes_of(dataclasses.replace(context, neighbourhood=near)) == [1, 0]
 
     def test_terms_add_up_to_the_chance_of_the_first_pick(self) -> None:
         context = SyntheticPlace(20).context(candidates=60, observed=200)

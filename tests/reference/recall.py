@@ -29,6 +29,11 @@ def base(graph, attempts, savers) -> list[float]:
     return rates
 
 
+def rms(near, row) -> float:
+    """Distance of a candidate, with how vaguely it is known."""
+    return math.hypot(near.distance_m[row], near.sigma_m[row])
+
+
 def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(margins)) -> list[int]:
     """Rows best first. `rates` is of `base`, `c` the constants, `basin_m` the shipped one.
 
@@ -70,10 +75,10 @@ def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(mar
                 if session == graph.sessions[node]:
                     weight += c.regret
                     total += c.regret * margin
-            margins.append(total / weight - c.distance * near.distance_m[row] / basin_m)
+            margins.append(total / weight - c.distance * rms(near, row) / basin_m)
         best = left.pop(int(choose(margins, left)))
         picked.append(best)
         if len(picked) < PICKS:
-            cost = c.distance * near.distance_m[best] / basin_m
+            cost = c.distance * rms(near, best) / basin_m
             supposed.append((graph.sessions[near.nodes[best]], math.log(1 / NEEDED) + cost))
     return picked

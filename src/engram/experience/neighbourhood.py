@@ -42,6 +42,11 @@ class Neighbourhood:
     def __len__(self) -> int:
         return len(self.nodes)
 
+    @property
+    def rms_distance_m(self) -> NDArray[np.float64]:
+        """(Y,) root mean square of the distance, metres: it may be longer than predicted."""
+        return np.asarray(np.hypot(self.distance_m, self.sigma_m))
+
     def rows(self, rows: NDArray[np.intp]) -> Neighbourhood:
         """Some of the candidates, in the order of `rows`."""
         return Neighbourhood(*(getattr(self, field.name)[rows] for field in fields(self)))

@@ -242,7 +242,8 @@ class Replay:
         self._writer.add_omission(self._centre.omit(node, position))
         self._link(node)
         self._end_run()
-        for edge in match_edges(localiser.outcomes):
+        acceptance = localiser.config.acceptance
+        for edge in match_edges(self._centre.graph, localiser.outcomes, acceptance):
             self._add_edge(edge)
 
     def _take(self, stored: StoredNode, frame: Frame, localiser: Localiser) -> None:

@@ -543,7 +543,12 @@ class Localiser:
         rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
         if neighbourhood is not None and (known := rows >= 0).any():
             near = rows[known]
-            distance_m[known] = neighbourhood.distance_m[near]
+            distance_m[known] = neighbourhood.rms_distance_m[near]
+            accepted = known & np.array([one.accepted for one in outcomes])
+            for at in np.flatnonzero(accepted).tolist():
+                found = outcomes[at].match.reference_from_live
+                assert found is not None
+                distance_m[at] = found.distance_m
             rates[known] = self._basin.success_rate(
                 neighbourhood.along_m[near], neighbourhood.across_m[near]
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,7 @@ from engram.experience.model import Edge, EdgeKind, Node, NodeId, Session, node_
 from engram.experience.proximity import lay_proximity_edges, tighten_chain
 from engram.frontend import Frame, FrameStatus
 from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
-from engram.localiser.attempts import Outcome
+from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch
 from engram.mapper.saver import Records, Saver
 from engram.odometry import OdometryStep
@@ -114,7 +113,9 @@ class Mapper:
         if localisation.status is LocalisationStatus.LOCALISED:
             self._joined = True
             edges += self._end_experience(localisation)
-            matched = match_edges(self._localiser.outcomes)
+            matched = match_edges(
+                self._graph, self._localiser.outcomes, self._localiser.config.acceptance
+            )
             self._add_to_graph(matched)
             edges += matched
         elif self._worth_saving(live):
@@ -251,26 +252,6 @@ class Mapper:
         self._add_to_graph([tie])
         chain = [self._graph.index(node) for node in experience]
         return [tie, *tighten_chain(self._graph, chain)]
-
-
-def match_edges(outcomes: Sequence[Outcome]) -> list[Edge]:
-    """Edges between nodes that were matched by the same live frame: their relation was measured."""
-    seen_from = [
-        Position(outcome.candidate.node, pose, covariance)
-        for outcome in outcomes
-        if outcome.accepted
-        and (pose := outcome.match.reference_from_live) is not None
-        and (covariance := outcome.match.covariance) is not None
-    ]
-    return [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
-
-
-def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
-    """The edge between two nodes from which the same live camera is seen."""
-    a_from_b = a.node_from_live @ b.node_from_live.inverse()
-    adjoint = a_from_b.adjoint()
-    covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
-    return Edge(a.node, b.node, kind, a_from_b, covariance)
 
 
 def _edge(position: Position, node: NodeId, kind: EdgeKind) -> Edge:

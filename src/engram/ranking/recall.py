@@ -23,7 +23,7 @@ class RecallConstants:
     Margins are logarithms of inliers over the 20 that a match needs.
 
     Attributes:
-        distance: margin lost per shipped match basin between node and robot.
+        distance: margin lost per shipped match basin between node and robot, root mean square.
         lessons: margin per log odds of how likely past drives matched the node.
         level: margin at no distance of a node that every other past drive matched.
         prior_weight: how many attempts of this very moment all that past drives say is worth.
@@ -57,7 +57,8 @@ RECALL = RecallConstants(
 )
 
 _MEANING = {
-    "distance": "log of inliers lost by the distance of the node; all terms add up, before any "
+    "distance": "log of inliers lost by the distance of the node, which is the longer the more "
+    "vaguely it is known; all terms add up, before any "
     "pick, to the log of inliers expected over the 20 needed",
     "past drives": "how past drives fared with the node, as far as this run has not spoken",
     "this run": "how this run fared with the node's drive and the node, over the last metres",
@@ -163,7 +164,7 @@ class RecallPolicy:
         """Margins lost by distance, and as past drives have them; (Y,) each, nearest first."""
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
-        costs = self._cost(context, near.distance_m[canonical])
+        costs = self._cost(context, near.rms_distance_m[canonical])
         return costs, c.level + c.lessons * np.log(base / (1 - base))
 
     def _cost(self, context: RankingContext, distance_m: Array) -> Array:

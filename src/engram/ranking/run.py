@@ -21,8 +21,8 @@ class RunAttempts:
         driven_m: odometry distance of the live session now.
         at_m: (R,) float64, that distance when each was made.
         nodes: (R,) int32, dense indices of the nodes attempted.
-        distance_m: (R,) float64, from the node to where the robot was expected. NaN where there
-            was no prediction (relocalisation).
+        distance_m: (R,) float64, from the node to where the robot was found, or else was expected,
+            root mean square. NaN where there was no prediction (relocalisation).
         rates: (R,) float64, g at the predicted offset: how likely a match was, had the appearance
             been compatible. NaN likewise.
         accepted: (R,) bool.

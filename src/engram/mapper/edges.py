@@ -1,0 +1,61 @@
+"""Edges that a live camera measures between nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from engram.experience.graph import ExperienceGraph
+from engram.experience.model import Edge, EdgeKind
+from engram.localiser import AcceptanceConfig, Position, Prediction, agrees
+from engram.localiser.attempts import Outcome
+
+
+def match_edges(
+    graph: ExperienceGraph, outcomes: Sequence[Outcome], config: AcceptanceConfig
+) -> list[Edge]:
+    """Edges between nodes that were matched by the same live frame: their relation was measured.
+
+    Not where that contradicts the way that is known between them: one of the two matches is of
+    something else then, a house of the same kind, say. An edge from it would fold the map for all
+    who come after. A robot that has lost its place tries nodes far apart, and all that it knows
+    agrees with either.
+
+    Args:
+        graph: has all nodes of the outcomes.
+        outcomes: of one live frame. All edges end in the node of the best match.
+        config: how far a relation may be off what is known, as for a match.
+    """
+    best_first = sorted(outcomes, key=lambda outcome: -outcome.match.inliers)
+    seen_from = [
+        Position(outcome.candidate.node, pose, covariance)
+        for outcome in best_first
+        if outcome.accepted
+        and (pose := outcome.match.reference_from_live) is not None
+        and (covariance := outcome.match.covariance) is not None
+    ]
+    edges = [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
+    return [edge for edge in edges if _fits(graph, edge, config)]
+
+
+def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
+    """The edge between two nodes from which the same live camera is seen."""
+    a_from_b = a.node_from_live @ b.node_from_live.inverse()
+    adjoint = a_from_b.adjoint()
+    covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
+    return Edge(a.node, b.node, kind, a_from_b, covariance)
+
+
+def _fits(graph: ExperienceGraph, edge: Edge, config: AcceptanceConfig) -> bool:
+    """Whether an edge lies within what is known of its ends; all fits what is not connected."""
+    known = graph.predict(graph.index(edge.a), graph.index(edge.b))
+    if known is None:
+        return True
+    a_from_b, covariance = known
+    whole = covariance + edge.covariance
+    sigma_m, sigma_rad = (
+        float(np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0.0)))
+        for part in (whole[:3, :3], whole[3:, 3:])
+    )
+    return agrees(edge.a_from_b, Prediction(a_from_b, sigma_m, sigma_rad), config)
