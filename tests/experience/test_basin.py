@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.reference import basin as reference
 from tests.worlds import make_node
 
 from engram.errors import InputError
@@ -16,6 +17,19 @@ NODE = make_node(0, 0).id
 def attempt(iteration, along_m, accepted, across_m=0.0, sigma_m=0.1) -> Attempt:
     return Attempt(
         iteration, NODE, NODE, along_m, across_m, 0.0, sigma_m, 0.01, accepted, 30, 0, "path"
+    )
+
+
+def count(log: list[Attempt], experiences=None, drives=None) -> BasinCounts:
+    """Counts of attempts; all of one experience and one drive where nothing else is said."""
+    alike = np.zeros(len(log), np.int64)
+    return count_attempts(
+        alike if drives is None else np.array(drives, np.int64),
+        alike if experiences is None else np.array(experiences, np.int64),
+        np.array([one.iteration for one in log], np.int64),
+        (np.array([one.along_m for one in log]), np.array([one.across_m for one in log])),
+        np.array([one.sigma_m for one in log]),
+        np.array([one.accepted for one in log], np.bool_),
     )
 
 
@@ -41,7 +55,7 @@ def test_prior_is_the_specified_one(focal_px: float, basin_m: float) -> None:
 
 def test_learns_the_basin_of_each_direction_whatever_the_prior() -> None:
     log = simulated(np.random.default_rng(0), 5.0, 3.0, 4000)
-    counts = count_attempts(log, np.zeros(len(log), np.int32))
+    counts = count(log)
     for focal_px in (256.0, 707.0):
         basin = MatchBasin.of(focal_px).learnt(counts)
         assert basin.basin_m == pytest.approx(5.0, abs=0.5)
@@ -67,7 +81,7 @@ def test_success_rate_falls_with_distance(seed: int, focal_px: float) -> None:
 def test_experiences_that_did_not_match_lately_say_nothing() -> None:
     log = [attempt(0, 1.0, False), attempt(0, 1.0, True), attempt(10, 3.0, False)]
     log += [attempt(11, 3.0, False), attempt(12, 3.0, False, sigma_m=2.0)]
-    counts = count_attempts(log, np.array([0, 1, 1, 1, 1]))
+    counts = count(log, [0, 1, 1, 1, 1])
     # Only the failure ten iterations after the match counts: not the match itself, not the other
     # experience, not eleven iterations after, not the vague prediction.
     assert counts.attempts[0].sum() == 1
@@ -77,13 +91,34 @@ def test_experiences_that_did_not_match_lately_say_nothing() -> None:
 
 def test_a_match_does_not_vouch_for_its_own_iteration() -> None:
     log = [attempt(4, 0.2, True), attempt(4, 1.2, False), attempt(5, 1.2, True)]
-    counts = count_attempts(log, np.zeros(3, np.int32))
+    counts = count(log)
     assert counts.attempts[0].sum() == counts.successes[0].sum() == 1
+
+
+made_attempts = st.builds(
+    attempt,
+    iteration=st.integers(0, 40),
+    along_m=st.floats(-30, 30, width=32),
+    accepted=st.booleans(),
+    across_m=st.sampled_from([0.0, 1.0, 1.5, -7.0]),
+    sigma_m=st.sampled_from([0.1, 1.0, 1.1]),
+)
+
+
+@given(st.lists(st.tuples(made_attempts, st.integers(0, 3), st.integers(0, 2)), max_size=40))
+def test_counting_all_drives_at_once_is_counting_one_attempt_after_another(made) -> None:
+    made.sort(key=lambda one: (one[2], one[0].iteration))
+    counts = count(*([one[k] for one in made] for k in range(3)))
+    expected = np.zeros((2, 2, 48), int)
+    for drive in range(3):
+        log = [one[0] for one in made if one[2] == drive]
+        expected += reference.counted(log, [one[1] for one in made if one[2] == drive])
+    np.testing.assert_array_equal([counts.attempts, counts.successes], expected)
 
 
 def test_counts_add_up() -> None:
     log = simulated(np.random.default_rng(1), 4.0, 4.0, 50)
-    whole = count_attempts(log, np.zeros(len(log), np.int32))
+    whole = count(log)
     twice = whole + whole
     np.testing.assert_array_equal(twice.attempts, 2 * whole.attempts)
     assert whole.attempts.sum() > 0

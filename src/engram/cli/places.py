@@ -169,7 +169,7 @@ def places(
     from engram.store import MapStore
 
     with MapStore.open(map_path, at=at) as store:
-        count = store.info().nodes
+        count = store.node_count()
     with progress("compare", count) as advance:
         confusion = find_lookalikes(map_path, at, advance=advance)
     if picture is not None:

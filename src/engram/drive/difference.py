@@ -162,8 +162,7 @@ def difference(
         for node in contents.nodes:
             graph.add_node(node)
     for contents in (old, new):
-        for edge in contents.edges:
-            graph.add_edge(edge)
+        graph.add_edges(contents.edges)
     sessions = {one.id: one for one in (*old.sessions, *new.sessions)}
     return MapDifference(before, after, old, new, graph, regions_of(graph, sessions, stretch_m))
 
@@ -251,8 +250,7 @@ def _components(contents: MapContents) -> int:
     graph = ExperienceGraph()
     for node in contents.nodes:
         graph.add_node(node)
-    for edge in contents.edges:
-        graph.add_edge(edge)
+    graph.add_edges(contents.edges)
     return int(graph.components().max(initial=-1)) + 1
 
 

@@ -152,7 +152,7 @@ def map_drive(
         if state is SessionState.COMMITTED:
             report.known = True
             return report
-        settings = settings.for_descriptor(store.info().descriptor)
+        settings = settings.for_descriptor(store.descriptor())
         if state is SessionState.ABSENT:
             writer = _begin(store, session, sequence, settings, options)
         else:

@@ -14,7 +14,7 @@ import numpy as np
 from engram.drive.place_words import stored_words
 from engram.drive.settings import Settings
 from engram.errors import ConfigError
-from engram.experience.basin import BasinCounts, MatchBasin, count_attempts
+from engram.experience.basin import MatchBasin
 from engram.experience.clock import Clocked
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import PathEntryKind, SessionId, path_id
@@ -67,8 +67,7 @@ class OpenMap:
         contents = store.load()
         for node in contents.nodes:
             self.graph.add_node(node)
-        for edge in contents.edges:
-            self.graph.add_edge(edge)
+        self.graph.add_edges(contents.edges)
         for entry in contents.path_entries:
             self.path_memory.add(entry)
         self.times = SessionTimes(contents.sessions)
@@ -76,14 +75,8 @@ class OpenMap:
         self._remembered = contents.attempts
         self._lessons: dict[float, Lessons] = {}
         self.sessions = {session.id: session for session in contents.sessions}
-        self.attempts = BasinCounts.empty()
-        self.last_iterations: dict[SessionId, int] = {}
-        for session in contents.sessions:
-            made = contents.attempts_of(session.id)
-            if made:
-                self.last_iterations[session.id] = made[-1].iteration
-            tried = [self.graph.index(attempt.node) for attempt in made]
-            self.attempts += count_attempts(made, self.graph.experiences[tried])
+        self.attempts = contents.basin_counts(self.graph.experiences)
+        self.last_iterations = contents.last_iterations()
 
     def __enter__(self) -> Self:
         return self
@@ -112,7 +105,7 @@ class OpenMap:
     @property
     def descriptor(self) -> DescriptorKind | None:
         """Kind of all descriptors of the map; None while it is empty."""
-        return self.store.info().descriptor
+        return self.store.descriptor()
 
     @cached_property
     def vocabulary(self) -> Vocabulary | None:

@@ -110,7 +110,7 @@ def train_map_vocabulary(
         MapError: a map cannot be read, or this one not written.
     """
     with MapStore.open(map_path) as store:
-        kind = store.info().descriptor
+        kind = store.descriptor()
     frames: list[NDArray[np.uint8]] = []
     for at, source in enumerate(sources or [map_path]):
         for frame in _frames(source, kind):
@@ -161,7 +161,7 @@ def use_vocabulary(
     """
     vocabulary = _read_vocabulary(source)
     with MapStore.open_for_writing(map_path) as writable:
-        kind = writable.info().descriptor
+        kind = writable.descriptor()
         if kind not in {None, vocabulary.descriptor}:
             raise IncompatibleError(
                 f"the words of {source} are of {vocabulary.descriptor} descriptors, those of "

@@ -128,7 +128,7 @@ def _built_session(
     assert report.revision is not None
     localisations = [one.localisation for one in report.results]
     with MapStore.open(draft) as store:
-        nodes = store.info().nodes
+        nodes = store.node_count()
     return BuiltSession(
         drive.name,
         report.revision,

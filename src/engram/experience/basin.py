@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +11,6 @@ from scipy.optimize import isotonic_regression
 
 from engram import _core
 from engram.errors import InputError
-from engram.experience.model import Attempt
 
 Array = NDArray[np.float64]
 
@@ -142,39 +140,47 @@ class MatchBasin:
         return max(least_m, self.basin_m + min(2 * sigma_m, max(most_m - self.basin_m, 0.0)))
 
 
-def count_attempts(attempts: Sequence[Attempt], experiences: NDArray[np.int32]) -> BasinCounts:
-    """Counts of one session's attempts on experiences that were matched within the last 5 m.
+def count_attempts(
+    drives: NDArray[np.int64],
+    experiences: NDArray[np.int64],
+    iterations: NDArray[np.int64],
+    offsets_m: tuple[Array, Array],
+    sigma_m: Array,
+    accepted: NDArray[np.bool_],
+) -> BasinCounts:
+    """Counts of the attempts on experiences that the drive had matched within the last 5 m.
 
     An attempt on an experience that had no match in the ten iterations before says more about
     appearance than about distance, and is left out; so is one whose prediction was vague. A match
     does not vouch for itself: only earlier iterations count.
 
     Args:
-        attempts: of one session, in the order of their iterations.
-        experiences: (A,) int32, for each attempt the experience of its node, numbered anyhow.
+        drives: (A,) which drive made each attempt, numbered from 0.
+        experiences: (A,) the experience of its node, numbered from 0.
+        iterations: (A,) when.
+        offsets_m: (A,) each, where it was expected along and across the viewing direction.
+        sigma_m: (A,) how vaguely.
+        accepted: (A,) whether it was a success.
     """
+    if len(iterations) == 0:
+        return BasinCounts.empty()
+    # Drive, experience and iteration in one number: what was matched last before an attempt
+    # stands before it in order.
+    chain = drives.astype(np.int64) * (int(experiences.max()) + 1) + experiences
+    span = int(iterations.max() - iterations.min()) + 1
+    when = chain * span + (iterations - iterations.min())
+    matched = np.r_[-1, np.unique(when[accepted])]
+    last = matched[np.searchsorted(matched, when) - 1]
+    compatible = (last >= chain * span) & (when - last <= _COMPATIBLE_ITERATIONS)
+    counted = compatible & (sigma_m <= _GREATEST_SIGMA_M)
+    along_m, across_m = (np.abs(offset.astype(np.float64)) for offset in offsets_m)
     counts = np.zeros((2, 2, BIN_COUNT), dtype=np.int64)
-    last_match: dict[int, int] = {}
-    fresh: list[tuple[int, int]] = []
-    for attempt, experience in zip(attempts, experiences.tolist(), strict=True):
-        while fresh and fresh[0][1] < attempt.iteration:
-            matched, iteration = fresh.pop(0)
-            last_match[matched] = iteration
-        since = attempt.iteration - last_match.get(experience, -_COMPATIBLE_ITERATIONS - 1)
-        if since <= _COMPATIBLE_ITERATIONS and attempt.sigma_m <= _GREATEST_SIGMA_M:
-            _count(counts, attempt)
-        if attempt.accepted:
-            fresh.append((experience, attempt.iteration))
+    for direction, (offset_m, aside_m) in enumerate(((along_m, across_m), (across_m, along_m))):
+        bins = np.minimum(offset_m / BIN_M, BIN_COUNT - 1).astype(np.int64)
+        here = counted & (aside_m <= _ASIDE_M)
+        for row, some in enumerate((here, here & accepted)):
+            counts[row, direction] = np.bincount(bins[some], minlength=BIN_COUNT)
     return BasinCounts(counts[0], counts[1])
-
-
-def _count(counts: NDArray[np.int64], attempt: Attempt) -> None:
-    offsets = (abs(attempt.along_m), abs(attempt.across_m))
-    for direction in (0, 1):
-        if offsets[1 - direction] <= _ASIDE_M:
-            place = min(int(offsets[direction] / BIN_M), BIN_COUNT - 1)
-            counts[0, direction, place] += 1
-            counts[1, direction, place] += attempt.accepted
 
 
 def _prior_rates(basin_m: float) -> Array:

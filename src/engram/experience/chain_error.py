@@ -12,6 +12,7 @@ metre's error is the same error again, not a fresh one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,14 +50,7 @@ class PivotedError:
             InputError: the covariance has the wrong shape, is not finite or not positive
                 semi-definite.
         """
-        if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-            raise InputError(f"a covariance is a finite (6, 6) matrix, not {covariance.shape}")
-        eigenvalues = np.linalg.eigvalsh(covariance)
-        if eigenvalues[0] < -1e-9 * max(eigenvalues[-1], 1e-12):
-            raise InputError(
-                f"a covariance must be positive semi-definite; smallest eigenvalue "
-                f"{eigenvalues[0]:.3g}"
-            )
+        _check([covariance])
         tau, v, *pivot = _core.pivoted_error(np.ascontiguousarray(covariance))
         return PivotedError(float(tau), float(v), np.array(pivot))
 
@@ -105,11 +99,35 @@ class ChainError:
         return PivotedError(float(tau) + spread, float(v), pivot)
 
 
-def edge_error_row(a_from_b: SE3, covariance: Array) -> Array:
-    """(8,) τ, v, pivot in a, pivot in b: an edge's row for the search kernels."""
-    error = PivotedError.from_covariance(covariance)
-    row = np.empty(8)
-    row[:2] = error.translation_var, error.rotation_var
-    row[2:5] = error.pivot_in_a
-    row[5:] = a_from_b.inverse() @ error.pivot_in_a
-    return row
+def edge_error_rows(edges: Sequence[tuple[SE3, Array]]) -> Array:
+    """(E, 8) τ, v, pivot in a, pivot in b: the rows of edges for the search kernels.
+
+    Args:
+        edges: (E) ``a_from_b`` with its (6, 6) covariance, as for `PivotedError.from_covariance`.
+
+    Raises:
+        InputError: a covariance is none.
+    """
+    _check([covariance for _, covariance in edges])
+    rows = np.empty((len(edges), 8))
+    for row, (a_from_b, covariance) in zip(rows, edges, strict=True):
+        row[:5] = _core.pivoted_error(np.ascontiguousarray(covariance))
+        row[5:] = a_from_b.inverse() @ row[2:5]
+    return rows
+
+
+def _check(covariances: Sequence[Array]) -> None:
+    """All at once: a map has tens of thousands."""
+    for one in covariances:
+        if one.shape != (6, 6):
+            raise InputError(f"a covariance is a finite (6, 6) matrix, not {one.shape}")
+    stack = np.reshape(covariances, (-1, 6, 6))
+    if not np.isfinite(stack).all():
+        raise InputError("a covariance is a finite (6, 6) matrix; it has numbers that are not")
+    eigenvalues = np.linalg.eigvalsh(stack)
+    bad = eigenvalues[:, 0] < -1e-9 * np.maximum(eigenvalues[:, -1], 1e-12)
+    if bad.any():
+        raise InputError(
+            "a covariance must be positive semi-definite; smallest eigenvalue "
+            f"{eigenvalues[bad][0, 0]:.3g}"
+        )

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from engram import _core
 from engram.errors import InputError
-from engram.experience.chain_error import ChainError, edge_error_row
+from engram.experience.chain_error import ChainError, edge_error_rows
 from engram.experience.growing import Column
 from engram.experience.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.experience.neighbourhood import Neighbourhood
@@ -162,17 +162,23 @@ class ExperienceGraph:
             InputError: an end is not in the graph, both ends are the same node, or the covariance
                 is none.
         """
-        a, b = self.index(edge.a), self.index(edge.b)
-        if a == b:
-            raise InputError(f"an edge joins two nodes; both ends are {edge.a}")
-        error_row = edge_error_row(edge.a_from_b, edge.covariance)
-        known = self._edge_index.get((a, b, edge.kind))
-        if known is None:
-            known = self._link(a, b, edge)
-        self._edges[known] = edge
-        self._a_from_b.rows[known, :9] = edge.a_from_b.rotation.ravel()
-        self._a_from_b.rows[known, 9:] = edge.a_from_b.translation
-        self._errors.rows[known] = error_row
+        self.add_edges([edge])
+
+    def add_edges(self, edges: Sequence[Edge]) -> None:
+        """Add many edges, in this order; see `add_edge`. Where one is refused none is added."""
+        ends = [(self.index(edge.a), self.index(edge.b)) for edge in edges]
+        for (a, b), edge in zip(ends, edges, strict=True):
+            if a == b:
+                raise InputError(f"an edge joins two nodes; both ends are {edge.a}")
+        error_rows = edge_error_rows([(edge.a_from_b, edge.covariance) for edge in edges])
+        for (a, b), edge, error_row in zip(ends, edges, error_rows, strict=True):
+            known = self._edge_index.get((a, b, edge.kind))
+            if known is None:
+                known = self._link(a, b, edge)
+            self._edges[known] = edge
+            self._a_from_b.rows[known, :9] = edge.a_from_b.rotation.ravel()
+            self._a_from_b.rows[known, 9:] = edge.a_from_b.translation
+            self._errors.rows[known] = error_row
 
     def _link(self, a: int, b: int, edge: Edge) -> int:
         number = len(self._edges)

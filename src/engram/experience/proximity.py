@@ -81,8 +81,7 @@ def lay_proximity_edges(
                 covariance=near.covariance(row),
             )
         )
-    for edge in edges:
-        graph.add_edge(edge)
+    graph.add_edges(edges)
     return edges
 
 
@@ -107,8 +106,7 @@ def tighten_chain(
         The new and the superseding edges. They are in the graph already, and are to be stored.
     """
     edges = list(_sharpened(graph, chain))
-    for edge in edges:
-        graph.add_edge(edge)
+    graph.add_edges(edges)
     for node in reversed(chain):
         edges += lay_proximity_edges(graph, node, config)
     return edges

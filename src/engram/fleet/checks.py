@@ -22,7 +22,7 @@ def check_fits(centre: Centre, robot: HandedIn) -> None:
         IncompatibleError: it has another kind of descriptors; or it has a node or a session under
             the UUID of one of the centre's, and another content.
     """
-    kind, theirs = centre.opened.descriptor, robot.store.info().descriptor
+    kind, theirs = centre.opened.descriptor, robot.store.descriptor()
     if None not in {kind, theirs} and kind is not theirs:
         raise IncompatibleError(
             f"{robot.name} holds {theirs} descriptors, the centre {kind}; the two cannot be "

@@ -94,7 +94,7 @@ def _merge_one(
         HandedIn(MapStore.open(robot), str(robot)) as handed_in,
         deferred_interrupt() as raise_if_asked,
     ):
-        resolved = settings.for_descriptor(handed_in.store.info().descriptor)
+        resolved = settings.for_descriptor(handed_in.store.descriptor())
         try:
             return merge_map(
                 store, handed_in, resolved, options, _interruptible(progress, raise_if_asked), gate

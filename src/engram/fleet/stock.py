@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.experience.basin import BasinCounts, count_attempts
+from engram.experience.basin import BasinCounts
 from engram.experience.clock import hour_of_day
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
@@ -51,8 +51,7 @@ class Stock:
         self.graph = ExperienceGraph()
         for node in self.nodes:
             self.graph.add_node(node)
-        for edge in self.edges:
-            self.graph.add_edge(edge)
+        self.graph.add_edges(self.edges)
         self.session_of: NDArray[np.int64] = np.array(
             [place[node.session] for node in self.nodes], np.int64
         )
@@ -133,12 +132,8 @@ class Stock:
     @cached_property
     def basin_counts(self) -> BasinCounts:
         """From which match basins are learnt."""
-        counts = BasinCounts.empty()
-        for session in self.sessions:
-            made = self.contents.attempts_of(session.id)
-            tried = [self.graph.index(attempt.node) for attempt in made]
-            counts += count_attempts(made, self.graph.experiences[tried])
-        return counts
+        places = [self.graph.index(node.id) for node in self.contents.nodes]
+        return self.contents.basin_counts(self.graph.experiences[places])
 
     @cached_property
     def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

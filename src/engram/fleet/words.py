@@ -42,7 +42,7 @@ class CentreWords:
 
     def __init__(self, store: MapStore) -> None:
         self._store = store
-        body, descriptor = store.vocabulary(), store.info().descriptor
+        body, descriptor = store.vocabulary(), store.descriptor()
         self._vocabulary = None
         if body is not None:
             self._vocabulary = decode_vocabulary(body)

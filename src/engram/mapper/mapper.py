@@ -226,8 +226,7 @@ class Mapper:
         return edges
 
     def _add_to_graph(self, edges: list[Edge]) -> None:
-        for edge in edges:
-            self._graph.add_edge(edge)
+        self._graph.add_edges(edges)
 
     def _edge_to_last_saved(self, position: Position, node: NodeId) -> list[Edge]:
         """Ties a new experience to this session's last one too, where that is still near.

@@ -194,6 +194,16 @@ class MapStore:
         with self._database.reading() as connection:
             return resolve(connection, named, self._database.name)
 
+    def descriptor(self) -> DescriptorKind | None:
+        """Kind of all descriptors of the map; None before its first session."""
+        with self._database.reading() as connection:
+            return reading.descriptor_of(connection, self._view)
+
+    def node_count(self) -> int:
+        """How many nodes the map has."""
+        with self._database.reading() as connection:
+            return reading.node_count(connection, self._view)
+
     def info(self) -> MapInfo:
         """The map in numbers."""
         with self._database.reading() as connection:

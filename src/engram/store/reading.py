@@ -160,7 +160,7 @@ def info(connection: Connection, view: View, *, format_version: int, size_bytes:
         descriptor=descriptor_of(connection, view),
         cameras=connection.execute(select(func.count()).select_from(used.subquery())).scalar_one(),
         sessions=_count(connection, view.select(sessions)),
-        nodes=_count(connection, view.select(nodes)),
+        nodes=node_count(connection, view),
         edges=sum(by_kind.values()),
         edges_of_kind={str(kind): count for kind, count in by_kind.items() if count},
         path_entries=_count(connection, view.select(path_entries)),
@@ -168,6 +168,11 @@ def info(connection: Connection, view: View, *, format_version: int, size_bytes:
         mapped_m=mapped_m,
         size_bytes=size_bytes,
     )
+
+
+def node_count(connection: Connection, view: View) -> int:
+    """How many nodes are seen."""
+    return _count(connection, view.select(nodes))
 
 
 def load_statistics(connection: Connection, view: View) -> dict[str, dict[str, Any]]:

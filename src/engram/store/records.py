@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.experience.basin import BasinCounts, count_attempts
 from engram.experience.model import Attempt, Edge, Node, PathEntry, Session, SessionId
 from engram.frontend import DescriptorKind, FrameStatus
 from engram.geometry import CameraId, StereoCamera
@@ -191,6 +192,33 @@ class MapContents:
     edges: tuple[Edge, ...]
     path_entries: tuple[PathEntry, ...]
     attempts: AttemptArrays
+
+    def basin_counts(self, experiences: NDArray[np.int32]) -> BasinCounts:
+        """From which match basins are learnt: all remembered attempts.
+
+        Args:
+            experiences: (N,) of each of `nodes`, numbered from 0.
+        """
+        made = self.attempts
+        return count_attempts(
+            made.session.astype(np.int64),
+            experiences[made.node].astype(np.int64),
+            made.iteration,
+            (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
+            made.sigma_m.astype(np.float64),
+            made.accepted,
+        )
+
+    def last_iterations(self) -> dict[SessionId, int]:
+        """Number of the newest remembered iteration of each session that has any."""
+        made = self.attempts
+        newest = np.flatnonzero(np.diff(made.session, append=-1))  # they stand session by session
+        return {
+            self.sessions[place].id: iteration
+            for place, iteration in zip(
+                made.session[newest].tolist(), made.iteration[newest].tolist(), strict=True
+            )
+        }
 
     def attempts_of(self, session: SessionId) -> list[Attempt]:
         """The remembered attempts of one session as records."""

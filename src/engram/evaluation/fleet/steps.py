@@ -113,7 +113,7 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
     if report.interrupted:
         raise KeyboardInterrupt
     with MapStore.open(draft) as store:
-        nodes = store.info().nodes
+        nodes = store.node_count()
     made = MergeRecord(
         name=robot,
         nodes=nodes,
