@@ -26,7 +26,7 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
             "content_hash": store.content_hash(),
             "descriptor": None if info.descriptor is None else info.descriptor.value,
             "sessions": info.sessions,
-            "robots": sorted({session.robot for session in store.load().sessions}),
+            "robots": sorted({session.robot for session in opened.sessions.values()}),
             "cameras": info.cameras,
             "nodes": info.nodes,
             "experiences": len(set(opened.graph.experiences.tolist())),
