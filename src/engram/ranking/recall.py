@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.experience.basin import prior_basin_m
 from engram.ranking.context import RankingContext, order_by
+from engram.ranking.likeness import standard_likenesses
 from engram.ranking.reasons import Reasons
 from engram.ranking.run import RunAttempts
 
@@ -29,6 +30,8 @@ class RecallConstants:
         prior_weight: how many attempts of this very moment all that past drives say is worth.
         memory_m: metres driven over which an attempt of this run comes to weigh e times less.
         regret: how many attempts of this very moment a pick counts as, supposed to have failed.
+        likeness: margin per standard deviation that a node looks liker than the others do.
+        vague_m: how vaguely even the surest candidate is known, σ, before likeness counts.
         steepness: log odds of a success per margin.
         bias: log odds of a success at margin 0.
     """
@@ -39,6 +42,8 @@ class RecallConstants:
     prior_weight: float
     memory_m: float
     regret: float
+    likeness: float
+    vague_m: float
     steepness: float
     bias: float
 
@@ -52,6 +57,8 @@ RECALL = RecallConstants(
     prior_weight=0.5,
     memory_m=4.0,
     regret=2.0,
+    likeness=0.4,
+    vague_m=0.5,
     steepness=1.8,
     bias=0.6,
 )
@@ -60,6 +67,8 @@ _MEANING = {
     "distance": "log of inliers lost by the distance of the node, which is the longer the more "
     "vaguely it is known; all terms add up, before any "
     "pick, to the log of inliers expected over the 20 needed",
+    "likeness": "how much liker than the others it looks, by its words; only where the robot does "
+    "not know well where it is",
     "past drives": "how past drives fared with the node, as far as this run has not spoken",
     "this run": "how this run fared with the node's drive and the node, over the last metres",
 }
@@ -120,7 +129,13 @@ class RecallPolicy:
         order, margins, first = self._pick(context, canonical, costs, prior)
         rows = np.empty_like(canonical)
         rows[canonical] = np.arange(len(canonical))
-        terms = {"distance": -costs, "past drives": prior, "this run": first + costs - prior}
+        likeness = self._likeness(context, canonical)
+        terms = {
+            "distance": -costs - likeness,
+            "likeness": likeness,
+            "past drives": prior,
+            "this run": first + costs - prior,
+        }
         picks, by_turn = self._in_turns(context, canonical[order])
         return RecallJudgement(
             picks,
@@ -161,11 +176,23 @@ class RecallPolicy:
     def _costs_and_prior(
         self, context: RankingContext, canonical: NDArray[np.int64]
     ) -> tuple[Array, Array]:
-        """Margins lost by distance, and as past drives have them; (Y,) each, nearest first."""
+        """Margins lost by place and looks, and as past drives have them; (Y,), nearest first."""
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
         costs = self._cost(context, near.rms_distance_m[canonical])
+        costs -= self._likeness(context, canonical)
         return costs, c.level + c.lessons * np.log(base / (1 - base))
+
+    def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
+        """Margins won by looking like the live frame, (Y,), nearest first.
+
+        Which words a frame shares with others of its place is noise beside what distance and this
+        run tell, unless nobody knows the distance.
+        """
+        c, sigma_m = self._constants, context.neighbourhood.sigma_m
+        if len(canonical) == 0 or sigma_m.min() < c.vague_m:
+            return np.zeros(len(canonical))
+        return np.asarray(c.likeness * standard_likenesses(context)[canonical])
 
     def _cost(self, context: RankingContext, distance_m: Array) -> Array:
         """A longer lens sees alike from farther away."""
