@@ -18,6 +18,7 @@ from engram.evaluation import (
     Plan,
     building,
     drives_of,
+    forget,
     make_plan,
     open_campaign,
     run,
@@ -133,6 +134,18 @@ def test_more_policies_later_cost_only_what_is_new(plan: Plan, tmp_path: Path) -
     assert {key: found[key] for key in results(plan)} == results(plan)
     assert {one.policy for _, one in found} == {"distance", "path", "random"}
     assert all(path.read_bytes() == bytes_ for path, bytes_ in before.items())
+
+
+def test_policies_are_run_again_in_the_folds_that_are_run(plan: Plan, tmp_path: Path) -> None:
+    work = tmp_path / plan.work.name
+    shutil.copytree(plan.work, work)
+    one_fold = replace(plan, options=replace(plan.options, only_folds=(1,)), work=work)
+    forget(one_fold, ["path"])
+    left = results(one_fold)
+    dropped = {(session, one.policy) for session, one in set(results(plan)) - set(left)}
+    assert dropped == {(session, "path") for session in plan.folds[1].held_out}
+    run(one_fold)
+    assert results(one_fold) == results(plan)
 
 
 def test_folds_may_be_run_one_after_another(campaign, plan: Plan, tmp_path: Path) -> None:

@@ -205,8 +205,11 @@ def _tasks(plan: Plan) -> list[Task]:
 
 
 def forget(plan: Plan, policies: Sequence[str]) -> None:
-    """Drops the results of some policies, whose code has changed; maps and matches stay."""
-    for session in range(len(plan.drives.drives)):
+    """Drops the results of some policies, whose code has changed; maps and matches stay.
+
+    Only those of the folds that are run: others would be missed by a report that takes in all.
+    """
+    for session in (session for fold in plan.run_folds for session in fold.held_out):
         for mode in ("memo", "live"):
             path = plan.runs_path(session, mode)
             runs = read_runs(path)
