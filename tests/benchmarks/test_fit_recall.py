@@ -75,4 +75,4 @@ def test_chances_come_from_the_odds_that_made_the_outcomes() -> None:
 
 def test_the_search_leaves_no_constant_out() -> None:
     fields = {one.name for one in dataclasses.fields(RECALL)}
-    assert {*fit_recall.SEARCHED, *fit_recall.CHANCES} == fields
+    assert {*fit_recall.SEARCHED, *fit_recall.CHANCES, *fit_recall.WHEN_LOST} == fields

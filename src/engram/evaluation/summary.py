@@ -29,6 +29,7 @@ from engram.measures import (
     longest_gap_m,
     not_localised_sums,
 )
+from engram.ranking import POLICIES
 
 Array = NDArray[np.float64]
 
@@ -202,8 +203,9 @@ class CampaignResult:
 
     @property
     def policies(self) -> list[str]:
-        """Those run, in the order of the table."""
-        return list(dict.fromkeys(one.policy for one in self.memo))
+        """Those run, in the order of `POLICIES`, whichever came first."""
+        run = {one.policy for one in self.memo}
+        return [name for name in POLICIES if name in run]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

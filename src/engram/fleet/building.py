@@ -265,6 +265,7 @@ def _map(
             )
         else:
             map_groups(missing, scratch.group, options.workers, advance, check, scratch.remember)
+        check()  # also where the last groups were done as Ctrl-C was pressed
     results = [scratch.result(task.number) for task in tasks]
     return [result for result in results if result is not None]
 
