@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.worlds import MadeUpWords, make_context
+from tests.worlds import MadeUpWords, flat_graph, make_context
 
+from engram.errors import MapCorruptError
+from engram.experience.model import NodeId
+from engram.frontend import DescriptorKind, Frame
+from engram.places import default_vocabulary
+from engram.ranking import QuantisedWords
 from engram.ranking.likeness import Likeness, standard_likenesses
 from engram.ranking.recall import RECALL, RecallPolicy
 
@@ -68,3 +73,18 @@ def test_recall_looks_at_what_it_sees_where_nobody_knows_the_distance(
     )
     odds = RECALL.bias + RECALL.steepness * sum(term[first] for term in judged.terms.values())
     assert judged.chances[first] == pytest.approx(1 / (1 + np.exp(-odds)))
+
+
+class _Unreadable:
+    """Frames of a map all of whose landmarks are damaged."""
+
+    def frame(self, node: NodeId) -> Frame:
+        raise MapCorruptError(f"node {node}: its landmarks do not match their hash")
+
+
+def test_a_node_that_cannot_be_read_shows_nothing() -> None:
+    words = QuantisedWords(
+        flat_graph(2), _Unreadable(), lambda: default_vocabulary(DescriptorKind.BRIEF)
+    )
+    words.prepare()
+    assert len(words.of_node(1)) == 0

@@ -43,6 +43,7 @@ from engram.ranking import (
     SessionTimes,
     check_for_robot,
     policy_named,
+    uses_words,
 )
 from engram.store import MapStore
 
@@ -191,11 +192,15 @@ class OpenMap:
         Raises:
             ConfigError: there is no such policy or relocaliser.
         """
+        ranking = policy_named(policy) if isinstance(policy, str) else policy
+        background = self._background(camera.fx, settings.frontend.descriptor)
+        if uses_words(ranking):
+            self._words[settings.frontend.descriptor].prepare()
         return Localiser(
             self.graph,
             self.path_memory,
             self.store.frames,
-            policy=policy_named(policy) if isinstance(policy, str) else policy,
+            policy=ranking,
             budget=budget or Budget(),
             relocaliser=self.relocaliser(relocaliser, settings.frontend.descriptor)
             if isinstance(relocaliser, str)
@@ -207,7 +212,7 @@ class OpenMap:
             matcher=matcher,
             threads=threads,
             search=search,
-            background=self._background(camera.fx, settings.frontend.descriptor),
+            background=background,
             clock=clock,
         )
 

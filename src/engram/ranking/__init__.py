@@ -12,7 +12,7 @@ from engram.ranking.background import Background
 from engram.ranking.bag_of_words import BagOfWordsPolicy
 from engram.ranking.bandit import BanditPolicy
 from engram.ranking.collaborative import CollaborativePolicy
-from engram.ranking.context import Foreseen, RankingContext, RankingPolicy
+from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, uses_words
 from engram.ranking.distance import DistancePolicy
 from engram.ranking.lessons import Lessons, PastAttempts
 from engram.ranking.nearest_of_each import NearestOfEachPolicy
@@ -91,4 +91,5 @@ __all__ = [
     "check_for_robot",
     "policy_named",
     "reasons_of",
+    "uses_words",
 ]

@@ -21,6 +21,7 @@ class BagOfWordsPolicy:
     """
 
     name = "bag-of-words"
+    uses_words = True
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""

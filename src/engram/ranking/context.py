@@ -100,6 +100,11 @@ class RankingPolicy(Protocol):
         ...
 
 
+def uses_words(policy: RankingPolicy) -> bool:
+    """Whether a policy looks at visual words: a localiser then has them read before it sets off."""
+    return bool(getattr(policy, "uses_words", False))
+
+
 def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
     """Rows by the keys, (Y,) each, smallest first; ties by distance, then by UUID (SPEC §4)."""
     neighbourhood = context.neighbourhood

@@ -111,6 +111,7 @@ class RecallPolicy:
     """
 
     name = "recall"
+    uses_words = True
 
     def __init__(self, constants: RecallConstants = RECALL) -> None:
         self._constants = constants

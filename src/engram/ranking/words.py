@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.errors import MapCorruptError
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
@@ -79,12 +80,12 @@ class QuantisedWords:
             last = self._last = (frame, words)
         return last[1]
 
-    def of_node(self, node: int) -> NDArray[np.int32]:
-        """See `WordSource`.
+    def prepare(self) -> None:
+        """Reads the vocabulary and the nodes' words now, not in the midst of a drive."""
+        _ = self.idf
 
-        Raises:
-            MapCorruptError: the node's landmarks do not match their hash.
-        """
+    def of_node(self, node: int) -> NDArray[np.int32]:
+        """See `WordSource`; none of a node that is damaged: whoever attempts it says so."""
         words = self._of_node.get(node)
         if words is None:
             words = self._read(self._graph.node(node).id)
@@ -95,7 +96,10 @@ class QuantisedWords:
         vocabulary = self._loaded
         words = self._known.get(node)
         if words is None:
-            frame = self._frames.frame(node)
+            try:
+                frame = self._frames.frame(node)
+            except MapCorruptError:
+                return np.zeros(0, np.int32)
             words = vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
         return words
 
