@@ -49,7 +49,8 @@ class RecallConstants:
 
 
 # Found on `village@2`, a town that nothing is judged on, as `benchmarks/fit_recall.py` does it, and
-# rounded: what is lost depends little on any of them but the distance.
+# rounded: what is lost depends little on any of them but the distance. Likeness and what counts as
+# vague are of other origin (docs/ranking.md).
 RECALL = RecallConstants(
     distance=1.1,
     lessons=0.3,
@@ -102,9 +103,9 @@ class RecallPolicy:
     """By the inliers that a match would have, picked greedily and diversely.
 
     Inliers fall exponentially with distance. What is left when that is made up for tells how
-    alike the node's drive looks now: this run's attempts say so, the newest loudest, and past
-    drives where it has not tried. Each pick is made as if those before it had failed: what would
-    fail with them comes later.
+    alike the node's drive looks now: this run's attempts say so, the newest loudest, past drives
+    where it has not tried, and words where nobody knows the distance. Each pick is made as if those
+    before it had failed: what would fail with them comes later.
 
     Args:
         constants: None for those that ship with the package.
