@@ -7,6 +7,7 @@ import numpy as np
 from engram.experience.basin import MatchBasin
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import (
+    Attempt,
     Clock,
     Edge,
     EdgeKind,
@@ -32,6 +33,7 @@ from engram.ranking import (
     RunAttempts,
     SessionTimes,
 )
+from engram.store import MapContents
 
 CAMERA = CameraId("0" * 32)
 
@@ -210,3 +212,26 @@ def make_context(
         ),
         live_words=None if live_words is None else lambda: np.array(sorted(live_words), np.int32),
     )
+
+
+def attempts_of(contents: MapContents, session: SessionId) -> list[Attempt]:
+    """The remembered attempts of one session as records."""
+    made = contents.attempts
+    place = next((at for at, one in enumerate(contents.sessions) if one.id == session), -1)
+    return [
+        Attempt(
+            iteration=int(made.iteration[row]),
+            reference=contents.nodes[made.reference[row]].id,
+            node=contents.nodes[made.node[row]].id,
+            along_m=float(made.along_m[row]),
+            across_m=float(made.across_m[row]),
+            yaw_rad=float(made.yaw_rad[row]),
+            sigma_m=float(made.sigma_m[row]),
+            sigma_yaw_rad=float(made.sigma_yaw_rad[row]),
+            accepted=bool(made.accepted[row]),
+            inliers=int(made.inliers[row]),
+            rank=int(made.rank[row]),
+            policy=made.policies[made.policy[row]],
+        )
+        for row in np.flatnonzero(made.session == place)
+    ]

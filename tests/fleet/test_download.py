@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.worlds import attempts_of
 
 from engram.drive.place_words import keep_missing_words, stored_words
 from engram.errors import ConfigError, InputError, NotAMapError, RevisionError
@@ -120,7 +121,7 @@ def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
         assert set(mine.path_entries) == set(given.path_entries)
         assert len(mine.attempts) == len(given.attempts)
         for session in mine.sessions:
-            assert mine.attempts_of(session.id) == given.attempts_of(session.id)
+            assert attempts_of(mine, session.id) == attempts_of(given, session.id)
         keys = [{(e.a, e.b, e.kind) for e in one.edges} for one in (mine, given)]
         assert keys[0] == keys[1]
         assert ours.landmark_hashes() == theirs.landmark_hashes()

@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from tests.worlds import attempts_of
 
 from engram.drive import open_map
 from engram.experience.model import EdgeKind, PathEntryKind, path_id
@@ -30,8 +31,8 @@ def test_an_empty_centre_takes_everything_to_the_byte(tmp_path, fleet):
         assert ours.landmark_hashes() == theirs.landmark_hashes()
         assert ours.omissions() == {}
         for session in given.sessions:
-            kept = mine.attempts_of(session.id)[: len(given.attempts_of(session.id))]
-            assert kept == given.attempts_of(session.id)
+            kept = attempts_of(mine, session.id)[: len(attempts_of(given, session.id))]
+            assert kept == attempts_of(given, session.id)
     assert (report.taken, report.omitted, report.revision) == (len(given.nodes), 0, 1)
     assert report.segments[0].seed is Seed.NONE
     assert_sound(centre)
@@ -203,7 +204,7 @@ def test_attempts_go_along_to_the_equivalents(tmp_path, fleet):
     (drive,) = [
         one for one in given.sessions if one.start_ns == max(s.start_ns for s in given.sessions)
     ]
-    made, kept = given.attempts_of(drive.id), mine.attempts_of(drive.id)
+    made, kept = attempts_of(given, drive.id), attempts_of(mine, drive.id)
     assert report.attempts > 0
     assert len(kept) >= len(made) > 20
     for one, now in zip(made, kept, strict=False):

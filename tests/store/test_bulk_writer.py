@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import insert
+from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.experience.model import (
@@ -58,7 +59,7 @@ def assert_same_contents(copy: MapStore, source: MapStore) -> None:
     assert read.path_entries == written.path_entries
     assert_same_edges(read.edges, list(written.edges))
     for one in written.sessions:
-        assert read.attempts_of(one.id) == written.attempts_of(one.id)
+        assert attempts_of(read, one.id) == attempts_of(written, one.id)
     assert copy.frontends() == source.frontends()
     assert copy.landmark_hashes() == source.landmark_hashes()
     assert copy.statistics() == source.statistics()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError
 from engram.experience.model import EdgeKind
@@ -34,7 +35,7 @@ def test_format_1_reads_as_it_was_written(old):
         expected += [node(session("robot-2"), index) for index in range(3)]
         assert contents.nodes == tuple(expected)
         assert len(contents.path_entries) == 7
-        made = contents.attempts_of(session("robot-2").id)
+        made = attempts_of(contents, session("robot-2").id)
         assert [(one.iteration, one.rank) for one in made] == [
             (iteration, rank) for iteration in (1, 2) for rank in range(3)
         ]

@@ -8,6 +8,7 @@ import os
 import numpy as np
 import pytest
 from sqlalchemy import insert
+from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, MapLockedError, RevisionError
 from engram.experience.model import EdgeKind, NodeId, PathEntry, PathEntryKind
@@ -44,7 +45,7 @@ def assert_holds(store: MapStore, *drives: Drive) -> None:
     assert_same_edges(contents.edges, [edge for drive in drives for edge in drive.edges])
     assert contents.path_entries == tuple(entry for drive in drives for entry in drive.entries)
     for drive in drives:
-        read = contents.attempts_of(drive.session.id)
+        read = attempts_of(contents, drive.session.id)
         assert [(a.iteration, a.node, a.rank) for a in read] == [
             (a.iteration, a.node, a.rank) for a in drive.attempts
         ]
@@ -331,7 +332,7 @@ class TestHidden:
         assert contents.nodes == tuple(one for one in drive.nodes if one.id != gone)
         assert_same_edges(contents.edges, [e for e in drive.edges if gone not in {e.a, e.b}])
         assert [e.sequence for e in contents.path_entries] == [0, 1, 3, 4]
-        assert {a.iteration for a in contents.attempts_of(session().id)} == {1, 4}
+        assert {a.iteration for a in attempts_of(contents, session().id)} == {1, 4}
         info = store.info()
         assert (info.nodes, info.edges, info.path_entries) == (4, 2, 4)
         with MapStore.open(location) as reader, pytest.raises(InputError, match="not part"):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.experience.basin import BasinCounts, count_attempts
-from engram.experience.model import Attempt, Edge, Node, PathEntry, Session, SessionId
+from engram.experience.model import Edge, Node, PathEntry, Session, SessionId
 from engram.frontend import DescriptorKind, FrameStatus
 from engram.geometry import CameraId, StereoCamera
 
@@ -219,28 +219,6 @@ class MapContents:
                 made.session[newest].tolist(), made.iteration[newest].tolist(), strict=True
             )
         }
-
-    def attempts_of(self, session: SessionId) -> list[Attempt]:
-        """The remembered attempts of one session as records."""
-        place = next((at for at, one in enumerate(self.sessions) if one.id == session), -1)
-        return [self._attempt(int(row)) for row in np.flatnonzero(self.attempts.session == place)]
-
-    def _attempt(self, row: int) -> Attempt:
-        arrays = self.attempts
-        return Attempt(
-            iteration=int(arrays.iteration[row]),
-            reference=self.nodes[arrays.reference[row]].id,
-            node=self.nodes[arrays.node[row]].id,
-            along_m=float(arrays.along_m[row]),
-            across_m=float(arrays.across_m[row]),
-            yaw_rad=float(arrays.yaw_rad[row]),
-            sigma_m=float(arrays.sigma_m[row]),
-            sigma_yaw_rad=float(arrays.sigma_yaw_rad[row]),
-            accepted=bool(arrays.accepted[row]),
-            inliers=int(arrays.inliers[row]),
-            rank=int(arrays.rank[row]),
-            policy=arrays.policies[arrays.policy[row]],
-        )
 
 
 @dataclass(frozen=True, slots=True)
