@@ -29,10 +29,11 @@ from engram.localiser import (
     Localisation,
     Localiser,
     Matcher,
+    Motion,
     Relocaliser,
     Searched,
 )
-from engram.odometry import Odometry
+from engram.odometry import Odometry, OdometryStep
 from engram.places import Vocabulary, decode_vocabulary, default_vocabulary
 from engram.ranking import (
     Background,
@@ -173,6 +174,7 @@ class OpenMap:
         matcher: Matcher | None = None,
         threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
+        motion: Callable[[OdometryStep, int], Motion | None] | None = None,
         clock: Clocked | None = None,
     ) -> Localiser:
         """A localiser for one session in this map.
@@ -186,7 +188,7 @@ class OpenMap:
             live: the live session.
             saves: whether it is being mapped.
             threads: whether lanes run on threads.
-            matcher, search: in place of the map's own; see `Localiser`.
+            matcher, search, motion: in place of the usual ones; see `Localiser`.
             clock: what its stamps mean, and where it is; None if unknown.
 
         Raises:
@@ -212,6 +214,7 @@ class OpenMap:
             matcher=matcher,
             threads=threads,
             search=search,
+            motion=motion,
             background=background,
             clock=clock,
         )

@@ -20,7 +20,7 @@ from engram.experience.model import NodeId
 from engram.experience.neighbourhood import Neighbourhood
 from engram.frontend import Frame
 from engram.geometry import SE3
-from engram.localiser import Localiser, Matcher, Position, driven_steps_m
+from engram.localiser import GapFiller, Localiser, Matcher, Motion, Position, driven_steps_m
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.sequences import LoggedFrame
 
@@ -60,6 +60,22 @@ class SharedSearch:
             found = self._search(reference, reference_from_live, covariance, **options)
             self._known[key] = found
         return found
+
+
+class SharedMotion:
+    """Fills the gaps of odometry for all: it depends on the drive alone."""
+
+    def __init__(self) -> None:
+        self._gaps = GapFiller()
+        self._asked: tuple[OdometryStep, int] | None = None
+        self._motion: Motion | None = None
+
+    def __call__(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
+        """See `GapFiller.motion`; asked again for the very same step it says the same."""
+        if self._asked is None or odometry is not self._asked[0] or stamp_ns != self._asked[1]:
+            self._motion = self._gaps.motion(odometry, stamp_ns)
+            self._asked = odometry, stamp_ns
+        return self._motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,6 +253,7 @@ def _localisers(
 ) -> Iterator[list[Localiser]]:
     """One per configuration; in one map they share what is known of it."""
     views: dict[PathKinds, OpenMap] = {}
+    motion = SharedMotion()
     with ExitStack() as stack:
         localisers = []
         for one in configurations:
@@ -252,6 +269,7 @@ def _localisers(
                 live=situation.drive.session.id,
                 matcher=matcher,
                 search=search,
+                motion=motion,
                 clock=situation.drive.session,
             )
             localiser.keeps_attempts = False  # nothing is written

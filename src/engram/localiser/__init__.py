@@ -11,7 +11,7 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
-from engram.localiser.gaps import driven_steps_m
+from engram.localiser.gaps import GapFiller, Motion, driven_steps_m
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
 from engram.localiser.place_book import PlaceBook, Searched
@@ -34,11 +34,13 @@ __all__ = [
     "ByAppearance",
     "Exhaustive",
     "FrameMatcher",
+    "GapFiller",
     "Localisation",
     "LocalisationStatus",
     "Localiser",
     "LocaliserConfig",
     "Matcher",
+    "Motion",
     "PlaceBelief",
     "PlaceBook",
     "Position",

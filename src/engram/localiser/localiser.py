@@ -146,6 +146,8 @@ class Localiser:
         threads: whether lanes run on threads; a `matcher` that is given says so itself.
         search: finds the candidates; None for the graph's own `neighbourhood`. Localisers in step
             with each other, in a graph that does not grow, may share one that remembers.
+        motion: fills the gaps of odometry; None for a `GapFiller` of its own. Localisers in step
+            with each other may share one that remembers.
         background: what policies may know of the map beyond its graph and paths.
         clock: what the live frames' stamps mean, and where the robot is; None if unknown.
     """
@@ -166,6 +168,7 @@ class Localiser:
         matcher: Matcher | None = None,
         threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
+        motion: Callable[[OdometryStep, int], Motion | None] | None = None,
         background: Background | None = None,
         clock: Clocked | None = None,
     ) -> None:
@@ -197,7 +200,7 @@ class Localiser:
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
-        self._gaps = GapFiller()
+        self._motion_of = GapFiller().motion if motion is None else motion
         self._motion: Motion | None = None
         # Variance of the motion guessed since the robot last knew where it was, m².
         self._guessed_m2 = 0.0
@@ -341,7 +344,7 @@ class Localiser:
             odometry: the step that ends in the frame.
             stamp_ns: stamp of the frame.
         """
-        self._motion = motion = self._gaps.motion(odometry, stamp_ns)
+        self._motion = motion = self._motion_of(odometry, stamp_ns)
         if motion is None:
             return
         moved_m = motion.prev_from_curr.distance_m
