@@ -71,6 +71,8 @@ def graph_candidates(
     view_gate_rad: float,
     slack_sigmas: float,
     slack_m: float,
+    vague_m: float,
+    detour_m: float,
     sessions: NDArray[np.int32],
     driven_m: NDArray[np.float64],
     own_session: int,

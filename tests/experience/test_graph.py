@@ -49,9 +49,18 @@ def random_graph(seed: int, nodes: int = 60, extra: int = 60) -> ExperienceGraph
     return graph
 
 
-@given(st.integers(0, 2**31), st.floats(2, 12), st.floats(0.3, 3.2), st.floats(0, 6))
-@settings(max_examples=40)
-def test_neighbourhood_equals_plain_python(seed, radius_m, gate_rad, margin_m) -> None:
+@given(
+    st.integers(0, 2**31),
+    st.floats(2, 12),
+    st.floats(0.3, 3.2),
+    st.floats(0, 6),
+    st.floats(0, 2),
+    st.floats(0, 10),
+)
+@settings(max_examples=60)
+def test_neighbourhood_equals_plain_python(
+    seed, radius_m, gate_rad, margin_m, vague_m, detour_m
+) -> None:
     graph = random_graph(seed)
     rng = np.random.default_rng(seed)
     reference_from_live = SE3.exp(rng.normal(size=6) * [1, 0.1, 1, 0.01, 0.3, 0.01])
@@ -59,10 +68,12 @@ def test_neighbourhood_equals_plain_python(seed, radius_m, gate_rad, margin_m) -
     found = graph.neighbourhood(
         5, reference_from_live, root @ root.T,
         radius_m=radius_m, view_gate_rad=gate_rad, margin_m=margin_m, slack_sigmas=0.0,
+        vague_m=vague_m, detour_m=detour_m,
     )  # fmt: skip
     expected = oracle.neighbourhood(
-        graph, 5, reference_from_live, root @ root.T, radius_m, gate_rad, margin_m
-    )
+        graph, 5, reference_from_live, root @ root.T,
+        radius_m, gate_rad, margin_m, vague_m, detour_m,
+    )  # fmt: skip
     assert set(found.nodes.tolist()) == set(expected)
     for row, node in enumerate(found.nodes.tolist()):
         pose, sigma_m, sigma_yaw = expected[node]
@@ -189,6 +200,17 @@ def test_uncertain_candidates_are_kept_though_predicted_just_outside() -> None:
     strict = graph.neighbourhood(0, SE3.identity(), TIGHT, slack_sigmas=0.0, **query)
     assert 2 in loose.nodes
     assert 2 not in strict.nodes
+
+
+def test_a_vague_chain_does_not_bring_near_what_is_known_to_be_elsewhere() -> None:
+    graph, nodes = chain_graph(40)
+    gap = make_edge(nodes[0].id, nodes[35].id, forward(30.0), EdgeKind.PROXIMITY, (15.0, 0.1))
+    graph.add_edge(gap)
+    query = {"radius_m": 8.0, "view_gate_rad": 1.0}
+    taken_in = graph.neighbourhood(0, SE3.identity(), TIGHT, detour_m=0.0, **query)
+    assert {35, 36}.issubset(taken_in.nodes.tolist())
+    near = graph.neighbourhood(0, SE3.identity(), TIGHT, **query)
+    assert sorted(near.nodes.tolist()) == list(range(9))
 
 
 def test_newest_edge_with_the_same_key_counts() -> None:

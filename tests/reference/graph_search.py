@@ -41,18 +41,41 @@ def chains(graph: ExperienceGraph, root: int, anchor=None, reach_m: float = np.i
     return settled
 
 
-def neighbourhood(graph, reference, reference_from_live, covariance, radius_m, gate_rad, margin_m):
+def neighbourhood(
+    graph,
+    reference,
+    reference_from_live,
+    covariance,
+    radius_m,
+    gate_rad,
+    margin_m,
+    vague_m,
+    detour_m,
+):
     """node -> (node_from_live, sigma_m, sigma_yaw_rad) of the candidates, no slack."""
     live = reference_from_live.translation
     reach_m = max(radius_m, float(np.linalg.norm(live))) + margin_m
     own = PivotedError.from_covariance(covariance)
     own_term = (own.translation_var, own.rotation_var, own.pivot_in_a)
+    wide = chains(graph, reference, live, reach_m + detour_m)
+
+    def sight(pose, errors):
+        node_from_live = pose.inverse() @ reference_from_live
+        near = node_from_live.distance_m <= radius_m and abs(node_from_live.yaw_rad) <= gate_rad
+        terms = [*errors, own_term]
+        sigma_yaw = np.sqrt(sum(v for _, v, _ in terms))
+        return near, (node_from_live, np.sqrt(variance_at(live, terms)), sigma_yaw)
+
     found = {}
     for node, (pose, errors, _) in chains(graph, reference, live, reach_m).items():
-        node_from_live = pose.inverse() @ reference_from_live
-        if node_from_live.distance_m > radius_m or abs(node_from_live.yaw_rad) > gate_rad:
-            continue
-        terms = [*errors, own_term]
-        variance = sum(tau + v * np.sum((live - pivot) ** 2) for tau, v, pivot in terms)
-        found[node] = (node_from_live, np.sqrt(variance), np.sqrt(sum(v for _, v, _ in terms)))
+        near, seen = sight(pose, errors)
+        if near and variance_at(live, errors) > vague_m**2:
+            near, seen = sight(*wide[node][:2])
+        if near:
+            found[node] = seen
     return found
+
+
+def variance_at(point, terms):
+    """Of a chain's translation, as seen at a point."""
+    return sum(tau + v * np.sum((point - pivot) ** 2) for tau, v, pivot in terms)

@@ -240,21 +240,39 @@ void mean_pivot(const ChainError &error, const double *live, double *pivot) {
     pivot[i] = error.s0 > 0 ? error.s1[i] / error.s0 : live[i];
 }
 
-void add_candidate(const CandidateQuery &query, const Reached &row, Candidates &found) {
+// A node as seen from the live camera, and how well that is known.
+struct Sight {
   double node_from_live[12];
-  compose_inverse(row.root_from_node, query.reference_from_live, node_from_live);
-  const double *offset = node_from_live + 9;
-  ChainError error = row.error;
-  add_error(error, query.live_error[0], query.live_error[1], query.live_error + 2);
-  const double *live = query.reference_from_live + 9;
-  const double sigma = std::sqrt(variance_at(error, live)), sigma_yaw = std::sqrt(error.s0);
-  const double distance = std::sqrt(dot(offset, offset));
-  const double yaw = std::atan2(node_from_live[2], node_from_live[8]);
-  if (distance > query.radius_m + std::min(query.slack_sigmas * sigma, query.slack_m) ||
-      std::abs(yaw) > query.view_gate_rad + query.slack_sigmas * sigma_yaw)
+  ChainError error;
+  double distance, sigma, yaw, sigma_yaw;
+};
+
+Sight sight_of(const CandidateQuery &query, const Reached &row) {
+  Sight sight;
+  compose_inverse(row.root_from_node, query.reference_from_live, sight.node_from_live);
+  sight.error = row.error;
+  add_error(sight.error, query.live_error[0], query.live_error[1], query.live_error + 2);
+  const double *offset = sight.node_from_live + 9;
+  sight.distance = std::sqrt(dot(offset, offset));
+  sight.sigma = std::sqrt(variance_at(sight.error, query.reference_from_live + 9));
+  sight.yaw = std::atan2(sight.node_from_live[2], sight.node_from_live[8]);
+  sight.sigma_yaw = std::sqrt(sight.error.s0);
+  return sight;
+}
+
+bool may_be_near(const CandidateQuery &query, const Sight &sight) {
+  return sight.distance <=
+             query.radius_m + std::min(query.slack_sigmas * sight.sigma, query.slack_m) &&
+         std::abs(sight.yaw) <= query.view_gate_rad + query.slack_sigmas * sight.sigma_yaw;
+}
+
+void add_candidate(const CandidateQuery &query, const Reached &row, Candidates &found) {
+  const Sight sight = sight_of(query, row);
+  if (!may_be_near(query, sight))
     return;
+  const double *offset = sight.node_from_live + 9;
   double pivot_in_reference[3];
-  mean_pivot(error, live, pivot_in_reference);
+  mean_pivot(sight.error, query.reference_from_live + 9, pivot_in_reference);
   const double reference_from_pivot[12] = {
       1, 0, 0, 0, 1, 0, 0, 0, 1, pivot_in_reference[0], pivot_in_reference[1],
       pivot_in_reference[2]};
@@ -262,17 +280,17 @@ void add_candidate(const CandidateQuery &query, const Reached &row, Candidates &
   compose_inverse(row.root_from_node, reference_from_pivot, node_from_pivot);
   found.nodes.push_back(row.node);
   for (int i = 0; i < 3; ++i) {
-    found.node_from_live.insert(found.node_from_live.end(), node_from_live + 3 * i,
-                                node_from_live + 3 * i + 3);
+    found.node_from_live.insert(found.node_from_live.end(), sight.node_from_live + 3 * i,
+                                sight.node_from_live + 3 * i + 3);
     found.node_from_live.push_back(offset[i]);
   }
   found.node_from_live.insert(found.node_from_live.end(), {0, 0, 0, 1});
-  found.distance_m.push_back(distance);
+  found.distance_m.push_back(sight.distance);
   found.along_m.push_back(offset[2]);
   found.across_m.push_back(offset[0]);
-  found.yaw_rad.push_back(yaw);
-  found.sigma_m.push_back(sigma);
-  found.sigma_yaw_rad.push_back(sigma_yaw);
+  found.yaw_rad.push_back(sight.yaw);
+  found.sigma_m.push_back(sight.sigma);
+  found.sigma_yaw_rad.push_back(sight.sigma_yaw);
   found.pivot_in_node.insert(found.pivot_in_node.end(), node_from_pivot + 9, node_from_pivot + 12);
 }
 
@@ -374,17 +392,39 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
   // The reference may lie behind, after a while on odometry alone: reach at least as far as it.
   const double *live = query.reference_from_live + 9;
   const double reach = std::max(query.radius_m, std::sqrt(dot(live, live))) + query.margin_m;
-  const SearchLimits limits{live, reach, query.slack_sigmas, query.slack_m, nullptr, nullptr, 0};
-  static thread_local std::vector<Reached> seen;
-  std::vector<int32_t> order;
+  SearchLimits limits{live, reach, query.slack_sigmas, query.slack_m, nullptr, nullptr, 0};
+  static thread_local std::vector<Reached> near, wide;
+  std::vector<const Reached *> chains;
+  std::vector<int32_t> vague;
   {
-    Search search(graph, limits, seen);
-    order = search.run(query.reference);
+    Search search(graph, limits, near);
+    for (const int32_t row : search.run(query.reference)) {
+      const Reached &chain = near[static_cast<size_t>(row)];
+      if (variance_at(chain.error, live) <= query.vague_m * query.vague_m)
+        chains.push_back(&chain);
+      else if (may_be_near(query, sight_of(query, chain)))
+        vague.push_back(chain.node);
+    }
   }
-  found.node_from_live.reserve(16 * order.size());
-  for (const int32_t row : order)
-    if (!is_own_recent(query, seen[static_cast<size_t>(row)].node))
-      add_candidate(query, seen[static_cast<size_t>(row)], found);
+  if (!vague.empty()) {
+    std::sort(vague.begin(), vague.end());
+    limits.reach_m += query.detour_m;
+    limits.goals = vague.data();
+    limits.goal_count = static_cast<int32_t>(vague.size());
+    Search search(graph, limits, wide);
+    for (const int32_t row : search.run(query.reference)) {
+      const Reached &chain = wide[static_cast<size_t>(row)];
+      if (std::binary_search(vague.begin(), vague.end(), chain.node))
+        chains.push_back(&chain);
+    }
+    std::sort(chains.begin(), chains.end(), [](const Reached *a, const Reached *b) {
+      return a->cost != b->cost ? a->cost < b->cost : a->node < b->node;
+    });
+  }
+  found.node_from_live.reserve(16 * chains.size());
+  for (const Reached *chain : chains)
+    if (!is_own_recent(query, chain->node))
+      add_candidate(query, *chain, found);
 }
 
 } // namespace engram::ENGRAM_ISA

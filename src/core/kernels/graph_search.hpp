@@ -60,6 +60,9 @@ struct CandidateQuery {
   const double *reference_from_live; // (12)
   const double *live_error;          // (5) tau, v, pivot in the reference's frame
   double radius_m, margin_m, view_gate_rad, slack_sigmas, slack_m;
+  // Where the chain to a node is vaguer than this, a better one is looked for that goes so much
+  // further out: a vague chain may say that a node is near of which others know that it is not.
+  double vague_m, detour_m;
   const int32_t *sessions; // (nodes)
   const double *driven_m;  // (nodes)
   int32_t own_session;     // -1 for none

@@ -25,6 +25,10 @@ DEFAULT_MARGIN_M = 12.0
 DEFAULT_SLACK_SIGMAS = 2.0
 # Beyond this the map does not know where the node is, and looking for it there costs too much.
 DEFAULT_SLACK_M = 30.0
+# Chains through a gap of odometry are vaguer than this, others hardly ever.
+DEFAULT_VAGUE_M = 1.0
+# How much further out a better chain is looked for: about a block of houses.
+DEFAULT_DETOUR_M = 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -351,6 +355,8 @@ class ExperienceGraph:
         margin_m: float = DEFAULT_MARGIN_M,
         slack_sigmas: float = DEFAULT_SLACK_SIGMAS,
         slack_m: float = DEFAULT_SLACK_M,
+        vague_m: float = DEFAULT_VAGUE_M,
+        detour_m: float = DEFAULT_DETOUR_M,
     ) -> Neighbourhood:
         """The candidates Y near the live camera (SPEC §3.1).
 
@@ -366,6 +372,10 @@ class ExperienceGraph:
         the prediction (the distance by no more than `slack_m`): so nodes that are truly within are
         in, also where the map is loose. The search's reach is extended alike.
 
+        Sharp chains end at the reach, vague ones lead back into it: through a gap of odometry a
+        node may seem to be near of which the road around knows that it is not. For such nodes a
+        better chain is looked for that may go `detour_m` further out.
+
         Args:
             reference: dense index of the node that the position refers to.
             reference_from_live: the live camera in that node.
@@ -379,6 +389,8 @@ class ExperienceGraph:
             margin_m: see above.
             slack_sigmas: see above.
             slack_m: see above.
+            vague_m: standard deviation of a chain past which a better one is looked for.
+            detour_m: see above.
         """
         number = None if own_session is None else self._session_index.get(own_session)
         columns = _core.graph_candidates(
@@ -391,6 +403,8 @@ class ExperienceGraph:
             view_gate_rad,
             slack_sigmas,
             slack_m,
+            vague_m,
+            detour_m,
             self._node_sessions.rows,
             self._driven_m.rows,
             -1 if number is None else number,
