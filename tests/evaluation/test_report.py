@@ -91,7 +91,9 @@ def plan(tmp_path_factory, monkeypatch_module=None) -> Plan:
             write_runs(plan.runs_path(session, "memo"), made_up_runs(session, configurations))
             if fold.number == 0:
                 live = [Configuration(one, 2) for one in MISSES if one != "oracle"]
-                write_runs(plan.runs_path(session, "live"), made_up_runs(session, live))
+                guided = made_up_runs(session, live)
+                guided.matched[live.index(Configuration("path", 2))] = True
+                write_runs(plan.runs_path(session, "live"), guided)
     return plan
 
 
@@ -190,6 +192,17 @@ def test_claims_stand_beside_what_was_measured(out: Path) -> None:
     assert "11.00×" in to_bound
     for policy in MISSES:
         assert f"| {policy} | " in text
+
+
+def test_guided_runs_stand_beside_the_unguided_ones_of_the_same_sessions(out: Path) -> None:
+    text = (out / "claims.md").read_text()
+    guided = text[text.index("Guided and without memo, as on a robot: 2 sessions") :]
+    rows = {line.split(" | ")[0].lstrip("| "): line for line in guided.splitlines()}
+    assert set(MISSES) - {"oracle"} < set(rows)
+    assert "oracle" not in rows
+    share = "15.00 % (15.00 … 15.00)"
+    assert rows["distance"].startswith(f"| distance | {share} | {share} | ")
+    assert rows["path"].startswith("| path | 0.00 % (0.00 … 0.00) | 5.00 % (5.00 … 5.00) | ")
 
 
 def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path) -> None:

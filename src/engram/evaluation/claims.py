@@ -6,10 +6,16 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from engram.evaluation.configurations import EVERYTHING, UNLIMITED, PathKinds, Radius
+from engram.evaluation.configurations import (
+    EVERYTHING,
+    UNLIMITED,
+    Configuration,
+    PathKinds,
+    Radius,
+)
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
 from engram.evaluation.wording import Row, against, percent, table, times
-from engram.measures import beats, difference, excess_ratio, ratio
+from engram.measures import Resamples, beats, difference, excess_ratio, ratio
 
 # Shares as low as this differ by less than anyone would notice: added to both sides of ratios to
 # the oracle.
@@ -22,6 +28,7 @@ def claims_page(campaigns: Sequence[CampaignResult]) -> str:
     lines: list[str] = []
     for campaign in campaigns:
         lines += [f"## {campaign.name}", "", *_policies(campaign), "", *_claims(campaign), ""]
+        lines += _guided(campaign)
         if not campaign.with_truth:
             lines += [
                 "The drives have no truth beside them: no pose errors, no false successes.",
@@ -259,25 +266,67 @@ def _seen(campaign: CampaignResult) -> Iterable[Row]:
 
 def _order(campaign: CampaignResult) -> Iterable[Row]:
     """Whether the guided, unmemoised runs put the policies in the order of the memoised ones."""
-    live = {one.policy: result for one, result in campaign.live.items()}
-    memo = {policy: campaign.get(policy) for policy in live}
-    if len(live) < 2 or any(one is None for one in memo.values()):
+    pairs = _guided_and_not(campaign)
+    if len(pairs) < 2:
         return
-    known = {policy: one for policy, one in memo.items() if one is not None}
-    by_live = sorted(live, key=lambda p: live[p].not_localised.value)
-    sessions = {one.session for result in live.values() for one in result.sessions}
-    same = {
-        policy: ConfigurationResult(
-            one.configuration, [s for s in one.sessions if s.session in sessions]
-        ).not_localised.value
-        for policy, one in known.items()
-    }
-    by_memo = sorted(known, key=lambda p: same[p])
-    text = ", ".join(f"{p} {100 * live[p].not_localised.value:.2f} %" for p in by_live)
+    by_live = sorted(pairs, key=lambda pair: pair[0].not_localised.value)
+    by_memo = sorted(pairs, key=lambda pair: pair[1].not_localised.value)
+    text = ", ".join(_missed(live) for live, _ in by_live)
     if by_live != by_memo:
-        text += "; memoised: " + ", ".join(f"{p} {100 * same[p]:.2f} %" for p in by_memo)
-    what = f"route not localised guided and unmemoised, {len(sessions)} sessions"
+        text += "; memoised: " + ", ".join(_missed(memo) for _, memo in by_memo)
+    what = f"route not localised guided and unmemoised, {len(pairs[0][0].sessions)} sessions"
     yield (what, "–", "order as memoised", "", text)
+
+
+def _guided(campaign: CampaignResult) -> list[str]:
+    """The product as it runs on a robot beside the memoised, unguided runs of the same sessions."""
+    pairs = _guided_and_not(campaign)
+    if not pairs:
+        return []
+    resamples = Resamples.of(len(pairs[0][0].sessions), seed=campaign.seed)
+    head = (
+        "policy",
+        "route not localised",
+        "unguided",
+        "P(> 10 m)",
+        "unguided",
+        "false successes",
+        "unguided",
+        "ms per frame",
+    )
+    rows = [
+        (
+            live.configuration.policy,
+            *(percent(resamples.interval(one.not_localised)) for one in (live, memo)),
+            *(f"{100 * one.failure(10.0).value:.2f} %" for one in (live, memo)),
+            *(_false(one) for one in (live, memo)),
+            f"{live.step_ms:.1f}",
+        )
+        for live, memo in pairs
+    ]
+    title = f"Guided and without memo, as on a robot: {len(pairs[0][0].sessions)} sessions"
+    return [title, "", *table(head, rows), ""]
+
+
+def _guided_and_not(
+    campaign: CampaignResult,
+) -> list[tuple[ConfigurationResult, ConfigurationResult]]:
+    """Of each policy that was run live, these runs and the memoised ones of the same sessions."""
+    pairs = []
+    for policy in campaign.policies:
+        live, memo = (
+            campaign.live.get(Configuration(policy, campaign.few_lanes)),
+            campaign.get(policy),
+        )
+        if live is not None and memo is not None:
+            names = {one.session for one in live.sessions}
+            same = [one for one in memo.sessions if one.session in names]
+            pairs.append((live, ConfigurationResult(memo.configuration, same)))
+    return pairs
+
+
+def _missed(result: ConfigurationResult) -> str:
+    return f"{result.configuration.policy} {100 * result.not_localised.value:.2f} %"
 
 
 def _against(campaign: CampaignResult, a: ConfigurationResult, b: ConfigurationResult) -> str:
