@@ -51,7 +51,7 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
     for estimator in Estimator:
         draw(
             f"fig12_curves_{estimator.value}.png",
-            [_curves(one, lanes, estimator) for one in campaigns for lanes in (2, 4)],
+            [_curves(one, lanes, estimator) for lanes in (2, 4) for one in campaigns],
             f"failure curves; P(X ≥ x) = {FORMULAS[estimator]}",
         )
     draw("fig13_T.png", map(_sensitivity, campaigns), "sensitivity of path to T, Np = 2")

@@ -10,8 +10,10 @@ import numpy as np
 from engram.errors import MissingExtraError
 
 
-def subplots(count: int, *, width: float, height: float) -> tuple[Any, list[Any]]:
-    """A figure with some axes in a row; sizes in inches.
+def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple[Any, list[Any]]:
+    """A figure with some axes in a row, or in rows of which the last may be shorter.
+
+    Sizes are those of the figure, in inches.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.
@@ -23,10 +25,14 @@ def subplots(count: int, *, width: float, height: float) -> tuple[Any, list[Any]
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
+    columns = -(-count // rows)
     figure, axes = pyplot.subplots(
-        1, count, figsize=(width, height), layout="constrained", squeeze=False
+        rows, columns, figsize=(width, height), layout="constrained", squeeze=False
     )
-    return figure, list(np.ravel(axes))
+    every = list(np.ravel(axes))
+    for unused in every[count:]:
+        unused.remove()
+    return figure, every[:count]
 
 
 def save(figure: Any, path: Path) -> None:

@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 # Ten colours that differ in lightness too, then other line styles.
 _STYLES = ("-", "--", ":")
+_PANELS_IN_A_ROW = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,12 +71,15 @@ class _Looks:
 
 
 def draw_curves(panels: Sequence[Panel], path: Path, title: str) -> None:
-    """Draws panels in a row into an image file, with one legend.
+    """Draws panels into an image file, up to four in a row, with one legend.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.
     """
-    figure, axes = subplots(len(panels), width=max(4.6 * len(panels), 6.5) + 2.0, height=4.2)
+    rows = -(-len(panels) // _PANELS_IN_A_ROW)
+    columns = -(-len(panels) // rows)
+    width = max(4.6 * columns, 6.5) + 2.0
+    figure, axes = subplots(len(panels), width=width, height=4.2 * rows, rows=rows)
     looks = _Looks()
     handles: dict[str, Any] = {}
     for one, panel in zip(axes, panels, strict=True):
