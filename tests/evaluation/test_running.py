@@ -136,6 +136,22 @@ def test_more_policies_later_cost_only_what_is_new(plan: Plan, tmp_path: Path) -
     assert all(path.read_bytes() == bytes_ for path, bytes_ in before.items())
 
 
+def test_a_relocaliser_shares_maps_and_matches_but_not_results(
+    campaign, plan: Plan, tmp_path: Path
+) -> None:
+    work = tmp_path / plan.work.name
+    shutil.copytree(plan.work, work)
+    options = replace(plan.options, relocaliser="fabmap")
+    other = make_plan(campaign, Settings(), options, tmp_path)
+    assert other.work == work
+    maps = {path: path.read_bytes() for path in work.glob("fold*.engram")}
+    before = results(replace(plan, work=work))
+    run(other)
+    assert {path: path.read_bytes() for path in work.glob("fold*.engram")} == maps
+    assert results(replace(plan, work=work)) == before
+    assert set(results(other)) == set(before)
+
+
 def test_policies_are_run_again_in_the_folds_that_are_run(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)

@@ -80,9 +80,10 @@ def _policies(campaign: CampaignResult) -> list[str]:
         )
     count = max((len(one.sessions) for one in campaign.memo.values()), default=0)
     driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
+    found_again = "no relocalisation" if campaign.relocaliser is None else campaign.relocaliser
     title = (
         f"Np = {campaign.few_lanes}, Nr = 1, T = 10; {count} held-out sessions, "
-        f"{driven / 1e3:.1f} km, unguided, no relocalisation"
+        f"{driven / 1e3:.1f} km, unguided, {found_again}"
     )
     return [title, "", *table(head, rows)]
 

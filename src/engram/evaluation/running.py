@@ -124,8 +124,12 @@ class Plan:
         return self.work / f"fold{fold.number}.engram"
 
     def runs_path(self, session: int, mode: str) -> Path:
-        """Results of one held-out session; `mode` is "memo" or "live"."""
-        return self.work / f"{mode}-{self.drives.drives[session].name}.npz"
+        """Results of one held-out session; `mode` is "memo" or "live".
+
+        Maps and matches serve every relocaliser, results are its own.
+        """
+        with_it = "" if self.options.relocaliser is None else f"-{self.options.relocaliser}"
+        return self.work / f"{mode}{with_it}-{self.drives.drives[session].name}.npz"
 
     def configuration(self) -> dict[str, Any]:
         """The resolved configuration, kept with the results."""
@@ -146,7 +150,7 @@ class Plan:
 def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, work: Path) -> Plan:
     """A plan; its folder below `work` depends on all that its maps and results depend on.
 
-    More policies or lanes may be run later, and find there what was done.
+    More policies, lanes or relocalisers may be run later, and find there what was done.
     """
     settings = settings.for_descriptor(drives.drives[0].descriptor)
     depends = (
@@ -155,7 +159,6 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
         to_dict(options.build),
         options.folds,
         options.seed,
-        options.relocaliser,
         matcher_hash(settings.localiser.matcher),
         __version__,
     )

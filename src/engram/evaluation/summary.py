@@ -177,6 +177,7 @@ class CampaignResult:
         with_truth: whether pose errors are known.
         seed: of the bootstrap.
         few_lanes: Np of the figures that show one budget.
+        relocaliser: what found the lost; None for nothing.
         lap: per-frame candidates and possible successes of one session ([L15] Fig. 10); None
             where that was not run.
     """
@@ -187,6 +188,7 @@ class CampaignResult:
     with_truth: bool
     seed: int
     few_lanes: int
+    relocaliser: str | None
     lap: Lap | None
 
     @cached_property
@@ -262,7 +264,14 @@ def collect(plan: Plan) -> CampaignResult:
         for found in by_mode.values()
     )
     return CampaignResult(
-        plan.drives.name, memo, live, plan.drives.has_truth, options.seed, options.few_lanes, lap
+        plan.drives.name,
+        memo,
+        live,
+        plan.drives.has_truth,
+        options.seed,
+        options.few_lanes,
+        options.relocaliser,
+        lap,
     )
 
 
