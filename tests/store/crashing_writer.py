@@ -9,7 +9,8 @@ from store.maps import Drive, begin, session
 
 
 def say(*words: object) -> None:
-    print(*words, flush=True)
+    # In one piece, so that a kill cannot leave half a line, whatever the stream buffers.
+    print(" ".join(map(str, words)) + "\n", end="", flush=True)
 
 
 def main(path: str, sessions: int, nodes: int) -> None:
