@@ -25,9 +25,10 @@ DEFAULT_MARGIN_M = 12.0
 DEFAULT_SLACK_SIGMAS = 2.0
 # Beyond this the map does not know where the node is, and looking for it there costs too much.
 DEFAULT_SLACK_M = 30.0
-# Chains through a gap of odometry are vaguer than this, others hardly ever.
+# Chains through a gap of odometry are vaguer. 0.5 and 2 m give nearly the same candidates.
 DEFAULT_VAGUE_M = 1.0
-# How much further out a better chain is looked for: about a block of houses.
+# How much further out a better chain is looked for: about a block of houses. From 30 m on
+# candidates change by an eighth at most, and the search gets slower.
 DEFAULT_DETOUR_M = 60.0
 
 
