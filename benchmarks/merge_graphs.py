@@ -4,10 +4,12 @@
     python benchmarks/merge_graphs.py --cases 200 --workers 2
 
 A case is a few robots' maps: drives past places of a road in one of two looks, strung by
-odometry with holes and branches, tied here and there; some robots went out with the map of another.
+odometry with holes and branches, tied here and there; some robots went out with the map of another
+and know more of its attempts than it does.
 For each case:
 
 - the merged map is sound (`engram check`), and every node handed in is in it or omitted;
+- every remembered attempt that was handed in is remembered;
 - nodes that hang together in a robot's map do so in the centre, and it falls into no more parts
   than both had before;
 - handing any map in again changes nothing;
@@ -22,6 +24,7 @@ import argparse
 import random
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -32,6 +35,7 @@ import numpy as np
 
 from engram.drive import OpenMap, Settings
 from engram.experience.model import (
+    Attempt,
     Edge,
     EdgeKind,
     Node,
@@ -39,9 +43,11 @@ from engram.experience.model import (
     PathEntry,
     PathEntryKind,
     Session,
+    SessionId,
     path_id,
 )
 from engram.fleet import MergeOptions, MergeReport, merge_maps
+from engram.fleet.attempts import from_records
 from engram.geometry import SE3
 from engram.store import MapStore
 from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_bytes, node_of, stored
@@ -58,19 +64,31 @@ class RandomMap:
     Attributes:
         sessions: its drives.
         nodes: with place and appearance of each.
-        edges, entries: between them.
+        edges, entries, attempts: between them; attempts by session.
     """
 
     sessions: list[Session] = field(default_factory=list)
     nodes: dict[NodeId, tuple[Node, int, int]] = field(default_factory=dict)
     edges: dict[tuple[NodeId, NodeId, EdgeKind], Edge] = field(default_factory=dict)
     entries: list[PathEntry] = field(default_factory=list)
+    attempts: dict[SessionId, list[Attempt]] = field(default_factory=dict)
 
     def copy(self) -> RandomMap:
         """What a robot goes out with."""
         return RandomMap(
-            list(self.sessions), dict(self.nodes), dict(self.edges), list(self.entries)
+            list(self.sessions),
+            dict(self.nodes),
+            dict(self.edges),
+            list(self.entries),
+            dict(self.attempts),
         )
+
+    def forget(self, rng: random.Random) -> None:
+        """Some attempts are not in this map, as in a download."""
+        self.attempts = {
+            session: [one for one in made if rng.random() < 0.6]
+            for session, made in self.attempts.items()
+        }
 
 
 @cache
@@ -105,6 +123,23 @@ def add_drive(made: RandomMap, number: int, rng: random.Random) -> None:
     for sequence, node in enumerate(own + walked):
         kind = PathEntryKind.SAVED if sequence < len(own) else PathEntryKind.MATCHED
         made.entries.append(PathEntry(path_id(drive.id), sequence, node, kind, sequence))
+    made.attempts[drive.id] = [
+        Attempt(
+            iteration=number,
+            reference=rng.choice(own),
+            node=rng.choice(list(made.nodes)),
+            along_m=rng.uniform(-8, 8),
+            across_m=rng.uniform(-2, 2),
+            yaw_rad=rng.uniform(-3, 3),
+            sigma_m=rng.uniform(0, 2),
+            sigma_yaw_rad=rng.uniform(0, 0.2),
+            accepted=rng.random() < 0.5,
+            inliers=rng.randrange(100),
+            rank=rng.randrange(400),
+            policy=rng.choice(["recall", "distance"]),
+        )
+        for number in range(rng.randrange(6) if own else 0)
+    ]
 
 
 def add_edge(made: RandomMap, a: NodeId, b: NodeId, kind: str) -> None:
@@ -122,7 +157,11 @@ def random_fleet(seed: int) -> list[RandomMap]:
     fleet: list[RandomMap] = []
     number = 0
     for _ in range(rng.randrange(2, 4)):
-        made = rng.choice(fleet).copy() if fleet and rng.random() < 0.4 else RandomMap()
+        made = RandomMap()
+        if fleet and rng.random() < 0.4:
+            other = rng.choice(fleet)
+            made = other.copy()
+            other.forget(rng)
         for _ in range(rng.randrange(1, 3)):
             add_drive(made, number, rng)
             number += 1
@@ -145,6 +184,8 @@ def write(made: RandomMap, path: Path, order: int) -> None:
                 writer.add_edge(edge)
             for entry in shuffled(made.entries, rng):
                 writer.add_path_entry(entry)
+            for session, tried in shuffled(made.attempts.items(), rng):
+                writer.add_attempts(session, *from_records(tried))
             writer.commit()
 
 
@@ -168,6 +209,16 @@ def parts(path: Path) -> tuple[dict[NodeId, int], int]:
     return found, int(labels.max(initial=-1)) + 1
 
 
+def remembered(path: Path) -> Counter[tuple[SessionId, int, int, bool, int]]:
+    """The remembered attempts of a map, by what carrying them over leaves alone."""
+    with MapStore.open(path) as store:
+        contents = store.load()
+    made = contents.attempts
+    sessions = [contents.sessions[at].id for at in made.session]
+    columns = (made.iteration, made.rank, made.accepted, made.inliers)
+    return Counter(zip(sessions, *(column.tolist() for column in columns), strict=True))
+
+
 def violations(seed: int) -> Iterator[str]:
     """What does not hold for one case."""
     fleet = random_fleet(seed)
@@ -188,6 +239,8 @@ def violations(seed: int) -> Iterator[str]:
                 together.setdefault(label, set()).add(ours.get(node, -1))
             if any(len(labels) > 1 for labels in together.values()):
                 yield f"merge {number}: nodes that hung together are in {together}"
+            if lost := remembered(robot) - remembered(centre):
+                yield f"merge {number}: attempts {lost} are not remembered"
             if after > before + of_robot or after != report.components:
                 yield f"merge {number}: {after} parts of {before} and {of_robot}"
             before = after

@@ -56,7 +56,8 @@ class OpenMap:
         store: the file.
         graph: its experience graph.
         path_memory: its paths.
-        attempts: counts of remembered attempts, from which match basins are learnt.
+        remembered: its attempts; sessions are places in `sessions`, nodes are dense indices.
+        attempts: counts of them, from which match basins are learnt.
         times: when its sessions were driven.
         sessions: its sessions, by id.
         last_iterations: number of the newest remembered iteration of each session that has any.
@@ -74,7 +75,7 @@ class OpenMap:
             self.path_memory.add(entry)
         self.times = SessionTimes(contents.sessions)
         self._words: dict[DescriptorKind, QuantisedWords] = {}
-        self._remembered = contents.attempts
+        self.remembered = contents.attempts
         self._lessons: dict[float, Lessons] = {}
         self.sessions = {session.id: session for session in contents.sessions}
         self.attempts = contents.basin_counts(self.graph.experiences)
@@ -148,7 +149,7 @@ class OpenMap:
     def lessons(self, focal_px: float) -> Lessons:
         """What the drives of this map learnt, for a live camera of this focal length, px."""
         if focal_px not in self._lessons:
-            made, basin = self._remembered, MatchBasin.of(focal_px, self.attempts)
+            made, basin = self.remembered, MatchBasin.of(focal_px, self.attempts)
             along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
             attempts = PastAttempts(
                 made.session, made.node, basin.success_rate(along_m, across_m), made.accepted

@@ -44,6 +44,49 @@ def at_equivalents(made: AttemptArrays, positions: Sequence[Position | None]) ->
     )
 
 
+def lacking(made: AttemptArrays, remembered: AttemptArrays) -> NDArray[np.intp]:
+    """Places of the attempts that are not remembered yet.
+
+    Two attempts are one when they agree in all that carrying them over leaves alone: session,
+    iteration, rank, the uncertainty of the prediction, outcome and policy. Iteration and rank alone
+    would not do: ranks above 255 are stored as 255, and two centres that replay one drive number
+    their iterations alike. Of equal attempts as many are lacking as there are more of.
+
+    Args:
+        made: attempts, sessions named as in `remembered`.
+        remembered: those that are known.
+    """
+    if not len(made):
+        return np.empty(0, np.intp)
+    policies = list(dict.fromkeys((*remembered.policies, *made.policies)))
+    keys = np.concatenate([_identities(one, policies) for one in (remembered, made)])
+    _, named = np.unique(keys, axis=0, return_inverse=True)
+    named = named.reshape(-1)
+    known, new = named[: len(remembered)], named[len(remembered) :]
+    order = np.argsort(new, kind="stable")
+    ranked = new[order]
+    # How many equals came before each: they take what is remembered one by one.
+    before = np.arange(len(ranked)) - np.searchsorted(ranked, ranked)
+    counts = np.bincount(known, minlength=int(named.max(initial=-1)) + 1)
+    return np.sort(order[before >= counts[ranked]])
+
+
+def _identities(made: AttemptArrays, policies: Sequence[str]) -> NDArray[np.int64]:
+    """(A, 8) what names each attempt, free of the nodes that it is told from."""
+    policy = np.array([policies.index(name) for name in made.policies], np.int64)
+    columns: list[NDArray[Any]] = [
+        made.session,
+        made.iteration,
+        made.rank,
+        made.sigma_m.view(np.int32),  # to the bit
+        made.sigma_yaw_rad.view(np.int32),
+        made.accepted,
+        made.inliers,
+        policy[made.policy],
+    ]
+    return np.stack(columns, axis=1, dtype=np.int64)
+
+
 def from_records(made: Sequence[Attempt]) -> tuple[AttemptArrays, list[NodeId]]:
     """Records as columns, and the nodes that their columns are indices into."""
     ids = list(dict.fromkeys(node for one in made for node in (one.reference, one.node)))

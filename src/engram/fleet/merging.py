@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -25,7 +26,7 @@ from engram.experience.model import (
     SessionId,
     path_id,
 )
-from engram.fleet.attempts import at_equivalents, from_records
+from engram.fleet.attempts import at_equivalents, from_records, lacking
 from engram.fleet.centre import Centre, LazyRelocaliser
 from engram.fleet.checks import check_fits, notes
 from engram.fleet.handed_in import HandedIn
@@ -36,7 +37,7 @@ from engram.fleet.segments import Segment, string_segments
 from engram.fleet.words import keep_words
 from engram.localiser import Position
 from engram.places import RECOGNISERS
-from engram.store import BulkWriter, WritableMapStore
+from engram.store import AttemptArrays, BulkWriter, WritableMapStore
 
 Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 # Relocalisers that know places by their words.
@@ -149,6 +150,7 @@ def _has_more(centre: Centre, robot: HandedIn) -> bool:
         or any(centre.new_entry(entry) for entry in robot.contents.path_entries)
         or any(_is_new(centre, edge) for edge in robot.edges)
         or any(_carries(centre, robot, omitted) for omitted in robot.omissions)
+        or len(_new_attempts(centre, robot, centre.opened.sessions, centre.opened.remembered)) > 0
     )
 
 
@@ -284,19 +286,24 @@ class _Merging:
 
     def _carry_attempts(self, replay: Replay) -> None:
         """Remembered attempts go along (SPEC §7 MERGE 4), those of the replay too."""
-        contents = self._robot.contents
-        positions = [self._centre.equivalent(node.id) for node in contents.nodes]
+        opened = self._centre.opened
+        sessions, remembered = list(opened.sessions), opened.remembered
+        if self._writer.shows_again:
+            # A node that is seen again brings back the attempts that were remembered at it.
+            self._writer.flush()
+            now = self._centre.store.load()
+            sessions, remembered = [session.id for session in now.sessions], now.attempts
+        new = _new_attempts(self._centre, self._robot, sessions, remembered)
+        self._report.attempts += len(new)
         ids = [
             node.id if at is None else at.node
-            for node, at in zip(contents.nodes, positions, strict=True)
+            for node in self._robot.contents.nodes
+            for at in [self._centre.equivalent(node.id)]
         ]
-        place = {session.id: at for at, session in enumerate(contents.sessions)}
+        place = {session.id: at for at, session in enumerate(self._robot.contents.sessions)}
         for session in self._robot.sessions:
-            if session.id not in self._centre.opened.sessions:
-                rows = np.flatnonzero(contents.attempts.session == place[session.id])
-                made = at_equivalents(contents.attempts.rows(rows), positions)
-                self._writer.add_attempts(session.id, made, ids)
-                self._report.attempts += len(made)
+            own = new.rows(new.session == place[session.id])
+            self._writer.add_attempts(session.id, own, ids)
             replayed, nodes = from_records(replay.attempts.get(session.id, []))
             self._writer.add_attempts(session.id, replayed, nodes)
 
@@ -316,6 +323,32 @@ def _is_new(centre: Centre, edge: Edge) -> bool:
         and edge.b in centre.graph
         and centre.graph.find_edge(edge.a, edge.b, edge.kind) is None
     )
+
+
+def _new_attempts(
+    centre: Centre,
+    robot: HandedIn,
+    sessions: Iterable[SessionId],
+    remembered: AttemptArrays,
+) -> AttemptArrays:
+    """The robot's attempts between known nodes that the centre lacks, told from the equivalents.
+
+    Args:
+        centre: which nodes it knows.
+        robot: whose attempts; `session`, `reference` and `node` of the result are indices into
+            its contents.
+        sessions: of the centre.
+        remembered: its attempts; `session` is a place in `sessions`.
+    """
+    contents = robot.contents
+    made = at_equivalents(
+        contents.attempts, [centre.equivalent(node.id) for node in contents.nodes]
+    )
+    place: dict[SessionId, int] = {}
+    for session in (*sessions, *(one.id for one in contents.sessions)):
+        place.setdefault(session, len(place))
+    named = np.array([place[one.id] for one in contents.sessions], np.int32)
+    return made.rows(lacking(replace(made, session=named[made.session]), remembered))
 
 
 def _carries(centre: Centre, robot: HandedIn, omitted: NodeId) -> Position | None:

@@ -138,7 +138,8 @@ class MergeReport:
         sessions: drives that were new to the centre.
         known, known_omissions: nodes that the centre had, and had omitted before.
         taken, omitted: nodes.
-        edges, path_entries, attempts: how many were added.
+        edges, path_entries: how many were added.
+        attempts: remembered ones of the robot's that were new to the centre.
         match_attempts: match attempts of the replay, what the merge costs.
         lookups: frames of the replay for which the relocaliser was asked.
         seconds: wall time.
@@ -172,7 +173,15 @@ class MergeReport:
     @property
     def changed(self) -> bool:
         """Whether the centre has learnt anything."""
-        return bool(self.sessions or self.taken or self.omitted or self.edges or self.path_entries)
+        learnt = (
+            self.sessions,
+            self.taken,
+            self.omitted,
+            self.edges,
+            self.path_entries,
+            self.attempts,
+        )
+        return any(learnt)
 
     def to_dict(self) -> dict[str, Any]:
         """What ``merge --json`` prints for this map."""

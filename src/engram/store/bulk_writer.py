@@ -116,6 +116,7 @@ class BulkWriter:
             self._interrupted = open_sessions(connection)
         self._sequences: dict[int, set[int]] = {}
         self._omitted: set[bytes] = set()
+        self._shows_again = False
         self._clear()
 
     # -- what may be added
@@ -322,6 +323,11 @@ class BulkWriter:
         }
         self._put(vocabularies, row, len(body))
 
+    @property
+    def shows_again(self) -> bool:
+        """Whether anything that a revert had hidden is seen again by this revision."""
+        return self._shows_again
+
     # -- how it ends
 
     def flush(self) -> None:
@@ -516,6 +522,7 @@ class BulkWriter:
         return int(again["key"])
 
     def _show(self, table: Table, key: int) -> None:
+        self._shows_again = True
         row = hidden_row(self._keys, self._revision_key, table, key, hide=False)
         self._put(hidden, row)
 
