@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from .robots import robot_map
+from .robots import frame_log, robot_map
 
 
 @pytest.fixture(scope="package")
@@ -26,3 +26,17 @@ def fleet(tmp_path_factory):
 
 def made(path, places_m, appearance, **about):
     return path, robot_map(path, places_m, appearance, **about)
+
+
+@pytest.fixture(scope="package")
+def logs(tmp_path_factory):
+    """Three drives by day, one of which sees another look; and two that are in no map."""
+    folder = tmp_path_factory.mktemp("logs")
+    near, far = np.arange(0, 16, 0.8), np.arange(8, 24, 0.8)
+    return {
+        "a": str(frame_log(folder / "a.framelog", near, 0, day=1)),
+        "b": str(frame_log(folder / "b.framelog", far, 0, day=2, aside_m=0.2)),
+        "c": str(frame_log(folder / "c.framelog", near, 1, day=3)),
+        "held-out": str(frame_log(folder / "held-out.framelog", far, 0, day=9, aside_m=-0.2)),
+        "other": str(frame_log(folder / "other.framelog", near, 1, day=8, aside_m=0.2)),
+    }

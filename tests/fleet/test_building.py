@@ -8,42 +8,15 @@ import signal
 from contextlib import contextmanager
 from itertools import permutations
 
-import numpy as np
 import pytest
 
 from engram.drive import MapOptions, Settings
 from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
-from engram.fleet import BuildOptions, JudgeOptions, build_map, order_costs
+from engram.fleet import JudgeOptions, build_map, order_costs
 from engram.fleet.gate import GateOptions
 from engram.store import MapStore
 
-from .robots import OPTIONS, frame_log
-
-MAPPING = MapOptions(relocaliser="exhaustive")
-
-
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory):
-    """Three drives by day, one of which sees another look; and one for validation."""
-    folder = tmp_path_factory.mktemp("logs")
-    near, far = np.arange(0, 16, 0.8), np.arange(8, 24, 0.8)
-    return {
-        "a": str(frame_log(folder / "a.framelog", near, 0, day=1)),
-        "b": str(frame_log(folder / "b.framelog", far, 0, day=2, aside_m=0.2)),
-        "c": str(frame_log(folder / "c.framelog", near, 1, day=3)),
-        "held-out": str(frame_log(folder / "held-out.framelog", far, 0, day=9, aside_m=-0.2)),
-    }
-
-
-def options(**changes: object) -> BuildOptions:
-    values = {"workers": 2, "groups": 2, "mapping": MAPPING, "merging": OPTIONS} | changes
-    return BuildOptions(**values)
-
-
-def build(centre, logs, names="abc", progress=None, **changes):
-    shown = {} if progress is None else {"progress": progress}
-    drives = [logs[name] for name in names]
-    return build_map(centre, drives, Settings(), options(**changes), **shown)
+from .builds import build, interrupting, options
 
 
 @pytest.fixture(scope="module")
@@ -106,26 +79,6 @@ def test_a_group_that_kills_every_worker_is_given_up(tmp_path, logs):
     with pytest.raises(WorkerError, match="died 4 times"):
         build(centre, logs, names="a", groups=1, workers=1, progress=killing)
     assert not centre.exists()
-
-
-def interrupting(frames):
-    """A progress bar that presses Ctrl-C after so many steps."""
-    count = 0
-
-    def progress(what, total):
-        @contextmanager
-        def shown():
-            def advance(word):
-                nonlocal count
-                count += 1
-                if count == frames:
-                    signal.raise_signal(signal.SIGINT)
-
-            yield advance
-
-        return shown()
-
-    return progress
 
 
 def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, built):

@@ -41,14 +41,17 @@ def build(
     ] = False,
     validate: Annotated[
         list[Path] | None,
-        typer.Option("--validate", metavar="DRIVE", help="Judges orders; may be repeated."),
+        typer.Option(
+            "--validate", metavar="DRIVE", help="Judges orders, held out; may be repeated."
+        ),
     ] = None,
     judge_at: Annotated[
         float,
         typer.Option("--judge-at", metavar="METRES", min=0.0, help="What dead reckoning bears."),
     ] = 10.0,
     keep: Annotated[
-        bool, typer.Option("--keep", help="Leave the groups' maps in CENTRE.build.")
+        bool,
+        typer.Option("--keep", help="Leave the groups' maps in CENTRE.build till the next build."),
     ] = False,
     policy: options.Policy = "recall",
     lanes: options.Lanes = 2,

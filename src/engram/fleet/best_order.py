@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from engram.drive import DriveSequence, OpenMap, Settings, open_drive
-from engram.errors import ConfigError
+from engram.config import config_hash, to_dict
+from engram.drive import DriveSequence, OpenMap, Settings, open_drive, session_of_drive
+from engram.errors import ConfigError, MapError
+from engram.experience.model import SessionId
 from engram.fleet.docking import merge_maps
 from engram.fleet.gate import GateOptions, localise_drive
 from engram.fleet.merging import Progress
@@ -44,7 +46,8 @@ class JudgeOptions:
         localising: policy and budget of the validation.
         reported: further sessions, which choose nothing: how they fare tells how good the chosen
             order is.
-        localise: how a drive is localised in a map; None for `localise_drive`.
+        localise: how a drive is localised in a map; None for `localise_drive`. Results that a
+            search finds from earlier are taken to be by the same.
     """
 
     drives: Sequence[Path]
@@ -58,6 +61,40 @@ class JudgeOptions:
             raise ConfigError("the best order is judged by validation drives: name at least one")
         if not 0 <= self.judge_at_m < math.inf:
             raise ConfigError(f"judge_at_m is {self.judge_at_m}, must be finite and >= 0")
+
+    def hash(self) -> str:
+        """Changes when any order could be judged otherwise: by drives, distance or localising.
+
+        Raises:
+            SequenceError: a drive cannot be read.
+        """
+        sessions = [
+            [str(session_of_drive(open_drive(path)).id) for path in paths]
+            for paths in (self.drives, self.reported)
+        ]
+        return config_hash([*sessions, self.judge_at_m, to_dict(self.localising)])
+
+
+def check_held_out(judge: JudgeOptions, mapped: Mapping[SessionId, str]) -> None:
+    """Refuses to judge a map by what it was made of, or by one drive twice.
+
+    Args:
+        judge: the drives that must be held out.
+        mapped: where each session is that they must not be, in words.
+
+    Raises:
+        ConfigError: a drive is not held out; names it.
+        SequenceError: a drive cannot be read.
+    """
+    seen = dict(mapped)
+    for path in (*judge.drives, *judge.reported):
+        session = session_of_drive(open_drive(path)).id
+        if session in seen:
+            raise ConfigError(
+                f"{path} judges the orders of merging, but is {seen[session]}; judge by drives "
+                "that are in no map, and name each once"
+            )
+        seen[session] = f"the same drive as {path}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,21 +128,16 @@ class OrderResult:
         return self.judged, self.area_m, self.order
 
 
-@dataclass(slots=True)
-class BestOrder:
-    """All orders of some groups.
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What a step of the search took; steps of earlier runs count like those of this one.
 
     Attributes:
-        results: one per order, best first.
-        judge_at_m: what they were judged by.
-        merges, copies: made in this search.
+        merges, copies: made.
         merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
-        replayed, attempts, lookups: nodes that were replayed in merging, match attempts, and
-            nodes for which the relocaliser was asked.
+        replayed, attempts, lookups: see `BestOrder`.
     """
 
-    results: list[OrderResult] = field(default_factory=list)
-    judge_at_m: float = 10.0
     merges: int = 0
     copies: int = 0
     merge_s: float = 0.0
@@ -114,6 +146,45 @@ class BestOrder:
     replayed: int = 0
     attempts: int = 0
     lookups: int = 0
+
+
+@dataclass(slots=True)
+class BestOrder:
+    """All orders of some groups.
+
+    Attributes:
+        results: one per order, best first.
+        judge_at_m: what they were judged by.
+        rooted: whether every order began with a centre that was there, not with its first group.
+        merges, copies: made in this search, in all its runs; what an interruption undid is
+            counted once.
+        merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
+        replayed, attempts, lookups: nodes that were replayed in merging, match attempts, and
+            nodes for which the relocaliser was asked.
+    """
+
+    results: list[OrderResult] = field(default_factory=list)
+    judge_at_m: float = 10.0
+    rooted: bool = False
+    merges: int = 0
+    copies: int = 0
+    merge_s: float = 0.0
+    copy_s: float = 0.0
+    judge_s: float = 0.0
+    replayed: int = 0
+    attempts: int = 0
+    lookups: int = 0
+
+    def count(self, spent: Spent) -> None:
+        """One more step."""
+        for one in fields(Spent):
+            setattr(self, one.name, getattr(self, one.name) + getattr(spent, one.name))
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> BestOrder:
+        """From what `to_dict` gave."""
+        kept = {one.name: values[one.name] for one in fields(BestOrder) if one.name in values}
+        return BestOrder([_order_result(one) for one in values["orders"]], **kept)
 
     @property
     def order(self) -> tuple[int, ...]:
@@ -138,6 +209,7 @@ class BestOrder:
         return {
             "order": list(self.order),
             "judge_at_m": self.judge_at_m,
+            "rooted": self.rooted,
             "orders": [asdict(one) for one in self.results],
             "spread": self.spread(),
             "merges": self.merges,
@@ -174,12 +246,15 @@ def find_best_order(
     merging: MergeOptions,
     judge: JudgeOptions,
     progress: Progress,
+    *,
+    root: Path | None = None,
 ) -> BestOrder:
     """Merges groups in every order and judges the results.
 
     Merges of a common prefix are made once and copied: k! orders of k groups take
-    Σ k!/(k−d)! over d = 2 … k merges, 60 for k = 4. The search walks the tree depth first, so that
-    no more than k maps lie on the disk; results are kept, so that it can be interrupted.
+    Σ k!/(k−d)! over d = 2 … k merges, 60 for k = 4; with a root over d = 1 … k, 64. The search
+    walks the tree depth first, so that no more than k maps lie on the disk; results are kept with
+    all that they depend on, so that it can be interrupted.
 
     Args:
         maps: the groups' maps, by number.
@@ -188,9 +263,12 @@ def find_best_order(
         merging: policy and budget of the merges.
         judge: by what the best is told.
         progress: shows how it goes.
+        root: the map that all orders begin with; None where each begins with its first group's.
 
     Raises:
-        ConfigError: more groups than all orders of them could be tried.
+        ConfigError: more groups than all orders of them could be tried, or a drive that judges is
+            in one of the maps.
+        MapError: the root was written to meanwhile.
         KeyboardInterrupt: a merge was interrupted.
     """
     if not 1 <= len(maps) <= _MOST_GROUPS:
@@ -199,11 +277,21 @@ def find_best_order(
             "groups can be tried in all orders"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    search = _Search(maps, folder, settings, merging, judge)
+    search = _Search(maps, folder, settings, merging, judge, root)
     with progress("try orders", math.factorial(len(maps))) as advance:
-        search.below((), None, advance)
+        search.below((), root, advance)
+    search.check_root()
     search.found.results.sort(key=lambda one: one.rank)
     return search.found
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """One node of the prefix tree: its map was made, and judged if it has all groups."""
+
+    order: tuple[int, ...]
+    spent: Spent
+    result: OrderResult | None
 
 
 class _Search:
@@ -216,59 +304,90 @@ class _Search:
         settings: Settings,
         merging: MergeOptions,
         judge: JudgeOptions,
+        root: Path | None,
     ) -> None:
-        self.found = BestOrder(judge_at_m=judge.judge_at_m)
+        self.found = BestOrder(judge_at_m=judge.judge_at_m, rooted=root is not None)
         self._maps = maps
         self._folder = folder
         self._settings = settings
         self._merging = merging
         self._judge = judge
+        self._root = root
         self._localise = judge.localise or localise_drive
+        mapped: dict[SessionId, str] = {}
+        hashes = []
+        for path in (*maps, *([] if root is None else [root])):
+            with MapStore.open(path) as store:
+                mapped |= dict.fromkeys(store.frontends(), f"in {path}")
+                hashes.append(store.content_hash())
+        check_held_out(judge, mapped)
+        self._root_hash = None if root is None else hashes[-1]
+        self._depends = config_hash(
+            [hashes, self._root_hash, to_dict(settings), to_dict(merging), judge.hash()]
+        )
         self._sequences = [open_drive(path) for path in judge.drives]
         self._reported = [open_drive(path) for path in judge.reported]
+        for left in (*folder.glob("order-*.engram*"), *folder.glob(".order-*.new")):
+            left.unlink()  # by a run that was killed
 
     def below(
         self, prefix: tuple[int, ...], merged: Path | None, advance: Callable[[str], None]
     ) -> None:
         """All orders that begin so; `merged` is the map of the prefix."""
-        if len(prefix) == len(self._maps):
-            assert merged is not None
-            self._keep(self._judged(prefix, merged))
-            advance(" ".join(map(str, prefix)))
-            return
         for number in range(len(self._maps)):
             order = (*prefix, number)
             if number in prefix:
                 continue
-            if (known := self._known_below(order)) is not None:
-                self.found.results += known
-                for one in known:
-                    advance(" ".join(map(str, one.order)))
+            if (known := self._known_from(order)) is not None:
+                for step in known:
+                    self._count(step, advance)
                 continue
             with _Intermediate(self._folder, order) as place:
-                self._make(place, number, merged)
+                step = self._step(order, place, merged)
+                self._keep(step)
+                self._count(step, advance)
                 self.below(order, place, advance)
 
-    def _make(self, place: Path, number: int, prefix: Path | None) -> None:
+    def check_root(self) -> None:
+        """The maps that were judged are those that merging would give now."""
+        if self._root is None:
+            return
+        with MapStore.open(self._root) as store:
+            if store.content_hash() != self._root_hash:
+                raise MapError(
+                    f"{self._root} was written to while the orders were tried, so that they were "
+                    "judged by what would not be built; give the same command again"
+                )
+
+    def _step(self, order: tuple[int, ...], place: Path, prefix: Path | None) -> _Step:
         """The map of an order: a copy of its prefix's, and one more group."""
         started = time.perf_counter()
-        MapStore.copy(self._maps[number] if prefix is None else prefix, place)
-        copied = time.perf_counter()
-        self.found.copies += 1
-        self.found.copy_s += copied - started
-        if prefix is None:
-            return
-        (report,) = merge_maps(place, [self._maps[number]], self._settings, self._merging)
+        added = self._maps[order[-1]]
+        MapStore.copy(added if prefix is None else prefix, place)
+        costs: dict[str, Any] = {"copies": 1, "copy_s": time.perf_counter() - started}
+        if prefix is not None:
+            costs |= self._merge(place, added)
+        result = None
+        if len(order) == len(self._maps):
+            started = time.perf_counter()
+            result = self._judged(order, place)
+            costs["judge_s"] = time.perf_counter() - started
+        return _Step(order, Spent(**costs), result)
+
+    def _merge(self, place: Path, added: Path) -> dict[str, Any]:
+        started = time.perf_counter()
+        (report,) = merge_maps(place, [added], self._settings, self._merging)
         if report.interrupted:
             raise KeyboardInterrupt
-        self.found.merges += 1
-        self.found.replayed += sum(one.taken + one.omitted for one in report.segments)
-        self.found.attempts += report.match_attempts
-        self.found.lookups += report.lookups
-        self.found.merge_s += time.perf_counter() - copied
+        return {
+            "merges": 1,
+            "merge_s": time.perf_counter() - started,
+            "replayed": sum(one.taken + one.omitted for one in report.segments),
+            "attempts": report.match_attempts,
+            "lookups": report.lookups,
+        }
 
     def _judged(self, order: tuple[int, ...], place: Path) -> OrderResult:
-        started = time.perf_counter()
         with OpenMap(MapStore.open(place)) as opened:
             drives, reported = (
                 [
@@ -280,7 +399,6 @@ class _Search:
             nodes, content_hash = len(opened.graph), opened.store.content_hash()
         steps = np.arange(0.0, _AREA_TO_M, _AREA_STEP_M) + _AREA_STEP_M / 2
         area_m = sum(failure_route(drives, float(at)) for at in steps) * _AREA_STEP_M
-        self.found.judge_s += time.perf_counter() - started
         return OrderResult(
             order,
             failure_route(drives, self._judge.judge_at_m),
@@ -292,27 +410,49 @@ class _Search:
             route_not_localised(reported),
         )
 
-    def _keep(self, result: OrderResult) -> None:
-        self.found.results.append(result)
-        draft = self._result_path(result.order).with_suffix(".part")
-        draft.write_text(json.dumps({**asdict(result), "judge_at_m": self._judge.judge_at_m}))
-        draft.replace(self._result_path(result.order))
+    def _count(self, step: _Step, advance: Callable[[str], None]) -> None:
+        self.found.count(step.spent)
+        if step.result is not None:
+            self.found.results.append(step.result)
+            advance(" ".join(map(str, step.order)))
 
-    def _known_below(self, prefix: tuple[int, ...]) -> list[OrderResult] | None:
-        """Results of all orders below a prefix from an earlier run; None if any is missing."""
+    def _keep(self, step: _Step) -> None:
+        path = self._path(step.order)
+        draft = path.with_suffix(".part")
+        draft.write_text(json.dumps({"depends": self._depends, **asdict(step)}))
+        draft.replace(path)
+
+    def _known_from(self, prefix: tuple[int, ...]) -> list[_Step] | None:
+        """All steps from a prefix on, if earlier runs made them by the same; else None."""
         known = []
-        for order in _orders(prefix, len(self._maps)):
-            path = self._result_path(order)
-            if not path.exists():
+        for order in _tree(prefix, len(self._maps)):
+            step = self._known(order)
+            if step is None:
                 return None
-            values = json.loads(path.read_text())
-            if values.pop("judge_at_m") != self._judge.judge_at_m:
-                return None
-            known.append(OrderResult(**{**values, "order": tuple(values["order"])}))
+            known.append(step)
         return known
 
-    def _result_path(self, order: tuple[int, ...]) -> Path:
+    def _known(self, order: tuple[int, ...]) -> _Step | None:
+        path = self._path(order)
+        if not path.exists():
+            return None
+        values = json.loads(path.read_text())
+        if values.get("depends") != self._depends:
+            return None
+        result = values["result"]
+        return _Step(
+            order,
+            Spent(**values["spent"]),
+            None if result is None else _order_result(result),
+        )
+
+    def _path(self, order: tuple[int, ...]) -> Path:
         return self._folder / f"order-{'-'.join(map(str, order))}.json"
+
+
+def _order_result(values: Mapping[str, Any]) -> OrderResult:
+    """From plain values."""
+    return OrderResult(**{**values, "order": tuple(values["order"])})
 
 
 class _Intermediate:
@@ -333,14 +473,12 @@ class _Intermediate:
             beside.unlink()
 
 
-def _orders(prefix: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:
-    """All orders of `count` groups that begin with the prefix."""
-    if len(prefix) == count:
-        yield prefix
-        return
+def _tree(prefix: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:
+    """The nodes of the prefix tree of `count` groups from a prefix on, itself first."""
+    yield prefix
     for number in range(count):
         if number not in prefix:
-            yield from _orders((*prefix, number), count)
+            yield from _tree((*prefix, number), count)
 
 
 @dataclass(frozen=True, slots=True)

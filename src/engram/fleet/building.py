@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 import time
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -17,7 +14,13 @@ from engram.drive import MapOptions, Settings
 from engram.drive.interruption import deferred_interrupt
 from engram.errors import ConfigError
 from engram.experience.model import SessionId, path_id
-from engram.fleet.best_order import BestOrder, JudgeOptions, find_best_order, order_costs
+from engram.fleet.best_order import (
+    BestOrder,
+    JudgeOptions,
+    check_held_out,
+    find_best_order,
+    order_costs,
+)
 from engram.fleet.cluster import map_groups_on_cluster
 from engram.fleet.docking import merge_maps
 from engram.fleet.group_mapping import GroupResult, GroupTask, fetched
@@ -25,6 +28,7 @@ from engram.fleet.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.merging import Progress, silent
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
+from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sessions_of
 from engram.fleet.workers import map_groups
 from engram.store import MapStore
 
@@ -69,8 +73,11 @@ class BuildReport:
         left_out: names of the drives that the centre had before.
         groups: names of the drives of each group, in the order of merging.
         mapped: what mapping each group came to.
-        merges: one report per merge; the first group's map becomes a centre that is new.
+        merges: one report per merge of this run; the first group's map becomes a centre that is
+            new.
+        merged_before_s: time of the merges of earlier runs of this build, seconds.
         best: how the order was found, where that was asked.
+        notes: what somebody should look at.
         interrupted: whether it was stopped; the same command goes on.
         content_hash: of the map.
         seconds: wall time of this run.
@@ -81,7 +88,9 @@ class BuildReport:
     groups: list[list[str]] = field(default_factory=list)
     mapped: list[GroupResult] = field(default_factory=list)
     merges: list[MergeReport] = field(default_factory=list)
+    merged_before_s: float = 0.0
     best: BestOrder | None = None
+    notes: list[str] = field(default_factory=list)
     interrupted: bool = False
     content_hash: str = ""
     seconds: float = 0.0
@@ -94,7 +103,9 @@ class BuildReport:
             "groups": self.groups,
             "mapped": [one.to_dict() for one in self.mapped],
             "merges": [one.to_dict() for one in self.merges],
+            "merged_before_s": self.merged_before_s,
             "best_order": None if self.best is None else self.best.to_dict(),
+            "notes": self.notes,
             "interrupted": self.interrupted,
             "content_hash": self.content_hash,
             "seconds": self.seconds,
@@ -105,7 +116,12 @@ class BuildReport:
     def parallel_s(self) -> float:
         """Time with a worker per group: the slowest group, then the merges one after another."""
         slowest = max((one.seconds for one in self.mapped), default=0.0)
-        return slowest + sum(one.seconds for one in self.merges)
+        return slowest + self.merged_s
+
+    @property
+    def merged_s(self) -> float:
+        """Time of all merges, those of earlier runs too."""
+        return self.merged_before_s + sum(one.seconds for one in self.merges)
 
     def text(self) -> str:
         """For people."""
@@ -118,20 +134,18 @@ class BuildReport:
         if not self.groups:
             return "\n".join([*lines, f"{self.centre}: nothing new; content {self.content_hash}"])
         for names, one in zip(self.groups, self.mapped, strict=True):
-            saved = sum(session["nodes_saved"] for session in one.sessions)
             died = f", {one.retries} workers died" if one.retries else ""
-            lines.append(
-                f"group {one.number}: {len(names)} drives, {saved} nodes, {one.seconds:.1f} s{died}"
-            )
+            made = f"{one.nodes} nodes, {one.seconds:.1f} s"
+            lines.append(f"group {one.number}: {len(names)} drives, {made}{died}")
         lines += [one.text() for one in self.merges]
         if self.best is not None:
             lines += [self.best.text(), self._costs()]
         mapped_s = sum(one.seconds for one in self.mapped)
-        merged_s = sum(one.seconds for one in self.merges)
+        lines += [f"  note: {note}" for note in self.notes]
         lines.append(
             f"{self.centre}: content {self.content_hash}; mapping {mapped_s:.1f} s in "
-            f"{len(self.mapped)} groups, merging {merged_s:.1f} s; with a worker for each group "
-            f"{self.parallel_s:.1f} s"
+            f"{len(self.mapped)} groups, merging {self.merged_s:.1f} s; with a worker for each "
+            f"group {self.parallel_s:.1f} s"
         )
         return "\n".join(lines)
 
@@ -143,10 +157,15 @@ class BuildReport:
         merge_s = self.best.merge_s / max(self.best.merges, 1)
         copy_s = self.best.copy_s / max(self.best.copies, 1)
         spent_s = mapped_s + self.best.merge_s + self.best.copy_s
+        took = (
+            f"  all orders took {spent_s:.1f} s (T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C "
+            f"{copy_s:.2f} s)"
+        )
+        if self.best.rooted:
+            return f"{took}; the models of it are of centres that are new"
         costs = order_costs(len(self.mapped), group_s, merge_s, copy_s)
         return (
-            f"  all orders took {spent_s:.1f} s (T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C "
-            f"{copy_s:.2f} s): {spent_s / costs.sequential_s:.2%} of building each order "
+            f"{took}: {spent_s / costs.sequential_s:.2%} of building each order "
             f"sequentially, {spent_s / costs.sequential_tree_s:.2%} of a sequential prefix tree; "
             f"model (8) {costs.model_s / costs.sequential_s:.2%}, prefix tree "
             f"{costs.tree_s / costs.sequential_s:.2%}"
@@ -174,44 +193,39 @@ def build_map(
         drives: paths or fsspec URLs of frame logs or images.
         settings: the resolved configuration.
         options: how.
-        keep: leave the intermediate maps.
+        keep: leave the groups' maps, until the next build into this centre.
         progress: shows how it goes.
 
     Raises:
-        ConfigError: the groups do not fit the drives, or another build lies there unfinished.
+        ConfigError: the groups do not fit the drives, another build lies there unfinished, or a
+            drive that judges orders is not held out.
         WorkerError: workers died again and again.
         EngramError: a drive or a map cannot be used.
     """
     started = time.perf_counter()
     looked_at = _look_at(drives)
-    known = _known_sessions(centre)
+    scratch = Scratch(centre)
+    known = _known_sessions(scratch)
     grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
+    if options.judge is not None:
+        _check_judges(options.judge, looked_at, centre)
     report = BuildReport(
         str(centre), left_out=[drive.name for drive in looked_at if drive.session.id in known]
     )
-    with _scratch(centre, grouped, known, settings, options, keep=keep) as scratch:
+    if grouped:
+        scratch.begin(_plan(grouped, known, settings, options, keep=keep))
         try:
-            report.mapped = _map(scratch, grouped, settings, options, progress)
-            order = list(range(len(grouped)))
-            if options.judge is not None and grouped:
-                maps = [scratch.group(number) for number in order]
-                report.best = find_best_order(
-                    maps, scratch.orders, settings, options.merging, options.judge, progress
-                )
-                order = list(report.best.order)
-            report.groups = [[drive.name for drive in grouped[number]] for number in order]
-            report.mapped = [report.mapped[number] for number in order]
-            report.merges = _merge(
-                scratch, centre, [scratch.group(number) for number in order], settings, options,
-                progress,
-            )  # fmt: skip
-            report.interrupted = any(one.interrupted for one in report.merges)
+            _map_and_merge(scratch, grouped, settings, options, progress, report)
         except KeyboardInterrupt:
             report.interrupted = True
-        scratch.complete = not report.interrupted
     if not report.interrupted:
         with MapStore.open(centre) as store:
             report.content_hash = store.content_hash()
+        report.notes += _not_as_judged(report)
+        if grouped:
+            scratch.finish()
+        else:
+            scratch.remove_leftovers()
     report.seconds = time.perf_counter() - started
     return report
 
@@ -225,26 +239,66 @@ def _look_at(sources: Sequence[str]) -> list[Drive]:
     return drives
 
 
-def _known_sessions(centre: Path) -> frozenset[SessionId]:
+def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
     """The drives that the centre had when the build began, partial paths left aside."""
-    begun = _folder(centre) / "build.json"
-    if begun.exists():
-        earlier = json.loads(begun.read_text()).get("known", [])
-        return frozenset(SessionId(UUID(one)) for one in earlier)
-    if not centre.exists():
+    if scratch.unfinished is not None:
+        return frozenset(SessionId(UUID(one)) for one in scratch.unfinished.known)
+    if not scratch.centre.exists():
         return frozenset()
-    with MapStore.open(centre) as store:
+    with MapStore.open(scratch.centre) as store:
         partial = store.partial_paths()
         return frozenset(one for one in store.frontends() if path_id(one) not in partial)
 
 
-def _folder(centre: Path) -> Path:
-    """Where the intermediate maps of a build lie."""
-    return centre.with_name(f"{centre.name}.build")
+def _check_judges(judge: JudgeOptions, drives: Sequence[Drive], centre: Path) -> None:
+    """Before hours of mapping: what judges the orders must be held out."""
+    mapped = {SessionId(UUID(one)): f"in {centre} already" for one in sessions_of(centre)}
+    mapped |= {drive.session.id: f"{drive.source}, which is to be built from" for drive in drives}
+    check_held_out(judge, mapped)
+
+
+def _plan(
+    grouped: Sequence[Sequence[Drive]],
+    known: frozenset[SessionId],
+    settings: Settings,
+    options: BuildOptions,
+    *,
+    keep: bool,
+) -> BuildPlan:
+    return BuildPlan(
+        groups=[[str(drive.session.id) for drive in group] for group in grouped],
+        known=sorted(map(str, known)),
+        settings=config_hash(settings),
+        mapping=to_dict(options.mapping),
+        merging=to_dict(options.merging),
+        kept=keep,
+    )
+
+
+def _map_and_merge(
+    scratch: Scratch,
+    grouped: Sequence[Sequence[Drive]],
+    settings: Settings,
+    options: BuildOptions,
+    progress: Progress,
+    report: BuildReport,
+) -> None:
+    """What a build comes to, as far as this run takes it.
+
+    Raises:
+        KeyboardInterrupt: while groups were mapped or orders tried.
+    """
+    mapped = _map(scratch, grouped, settings, options, progress)
+    begun = _settled_order(scratch, len(grouped), settings, options, progress)
+    report.best = begun.best_order()
+    report.groups = [[drive.name for drive in grouped[number]] for number in begun.order]
+    report.mapped = [mapped[number] for number in begun.order]
+    report.merged_before_s = sum(begun.seconds.values())
+    _merge(scratch, begun, settings, options, progress, report)
 
 
 def _map(
-    scratch: _Scratch,
+    scratch: Scratch,
     grouped: Sequence[Sequence[Drive]],
     settings: Settings,
     options: BuildOptions,
@@ -270,91 +324,78 @@ def _map(
     return [result for result in results if result is not None]
 
 
+def _settled_order(
+    scratch: Scratch, groups: int, settings: Settings, options: BuildOptions, progress: Progress
+) -> MergingBegun:
+    """The order of merging, written down before the first merge: it is not changed half way.
+
+    Raises:
+        ConfigError: merging has begun in an order that was found otherwise.
+    """
+    judge = options.judge
+    judged_by = None if judge is None else judge.hash()
+    begun = scratch.merging_begun()
+    if begun is not None:
+        if begun.judge != judged_by:
+            raise ConfigError(
+                f"the groups of {scratch.folder} are being merged already, in the order "
+                f"{' '.join(map(str, begun.order))}, which was found otherwise; finish it with the "
+                "same --best-order, --validate and --judge-at, or delete the folder"
+            )
+        return begun
+    if judge is None:
+        begun = MergingBegun(list(range(groups)))
+    else:
+        best = find_best_order(
+            [scratch.group(number) for number in range(groups)],
+            scratch.orders,
+            settings,
+            options.merging,
+            judge,
+            progress,
+            root=scratch.centre if scratch.centre.exists() else None,
+        )
+        begun = MergingBegun(list(best.order), judged_by, best.to_dict())
+    scratch.remember_merging(begun)
+    return begun
+
+
 def _merge(
-    scratch: _Scratch,
-    centre: Path,
-    maps: Sequence[Path],
+    scratch: Scratch,
+    begun: MergingBegun,
     settings: Settings,
     options: BuildOptions,
     progress: Progress,
-) -> list[MergeReport]:
-    if scratch.new_centre:
-        if not centre.exists():
-            MapStore.copy(maps[0], centre)
-        maps = maps[1:]
-    return merge_maps(centre, maps, settings, options.merging, progress=progress)
+    report: BuildReport,
+) -> None:
+    """Merges the groups' maps into the centre, in their order.
 
-
-class _Scratch:
-    """The intermediate maps of a build, and what is known of them."""
-
-    def __init__(self, folder: Path, *, new_centre: bool) -> None:
-        self.folder = folder
-        self.new_centre = new_centre
-        self.complete = False
-
-    def group(self, number: int) -> Path:
-        """The map of a group."""
-        return self.folder / f"group-{number}.engram"
-
-    @property
-    def orders(self) -> Path:
-        """Folder of the maps of partial orders."""
-        return self.folder / "orders"
-
-    def remember(self, result: GroupResult) -> None:
-        """A group is mapped."""
-        _write_json(self._result_path(result.number), result.to_dict())
-
-    def result(self, number: int) -> GroupResult | None:
-        """What mapping a group came to; None if that is still to be done."""
-        path = self._result_path(number)
-        return GroupResult(**json.loads(path.read_text())) if path.exists() else None
-
-    def _result_path(self, number: int) -> Path:
-        return self.folder / f"group-{number}.json"
-
-
-@contextmanager
-def _scratch(
-    centre: Path,
-    grouped: Sequence[Sequence[Drive]],
-    left_out: Collection[SessionId],
-    settings: Settings,
-    options: BuildOptions,
-    *,
-    keep: bool,
-) -> Iterator[_Scratch]:
-    """The folder of a build: new, or that of an earlier run of the same build."""
-    folder = _folder(centre)
-    plan = {
-        "groups": [[str(drive.session.id) for drive in group] for group in grouped],
-        "known": sorted(str(session) for session in left_out),
-        "settings": config_hash(settings),
-        "mapping": to_dict(options.mapping),
-        "merging": to_dict(options.merging),
-        "new_centre": not centre.exists(),
-    }
-    known = folder / "build.json"
-    if known.exists():
-        earlier = json.loads(known.read_text())
-        plan["new_centre"] = earlier.get("new_centre")
-        if earlier != json.loads(json.dumps(plan)):
-            raise ConfigError(
-                f"{folder} is of another build that is not complete; finish it with its own "
-                "command, or delete the folder"
+    A centre that is there takes in all of them, also the first: an earlier run may have made it
+    as a copy of that, or somebody else meanwhile. Handing in again changes nothing.
+    """
+    order = begun.order
+    if not scratch.centre.exists():
+        MapStore.copy(scratch.group(order[0]), scratch.centre)
+        order = order[1:]
+    for number in order:
+        report.merges += merge_maps(
+            scratch.centre, [scratch.group(number)], settings, options.merging, progress=progress
+        )
+        if report.merges[-1].interrupted:
+            report.interrupted = True
+            return
+        if report.merges[-1].changed:
+            begun = replace(
+                begun, seconds={**begun.seconds, str(number): report.merges[-1].seconds}
             )
-    else:
-        folder.mkdir(parents=True, exist_ok=True)
-        _write_json(known, plan)
-    scratch = _Scratch(folder, new_centre=bool(plan["new_centre"]))
-    yield scratch
-    if scratch.complete and not keep:
-        shutil.rmtree(folder)
+            scratch.remember_merging(begun)
 
 
-def _write_json(path: Path, values: dict[str, Any]) -> None:
-    """In one step: a killed build leaves no half file."""
-    draft = path.with_suffix(".part")
-    draft.write_text(json.dumps(values))
-    draft.replace(path)
+def _not_as_judged(report: BuildReport) -> list[str]:
+    """Says so where the map is not the one by which its order was chosen."""
+    if report.best is None or report.content_hash == report.best.results[0].content_hash:
+        return []
+    return [
+        f"{report.centre} is not the map that was judged, content "
+        f"{report.best.results[0].content_hash}: somebody else wrote to it meanwhile"
+    ]

@@ -42,6 +42,7 @@ class GroupResult:
         seconds: wall time of the runs that mapped it; the last run only, after a worker died.
         cpu_s: processor time of the same.
         sessions: one summary each, as of ``map --json``.
+        nodes: of the group's map.
         retries: how often a worker died over it.
     """
 
@@ -49,6 +50,7 @@ class GroupResult:
     seconds: float = 0.0
     cpu_s: float = 0.0
     sessions: list[dict[str, Any]] = field(default_factory=list)
+    nodes: int = 0
     retries: int = 0
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,6 +84,8 @@ def map_group(task: GroupTask, path: Path, advance: Callable[[str], None] = igno
         if report.interrupted:
             raise KeyboardInterrupt
         result.sessions.append({"source": source, **report.to_dict()})
+    with MapStore.open(path) as made:
+        result.nodes = made.node_count()
     result.seconds = time.perf_counter() - started
     result.cpu_s = time.process_time() - cpu_started
     return result

@@ -1,0 +1,186 @@
+"""The search for the best order: honest about what judged it, what it took, and what is built."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from engram.drive import Settings
+from engram.errors import ConfigError, MapError
+from engram.fleet import GateOptions, best_order, building, find_best_order, silent
+from engram.store import MapStore
+
+from .builds import build, judge, map_in_this_process
+from .robots import OPTIONS
+
+
+class KilledError(Exception):
+    """What lies on the disk is as if the process had been killed here."""
+
+
+def killed(*_: object, **__: object) -> None:
+    raise KilledError
+
+
+@pytest.fixture(autouse=True)
+def one_process(monkeypatch):
+    monkeypatch.setattr(building, "map_groups", map_in_this_process)
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory, logs):
+    """The maps of three groups of a drive each."""
+    folder = tmp_path_factory.mktemp("groups")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "map_groups", map_in_this_process)
+        build(folder / "centre.engram", logs, groups=3, keep=True)
+    return [folder / "centre.engram.build" / f"group-{number}.engram" for number in range(3)]
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory, maps, logs):
+    """The orders of the first two of them, tried without any trouble."""
+    folder = tmp_path_factory.mktemp("searched")
+    return folder, search(folder, maps[:2], judge(logs["held-out"]))
+
+
+def search(folder, maps, by, **changes):
+    return find_best_order(maps, folder, Settings(), OPTIONS, by, silent, **changes)
+
+
+def never(*_: object) -> None:
+    pytest.fail("this order was judged already")
+
+
+def test_a_search_that_is_done_is_not_done_again_and_says_what_it_took(
+    tmp_path, maps, logs, searched
+):
+    shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
+    again = search(tmp_path, maps[:2], judge(logs["held-out"], localise=never))
+    assert again.to_dict() == searched[1].to_dict()
+    assert (again.merges, again.copies) == (2, 4)
+    assert min(again.merge_s, again.copy_s, again.judge_s) > 0
+
+
+@pytest.mark.parametrize("what", ["drives", "distance", "localising", "reported", "groups"])
+def test_verdicts_on_other_maps_or_by_other_judges_are_not_used(
+    tmp_path, maps, logs, searched, monkeypatch, what
+):
+    by, groups = judge(logs["held-out"]), maps[:2]
+    others = {
+        "drives": (groups, judge(logs["other"])),
+        "distance": (groups, replace(by, judge_at_m=4.0)),
+        "localising": (groups, replace(by, localising=GateOptions())),
+        "reported": (groups, replace(by, reported=[logs["other"]])),
+        "groups": ([maps[0], maps[2]], by),
+    }
+    shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
+    monkeypatch.setattr(best_order, "merge_maps", killed)
+    search(tmp_path, groups, by)
+    with pytest.raises(KilledError):
+        search(tmp_path, *others[what])
+
+
+def test_a_search_that_was_killed_counts_what_it_had_done(tmp_path, maps, logs, searched):
+    calls = 0
+
+    def dies_over_the_second(*arguments):
+        nonlocal calls
+        calls += 1
+        return killed() if calls == 2 else best_order.localise_drive(*arguments)
+
+    with pytest.raises(KilledError):
+        search(tmp_path, maps[:2], judge(logs["held-out"], localise=dies_over_the_second))
+    (tmp_path / "order-0-1.engram").touch()  # a real kill leaves the map that it was at
+    again = search(tmp_path, maps[:2], judge(logs["held-out"]))
+    assert (again.merges, again.copies) == (2, 4)
+    assert again.results == searched[1].results
+    assert not list(tmp_path.glob("*.engram*"))
+
+
+def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
+    with pytest.raises(ConfigError, match=r"a\.framelog judges .* is in .*group-0\.engram"):
+        search(tmp_path, maps[:2], judge(logs["a"]))
+    with pytest.raises(ConfigError, match=r"held-out\.framelog .* the same drive"):
+        search(tmp_path, maps[:2], judge(logs["held-out"], reported=[logs["held-out"]]))
+    centre = tmp_path / "centre.engram"
+    with pytest.raises(ConfigError, match=r"b\.framelog judges .* to be built from"):
+        build(centre, logs, "ab", judge=judge(logs["b"]))
+    MapStore.copy(maps[2], centre)
+    with pytest.raises(ConfigError, match=r"c\.framelog judges .* in .*centre\.engram already"):
+        build(centre, logs, "ab", judge=judge(logs["c"]))
+    assert not centre.with_name("centre.engram.build").exists()
+
+
+def test_orders_are_judged_with_the_centre_that_they_are_merged_into(tmp_path, maps, logs):
+    centre = tmp_path / "centre.engram"
+    MapStore.copy(maps[2], centre)
+    report = build(centre, logs, "ab", judge=judge(logs["held-out"]))
+    assert (report.best.merges, report.best.copies) == (4, 4)
+    assert report.content_hash == report.best.results[0].content_hash
+    assert report.notes == []
+    assert "are of centres that are new" in report.text()
+
+
+def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
+    tmp_path, maps, logs, monkeypatch
+):
+    centre = tmp_path / "centre.engram"
+    MapStore.copy(maps[2], centre)
+
+    def meanwhile(*arguments):
+        found = best_order.localise_drive(*arguments)
+        building.merge_maps(centre, [maps[1]], Settings(), OPTIONS)
+        return found
+
+    with pytest.raises(MapError, match="written to while the orders were tried"):
+        search(
+            tmp_path / "orders", [maps[0]], judge(logs["held-out"], localise=meanwhile), root=centre
+        )
+
+
+def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch):
+    centre = tmp_path / "centre.engram"
+    with monkeypatch.context() as patch:
+        patch.setattr(building, "merge_maps", killed)
+        with pytest.raises(KilledError):
+            build(centre, logs, "ab", judge=judge(logs["held-out"]))
+    for other in (None, judge(logs["other"])):
+        with pytest.raises(ConfigError, match="being merged already, in the order"):
+            build(centre, logs, "ab", judge=other)
+    monkeypatch.setattr(best_order, "localise_drive", never)
+    report = build(centre, logs, "ab", judge=judge(logs["held-out"]), keep=True)
+    assert report.best.judge_s > 0
+    assert report.content_hash == report.best.results[0].content_hash
+    assert report.notes == []
+    # Other drives choose anew where there is no centre yet; the groups' maps are used again.
+    monkeypatch.undo()
+    centre.unlink()
+    monkeypatch.setattr(building, "map_groups", lambda tasks, *_: None if not tasks else killed())
+    other = build(centre, logs, "ab", judge=judge(logs["other"]))
+    assert other.best.results != report.best.results
+
+
+def test_a_map_that_is_not_the_one_that_was_judged_is_told(tmp_path, maps, logs, monkeypatch):
+    centre = tmp_path / "centre.engram"
+    with monkeypatch.context() as patch:
+        patch.setattr(MapStore, "copy", lambda source, target: copied(source, target, centre))
+        with pytest.raises(KilledError):
+            build(centre, logs, "ab", judge=judge(logs["held-out"]))
+    copied_really(maps[2], centre)
+    report = build(centre, logs, "ab", judge=judge(logs["held-out"]))
+    assert "is not the map that was judged" in report.notes[0]
+    assert report.notes[0] in report.text()
+
+
+copied_really = MapStore.copy
+
+
+def copied(source: Path, target: Path, centre: Path) -> None:
+    """Dies before the centre is made."""
+    if target == centre:
+        raise KilledError
+    copied_really(source, target)
