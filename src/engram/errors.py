@@ -76,7 +76,7 @@ class IncompatibleError(EngramError):
 
 
 class RefusedError(EngramError):
-    """A result is worse than what it would take the place of; nothing was changed."""
+    """A result is worse than what it would take the place of, and was not kept."""
 
 
 class WorkerError(EngramError):

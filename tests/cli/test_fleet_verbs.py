@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from engram.errors import MapCorruptError
+from engram.fleet import MergeReport
+
 
 @pytest.fixture
 def robot(engram, street, tmp_path):
@@ -31,6 +34,42 @@ def test_merge_refuses_what_is_no_map(engram, robot, tmp_path):
     refused = engram("merge", robot, tmp_path / "nothing.engram", "--json")
     assert refused.status == 2
     assert refused.json["error"]["kind"] == "NotAMapError"
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """The second map of every merge fails, with this error."""
+
+    def fail(error):
+        def merge_maps(centre, robots, *_, told, **__):
+            told(MergeReport(str(robots[0]), "", ["r1"], revision=2, taken=3))
+            raise error
+
+        monkeypatch.setattr("engram.fleet.merge_maps", merge_maps)
+
+    return fail
+
+
+def test_merge_tells_what_stands_where_a_later_map_fails(engram, failing, tmp_path):
+    failing(MapCorruptError("r2.engram is damaged"))
+    asked = ("merge", tmp_path / "c.engram", "r1.engram", "r2.engram")
+    ran = engram(*asked, "--json")
+    assert ran.status == 2
+    assert [one["revision"] for one in ran.json["merges"]] == [2]
+    expected = {"kind": "MapCorruptError", "message": "r2.engram is damaged"}
+    assert ran.json["error"] == expected
+    ran = engram(*asked)
+    assert ran.status == 2
+    assert "revision 2" in ran.out
+    assert "r2.engram is damaged" in ran.err
+
+
+def test_merge_tells_what_stands_where_it_is_stopped_between_two_maps(engram, failing, tmp_path):
+    failing(KeyboardInterrupt())
+    ran = engram("merge", tmp_path / "c.engram", "r1.engram", "r2.engram", "--json")
+    assert ran.status == 130
+    assert [one["revision"] for one in ran.json["merges"]] == [2]
+    assert "stand" in ran.json["error"]["message"]
 
 
 def test_build_maps_and_merges(engram, street, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import select
 import shutil
@@ -10,13 +11,23 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from uuid import uuid4
 
 import numpy as np
 import pytest
 
-from engram.drive import Settings
-from engram.errors import IncompatibleError, InputError, MapError, NotAMapError, RefusedError
-from engram.experience.model import Clock
+from engram.drive import MapOptions, Settings, map_drive, open_drive
+from engram.errors import (
+    ConfigError,
+    IncompatibleError,
+    InputError,
+    MapError,
+    NotAMapError,
+    RefusedError,
+    SequenceError,
+)
+from engram.experience.model import Clock, SessionId
 from engram.fleet import MergeOptions, merge_maps
 from engram.fleet.gate import what_is_worse
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
@@ -27,6 +38,9 @@ from engram.store import MapStore
 from .robots import OPTIONS, frame_log, merged, robot_map
 
 HOUR_NS = 3_600_000_000_000
+OLDER_FORMAT = Path(__file__).parents[1] / "store" / "data" / "format-2.engram"
+WELL = Drive(np.ones(40), np.ones(40, np.bool_))
+BADLY = Drive(np.ones(40), np.zeros(40, np.bool_))
 
 
 @pytest.fixture
@@ -70,6 +84,33 @@ def rewritten(source: Path, target: Path, *, session=None, node=None, descriptor
                 writer.add_path_entry(entry)
             writer.commit()
     return target
+
+
+def damaged(source: Path, target: Path) -> Path:
+    """A copy of a map in which a bit of the last node's landmarks was lost."""
+    shutil.copy(source, target)
+    with MapStore.open(target) as store:
+        stored = list(store.frames.stored(store.load().nodes))[-1]
+    content = bytearray(target.read_bytes())
+    at = content.find(stored.landmarks[300:400])
+    assert at > 0
+    content[at + 50] ^= 1
+    target.write_bytes(bytes(content))
+    return target
+
+
+@pytest.fixture
+def judged(monkeypatch):
+    """Says how held-out drives localise: before, and after each merge."""
+
+    def say(*found: Drive) -> None:
+        answers = iter([[one] for one in found])
+        named = SimpleNamespace(id=SessionId(uuid4()))
+        monkeypatch.setattr("engram.fleet.gate.Gate._localise", lambda self, store: next(answers))
+        monkeypatch.setattr("engram.fleet.gate.open_drive", lambda path: path)
+        monkeypatch.setattr("engram.fleet.gate.session_of_drive", lambda sequence: named)
+
+    return say
 
 
 class TestRefused:
@@ -124,19 +165,72 @@ class TestRefused:
         self.refuses(centre, centre, InputError, "the centre itself")
 
     def test_landmarks_that_were_damaged_on_the_way(self, tmp_path, centre, fleet):
-        robot = tmp_path / "damaged.engram"
-        shutil.copy(fleet["longer"][0], robot)
-        with MapStore.open(robot) as store:
-            stored = list(store.frames.stored(store.load().nodes))[-1]
-        content = bytearray(robot.read_bytes())
-        at = content.find(stored.landmarks[300:400])
-        assert at > 0
-        content[at + 50] ^= 1
-        robot.write_bytes(bytes(content))
+        robot = damaged(fleet["longer"][0], tmp_path / "damaged.engram")
         self.refuses(centre, robot, MapError)
+
+    def test_a_map_that_does_not_fit_a_centre_of_an_older_format(self, tmp_path, fleet):
+        centre = tmp_path / "centre.engram"
+        shutil.copy(OLDER_FORMAT, centre)
+        robot = rewritten(
+            fleet["other"][0], tmp_path / "t.engram", descriptor=DescriptorKind.TEBLID
+        )
+        self.refuses(centre, robot, IncompatibleError, "teblid", "brief")
+        self.refuses(centre, damaged(fleet["other"][0], tmp_path / "d.engram"), MapError)
+
+
+class TestNothingIsMade:
+    """A centre that is new appears with its first merge, or not at all."""
+
+    @pytest.fixture
+    def new(self, tmp_path):
+        folder = tmp_path / "centres"
+        folder.mkdir()
+        yield folder / "new.engram"
+        assert list(folder.iterdir()) == []
+
+    @pytest.mark.parametrize("share", [0.3, 0.97])
+    def test_of_a_truncated_file(self, tmp_path, new, fleet, share):
+        robot = tmp_path / "cut.engram"
+        content = fleet["longer"][0].read_bytes()
+        robot.write_bytes(content[: int(len(content) * share)])
+        with pytest.raises(MapError):
+            merged(new, robot)
+
+    def test_of_damaged_landmarks(self, tmp_path, new, fleet):
+        with pytest.raises(MapError):
+            merged(new, damaged(fleet["longer"][0], tmp_path / "damaged.engram"))
+
+    def test_where_a_held_out_drive_is_missing(self, tmp_path, new, fleet):
+        with pytest.raises(SequenceError, match="nosuch"):
+            merged(new, fleet["first"][0], require_better=[tmp_path / "nosuch.framelog"])
+
+    def test_where_the_gate_refuses(self, tmp_path, new, fleet, judged):
+        judged(WELL, BADLY)
+        with pytest.raises(RefusedError):
+            merged(new, fleet["first"][0], require_better=[tmp_path / "held-out"])
+
+    @pytest.mark.parametrize("name", ["nowhere/x.png", "x.foo"])
+    def test_where_the_picture_cannot_be_drawn(self, tmp_path, new, fleet, name):
+        with pytest.raises(InputError, match="picture"):
+            merged(new, fleet["first"][0], picture=tmp_path / name)
+
+    def test_where_a_later_map_cannot_be_opened(self, tmp_path, new, fleet):
+        robot = tmp_path / "text.engram"
+        robot.write_text("hello")
+        with pytest.raises(NotAMapError):
+            merged(new, fleet["first"][0], robot)
 
 
 class TestReported:
+    def test_what_was_merged_before_a_later_map_failed(self, tmp_path, centre, fleet):
+        bad = damaged(fleet["other"][0], tmp_path / "damaged.engram")
+        told = []
+        with pytest.raises(MapError):
+            merged(centre, fleet["longer"][0], bad, told=told.append)
+        (report,) = told
+        assert (report.source, report.revision) == (str(fleet["longer"][0]), 2)
+        assert report.content_hash == hash_of(centre)
+
     def test_a_map_of_another_town_becomes_a_part_of_its_own(self, centre, fleet):
         (report,) = merged(centre, fleet["other"][0])
         assert report.omitted == 0
@@ -176,6 +270,8 @@ class TestReported:
         _, report = merged(tmp_path / "centre.engram", *maps)
         (note,) = [note for note in report.notes if "same name" in note]
         assert "'twin'" in note
+        # Told when it came; handed in again it is no news.
+        assert all(not one.notes for one in merged(tmp_path / "centre.engram", *maps))
 
     def test_a_clock_that_is_ahead_by_years(self, tmp_path, fleet):
         ahead = rewritten(
@@ -260,24 +356,50 @@ class TestGate:
         assert "longest gap" in what_is_worse([bad], [good])
 
     def test_a_merge_that_makes_held_out_drives_worse_is_refused(
-        self, tmp_path, centre, fleet, monkeypatch
+        self, tmp_path, centre, fleet, judged
     ):
-        before = hash_of(centre)
-        judged = iter(
-            [[Drive(np.ones(40), np.ones(40, bool))], [Drive(np.ones(40), np.zeros(40, bool))]]
-        )
-        monkeypatch.setattr("engram.fleet.gate.Gate._localise", lambda self, store: next(judged))
-        monkeypatch.setattr("engram.fleet.gate.open_drive", lambda path: path)
-        with pytest.raises(RefusedError, match=r"held-out localise worse.*centre is as it was"):
-            merged(centre, fleet["longer"][0], require_better=[tmp_path / "held-out"])
-        assert hash_of(centre) == before
+        judged(WELL, WELL, BADLY)
+        maps, told = [fleet["same"][0], fleet["longer"][0]], []
+        with pytest.raises(RefusedError) as raised:
+            merged(centre, *maps, require_better=[tmp_path / "held-out"], told=told.append)
+        assert str(maps[1]) in str(raised.value)
+        assert "held-out localise worse" in str(raised.value)
+        assert "as it was before this map" in str(raised.value)
+        # What passed stands.
+        assert [report.revision for report in told] == [2]
+        assert hash_of(centre) == told[0].content_hash
         assert MapStore.check(centre).problems == ()
+
+    def test_a_drive_that_a_map_holds_is_not_held_out(self, tmp_path, centre, fleet):
+        drive = frame_log(tmp_path / "drive.framelog", np.arange(0, 8, 0.8), 1, day=8)
+        robot = tmp_path / "robot.engram"
+        map_drive(robot, open_drive(drive), Settings(), MapOptions(relocaliser="exhaustive"))
+        before = centre.read_bytes()
+        with pytest.raises(ConfigError, match=r"drive\.framelog is not held out: .*robot\.engram"):
+            merged(centre, fleet["longer"][0], robot, require_better=[drive])
+        assert centre.read_bytes() == before
+        merged(centre, robot)
+        with pytest.raises(ConfigError, match=r"not held out: .*centre\.engram holds"):
+            merged(centre, fleet["longer"][0], require_better=[drive])
+
+    def test_the_report_says_what_the_gate_saw(self, tmp_path, centre, fleet, judged):
+        judged(BADLY, WELL)
+        (report,) = merged(centre, fleet["other"][0], require_better=[tmp_path / "held-out"])
+        told = json.loads(json.dumps(report.to_dict()))["held_out"]
+        assert told["drives"] == ["held-out"]
+        assert told["before"]["route_not_localised"] == 1.0
+        assert told["before"]["longest_gap_m"] == pytest.approx(40.0)
+        assert told["after"]["route_not_localised"] == 0.0
+        assert told["after"]["p_no_match"] == {"5": 0.0, "10": 0.0, "20": 0.0}
+        assert "route not localised 100.00% → 0.00%" in report.text()
 
 
 def test_a_merge_that_serves_held_out_drives_passes_the_gate(tmp_path, centre, fleet):
     held_out = frame_log(tmp_path / "held-out.framelog", np.arange(12, 36, 0.8), 0, day=8)
     (report,) = merged(centre, fleet["longer"][0], require_better=[held_out])
     assert report.revision == 2
+    assert report.held_out is not None
+    assert report.held_out.after.route_not_localised < report.held_out.before.route_not_localised
 
 
 def test_ctrl_c_ends_a_merge_between_two_nodes_and_the_next_one_completes_it(

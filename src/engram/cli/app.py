@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import sys
-from typing import cast
+from collections.abc import Mapping
+from typing import Any, cast
 
 import typer
 
-from engram.cli.verbs import VerbInterruptedError, register
+from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.cli.verbs import register
 from engram.errors import EngramError
 
 app = typer.Typer(
@@ -41,20 +43,24 @@ def main() -> None:
     except typer.Abort:
         _complain(VerbInterruptedError("interrupted"))
         sys.exit(EXIT_INTERRUPTED)
-    except EngramError as error:
+    except PartlyDoneError as partly:
+        _complain(partly.error, partly.done)
+        sys.exit(_status_of(partly.error))
+    except (EngramError, VerbInterruptedError) as error:
         _complain(error)
-        sys.exit(EXIT_BAD_INPUT)
-    except VerbInterruptedError as error:
-        _complain(error)
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(_status_of(error))
     sys.exit(code)
 
 
-def _complain(error: Exception) -> None:
-    _tell_machines(str(error), type(error).__name__)
+def _status_of(error: EngramError | VerbInterruptedError) -> int:
+    return EXIT_INTERRUPTED if isinstance(error, VerbInterruptedError) else EXIT_BAD_INPUT
+
+
+def _complain(error: Exception, done: Mapping[str, Any] | None = None) -> None:
+    _tell_machines(str(error), type(error).__name__, done)
     print(f"engram: {error}", file=sys.stderr)
 
 
-def _tell_machines(message: str, kind: str) -> None:
+def _tell_machines(message: str, kind: str, done: Mapping[str, Any] | None = None) -> None:
     if "--json" in sys.argv:
-        print(json.dumps({"error": {"kind": kind, "message": message}}))
+        print(json.dumps({**(done or {}), "error": {"kind": kind, "message": message}}))

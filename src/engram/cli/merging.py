@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from engram.cli import options
+from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.errors import EngramError
+
+if TYPE_CHECKING:
+    from engram.fleet import MergeReport
 
 
 def merge(
@@ -55,7 +60,8 @@ def merge(
 
     Every map handed in is one revision, whole or not at all. Nodes that the centre has are not
     taken again; the others are replayed as if they were a live drive, and only those that do not
-    localise are taken. The same map handed in twice changes nothing.
+    localise are taken. The same map handed in twice changes nothing. Where a later map fails, the
+    merges before it stand, and are told of.
 
     \b
     Examples:
@@ -70,20 +76,38 @@ def merge(
     asked = MergeOptions(
         policy, lanes, rounds, None if relocaliser == "none" else relocaliser, author
     )
-    reports = merge_maps(
-        centre,
-        robots,
-        load_settings(config),
-        asked,
-        dry_run=dry_run,
-        require_better=require_better or (),
-        picture=picture,
-        progress=progress,
-    )
-    if as_json:
-        print(json.dumps({"merges": [report.to_dict() for report in reports]}))
-    else:
-        for report in reports:
+    reports: list[MergeReport] = []
+
+    def tell(report: MergeReport) -> None:
+        reports.append(report)
+        if not as_json:
             typer.echo(report.text())
+
+    try:
+        merge_maps(
+            centre,
+            robots,
+            load_settings(config),
+            asked,
+            dry_run=dry_run,
+            require_better=require_better or (),
+            picture=picture,
+            progress=progress,
+            told=tell,
+        )
+    except EngramError as error:
+        raise PartlyDoneError(error, _told(reports)) from error
+    except KeyboardInterrupt:
+        if not reports:
+            raise
+        stopped = VerbInterruptedError("interrupted; the merges told of stand")
+        raise PartlyDoneError(stopped, _told(reports)) from None
+    if as_json:
+        print(json.dumps(_told(reports)))
     if any(report.interrupted for report in reports):
         raise typer.Exit(130)
+
+
+def _told(reports: list[MergeReport]) -> dict[str, Any]:
+    """What ``merge --json`` prints."""
+    return {"merges": [report.to_dict() for report in reports]}

@@ -12,6 +12,7 @@ from engram.cli.benchmark import bench
 from engram.cli.building import build
 from engram.cli.demonstration import demo
 from engram.cli.downloading import download
+from engram.cli.endings import VerbInterruptedError
 from engram.cli.evaluation import evaluate
 from engram.cli.explanation import explain
 from engram.cli.extraction import extract
@@ -50,10 +51,6 @@ VERBS: dict[str, Callable[..., None]] = {
 
 # Verbs that have verbs below them.
 GROUPS: tuple[typer.Typer, ...] = (evaluate,)
-
-
-class VerbInterruptedError(Exception):
-    """A verb was stopped by Ctrl-C before it had a result."""
 
 
 def register(app: typer.Typer) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 from engram.errors import IncompatibleError
@@ -13,6 +14,8 @@ from engram.fleet.handed_in import HandedIn
 _NS_PER_S = 1_000_000_000
 # Stamps count as running backwards only where odometry says that the robot drove on by as much.
 _DRIVEN_SLACK_M = 0.5
+# Pairs of drives at the same time that are named for each robot: a name shared by two makes many.
+_TOLD_OVERLAPS = 5
 
 
 def check_fits(centre: Centre, robot: HandedIn) -> None:
@@ -51,8 +54,20 @@ def check_fits(centre: Centre, robot: HandedIn) -> None:
             )
 
 
+def check_readable(robot: HandedIn, nodes: Sequence[Node]) -> None:
+    """Reads all landmarks that may be taken once, before a byte of the centre is written.
+
+    Raises:
+        MapError: something of them was damaged on the way.
+    """
+    for _ in robot.store.frames.stored(list(nodes)):
+        pass
+
+
 def notes(centre: Centre, robot: HandedIn, now_ns: int) -> list[str]:
     """What is odd about a map and does not stand in the way of a merge.
+
+    Drives that the centre has are left out: what is odd about them was told when they came.
 
     Args:
         centre: before the merge.
@@ -64,7 +79,8 @@ def notes(centre: Centre, robot: HandedIn, now_ns: int) -> list[str]:
         "not handed in before it is resumed or sealed there"
         for one in robot.store.interrupted()
     ]
-    for session in robot.sessions:
+    new = [one for one in robot.sessions if one.id not in centre.opened.sessions]
+    for session in new:
         told += _backwards(session, robot.nodes_of[session])
         if session.clock is Clock.UTC and session.start_ns > now_ns:
             told.append(
@@ -72,8 +88,7 @@ def notes(centre: Centre, robot: HandedIn, now_ns: int) -> list[str]:
                 f"{(session.start_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
                 "was wrong"
             )
-    told += _overlaps(centre, robot)
-    return told
+    return told + list(_overlaps(centre, robot, new))
 
 
 def _drive(session: Session) -> tuple[str, str, int]:
@@ -103,31 +118,52 @@ def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
         )
 
 
-def _overlaps(centre: Centre, robot: HandedIn) -> Iterator[str]:
+def _overlaps(centre: Centre, robot: HandedIn, new: Sequence[Session]) -> Iterator[str]:
     """Drives of one robot at the same time: two robots of one name, or a clock that was wrong."""
     spans = _spans(centre, robot)
-    for session in robot.sessions:
-        mine = spans.get(session)
-        if mine is None:
-            continue
-        for other, theirs in spans.items():
-            new = other.id not in {one.id for one in robot.sessions} or other.id > session.id
-            if other.robot != session.robot or other.id == session.id or not new:
-                continue
-            if mine[0] <= theirs[1] and theirs[0] <= mine[1]:
-                yield (
-                    f"sessions {session.id} and {other.id} are both of a robot named "
-                    f"{session.robot!r} and overlap in time: two robots have the same name, or a "
-                    "clock was wrong"
-                )
+    ids = {session.id for session in new}
+    for name in sorted({session.robot for session in new}):
+        pairs = list(overlapping([one for one in spans if one.session.robot == name], ids))
+        for one, other in pairs[:_TOLD_OVERLAPS]:
+            yield (
+                f"sessions {one.id} and {other.id} are both of a robot named {name!r} and overlap "
+                "in time: two robots have the same name, or a clock was wrong"
+            )
+        if len(pairs) > _TOLD_OVERLAPS:
+            yield f"… and {len(pairs) - _TOLD_OVERLAPS} more pairs of drives of {name!r}"
 
 
-def _spans(centre: Centre, robot: HandedIn) -> dict[Session, tuple[int, int]]:
-    """First and last stamp of every session whose clock is UTC."""
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A session and its first and last stamp, UTC."""
+
+    session: Session
+    first_ns: int
+    last_ns: int
+
+
+def overlapping(
+    spans: Iterable[Span], new: Container[SessionId]
+) -> Iterator[tuple[Session, Session]]:
+    """The pairs of sessions that overlap in time, at least one of them new; the earlier first.
+
+    One sweep over the starts, beside which only the sessions that have not ended are kept.
+    """
+    running: list[Span] = []
+    for span in sorted(spans, key=lambda one: (one.first_ns, one.session.id)):
+        running = [one for one in running if one.last_ns >= span.first_ns]
+        for one in running:
+            if span.session.id in new or one.session.id in new:
+                yield one.session, span.session
+        running.append(span)
+
+
+def _spans(centre: Centre, robot: HandedIn) -> list[Span]:
+    """Of every session whose clock is UTC."""
     sessions = {**centre.opened.sessions, **{one.id: one for one in robot.sessions}}
     last = {one.id: one.start_ns for one in sessions.values()}
     for node in (*centre.graph.nodes, *robot.contents.nodes):
         last[node.session] = max(last[node.session], node.stamp_ns)
-    return {
-        one: (one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC
-    }
+    return [
+        Span(one, one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC
+    ]

@@ -6,18 +6,23 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from engram.drive import Settings
 from engram.drive.interruption import deferred_interrupt
 from engram.errors import InputError
+from engram.fleet.centre import Centre
+from engram.fleet.checks import check_fits, check_readable
+from engram.fleet.drafts import draft_folder
 from engram.fleet.gate import Gate
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.merging import Progress, merge_map, silent
 from engram.fleet.pictures import picture_before_and_after
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
-from engram.store import MapStore, WritableMapStore
+from engram.store import FORMAT_VERSION, MapStore
+from engram.viewing import check_picture
 
 
 def merge_maps(
@@ -30,6 +35,7 @@ def merge_maps(
     require_better: Sequence[Path] = (),
     picture: Path | None = None,
     progress: Progress = silent,
+    told: Callable[[MergeReport], None] = lambda _: None,
 ) -> list[MergeReport]:
     """Merges robots' maps into a centre, in the order given; the centre is made if there is none.
 
@@ -45,39 +51,58 @@ def merge_maps(
         require_better: held-out drives that must not localise worse in the result.
         picture: an image file for the centre before and after, from above.
         progress: shows how it goes.
+        told: is given each report as soon as its map is merged, whatever becomes of the next.
 
     Returns:
         One report for each map, up to the one in which the command was interrupted.
 
     Raises:
-        InputError: the centre itself is handed in.
+        InputError: the centre itself is handed in, a drive is none, or the picture cannot be
+            drawn there. Nothing was merged.
+        ConfigError: a drive is not held out. Nothing was merged.
         IncompatibleError: a map does not fit the centre.
         RefusedError: held-out drives localise worse in the result.
-        MapError: a map cannot be read or written. Merges before the failing one stand.
+        MapError: a map cannot be read or written. Where a map cannot be opened or its records are
+            damaged, nothing was merged; else merges before the failing one stand.
     """
-    for robot in robots:
-        if not robot.exists():
-            MapStore.open(robot).close()  # raises, before anything is made
-        if centre.exists() and robot.samefile(centre):
-            raise InputError(f"{robot} is the centre itself; hand in other maps")
-    with _centre(centre, dry_run) as place:
-        reports: list[MergeReport] = []
-        with WritableMapStore.opened_or_created(place) as store:
+    if picture is not None:
+        check_picture(picture)
+    gate = Gate(require_better, settings) if require_better else None
+    _check_given(centre, robots, gate)
+    reports: list[MergeReport] = []
+    with _place(centre, dry_run=dry_run) as place:
+        with MapStore.open(place.path) as store:
             before = store.revision
-            gate = Gate(require_better, settings) if require_better else None
             if gate is not None:
                 gate.look_at(store)
         for robot in robots:
             started = time.perf_counter()
-            report = _merge_one(place, robot, settings, options, progress, gate)
+            report = _merge_one(place.path, robot, settings, options, progress, gate)
             report.dry_run = dry_run
             report.seconds = time.perf_counter() - started
+            if not report.interrupted:
+                place.settle()
             reports.append(report)
+            told(report)
             if report.interrupted:
                 break
         if picture is not None:
-            picture_before_and_after(place, before, picture)
+            picture_before_and_after(place.path, before, picture)
     return reports
+
+
+def _check_given(centre: Path, robots: Sequence[Path], gate: Gate | None) -> None:
+    """Looks at all that was given before anything is made or changed."""
+    for robot in robots:
+        with MapStore.open(robot) as store:
+            if centre.exists() and robot.samefile(centre):
+                raise InputError(f"{robot} is the centre itself; hand in other maps")
+            sessions = [session.id for session in store.load().sessions]
+        if gate is not None:
+            gate.check_held_out(sessions, robot)
+    if gate is not None and centre.exists():
+        with MapStore.open(centre) as store:
+            gate.check_held_out(store.frontends(), centre)
 
 
 def _merge_one(
@@ -89,21 +114,32 @@ def _merge_one(
     gate: Gate | None,
 ) -> MergeReport:
     """One merge in a freshly opened centre, so that it does not matter what came before it."""
-    with (
-        MapStore.open_for_writing(place) as store,
-        HandedIn(MapStore.open(robot), str(robot)) as handed_in,
-        deferred_interrupt() as raise_if_asked,
-    ):
-        resolved = settings.for_descriptor(handed_in.store.descriptor())
-        try:
-            return merge_map(
-                store, handed_in, resolved, options, _interruptible(progress, raise_if_asked), gate
-            )
-        except KeyboardInterrupt:
-            report = MergeReport(str(robot), handed_in.content_hash, handed_in.robots)
-            report.interrupted = True
-            report.content_hash = store.content_hash()
-            return report
+    with HandedIn(MapStore.open(robot), str(robot)) as handed_in:
+        _check_before_raising(place, handed_in)
+        with (
+            MapStore.open_for_writing(place) as store,
+            deferred_interrupt() as raise_if_asked,
+        ):
+            resolved = settings.for_descriptor(handed_in.store.descriptor())
+            shown = _interruptible(progress, raise_if_asked)
+            try:
+                return merge_map(store, handed_in, resolved, options, shown, gate)
+            except KeyboardInterrupt:
+                report = MergeReport(str(robot), handed_in.content_hash, handed_in.robots)
+                report.interrupted = True
+                report.content_hash = store.content_hash()
+                return report
+
+
+def _check_before_raising(place: Path, robot: HandedIn) -> None:
+    """A centre of an older format becomes one of the newest when it is opened for writing.
+
+    A map that is refused shall not do even that.
+    """
+    with MapStore.open(place) as store:
+        if store.format_version < FORMAT_VERSION:
+            check_fits(Centre(store), robot)
+            check_readable(robot, robot.contents.nodes)
 
 
 def _interruptible(progress: Progress, raise_if_asked: Callable[[], None]) -> Progress:
@@ -122,14 +158,40 @@ def _interruptible(progress: Progress, raise_if_asked: Callable[[], None]) -> Pr
     return shown
 
 
+@dataclass(slots=True)
+class _Place:
+    """Where merges go.
+
+    Attributes:
+        path: the map file.
+        target: the name it gets with its first merge; None where it has it, or never gets one.
+    """
+
+    path: Path
+    target: Path | None = None
+
+    def settle(self) -> None:
+        """A merge went well: a centre that is new appears under its name."""
+        if self.target is not None:
+            MapStore.publish(self.path, self.target)
+            self.path, self.target = self.target, None
+
+
 @contextmanager
-def _centre(centre: Path, dry_run: bool) -> Iterator[Path]:
-    """Where the merge goes: the centre, or a copy of it that is thrown away."""
-    if not dry_run:
-        yield centre
-        return
-    with tempfile.TemporaryDirectory(prefix="engram-dry-run-") as folder:
-        copy = Path(folder) / centre.name
-        if centre.exists():
-            MapStore.copy(centre, copy)
-        yield copy
+def _place(centre: Path, *, dry_run: bool) -> Iterator[_Place]:
+    """The centre; a copy of it that is thrown away; or the draft of one that is new."""
+    if centre.exists() and not dry_run:
+        yield _Place(centre)
+    elif dry_run:
+        with tempfile.TemporaryDirectory(prefix="engram-dry-run-") as folder:
+            copy = Path(folder) / centre.name
+            if centre.exists():
+                MapStore.copy(centre, copy)
+            else:
+                MapStore.create(copy).close()
+            yield _Place(copy)
+    else:
+        with draft_folder(centre) as folder:
+            draft = folder / centre.name
+            MapStore.create(draft).close()
+            yield _Place(draft, centre)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from engram.drive import OpenMap, Settings, live_frames, open_drive, session_of_drive
 from engram.drive.session import DriveSequence
-from engram.errors import RefusedError
+from engram.errors import ConfigError, RefusedError
+from engram.experience.model import SessionId
+from engram.fleet.report import HeldOutFigures, HeldOutReport
 from engram.localiser import Budget, LocalisationStatus
 from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
 from engram.store import MapStore
@@ -20,6 +22,8 @@ from engram.store import MapStore
 # SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
 _JUDGED_M = np.arange(0.0, 20.5, 0.5)
 _LONGEST_GAP_RATIO = 1.5
+# Where reports tell the failure curve (SPEC §8).
+_TOLD_M = (5, 10, 20)
 # Sums of the same gaps in another order differ by this much.
 _ROUNDING = 1e-9
 
@@ -57,29 +61,53 @@ class Gate:
     ) -> None:
         self._paths = list(drives)
         self._sequences = [open_drive(path) for path in drives]
+        self._sessions = [session_of_drive(sequence).id for sequence in self._sequences]
         self._settings = settings
         self._options = options or GateOptions()
         self._before: list[Drive] | None = None
+
+    def check_held_out(self, sessions: Collection[SessionId], where: Path) -> None:
+        """Refuses to judge by what is judged: a drive localises well in a map of itself.
+
+        Args:
+            sessions: of a map that takes part in the merge.
+            where: the map.
+
+        Raises:
+            ConfigError: one of them is one of the drives.
+        """
+        for path, session in zip(self._paths, self._sessions, strict=True):
+            if session in sessions:
+                raise ConfigError(
+                    f"{path} is not held out: {where} holds this very drive (session {session}); "
+                    "give --require-better drives that are in none of the maps"
+                )
 
     def look_at(self, store: MapStore) -> None:
         """The centre as it is; once, before the first merge."""
         self._before = self._localise(store)
 
-    def __call__(self, store: MapStore) -> None:
+    def __call__(self, store: MapStore, robot: str) -> HeldOutReport:
         """The centre as it would become.
+
+        Args:
+            store: with what is being merged.
+            robot: name of the map that is.
 
         Raises:
             RefusedError: the drives localise worse in it.
         """
         assert self._before is not None
-        after = self._localise(store)
-        worse = what_is_worse(after, self._before)
+        before, after = self._before, self._localise(store)
+        names = [path.name for path in self._paths]
+        worse = what_is_worse(after, before)
         if worse:
             raise RefusedError(
-                f"the merge is refused: {', '.join(path.name for path in self._paths)} localise "
-                f"worse in the result: {worse}; the centre is as it was"
+                f"{robot} is refused: {', '.join(names)} localise worse in the result: {worse}; "
+                "the centre is as it was before this map"
             )
         self._before = after
+        return HeldOutReport(names, _figures(before), _figures(after))
 
     def _localise(self, store: MapStore) -> list[Drive]:
         opened = OpenMap(store)
@@ -137,6 +165,14 @@ def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
         shares = [route_not_localised(drives) for drives in (after, before)]
         facts.append(f"route not localised {shares[0]:.2%}, was {shares[1]:.2%}")
     return "; ".join(facts)
+
+
+def _figures(drives: Sequence[Drive]) -> HeldOutFigures:
+    return HeldOutFigures(
+        route_not_localised(drives),
+        longest_gap_m(drives),
+        {within_m: failure_route(drives, float(within_m)) for within_m in _TOLD_M},
+    )
 
 
 def _curve(drives: Sequence[Drive]) -> NDArray[np.float64]:

@@ -28,21 +28,21 @@ from engram.experience.model import (
 )
 from engram.fleet.attempts import at_equivalents, from_records, lacking
 from engram.fleet.centre import Centre, LazyRelocaliser
-from engram.fleet.checks import check_fits, notes
+from engram.fleet.checks import check_fits, check_readable, notes
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.positions import recomposed, uncertainty_m2
 from engram.fleet.replay import MergeOptions, Replay
-from engram.fleet.report import MergeReport
+from engram.fleet.report import HeldOutReport, MergeReport
 from engram.fleet.segments import Segment, string_segments
 from engram.fleet.words import keep_words
 from engram.localiser import Position
 from engram.places import RECOGNISERS
-from engram.store import AttemptArrays, BulkWriter, WritableMapStore
+from engram.store import AttemptArrays, BulkWriter, MapStore, WritableMapStore
 
 Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 # Relocalisers that know places by their words.
 _BY_WORDS = frozenset(RECOGNISERS)
-Gate: TypeAlias = Callable[[WritableMapStore], None]
+Gate: TypeAlias = Callable[[MapStore, str], HeldOutReport]
 
 
 @contextmanager
@@ -68,7 +68,8 @@ def merge_map(
         settings: of localiser and mapper.
         options: policy and budget.
         progress: shows how it goes.
-        gate: is shown the result before it becomes part of the centre, and raises to refuse it.
+        gate: is shown the result before it becomes part of the centre, with the map's name; it
+            says what it found, or raises to refuse it.
 
     Raises:
         IncompatibleError: the map does not fit the centre.
@@ -83,13 +84,13 @@ def merge_map(
     report.known_omissions = sum(centre.has_omitted(node) for node in robot.nodes)
     report.known = len(robot.nodes) - len(new) - report.known_omissions
     if new or _has_more(centre, robot):
-        _check_readable(robot, new)
+        check_readable(robot, new)
         with store.begin_revision(**_about(robot, settings, options)) as writer:
             merging = _Merging(centre, robot, writer, settings, options, report)
             merging.take_over(new, progress)
             if gate is not None:
                 writer.flush()
-                gate(store)
+                report.held_out = gate(store, robot.name)
             report.revision = writer.commit().number
         if options.relocaliser in _BY_WORDS:
             keep_words(store, centre, robot, settings.frontend.descriptor)
@@ -100,16 +101,6 @@ def merge_map(
         report.notes += _parts_apart(apart, report)
     report.content_hash = store.content_hash()
     return report
-
-
-def _check_readable(robot: HandedIn, new: list[Node]) -> None:
-    """Reads everything that may be taken once, before a byte of the centre is written.
-
-    Raises:
-        MapError: something of it was damaged on the way.
-    """
-    for _ in robot.store.frames.stored(new):
-        pass
 
 
 def _parts_apart(apart: NDArray[np.bool_], report: MergeReport) -> list[str]:

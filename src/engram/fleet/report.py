@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -123,6 +123,64 @@ def _drive_text(segments: Sequence[SegmentReport]) -> str:
     return f"{line}: {'; '.join(told)}" if told else line
 
 
+@dataclass(frozen=True, slots=True)
+class HeldOutFigures:
+    """How held-out drives localise in a map.
+
+    Attributes:
+        route_not_localised: share of their way without a match.
+        longest_gap_m: longest way without one.
+        p_no_match: P(no match within x metres), by x.
+    """
+
+    route_not_localised: float
+    longest_gap_m: float
+    p_no_match: Mapping[int, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values; the distances become text, as JSON wants its keys."""
+        return {
+            "route_not_localised": self.route_not_localised,
+            "longest_gap_m": self.longest_gap_m,
+            "p_no_match": {str(within_m): p for within_m, p in self.p_no_match.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutReport:
+    """What a gate saw of a merge that it let pass.
+
+    Attributes:
+        drives: names of the held-out drives.
+        before, after: how they localise without and with it.
+    """
+
+    drives: Sequence[str]
+    before: HeldOutFigures
+    after: HeldOutFigures
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "drives": list(self.drives),
+            "before": self.before.to_dict(),
+            "after": self.after.to_dict(),
+        }
+
+    def text(self) -> str:
+        """One line for people."""
+        was, now = self.before, self.after
+        curve = ", ".join(
+            f"P(no match within {within_m} m) {was.p_no_match[within_m]:.2%} → {p:.2%}"
+            for within_m, p in now.p_no_match.items()
+        )
+        return (
+            f"held out {', '.join(self.drives)}: route not localised "
+            f"{was.route_not_localised:.2%} → {now.route_not_localised:.2%}, longest gap "
+            f"{was.longest_gap_m:.1f} → {now.longest_gap_m:.1f} m, {curve}"
+        )
+
+
 @dataclass(slots=True)
 class MergeReport:
     """What handing in one robot's map came to.
@@ -133,7 +191,7 @@ class MergeReport:
         robots: whose drives it holds.
         revision: number of the new revision; None where nothing changed, and in a dry run.
         dry_run: whether the centre was left as it was on purpose.
-        interrupted: whether it was stopped; the centre is as it was.
+        interrupted: whether it was stopped; the centre is as it was before this map.
         content_hash: of the centre afterwards; of what would have been in a dry run.
         sessions: drives that were new to the centre.
         known, known_omissions: nodes that the centre had, and had omitted before.
@@ -144,6 +202,7 @@ class MergeReport:
         lookups: frames of the replay for which the relocaliser was asked.
         seconds: wall time.
         components: connected components of the centre afterwards.
+        held_out: how held-out drives localise before and after; None where no gate was asked.
         segments: one report each, in the order of replay.
         notes: what somebody should look at.
     """
@@ -167,6 +226,7 @@ class MergeReport:
     lookups: int = 0
     seconds: float = 0.0
     components: int = 0
+    held_out: HeldOutReport | None = None
     segments: list[SegmentReport] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -188,12 +248,13 @@ class MergeReport:
         values: dict[str, Any] = {
             name: to_dict(getattr(self, name))
             for name in self.__slots__
-            if name not in {"segments", "robots"}
+            if name not in {"segments", "robots", "held_out"}
         }
         return {
             **values,
             "robots": list(self.robots),
             "changed": self.changed,
+            "held_out": None if self.held_out is None else self.held_out.to_dict(),
             "segments": [segment.to_dict() for segment in self.segments],
         }
 
@@ -210,6 +271,8 @@ class MergeReport:
             lines += [_drive_text(one) for one in drives[:_SHOWN_DRIVES]]
             if len(drives) > _SHOWN_DRIVES:
                 lines.append(f"  … and {len(drives) - _SHOWN_DRIVES} more drives")
+        if self.held_out is not None:
+            lines.append(f"  {self.held_out.text()}")
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
 
@@ -222,7 +285,7 @@ class MergeReport:
 
     def _outcome(self) -> str:
         if self.interrupted:
-            return "interrupted: the centre is as it was; give the same command again"
+            return "interrupted: nothing of it is in the centre; give the same command again"
         if not self.changed:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"

@@ -17,10 +17,12 @@ from engram.store.records import (
     StoredNode,
     StoredSession,
 )
+from engram.store.schema import FORMAT_VERSION
 from engram.store.session_writer import SessionWriter
 from engram.store.tags import Tag
 
 __all__ = [
+    "FORMAT_VERSION",
     "AttemptArrays",
     "BulkWriter",
     "CheckReport",

@@ -166,6 +166,11 @@ class MapStore:
         """Number of the newest revision that is seen; 0 for an empty map."""
         return self._view.at
 
+    @property
+    def format_version(self) -> int:
+        """Of the format in which the map is stored."""
+        return self._database.format_version
+
     def load(self) -> MapContents:
         """Everything but the landmarks: for a writer, what its open session has checkpointed too.
 
@@ -333,6 +338,16 @@ class MapStore:
             database.compact_to(target)
         finally:
             database.close()
+
+    @staticmethod
+    def publish(draft: Path, target: Path) -> None:
+        """Gives a map file that nobody has open its name, in the same file system: last of all.
+
+        Raises:
+            InputError: the target exists already, or its folder does not.
+            MapError: the name cannot be given.
+        """
+        SqliteDatabase.publish(draft, target)
 
     @staticmethod
     def check(location: Path | str) -> CheckReport:

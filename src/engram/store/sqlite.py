@@ -214,6 +214,21 @@ class SqliteDatabase:
             finally:
                 compact.close()
 
+    @staticmethod
+    def publish(draft: Path, path: Path) -> None:
+        """Give a map file that nobody has open its name, in the same file system.
+
+        Raises:
+            InputError: something is there already, or the folder is not.
+            MapError: the name cannot be given.
+        """
+        log = draft.with_name(draft.name + "-wal")
+        if log.exists() and log.stat().st_size:
+            raise MapError(f"{draft} is open still: {path} would lack what its log holds")
+        with _naming(path):
+            _publish(draft, path)
+            _sync_folder(path.parent)
+
     def size_bytes(self) -> int:
         """The file and its write-ahead log."""
         log = self.path.with_name(self.path.name + "-wal")
@@ -393,22 +408,30 @@ def _check_tables(connection: Connection, path: Path, version: int) -> None:
 @contextmanager
 def _new_file(path: Path) -> Iterator[Path]:
     """A draft to be filled, which then appears under its name whole or not at all."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        with _naming(path):
+            _remove(draft)
+            yield draft
+            _publish(draft, path)
+            _sync_folder(path.parent)
+    finally:
+        _remove(draft)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Around making a new file: what may stand in its way, as our errors."""
     if path.exists() or path.is_symlink():
         raise InputError(f"{path} exists already; open it, or choose another name")
     if not path.parent.is_dir():
         raise InputError(f"{path.parent} is no folder; make it first")
-    draft = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
-        _remove(draft)
-        yield draft
-        _publish(draft, path)
-        _sync_folder(path.parent)
+        yield
     except FileExistsError as error:
         raise InputError(f"{path} exists already; open it, or choose another name") from error
     except OSError as error:
         raise MapError(f"{path} cannot be created: {error.strerror}") from error
-    finally:
-        _remove(draft)
 
 
 def _write_empty(path: Path) -> None:

@@ -1,13 +1,20 @@
 """Pictures."""
 
 from engram.viewing.curves import Line, Panel, draw_bars, draw_curves
-from engram.viewing.from_above import Track, draw_attempts, draw_from_above, draw_panels
+from engram.viewing.from_above import (
+    Track,
+    check_picture,
+    draw_attempts,
+    draw_from_above,
+    draw_panels,
+)
 from engram.viewing.matches import match_picture
 
 __all__ = [
     "Line",
     "Panel",
     "Track",
+    "check_picture",
     "draw_attempts",
     "draw_bars",
     "draw_curves",

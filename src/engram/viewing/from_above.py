@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,14 +100,38 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
     _save(figure, path)
 
 
-def _axes(wide: bool = False, columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
+def check_picture(path: Path) -> None:
+    """Says before the work is done whether a picture can be drawn there.
+
+    Raises:
+        InputError: there is no such folder, it may not be written, or the ending means no format.
+        MissingExtraError: Matplotlib is not installed.
+    """
+    formats = _matplotlib().figure.Figure().canvas.get_supported_filetypes()
+    ending = path.suffix.removeprefix(".").lower()
+    if not path.parent.is_dir():
+        raise InputError(f"the picture {path} cannot be written: {path.parent} is no folder")
+    if ending and ending not in formats:
+        raise InputError(
+            f"the picture {path} cannot be written: .{ending} is none of {', '.join(formats)}"
+        )
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise InputError(f"the picture {path} cannot be written: permission denied, or a folder")
+
+
+def _matplotlib() -> ModuleType:
     try:
         import matplotlib
+        import matplotlib.figure
     except ImportError as error:
         raise MissingExtraError(
             "pictures of maps need Matplotlib: pip install 'engram[plots]'"
         ) from error
-    matplotlib.use("Agg")
+    return matplotlib
+
+
+def _axes(wide: bool = False, columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
+    _matplotlib().use("Agg")
     from matplotlib import pyplot
 
     size = (9, 3.2) if wide else (7 * columns, 6)
