@@ -60,6 +60,9 @@ def test_a_promise_is_held_against_a_drive(
         (("--policy", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
         (("--policy", "region", "--near", "xyz"), "no UUID"),
         (("--policy", "route", "--route", "00"), "0 sessions begin with '00'"),
+        (("--route", "zzzz"), "does not go by --route"),
+        (("--policy", "tod", "--start", "9:30", "--budget", "10kB"), "does not go by --budget"),
+        (("--policy", "budget", "--budget", "1MB", "--near", "ffffffffff"), "begins with"),
         (("--at", "summer"), "it has no tags"),
     ],
 )

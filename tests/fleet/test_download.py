@@ -8,12 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tests.worlds import attempts_of
 
 from engram.drive.place_words import keep_missing_words, stored_words
-from engram.errors import ConfigError, InputError, NotAMapError, RevisionError
+from engram.errors import ConfigError, InputError, MapError, NotAMapError, RevisionError
 from engram.experience.model import EdgeKind, path_id
 from engram.fleet import DownloadOptions, DownloadReport, download, silent
+from engram.fleet.downloading import most_that_fit
+from engram.fleet.selections import SELECTIONS, UNDERSTOOD
 from engram.frontend import DescriptorKind
 from engram.places import default_vocabulary
 from engram.store import MapStore
@@ -270,6 +274,49 @@ def test_what_was_taken_back_is_not_sent(centre, tmp_path):
     assert MapStore.check(tmp_path / "out.engram").problems == ()
 
 
+class TestMostThatFit:
+    """Files of a size as a test says: what every file holds, and nodes that take what they take."""
+
+    @given(
+        st.lists(st.integers(2_000, 60_000), min_size=1, max_size=300),
+        st.integers(0, 20_000_000),
+        st.floats(0.5, 2.0),
+        st.floats(0.0, 1.2),
+    )
+    def test_it_fits_and_leaves_little_free(self, node_bytes, held_bytes, growth, share):
+        taken = np.cumsum(node_bytes) * growth
+        written = []
+
+        def measure(count):
+            written.append(count)
+            return held_bytes + int(taken[count - 1])
+
+        # From no room for a node to room for all of them and more.
+        budget = held_bytes + int(share * taken[-1])
+        if measure(1) > budget:
+            with pytest.raises(InputError, match=f"take {measure(1)};"):
+                most_that_fit(measure, np.cumsum(node_bytes), budget)
+            return
+        written.clear()
+        count = most_that_fit(measure, np.cumsum(node_bytes), budget)
+        assert len(written) <= 9
+        assert measure(count) <= budget
+        assert (
+            count == len(node_bytes)
+            or measure(count) >= 0.99 * budget
+            or measure(count + 1) > budget
+        )
+
+    def test_sizes_that_are_not_as_expected_still_fit_well(self):
+        rng = np.random.default_rng(3)
+        expected = np.cumsum(rng.uniform(10_000, 30_000, 2_000))
+        # Nodes added late bring fewer edges with them.
+        real = 3_000_000 + expected * np.linspace(1.6, 0.9, 2_000)
+        for budget in np.linspace(real[0], real[-1], 40):
+            count = most_that_fit(lambda n: int(real[n - 1]), expected, int(budget) + 1)
+            assert 0.97 * budget <= real[count - 1] <= budget + 1
+
+
 class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "says"),
@@ -311,6 +358,48 @@ class TestMistakes:
             sent(centre, tmp_path / "out.engram", **options)
         assert list(tmp_path.iterdir()) == []
 
+    @pytest.mark.parametrize(
+        ("options", "says"),
+        [
+            ({"policy": "copy", "route": "zzzz"}, "copy does not go by --route"),
+            ({"policy": "copy", "near": ("ffff",)}, "does not go by --near"),
+            ({"policy": "tod", "start_h": 9.0, "budget_bytes": 10_000}, "choose --policy budget"),
+            ({"policy": "tod", "start_h": 9.0, "route": "0"}, "choose --policy route or budget"),
+            ({"policy": "tod", "start_h": 9.0, "epoch_min": 30.0}, "does not go by --epoch"),
+            ({"policy": "paths", "window_min": 60.0}, r"choose --policy tod or tod\+paths"),
+            ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "go by --budget"),
+            ({"policy": "route", "route": "0", "best_percent": 20.0}, "go by --best"),
+            ({"policy": "copy", "radius_m": 5.0}, "does not go by --radius"),
+            ({"policy": "budget", "budget_bytes": 9, "radius_m": 5.0}, "with it"),
+            ({"policy": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "one of the"),
+            ({"policy": "copy", "end_h": 9.0}, "needs --start with --end"),
+            ({"policy": "copy", "day": "2026-11-17"}, "at --start"),
+            ({"policy": "copy", "latitude_deg": 50.0}, "at --start"),
+        ],
+    )
+    def test_options_that_a_policy_would_pass_over(self, centre, tmp_path, options, says):
+        with pytest.raises(ConfigError, match=says):
+            sent(centre, tmp_path / "out.engram", **options)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_every_option_has_a_policy_that_goes_by_it(self):
+        assert UNDERSTOOD.keys() == SELECTIONS.keys()
+        mission = {"start_h", "end_h", "day", "latitude_deg"}
+        fields = {one.name for one in dataclasses.fields(DownloadOptions)}
+        assert frozenset().union(*UNDERSTOOD.values()) == fields - mission - {
+            "policy",
+            "thumbnails",
+        }
+
+    def test_nothing_is_there_where_the_report_fails(self, centre, tmp_path, monkeypatch):
+        def fails(*_):
+            raise MapError("no report")
+
+        monkeypatch.setattr("engram.fleet.downloading._report", fails)
+        with pytest.raises(MapError, match="no report"):
+            sent(centre, tmp_path / "out.engram", "tod", start_h=9.0)
+        assert list(tmp_path.iterdir()) == []
+
     def test_places_that_cannot_be_read_or_written(self, centre, tmp_path):
         (tmp_path / "there.engram").touch()
         for out, says in (("there.engram", "exists already"), ("no/out.engram", "is no folder")):
@@ -326,8 +415,9 @@ class TestMistakes:
     def test_a_map_without_hours_of_day_says_what_it_lacks(self, tmp_path, policy):
         timeless = tmp_path / "timeless.engram"
         map_simulated(timeless, steps_of(9.0, 0, 5, 5, day=1), "r1")
+        options = {"budget_bytes": 10**6} if policy == "budget" else {}
         with pytest.raises(InputError, match=r"1 of 1 sessions \(r1 .*--longitude or --zone"):
-            sent(timeless, tmp_path / "out.engram", policy, start_h=9.0, budget_bytes=10**6)
+            sent(timeless, tmp_path / "out.engram", policy, start_h=9.0, **options)
         # Without a time it can be chosen by what promises most.
         assert sent(timeless, tmp_path / "out.engram", "budget", budget_bytes=10**6).nodes > 0
 

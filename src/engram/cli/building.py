@@ -13,7 +13,10 @@ from engram.cli import options
 
 def build(
     centre: Annotated[
-        Path, typer.Argument(metavar="CENTRE", help="The map, made if there is none.")
+        Path,
+        typer.Argument(
+            metavar="CENTRE", help="The map, made if there is none.", parser=options.map_file
+        ),
     ],
     drives: Annotated[
         list[str], typer.Argument(metavar="LOG...", help="Frame logs or drives; paths or URLs.")

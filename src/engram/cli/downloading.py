@@ -15,8 +15,14 @@ if TYPE_CHECKING:
 
 
 def download(
-    centre: Annotated[Path, typer.Argument(metavar="CENTRE", help="The fleet's map.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="The robot's map, made anew.")],
+    centre: Annotated[
+        Path,
+        typer.Argument(metavar="CENTRE", help="The fleet's map.", parser=options.map_file),
+    ],
+    out: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", help="The robot's map, made anew.", parser=options.map_file),
+    ],
     *,
     policy: Annotated[
         str,

@@ -18,10 +18,18 @@ if TYPE_CHECKING:
 
 def merge(
     centre: Annotated[
-        Path, typer.Argument(metavar="CENTRE", help="The fleet's map, made if there is none.")
+        Path,
+        typer.Argument(
+            metavar="CENTRE",
+            help="The fleet's map, made if there is none.",
+            parser=options.map_file,
+        ),
     ],
     robots: Annotated[
-        list[Path], typer.Argument(metavar="ROBOT...", help="Maps that robots hand in, in order.")
+        list[Path],
+        typer.Argument(
+            metavar="ROBOT...", help="Maps that robots hand in, in order.", parser=options.map_file
+        ),
     ],
     *,
     dry_run: Annotated[

@@ -7,7 +7,26 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-MapPath: TypeAlias = Annotated[Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.")]
+
+def map_file(text: str) -> Path:
+    """A map as it is typed: a file; maps in PostgreSQL have addresses, which no verb takes.
+
+    Raises:
+        BadParameter: it is an address. It may hold a password, so it is not repeated.
+    """
+    from engram.store.map_store import is_address
+
+    if is_address(text):
+        raise typer.BadParameter(
+            "this is the address of a map in PostgreSQL; the program works on map files. From "
+            "Python, engram.fleet.download writes what is there to a file"
+        )
+    return Path(text)
+
+
+MapPath: TypeAlias = Annotated[
+    Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.", parser=map_file)
+]
 DrivePath: TypeAlias = Annotated[
     Path, typer.Argument(metavar="PATH", help="A drive: a folder of stereo images or a frame log.")
 ]

@@ -7,7 +7,6 @@ no host, and the file is compacted at the end.
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.config import to_dict
-from engram.errors import ConfigError, InputError
+from engram.errors import InputError
 from engram.experience.model import Edge, PathId, path_id
 from engram.fleet.bridges import close_gaps, components
-from engram.fleet.coverage import expected_missed
+from engram.fleet.coverage import Coverage, expected_missed
+from engram.fleet.drafts import draft_folder
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
-from engram.fleet.selections import SELECTIONS, Selection, coverage_for
+from engram.fleet.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.stock import Mask, Stock
 from engram.store import BulkWriter, MapStore, WritableMapStore
 
@@ -34,6 +34,8 @@ _PAGE_BYTES = 4096
 _TRIES = 8
 # A try that leaves less than this free is good enough.
 _FULL_ENOUGH = 0.99
+# So full a file is aimed at.
+_AIM = 0.995
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,12 +126,13 @@ def download(
         progress: shows how it goes.
 
     Raises:
-        ConfigError: an option is missing or out of range for the policy.
+        ConfigError: an option is missing, out of range, or means nothing to the policy.
         InputError: nothing fits the options, or `out` exists already.
-        MapError: the centre cannot be read, or `out` not be written; then it is not there.
+        MapError: the centre cannot be read, or `out` not be written.
+
+    Whatever is raised, `out` is not there: it gets its name last of all.
     """
-    if options.policy not in SELECTIONS:
-        raise ConfigError(f"policy {options.policy!r} is unknown; known: {', '.join(SELECTIONS)}")
+    check_options(options)
     if out.exists() or out.is_symlink():
         raise InputError(f"{out} exists already; choose another name")
     if not out.parent.is_dir():
@@ -139,13 +142,17 @@ def download(
         if not len(stock):
             raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
         selection = SELECTIONS[options.policy](stock, options)
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
-            sent = _fitting(stock, selection, options, Path(folder), progress)
-            MapStore.compact(Path(folder) / _DRAFT, out)
-        return _report(stock, sent, out, options)
+        coverage = selection.coverage or coverage_for(stock, options)
+        with draft_folder(out) as folder:
+            sent = _fitting(stock, selection, options, folder, progress)
+            compact = folder / _COMPACT
+            MapStore.compact(folder / _DRAFT, compact)
+            report = _report(stock, sent, coverage, compact, out, options)
+            MapStore.publish(compact, out)
+    return report
 
 
-_DRAFT = "draft.engram"
+_DRAFT, _COMPACT = "draft.engram", "compact.engram"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,30 +171,67 @@ def _fitting(
     landmarks, thumbnails = stock.sizes
     blobs = landmarks + thumbnails * options.with_thumbnails
     pages = np.ceil(blobs / _PAGE_BYTES) * _PAGE_BYTES + _ROWS_BYTES
-    filled = np.cumsum(pages[selection.order])
-    low, high = 0, len(stock)  # so many fit; more than so many do not
-    room = float(options.budget_bytes)
-    best: tuple[int, int] | None = None
-    for _ in range(_TRIES):
-        count = int(np.clip(np.searchsorted(filled, room, side="right"), low + 1, high))
+    newest: dict[int, _Sent] = {}
+
+    def measure(count: int) -> int:
+        newest.clear()
         part = _beginning(selection, count)
-        _write_draft(stock, part, options, folder, progress)
-        size_bytes = _compacted_bytes(folder)
-        if size_bytes <= options.budget_bytes:
-            low, best = count, (count, size_bytes)
-            if count == high or size_bytes >= _FULL_ENOUGH * options.budget_bytes:
-                break
-        else:
-            high = count - 1
-        if high <= low:
-            break
-        room = float(filled[count - 1]) * options.budget_bytes / size_bytes
-    if best is None:
+        newest[count] = _write_draft(stock, part, options, folder, progress)
+        return _compacted_bytes(folder)
+
+    count = most_that_fit(measure, np.cumsum(pages[selection.order]), options.budget_bytes)
+    if count not in newest:
+        measure(count)
+    return newest[count]
+
+
+def most_that_fit(
+    measure: Callable[[int], int], expected_bytes: NDArray[np.float64], budget_bytes: int
+) -> int:
+    """How many nodes fit into a budget, found by writing files and measuring them.
+
+    Every file holds something that does not shrink with the nodes: vocabulary, statistics. How much
+    is learnt from the file of one node. From there on sizes are taken to grow as expected, until
+    one file was too large; then as a line from the largest that fits to the smallest that does not.
+
+    Args:
+        measure: writes the file of the first so many nodes and returns its bytes.
+        expected_bytes: (N,) what the first 1, 2, … N nodes are expected to take; rises.
+        budget_bytes: what the file may take.
+
+    Raises:
+        InputError: not even one node fits.
+
+    Source: regula falsi, with the Illinois algorithm's halving where one end stays (Dowell and
+    Jarratt, BIT 11, 1971): sizes bend where later nodes bring fewer edges.
+    """
+    fits, fits_bytes = 1, measure(1)
+    if fits_bytes > budget_bytes:
         raise InputError(
-            f"not one node fits into {options.budget_bytes} bytes: the map's vocabulary, sessions "
-            f"and one node take {size_bytes}; give a larger --budget"
+            f"not one node fits into {budget_bytes} bytes: the map's vocabulary, statistics and "
+            f"the most useful node with its session take {fits_bytes}; give a larger --budget"
         )
-    return _write_draft(stock, _beginning(selection, best[0]), options, folder, progress)
+    too_many, too_many_bytes = len(expected_bytes) + 1, 0
+    aimed_bytes = _AIM * budget_bytes
+    low_weight = high_weight = 1.0
+    for _ in range(_TRIES):
+        if fits + 1 == too_many or fits_bytes >= _FULL_ENOUGH * budget_bytes:
+            break
+        room = aimed_bytes - fits_bytes
+        if too_many_bytes:
+            below, above = room * low_weight, (too_many_bytes - aimed_bytes) * high_weight
+            room = expected_bytes[too_many - 1] - expected_bytes[fits - 1]
+            room *= below / (below + above)
+        wanted = np.searchsorted(expected_bytes, expected_bytes[fits - 1] + room, side="right")
+        count = int(np.clip(wanted, fits + 1, too_many - 1))
+        size_bytes = measure(count)
+        if size_bytes <= budget_bytes:
+            fits, fits_bytes = count, size_bytes
+            low_weight, high_weight = 1.0, high_weight / 2
+        else:
+            too_many, too_many_bytes = count, size_bytes
+            low_weight, high_weight = low_weight / 2, 1.0
+    return fits
 
 
 def _beginning(selection: Selection, count: int) -> Selection:
@@ -198,7 +242,7 @@ def _beginning(selection: Selection, count: int) -> Selection:
 
 
 def _compacted_bytes(folder: Path) -> int:
-    compact = folder / "compact.engram"
+    compact = folder / _COMPACT
     MapStore.compact(folder / _DRAFT, compact)
     size_bytes = compact.stat().st_size
     compact.unlink()
@@ -322,10 +366,17 @@ def _write_attempts(writer: BulkWriter, stock: Stock, sent: Mask) -> None:
             writer.add_attempts(session.id, kept.rows(rows), stock.node_ids)
 
 
-def _report(stock: Stock, done: _Sent, out: Path, options: DownloadOptions) -> DownloadReport:
+def _report(
+    stock: Stock,
+    done: _Sent,
+    coverage: Coverage,
+    file: Path,
+    out: Path,
+    options: DownloadOptions,
+) -> DownloadReport:
+    """What was written to a file that is to be called `out`."""
     sent = done.selection.sent
-    coverage = coverage_for(stock, options)
-    with MapStore.open(out) as written:
+    with MapStore.open(file) as written:
         info = written.info()
         content_hash = written.content_hash()
     ends = np.array(
@@ -345,7 +396,7 @@ def _report(stock: Stock, done: _Sent, out: Path, options: DownloadOptions) -> D
         edges=info.edges,
         bridges=len(done.bridges),
         components=len(np.unique(components(len(stock), inner)[sent])),
-        size_bytes=out.stat().st_size,
+        size_bytes=file.stat().st_size,
         of_bytes=stock.store.info().size_bytes,
         why=dict(done.selection.why),
         expected_missed=expected_missed(coverage, sent),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,6 +21,7 @@ from engram.fleet.stock import Mask, Stock
 _HOURS = 24.0
 # Hours are told by clocks to the nanosecond; what is left over is rounding.
 _ROUNDING_H = 1e-9
+_DEFAULTS = asdict(DownloadOptions())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,11 +32,13 @@ class Selection:
         sent: (N,) which nodes of the stock are sent.
         why: what the policy found out, plain data.
         order: for `budget`: nodes by what they promise, of which a beginning is sent; else None.
+        coverage: what the mission needs, where the policy went by it; else None.
     """
 
     sent: Mask
     why: Mapping[str, Any]
     order: NDArray[np.int64] | None = None
+    coverage: Coverage | None = None
 
 
 Policy: TypeAlias = Callable[[Stock, DownloadOptions], Selection]
@@ -97,7 +100,7 @@ def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
     landmarks, thumbnails = stock.sizes
     size = landmarks + thumbnails * options.with_thumbnails
     order = greedy_order(coverage, size.astype(np.float64), _spare_order(stock, options))
-    return Selection(stock.everything(), {"demand": coverage.demand.total}, order)
+    return Selection(stock.everything(), {"demand": coverage.demand.total}, order, coverage)
 
 
 SELECTIONS: dict[str, Policy] = {
@@ -109,6 +112,71 @@ SELECTIONS: dict[str, Policy] = {
     "route": select_route,
     "budget": select_budget,
 }
+
+# What each policy goes by, beside when the mission is, for which every forecast is made, and
+# whether thumbnails go along.
+UNDERSTOOD: dict[str, frozenset[str]] = {
+    "copy": frozenset(),
+    "tod": frozenset({"window_min"}),
+    "paths": frozenset({"epoch_min", "best_percent", "buffer_min"}),
+    "tod+paths": frozenset({"window_min", "epoch_min", "best_percent", "buffer_min"}),
+    "region": frozenset({"near", "radius_m"}),
+    "route": frozenset({"route", "radius_m"}),
+    "budget": frozenset({"budget_bytes", "near", "route", "radius_m"}),
+}
+_FLAGS = {
+    "window_min": "--window",
+    "epoch_min": "--epoch",
+    "best_percent": "--best",
+    "buffer_min": "--buffer",
+    "budget_bytes": "--budget",
+    "near": "--near",
+    "route": "--route",
+    "radius_m": "--radius",
+}
+# Where a mission may have an end and no beginning: it begins with the first epoch that has data.
+_OPEN_START = frozenset({"paths", "tod+paths"})
+
+
+def check_options(options: DownloadOptions) -> None:
+    """Refuses what a policy would pass over in silence.
+
+    Raises:
+        ConfigError: the policy is unknown, or an option that is not its default means nothing to it
+            or nothing without another one.
+    """
+    policy = options.policy
+    if policy not in SELECTIONS:
+        raise ConfigError(f"policy {policy!r} is unknown; known: {', '.join(SELECTIONS)}")
+    for name, flag in _FLAGS.items():
+        if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[policy]:
+            continue
+        takers = [one for one, understood in UNDERSTOOD.items() if name in understood]
+        raise ConfigError(
+            f"policy {policy} does not go by {flag}; leave it out, or choose --policy "
+            f"{' or '.join(takers)}"
+        )
+    if policy == "budget":
+        _check_where(options)
+    if options.start_h is None:
+        _check_no_mission(options)
+
+
+def _check_where(options: DownloadOptions) -> None:
+    if options.near and options.route is not None:
+        raise ConfigError("the mission is along --route or around --near; give one of the two")
+    if options.radius_m != _DEFAULTS["radius_m"] and not options.near and options.route is None:
+        raise ConfigError("--radius is of --near or --route; give one of the two with it")
+
+
+def _check_no_mission(options: DownloadOptions) -> None:
+    """What tells more of a mission's time says nothing where it has none."""
+    if options.end_h is not None and options.policy not in _OPEN_START:
+        raise ConfigError(f"policy {options.policy} needs --start with --end")
+    if options.day is not None or options.latitude_deg is not None:
+        raise ConfigError(
+            "--date and --latitude tell how high the sun stands at --start; give it too"
+        )
 
 
 def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
