@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import select
 import signal
+import subprocess
+import sys
 from contextlib import contextmanager
 from itertools import permutations
+from pathlib import Path
 
 import pytest
 
@@ -60,6 +64,35 @@ def test_a_worker_that_dies_is_replaced_and_the_map_is_the_same(tmp_path, logs, 
     assert len(killed) == 1
     assert sum(one.retries for one in report.mapped) == 1
     assert report.content_hash == built[1].content_hash
+
+
+@contextmanager
+def process_of_a_build(*arguments):
+    """A process that builds, after the first word from a worker of it."""
+    command = [sys.executable, "-m", "fleet.building_process", *map(str, arguments)]
+    tests = Path(__file__).parents[1]
+    with subprocess.Popen(command, cwd=tests, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline()
+        yield process
+
+
+def test_no_worker_outlives_a_build_that_is_killed():
+    with process_of_a_build() as process:
+        process.kill()
+        # The worker has the same end of the pipe: it ends only when both are gone.
+        assert select.select([process.stdout], [], [], 60.0)[0]
+        assert process.stdout.read() == b""
+
+
+@pytest.mark.long
+def test_a_build_that_is_killed_goes_on_at_once_and_comes_to_the_same_map(tmp_path, logs, built):
+    centre = tmp_path / "centre.engram"
+    with process_of_a_build(centre, *(logs[name] for name in "abc")) as process:
+        process.kill()
+        process.wait()
+        report = build(centre, logs)
+    assert report.content_hash == built[1].content_hash
+    assert [one.nodes for one in report.mapped] == [one.nodes for one in built[1].mapped]
 
 
 @pytest.mark.long

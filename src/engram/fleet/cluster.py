@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import queue
 from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+from uuid import uuid4
 
-from engram.errors import MissingExtraError, WorkerError
+from engram.errors import EngramError, MissingExtraError, WorkerError
 from engram.fleet.group_mapping import GroupResult, GroupTask, map_group_far_away
-from engram.fleet.workers import MAX_RETRIES
+from engram.fleet.workers import LISTEN_S, MAX_RETRIES, WORDS_AT_ONCE
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
 
 _CONNECT_S = 30
+
+# A group's map and the last words on it, or what is wrong with a drive.
+_Outcome: TypeAlias = tuple[GroupResult, bytes, list[str]] | EngramError
+
+
+class _GivenUpError(Exception):
+    """In a worker: nobody waits for this group any more."""
 
 
 def map_groups_on_cluster(
@@ -28,48 +42,113 @@ def map_groups_on_cluster(
         tasks: the groups.
         place: where the map of a group goes, by its number.
         scheduler: address of the Dask scheduler.
-        advance: called once per frame of a group when the group is done.
-        check: called after each group; what it raises ends the work.
+        advance: called once per frame with a word on how it went.
+        check: called now and then; what it raises ends the work, on the workers too.
         mapped: told of each group that is done.
 
     Raises:
         MissingExtraError: Dask is not installed.
-        WorkerError: the scheduler cannot be reached, or a group's workers died again and again.
+        WorkerError: the scheduler cannot be reached or is lost, or a group's workers died again
+            and again.
         EngramError: a group cannot be mapped.
     """
+    heard: queue.SimpleQueue[list[str] | Future] = queue.SimpleQueue()
+    topic = f"engram-build-{uuid4().hex}"
+    with _connected(scheduler) as client:  # whose end tells the workers that nobody waits for them
+        client.subscribe_topic(topic, lambda event: heard.put(list(event[1])))
+        groups: dict[Future, int] = {}
+        for task in tasks:
+            # A pure function of its task, but what it does is work: each is submitted once.
+            future = client.submit(_map_on_worker, task, topic, pure=False, retries=MAX_RETRIES)
+            groups[future] = task.number
+            future.add_done_callback(heard.put)
+        while groups:
+            check()
+            try:
+                said = heard.get(timeout=LISTEN_S)
+            except queue.Empty:
+                continue
+            words = said
+            if not isinstance(said, list):
+                result, content, words = _outcome(said, groups.pop(said), scheduler)
+                _keep(place(result.number), content)
+                mapped(result)
+            for word in words:
+                advance(word)
+
+
+def _connected(scheduler: str) -> Client:
+    """A client of its own, which is nobody's default.
+
+    Raises:
+        MissingExtraError: Dask is not installed.
+        WorkerError: the scheduler does not answer.
+    """
     try:
-        from distributed import Client, KilledWorker, as_completed
+        from distributed import Client
     except ImportError as error:
         raise MissingExtraError(
             "building on a cluster needs Dask: pip install 'engram[cluster]'"
         ) from error
     try:
-        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+        return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise WorkerError(f"the scheduler at {scheduler} does not answer: {error}") from error
-    with client:
-        # Pure functions of their tasks, but what they do is work: each task is submitted once.
-        futures = [
-            client.submit(map_group_far_away, task, pure=False, retries=MAX_RETRIES)
-            for task in tasks
-        ]
-        try:
-            for future in as_completed(futures, loop=client.loop):
-                result, content = future.result()
-                _keep(place(result.number), content)
-                mapped(result)
-                for summary in result.sessions:
-                    for _ in range(summary["frames"]):
-                        advance("mapped")
-                check()
-        except KilledWorker as error:
-            raise WorkerError(f"workers of the cluster died over a group: {error}") from error
-        finally:
-            client.cancel(futures)
+
+
+def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
+    """In the worker; errors of a drive come back as values, since they would only come again."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    key = worker.get_current_task()
+    words: list[str] = []
+
+    def advance(word: str) -> None:
+        words.append(word)
+        if len(words) >= WORDS_AT_ONCE:
+            worker.log_event(topic, list(words))
+            words.clear()
+            known = worker.state.tasks.get(key)
+            if known is None or known.state == "cancelled":
+                raise _GivenUpError
+
+    try:
+        result, content = map_group_far_away(task, advance)
+    except EngramError as error:
+        return error
+    return result, content, words
+
+
+def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, bytes, list[str]]:
+    """What came of a group; its map is fetched from the worker.
+
+    Raises:
+        WorkerError: nothing came, because of the cluster.
+        EngramError: a drive cannot be mapped.
+    """
+    try:
+        outcome: _Outcome = future.result()
+    except CancelledError as error:
+        raise WorkerError(
+            f"the scheduler at {scheduler} was lost, and group {group} with it ({error}); groups "
+            "that were done are kept: give the same command again"
+        ) from error
+    except Exception as error:  # whatever Dask or a machine of the cluster may raise
+        raise WorkerError(
+            f"group {group} was not mapped on the cluster, whose workers try {MAX_RETRIES + 1} "
+            f"times: {type(error).__name__}: {error}; groups that were done are kept: give the "
+            "same command again, with fewer workers if memory was short"
+        ) from error
+    if isinstance(outcome, EngramError):
+        raise outcome
+    return outcome
 
 
 def _keep(path: Path, content: bytes) -> None:
-    """The group's map, whole or not at all."""
-    draft = path.with_suffix(".part")
+    """The group's map, whole or not at all, in place of what another worker left half done."""
+    draft = path.with_name(f"{path.name}.part")
     draft.write_bytes(content)
+    for suffix in ("", "-wal", "-shm"):  # another map's log would be taken for its own
+        path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
     draft.replace(path)

@@ -91,11 +91,13 @@ def map_group(task: GroupTask, path: Path, advance: Callable[[str], None] = igno
     return result
 
 
-def map_group_far_away(task: GroupTask) -> tuple[GroupResult, bytes]:
+def map_group_far_away(
+    task: GroupTask, advance: Callable[[str], None] = ignore
+) -> tuple[GroupResult, bytes]:
     """Maps a group on a machine that shares no disk with the caller; returns the map's bytes."""
     with tempfile.TemporaryDirectory(prefix="engram-group-") as folder:
         path = Path(folder) / "group.engram"
-        result = map_group(task, path)
+        result = map_group(task, path, advance)
         whole = Path(folder) / "whole.engram"
         MapStore.copy(path, whole)  # without the write-ahead log beside it
         return result, whole.read_bytes()

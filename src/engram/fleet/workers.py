@@ -1,9 +1,11 @@
-"""Groups mapped in processes of this machine; a process that dies is replaced."""
+"""Groups mapped in processes of this machine: who dies is replaced, none outlives its parent."""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +21,9 @@ from engram.fleet.group_mapping import GroupResult, GroupTask, map_group
 # A drive that kills its worker this often will do so again.
 MAX_RETRIES = 3
 # Words on the way are put together so that the pipe is not the bottleneck.
-_WORDS_AT_ONCE = 10
+WORDS_AT_ONCE = 10
+# How long Ctrl-C may wait.
+LISTEN_S = 0.5
 
 
 @dataclass(slots=True)
@@ -108,12 +112,13 @@ def _start(task: GroupTask, path: Path) -> _Running:
 def _work(task: GroupTask, path: Path, pipe: Connection) -> None:
     """In the worker: Ctrl-C is for the parent, which ends its workers."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
     cv2.setNumThreads(1)  # the groups run side by side
     words: list[str] = []
 
     def advance(word: str) -> None:
         words.append(word)
-        if len(words) >= _WORDS_AT_ONCE:
+        if len(words) >= WORDS_AT_ONCE:
             pipe.send(list(words))
             words.clear()
 
@@ -126,9 +131,28 @@ def _work(task: GroupTask, path: Path, pipe: Connection) -> None:
     pipe.close()
 
 
+def end_with_parent() -> None:
+    """Ends this process as soon as its parent is gone, however that was killed.
+
+    A worker left behind would hold the lock of its map, and the build that goes on would meet it.
+    Its map stays sound whenever it ends.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch(sentinel: int) -> None:
+        wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
+
+
 def _listen(running: Sequence[_Running], advance: Callable[[str], None]) -> None:
     """Until something happens, but no longer than Ctrl-C should take."""
-    ready = wait([one.pipe for one in running] + [one.process.sentinel for one in running], 0.5)
+    ready = wait(
+        [one.pipe for one in running] + [one.process.sentinel for one in running], LISTEN_S
+    )
     for one in running:
         if one.pipe in ready:
             _hear(one, advance)

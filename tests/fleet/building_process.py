@@ -1,0 +1,40 @@
+"""Builds a map in groups, saying so, until somebody kills it."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+
+from engram.drive import Settings
+from engram.fleet import build_map
+from engram.fleet.workers import end_with_parent
+
+from .builds import options
+
+# Longer than any test waits; yet a test that fails leaves nothing for ever.
+_LONG_S = 600.0
+
+
+def wait_long() -> None:
+    end_with_parent()
+    print("waiting", flush=True)
+    threading.Event().wait(_LONG_S)
+
+
+@contextmanager
+def telling(what, total):
+    yield lambda word: print(word, flush=True)
+
+
+def main(centre: str = "", *drives: str) -> None:
+    if centre:
+        build_map(Path(centre), drives, Settings(), options(), progress=telling)
+        return
+    multiprocessing.get_context("spawn").Process(target=wait_long).start()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
