@@ -56,8 +56,23 @@ def lacking(made: AttemptArrays, remembered: AttemptArrays) -> NDArray[np.intp]:
         made: attempts, sessions named as in `remembered`.
         remembered: those that are known.
     """
-    if not len(made):
-        return np.empty(0, np.intp)
+    known = _by_session(remembered)
+    found = [np.empty(0, np.intp)]
+    # One session at a time: a centre remembers millions.
+    for session, rows in _by_session(made).items():
+        ours = remembered.rows(known.get(session, np.empty(0, np.intp)))
+        found.append(rows[_lacking_in_session(made.rows(rows), ours)])
+    return np.sort(np.concatenate(found))
+
+
+def _by_session(made: AttemptArrays) -> dict[int, NDArray[np.intp]]:
+    """The places of each session's attempts, in their order."""
+    order = np.argsort(made.session, kind="stable")
+    ends = np.flatnonzero(np.diff(made.session[order])) + 1
+    return {int(made.session[rows[0]]): rows for rows in np.split(order, ends) if len(rows)}
+
+
+def _lacking_in_session(made: AttemptArrays, remembered: AttemptArrays) -> NDArray[np.intp]:
     policies = list(dict.fromkeys((*remembered.policies, *made.policies)))
     keys = np.concatenate([_identities(one, policies) for one in (remembered, made)])
     _, named = np.unique(keys, axis=0, return_inverse=True)
@@ -67,15 +82,14 @@ def lacking(made: AttemptArrays, remembered: AttemptArrays) -> NDArray[np.intp]:
     ranked = new[order]
     # How many equals came before each: they take what is remembered one by one.
     before = np.arange(len(ranked)) - np.searchsorted(ranked, ranked)
-    counts = np.bincount(known, minlength=int(named.max(initial=-1)) + 1)
-    return np.sort(order[before >= counts[ranked]])
+    counts = np.bincount(known, minlength=int(named.max()) + 1)
+    return order[before >= counts[ranked]]
 
 
 def _identities(made: AttemptArrays, policies: Sequence[str]) -> NDArray[np.int64]:
-    """(A, 8) what names each attempt, free of the nodes that it is told from."""
+    """(A, 7) what names each attempt of a session, free of the nodes that it is told from."""
     policy = np.array([policies.index(name) for name in made.policies], np.int64)
     columns: list[NDArray[Any]] = [
-        made.session,
         made.iteration,
         made.rank,
         made.sigma_m.view(np.int32),  # to the bit

@@ -332,14 +332,16 @@ def _new_attempts(
         remembered: its attempts; `session` is a place in `sessions`.
     """
     contents = robot.contents
-    made = at_equivalents(
-        contents.attempts, [centre.equivalent(node.id) for node in contents.nodes]
-    )
+    positions = [centre.equivalent(node.id) for node in contents.nodes]
+    known = np.array([position is not None for position in positions], np.bool_)
+    made = contents.attempts
+    made = made.rows(known[made.reference] & known[made.node])
     place: dict[SessionId, int] = {}
     for session in (*sessions, *(one.id for one in contents.sessions)):
         place.setdefault(session, len(place))
     named = np.array([place[one.id] for one in contents.sessions], np.int32)
-    return made.rows(lacking(replace(made, session=named[made.session]), remembered))
+    new = made.rows(lacking(replace(made, session=named[made.session]), remembered))
+    return at_equivalents(new, positions)
 
 
 def _carries(centre: Centre, robot: HandedIn, omitted: NodeId) -> Position | None:
