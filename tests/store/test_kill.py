@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import random
 import select
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from engram.errors import MapLockedError
 from engram.store import MapStore
 
 from .frames import assert_same_landmarks
-from .maps import node, node_frame, session
+from .maps import begin, node, node_frame, session, write_drive
 
 SESSIONS, NODES = 3, 9
 
@@ -103,3 +105,32 @@ def test_killed_at_any_moment_the_map_holds_what_was_checkpointed(tmp_path):
 @pytest.mark.parametrize("seed", range(2, 6))
 def test_killed_many_times_the_map_holds_what_was_checkpointed(tmp_path, seed):
     kill_and_resume(tmp_path / "town.engram", seed, kills=30)
+
+
+def test_a_map_made_where_another_was_removed_takes_nothing_of_its_log(tmp_path):
+    """A killed writer leaves its log; people remove the map and overlook what lies beside it."""
+    path, aside = tmp_path / "town.engram", tmp_path / "aside"
+    with MapStore.create(path) as store:
+        writer = begin(store, session())
+        write_drive(writer)
+        writer.checkpoint()
+        log = path.with_name("town.engram-wal")
+        shutil.copy(log, aside)  # as it is now, for closing empties it
+    other = tmp_path / "other.engram"
+    MapStore.create(other).close()
+    for make in (lambda: MapStore.create(path).close(), lambda: MapStore.copy(other, path)):
+        path.unlink()
+        shutil.copy(aside, log)
+        make()
+        assert MapStore.check(path).problems == ()
+        with MapStore.open(path) as store:
+            assert store.interrupted() == []
+
+
+def test_a_log_whose_writer_is_alive_is_not_removed(tmp_path):
+    path = tmp_path / "town.engram"
+    with MapStore.create(path):
+        path.unlink()
+        with pytest.raises(MapLockedError):
+            MapStore.create(path)
+        assert path.with_name("town.engram-wal").exists()

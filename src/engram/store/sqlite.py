@@ -451,6 +451,7 @@ def _write_empty(path: Path) -> None:
 
 def _publish(draft: Path, path: Path) -> None:
     """Give the draft its name, never replacing a map that came meanwhile as a rename would."""
+    _remove_orphans(path)
     try:
         os.link(draft, path)
     except OSError as error:
@@ -478,10 +479,34 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+_BESIDE = ("-wal", "-shm", "-journal")
+
+
 def _remove(path: Path) -> None:
-    for suffix in ("", "-wal", "-shm", "-journal"):
+    for suffix in ("", *_BESIDE):
         with suppress(FileNotFoundError):
             path.with_name(path.name + suffix).unlink()
+
+
+def _remove_orphans(path: Path) -> None:
+    """Logs of a map that was removed after its writer was killed.
+
+    SQLite would take them for those of the map that comes to lie beside them. Whoever finds some
+    holds the writer's lock, so that nobody makes that map, and a log of it, meanwhile.
+
+    Raises:
+        MapLockedError: somebody else does so now.
+    """
+    orphans = [path.with_name(path.name + suffix) for suffix in _BESIDE]
+    if not any(one.exists() for one in orphans):
+        return
+    lock = WriterLock(path)
+    try:
+        if not path.exists():
+            for one in orphans:
+                one.unlink(missing_ok=True)
+    finally:
+        lock.release()
 
 
 _CORRUPT = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
