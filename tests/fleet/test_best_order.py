@@ -115,6 +115,16 @@ def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
     assert not centre.with_name("centre.engram.build").exists()
 
 
+def test_more_groups_than_can_be_tried_are_refused_before_they_are_mapped(
+    tmp_path, logs, monkeypatch
+):
+    monkeypatch.setattr(best_order, "_MOST_GROUPS", 2)
+    centre = tmp_path / "centre.engram"
+    with pytest.raises(ConfigError, match="3 groups have 6 orders; at most 2"):
+        build(centre, logs, "abc", groups=3, judge=judge(logs["held-out"]))
+    assert not centre.with_name("centre.engram.build").exists()
+
+
 def test_orders_are_judged_with_the_centre_that_they_are_merged_into(tmp_path, maps, logs):
     centre = tmp_path / "centre.engram"
     MapStore.copy(maps[2], centre)

@@ -239,6 +239,19 @@ class BestOrder:
         return "\n".join(lines)
 
 
+def check_countable(groups: int) -> None:
+    """Refuses more groups than all orders of them could be tried.
+
+    Raises:
+        ConfigError: there are too many, or none.
+    """
+    if not 1 <= groups <= _MOST_GROUPS:
+        raise ConfigError(
+            f"{groups} groups have {math.factorial(groups):,} orders; at most {_MOST_GROUPS} "
+            "groups can be tried in all orders"
+        )
+
+
 def find_best_order(
     maps: Sequence[Path],
     folder: Path,
@@ -271,11 +284,7 @@ def find_best_order(
         MapError: the root was written to meanwhile.
         KeyboardInterrupt: a merge was interrupted.
     """
-    if not 1 <= len(maps) <= _MOST_GROUPS:
-        raise ConfigError(
-            f"{len(maps)} groups have {math.factorial(len(maps)):,} orders; at most {_MOST_GROUPS} "
-            "groups can be tried in all orders"
-        )
+    check_countable(len(maps))
     folder.mkdir(parents=True, exist_ok=True)
     search = _Search(maps, folder, settings, merging, judge, root)
     with progress("try orders", math.factorial(len(maps))) as advance:

@@ -17,6 +17,7 @@ from engram.experience.model import SessionId, path_id
 from engram.fleet.best_order import (
     BestOrder,
     JudgeOptions,
+    check_countable,
     check_held_out,
     find_best_order,
     order_costs,
@@ -197,8 +198,8 @@ def build_map(
         progress: shows how it goes.
 
     Raises:
-        ConfigError: the groups do not fit the drives, another build lies there unfinished, or a
-            drive that judges orders is not held out.
+        ConfigError: the groups do not fit the drives, another build lies there unfinished, there
+            are too many groups for all orders, or a drive that judges them is not held out.
         WorkerError: workers died again and again.
         EngramError: a drive or a map cannot be used.
     """
@@ -209,6 +210,8 @@ def build_map(
     grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
     if options.judge is not None:
         _check_judges(options.judge, looked_at, centre)
+        if grouped:
+            check_countable(len(grouped))
     report = BuildReport(
         str(centre), left_out=[drive.name for drive in looked_at if drive.session.id in known]
     )
