@@ -13,7 +13,7 @@ from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
 from engram.localiser.gaps import GapFiller, Motion, driven_steps_m
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
-from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser, LocaliserConfig
+from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
 from engram.localiser.place_book import PlaceBook, Searched
 from engram.localiser.relocalisation import (
     RELOCALISERS,
@@ -23,6 +23,7 @@ from engram.localiser.relocalisation import (
     best_places,
     spread,
 )
+from engram.localiser.settings import LocaliserConfig
 from engram.localiser.walk import Walk
 
 __all__ = [

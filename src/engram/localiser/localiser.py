@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import replace
 from functools import partial
 from time import perf_counter
 from typing import Self
@@ -12,7 +12,6 @@ from uuid import uuid5
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import ConfigError
 from engram.experience.basin import MatchBasin
 from engram.experience.clock import Clocked, hour_of_day
 from engram.experience.graph import ExperienceGraph
@@ -29,9 +28,8 @@ from engram.experience.model import (
 from engram.experience.neighbourhood import Neighbourhood
 from engram.experience.path_memory import PathMemory
 from engram.frontend import Frame, FrameStatus
-from engram.frontend.matching import MatcherConfig
 from engram.geometry import SE3
-from engram.localiser.acceptance import AcceptanceConfig, Prediction
+from engram.localiser.acceptance import Prediction
 from engram.localiser.attempts import (
     Attempter,
     Candidate,
@@ -44,6 +42,7 @@ from engram.localiser.gaps import GapFiller, Motion
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.relocalisation import Relocaliser
+from engram.localiser.settings import LocaliserConfig
 from engram.localiser.walk import Walk
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import (
@@ -52,7 +51,6 @@ from engram.ranking import (
     RankingContext,
     RankingPolicy,
     RecentAttempts,
-    RecentConfig,
     RunLog,
 )
 
@@ -64,64 +62,6 @@ _RESUMED_SIGMA_M = 3.0
 _RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
 # Stands for a drive that is not identified: equal input gives equal results there too.
 UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
-
-
-@dataclass(frozen=True, slots=True)
-class LocaliserConfig:
-    """Settings of the localiser.
-
-    Attributes:
-        search_radius_m: least radius of the neighbourhood. Source: SPEC §3, 8 m.
-        max_search_radius_m: largest, however uncertain the position; the match basin where that is
-            wider. Past it a robot is found by its relocaliser, not by trying everything around.
-        view_gate_rad: largest difference of heading to a candidate. Source: SPEC §3, 60°.
-        own_exclusion_m: own nodes saved within the last so many metres are no candidates.
-            Source: SPEC §3.1, 30 m.
-        lost_after_m: open loop distance past which the robot is lost. Source: SPEC §3.4, 10 m.
-        greatest_gap_m: largest standard deviation of motion that odometry did not measure. Past it
-            since the last match or saved node the robot is lost; past it at a stretch an
-            experience ends.
-        guide_below_m, guide_below_rad: an attempt is guided by the prediction where its standard
-            deviations lie below both; 0 turns guidance off.
-        lost_max_samples, lost_max_hypotheses: bounds of the matcher's for the attempts of a lost
-            robot. Nearly all of them are in vain, and cost 1.1 ms without, 0.27 ms with these
-            bounds; matches that it would believe have so many inliers that 98.8 % of them are
-            found all the same (measured as in `AcceptanceConfig`).
-        recent: what the ranking remembers of this session's attempts.
-        matcher, acceptance: settings of the two halves of an attempt.
-    """
-
-    search_radius_m: float = 8.0
-    max_search_radius_m: float = 30.0
-    view_gate_rad: float = float(np.deg2rad(60.0))
-    own_exclusion_m: float = 30.0
-    lost_after_m: float = 10.0
-    greatest_gap_m: float = 3.0
-    guide_below_m: float = 0.3
-    guide_below_rad: float = float(np.deg2rad(3.0))
-    lost_max_samples: int = 500
-    lost_max_hypotheses: int = 100
-    recent: RecentConfig = field(default_factory=RecentConfig)
-    matcher: MatcherConfig = field(default_factory=MatcherConfig)
-    acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
-
-    def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
-            if isinstance(value, float) and not 0 <= value < np.inf:
-                raise ConfigError(f"localiser: {one.name} is {value}, must be finite and >= 0")
-        for name in ("lost_max_samples", "lost_max_hypotheses"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"localiser: {name} is {getattr(self, name)}, must be >= 1")
-
-    @property
-    def lost_matcher(self) -> MatcherConfig:
-        """Settings of the first half of a lost robot's attempts."""
-        return replace(
-            self.matcher,
-            max_samples=min(self.matcher.max_samples, self.lost_max_samples),
-            max_hypotheses=min(self.matcher.max_hypotheses, self.lost_max_hypotheses),
-        )
 
 
 class Localiser:
