@@ -194,6 +194,22 @@ def test_claims_stand_beside_what_was_measured(out: Path) -> None:
         assert f"| {policy} | " in text
 
 
+def test_sweeps_are_told_as_tables(out: Path) -> None:
+    text = (out / "claims.md").read_text()
+    budgets = text[text.index("Route not localised by the number of lanes") :].splitlines()
+    assert budgets[2] == "| Np | 1 | 2 | 3 | 4 | 6 | 8 | 12 | 16 | unlimited |"
+    # 5, 3, 3, 2 … of 20 blocks.
+    distance = "| 25.00 | 15.00 | 15.00 | 10.00 | 10.00 | 10.00 | 10.00 | 10.00 |"
+    rows = budgets[: budgets.index("", 3)]
+    assert f"| distance {distance} 10.00 |" in rows
+    assert f"| distance, Nr = 2 {distance} – |" in rows
+    assert any(row.startswith("| path, matched only |") for row in rows)
+    sizes = text[text.index("P(> 10 m) as the map grows, Np = 2") :].splitlines()
+    assert sizes[2].startswith("| sessions in the map (nodes) | 1 (100) | 2 (200) | ")
+    assert sizes[2].endswith(" | all (800) |")
+    assert {row.split(" | ")[0] for row in sizes[4:9]} == {f"| {policy}" for policy in MISSES}
+
+
 def test_guided_runs_stand_beside_the_unguided_ones_of_the_same_sessions(out: Path) -> None:
     text = (out / "claims.md").read_text()
     guided = text[text.index("Guided and without memo, as on a robot: 2 sessions") :]

@@ -14,6 +14,7 @@ from engram.evaluation.configurations import (
     Radius,
 )
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
+from engram.evaluation.sweeps import sweep_tables
 from engram.evaluation.wording import Row, against, percent, table, times
 from engram.measures import Resamples, beats, difference, excess_ratio, ratio
 
@@ -28,7 +29,7 @@ def claims_page(campaigns: Sequence[CampaignResult]) -> str:
     lines: list[str] = []
     for campaign in campaigns:
         lines += [f"## {campaign.name}", "", *_policies(campaign), "", *_claims(campaign), ""]
-        lines += _guided(campaign)
+        lines += [*sweep_tables(campaign), *_guided(campaign)]
         if not campaign.with_truth:
             lines += [
                 "The drives have no truth beside them: no pose errors, no false successes.",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ from numpy.typing import NDArray
 from engram.evaluation.configurations import (
     T_SWEEP,
     UNLIMITED,
-    Configuration,
     PathKinds,
 )
 from engram.evaluation.summary import CURVE_AT_M, CampaignResult, ConfigurationResult
+from engram.evaluation.sweeps import by_lanes, by_map_size
 from engram.measures import FORMULAS, Estimator, Interval, SessionSums
 from engram.viewing import Line, Panel, draw_bars, draw_curves
 
@@ -68,29 +67,11 @@ def _map_size(campaign: CampaignResult) -> Panel | None:
     """[L15] Fig. 9: P(> 10 m) against nodes, after each training session."""
     lines = []
     for policy in campaign.policies:
-        results = _by_map_size(campaign, policy)
+        results = by_map_size(campaign, policy)
         if len(results) > 1:
             nodes = np.array([np.mean([s.nodes for s in one.sessions]) for one in results])
             lines.append(_line(campaign, policy, nodes, results, _p_gt_10m))
     return Panel(campaign.name, "nodes in the map", _P_GT_10M, lines) if lines else None
-
-
-def _by_map_size(campaign: CampaignResult, policy: str) -> list[ConfigurationResult]:
-    """One per size of map that every fold has, smallest first."""
-    whole = campaign.get(policy)
-    if whole is None:
-        return []
-    sizes = sorted(
-        (
-            one.configuration.sessions or 0
-            for one in campaign.memo.values()
-            if replace(one.configuration, sessions=None) == whole.configuration
-            and one.configuration.sessions is not None
-            and len(one.sessions) == len(whole.sessions)
-        ),
-    )
-    smaller = [campaign.get(policy, sessions=size) for size in sizes]
-    return [one for one in smaller if one is not None] + [whole]
 
 
 def _candidates(campaign: CampaignResult) -> Panel | None:
@@ -114,12 +95,7 @@ def _lanes(
     lines = []
     variants = [(policy, PathKinds.ALL) for policy in campaign.policies]
     for policy, paths in [*variants, ("path", PathKinds.MATCHED)]:
-        results = [
-            one
-            for one in campaign.memo.values()
-            if one.configuration == Configuration(policy, one.configuration.lanes, paths=paths)
-        ]
-        results.sort(key=lambda one: one.configuration.lanes)
+        results = by_lanes(campaign, policy, paths)
         if len(results) > 1:
             x = np.array([_lanes_place(one.configuration.lanes) for one in results])
             label = results[0].configuration.label
