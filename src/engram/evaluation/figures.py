@@ -155,12 +155,13 @@ def _draw_costs(out: Path, campaign: CampaignResult) -> list[Path]:
     """Attempts, time, false successes and pose errors of all policies at the few lanes."""
     memo = {policy: campaign.get(policy) for policy in campaign.policies}
     found = {policy: one for policy, one in memo.items() if one is not None}
-    live = {one.policy: result for one, result in campaign.live.items()}
+    timed = {one.policy: result.step_ms for one, result in campaign.live.items()}
     bars: list[tuple[str, list[tuple[str, float]]]] = [
         ("attempts per frame", [(p, one.attempts_per_frame) for p, one in found.items()])
     ]
-    if live:
-        bars.append(("ms per frame (guided, no memo)", [(p, r.step_ms) for p, r in live.items()]))
+    if timed:
+        in_order = [(policy, timed[policy]) for policy in found if policy in timed]
+        bars.append(("ms per frame (guided, no memo)", in_order))
     if campaign.with_truth:
         bars.append(
             (

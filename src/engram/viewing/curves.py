@@ -14,7 +14,8 @@ from engram.viewing.canvas import save, subplots
 
 Array = NDArray[np.float64]
 
-# Ten colours that differ in lightness too, then other line styles.
+# Matplotlib's ten and black, then other line styles.
+_COLOURS = (*(f"C{number}" for number in range(10)), "black")
 _STYLES = ("-", "--", ":")
 _PANELS_IN_A_ROW = 4
 
@@ -65,8 +66,8 @@ class _Looks:
 
     def of(self, label: str) -> tuple[str, str]:
         if label not in self.known:
-            number = len(self.known)
-            self.known[label] = (f"C{number % 10}", _STYLES[number // 10 % len(_STYLES)])
+            style, colour = divmod(len(self.known), len(_COLOURS))
+            self.known[label] = (_COLOURS[colour], _STYLES[style % len(_STYLES)])
         return self.known[label]
 
 
