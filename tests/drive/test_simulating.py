@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.drive import campaign_folder, simulate
-from engram.errors import ConfigError, SequenceError
+from engram.drive import Settings, campaign_folder, simulate
+from engram.errors import ConfigError, IncompatibleError, SequenceError
+from engram.frontend import FrontendConfig
 from engram.sequences import FrameLog, SimulatedSequence, open_sequence, session_of
 from engram.sequences.identity import first_pair_hash
 from engram.sequences.trajectories import read_kitti_poses, read_truth
@@ -44,6 +45,18 @@ def test_what_is_there_is_not_rendered_again(short: Campaign, tmp_path: Path) ->
     assert (report.rendered, report.already_there) == (0, 1)
     assert len(words) == len(SimulatedSequence(short, 1))
     assert Path(report.files[0]).read_bytes() == before
+
+
+def test_what_another_front_end_made_is_not_taken_for_this_ones(
+    short: Campaign, tmp_path: Path
+) -> None:
+    simulate(short, tmp_path, sessions=[1])
+    for other in (
+        Settings(frontend=FrontendConfig(landmarks=100)),
+        Settings(odometry=replace(Settings().odometry, min_inliers=21)),
+    ):
+        with pytest.raises(IncompatibleError, match="was rendered with another version"):
+            simulate(short, tmp_path, sessions=[1], settings=other)
 
 
 def test_a_killed_run_is_taken_up_again(short: Campaign, tmp_path: Path) -> None:

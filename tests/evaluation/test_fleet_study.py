@@ -180,7 +180,7 @@ def test_downloads_are_tried_for_as_many_held_out_drives_as_asked_for(plan: Flee
     for fold in plan.folds:
         assert len(list(plan.folder(plan.arms[0], fold).glob("downloads-*.json"))) == 1
         for drive in plan.held_out(fold)[:1]:
-            path = plan.folder(plan.arms[0], fold) / f"downloads-{drive.name}.json"
+            path = plan.folder(plan.arms[0], fold) / f"downloads-{drive.key}.json"
             kept = json.loads(path.read_text())
             names = [one["name"] for one in kept["tried"]]
             assert names[:3] == ["copy", "tod", "tod+paths"]

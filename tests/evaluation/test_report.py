@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from engram.drive import Settings
+from engram.errors import InputError
 from engram.evaluation import (
     UNLIMITED,
     Configuration,
@@ -18,6 +19,7 @@ from engram.evaluation import (
     EvaluatedDrive,
     Plan,
     RankingOptions,
+    make_plan,
     write_report,
 )
 from engram.evaluation.configurations import map_sizes, sweep
@@ -37,7 +39,7 @@ MISSES = {"oracle": 0.02, "recall": 0.03, "bandit": 0.06, "path": 0.05, "distanc
 def made_up_drive(number: int) -> EvaluatedDrive:
     session = Session(SessionId(UUID(int=number)), "robot", CAMERA.id, number, Clock.UTC)
     path = Path(f"{number:03d}.framelog")
-    return EvaluatedDrive(path, session, CAMERA, DescriptorKind.BRIEF, "made up", has_truth=True)
+    return EvaluatedDrive(path, session, CAMERA, DescriptorKind.BRIEF, "made up", "", "known")
 
 
 def miss_share(one: Configuration) -> float:
@@ -169,9 +171,11 @@ def test_every_figure_is_drawn(out: Path) -> None:
         "fig10_candidates.png",
         "fig11_lanes.png",
         "fig11_lanes_not_localised.png",
+        "fig11_lanes_against_distance.png",
         "fig12_curves_route.png",
         "fig12_curves_gap.png",
         "fig12_curves_lost.png",
+        "fig12_curves_lost_scaled.png",
         "fig13_T.png",
         "costs_made-up.png",
     }
@@ -249,4 +253,47 @@ def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Pat
     assert unfinished not in found.memo
     assert found.memo.keys() == collect(plan).memo.keys() - {unfinished}
     assert {len(one.sessions) for one in found.memo.values()} == {SESSIONS}
+    assert found.left_out == {unfinished: SESSIONS - 1}
     write_report(tmp_path / "out", [begun])
+    told = (tmp_path / "out" / "claims.md").read_text()
+    assert f"run on fewer than {SESSIONS} sessions: distance (Np = 4) on {SESSIONS - 1}." in told
+    # Only the folds that have it: there it is shown.
+    other = replace(begun, options=replace(begun.options, only_folds=(1,)))
+    assert unfinished in collect(other).memo
+    assert not collect(other).left_out
+
+
+def test_nothing_run_is_told_rather_than_reported(plan: Plan, tmp_path: Path) -> None:
+    (tmp_path / "work").mkdir()
+    with pytest.raises(InputError, match="nothing was run"):
+        write_report(tmp_path / "out", [replace(plan, work=tmp_path / "work")])
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(
+    plan: Plan, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(tmp_path / "file" / "out", [plan])
+    with pytest.raises(InputError, match="cannot be written"):
+        make_plan(plan.drives, plan.settings, plan.options, tmp_path / "file" / "work")
+
+
+def test_more_rounds_alone_are_reported_too(plan: Plan, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    work.mkdir()
+    options = replace(
+        plan.options, policies=("distance", "path"), lanes=(1, 2), rounds=(2,), map_sizes=False
+    )
+    twice = replace(plan, work=work, options=options)
+    for fold in plan.folds:
+        source = plan.map_path(fold).with_suffix(".json")
+        (work / source.name).write_bytes(source.read_bytes())
+        for session in fold.held_out:
+            runs = made_up_runs(session, sweep(options.policies, options.lanes, options.rounds))
+            write_runs(twice.runs_path(session, "memo"), runs)
+    write_report(tmp_path / "out", [twice])
+    text = (tmp_path / "out" / "claims.md").read_text()
+    assert "Np = 2, Nr = 2, T = 10" in text
+    assert "| distance | " in text

@@ -26,6 +26,7 @@ from engram.evaluation import (
     write_report,
 )
 from engram.evaluation.store import read_runs
+from engram.sequences.trajectories import truth_path
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +90,35 @@ def test_what_is_memoised_is_what_a_robot_would_do_unguided(plan: Plan) -> None:
     live, memo = results(unguided, "live"), results(plan)
     assert len(live) == 2 * 2
     assert all(memo[key] == value for key, value in live.items())
+
+
+def test_logs_of_one_name_in_several_folders_are_several_drives(
+    campaign, plan: Plan, tmp_path: Path
+) -> None:
+    logs = []
+    for number, drive in enumerate(campaign.drives):
+        folder = tmp_path / f"monday{number}"
+        folder.mkdir()
+        logs.append(shutil.copy(drive.path, folder / "log.framelog"))
+        shutil.copy(truth_path(drive.path), truth_path(folder / "log.framelog"))
+    same = DriveSet(campaign.name, drives_of([Path(one) for one in logs]))
+    other = make_plan(same, Settings(), few_options(), tmp_path / "work")
+    run(other)
+    assert results(other) == results(plan)
+
+
+def test_truth_that_comes_later_voids_what_was_run_without(campaign, tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    shutil.copytree(campaign.drives[0].path.parent, folder)
+    logs = [folder / one.path.name for one in campaign.drives]
+    whole = DriveSet("tiny", drives_of(logs)).hash
+    assert whole == campaign.hash
+    truth = truth_path(logs[0])
+    text = truth.read_text()
+    truth.write_text(text + "# the same poses, told again\n")
+    changed = DriveSet("tiny", drives_of(logs)).hash
+    truth.unlink()
+    assert len({whole, changed, DriveSet("tiny", drives_of(logs)).hash}) == 3
 
 
 class _KilledError(Exception):

@@ -46,7 +46,33 @@ def test_route_not_localised_counts_the_steps_that_end_unmatched() -> None:
 
 def test_sessions_do_not_run_into_one_another() -> None:
     end, start = drive([1, 1, 1], "x.."), drive([1, 1, 1], "..x")
-    assert sorted(gaps([end, start]).length_m) == [0, 1, 2, 3]
+    assert sorted(gaps([end, start]).length_m) == [1, 2, 3]
+
+
+def test_a_match_where_the_session_starts_or_ends_makes_no_gap_there() -> None:
+    whole = drive([0, 1, 1, 1, 1], "xxxxx")
+    np.testing.assert_allclose(gaps([whole]).length_m, [1, 1, 1, 1])
+    assert failure_gap([whole], 1.0) == 1.0
+    # At rest between two matches is a gap of no length; at rest without one is a failed one.
+    rest = drive([0, 0, 1, 0], "xxx.")
+    np.testing.assert_allclose(gaps([rest]).length_m, [0, 1, 0])
+    np.testing.assert_array_equal(gaps([rest]).failed, [False, False, True])
+
+
+@pytest.mark.parametrize(
+    "matched", [[0, 1, 1, 0], [0.0, 1.0, 1.0, 0.0], [False, True, True, False]]
+)
+def test_matches_may_be_told_as_numbers(matched) -> None:
+    for given in (matched, np.array(matched)):
+        told = Drive([1, 2, 3, 4], given)
+        assert route_not_localised([told]) == pytest.approx(0.5)
+        assert longest_gap_m([told]) == 4
+
+
+@pytest.mark.parametrize("matched", [[0, 2], [0.5, 1], ["yes", "no"], [np.nan, 1]])
+def test_what_is_neither_true_nor_false_is_refused(matched) -> None:
+    with pytest.raises(InputError):
+        Drive(np.ones(2), matched)
 
 
 def test_a_session_without_a_match_is_one_gap() -> None:

@@ -136,6 +136,7 @@ def ranking(
         relocaliser=None if relocaliser == "none" else relocaliser,
         only_folds=_only(only_folds),
     )
+    again = _redone(redo, asked.policies, report_only=report_only)
     started = time.perf_counter()
     settings = load_settings(config)
     plans = [
@@ -145,8 +146,7 @@ def ranking(
     for plan in plans:
         if report_only:
             continue
-        if redo:
-            forget(plan, redo.split(","))
+        forget(plan, again)
         with progress(f"evaluate {plan.drives.name}", task_count(plan)) as advance:
             run(plan, workers, advance)
     _tell_files(write_report(out, plans), time.perf_counter() - started, as_json=as_json)
@@ -217,9 +217,9 @@ def fleet(
         FleetOptions,
         fleet_tasks,
         make_fleet_plan,
+        run_fleet,
         write_fleet_report,
     )
-    from engram.evaluation.tasks import run_tasks
 
     counts = _numbers(groups, "--groups")
     asked = FleetOptions(
@@ -240,9 +240,8 @@ def fleet(
         for one in _drive_sets(drives, size, campaigns)
     ]
     for plan in [] if report_only else plans:
-        tasks = fleet_tasks(plan)
-        with progress(f"evaluate {plan.drives.name}", len(tasks)) as advance:
-            run_tasks(tasks, workers, advance)
+        with progress(f"evaluate {plan.drives.name}", len(fleet_tasks(plan))) as advance:
+            run_fleet(plan, workers, advance)
     _tell_files(write_fleet_report(out, plans), time.perf_counter() - started, as_json=as_json)
 
 
@@ -259,13 +258,38 @@ def _drive_sets(drives: list[str], size: str, campaigns: Path | None) -> list[Dr
     from engram.cli.simulation import campaigns_folder, size_named
     from engram.evaluation import DriveSet, drives_of, open_campaign
 
-    logs = [Path(one) for one in drives if one.endswith(".framelog") or Path(one).exists()]
-    names = [one for one in drives if Path(one) not in logs]
+    names = [one for one in drives if _names_campaign(one)]
+    logs = [Path(one) for one in drives if one not in names]
     folder = campaigns or campaigns_folder()
     sets = [open_campaign(name, folder, size_named(size)) for name in names]
     if logs:
         sets.append(DriveSet(logs[0].resolve().parent.name or "logs", drives_of(logs)))
     return sets
+
+
+def _names_campaign(text: str) -> bool:
+    """Whether it is to be a campaign: a known one comes before a folder of the same name."""
+    from engram.simulation import CAMPAIGNS
+
+    name = text.partition("@")[0]
+    return name in CAMPAIGNS or not (text.endswith(".framelog") or Path(text).exists())
+
+
+def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -> tuple[str, ...]:
+    """Policies whose results are dropped: only such as are then run again."""
+    from engram.errors import ConfigError
+
+    if redo is None:
+        return ()
+    if report_only:
+        raise ConfigError("--redo runs policies again, and --report-only runs nothing: give one")
+    again = tuple(redo.split(","))
+    for name in again:
+        if name not in policies:
+            raise ConfigError(
+                f"--redo {name!r}: is not among the policies of this run ({', '.join(policies)})"
+            )
+    return again
 
 
 def _lanes(text: str) -> tuple[int, ...]:

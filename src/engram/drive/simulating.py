@@ -15,10 +15,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from engram.config import config_hash
 from engram.drive.extracting import extract_log
 from engram.drive.live import ignore
 from engram.drive.settings import Settings
-from engram.errors import ConfigError, SequenceError, StorageFullError
+from engram.errors import ConfigError, IncompatibleError, SequenceError, StorageFullError
+from engram.frontend import Frontend
 from engram.geometry import SE3
 from engram.sequences import FrameLog, SimulatedSequence
 from engram.sequences.trajectories import truth_path, write_tum
@@ -98,6 +100,7 @@ def simulate(
 
     Raises:
         ConfigError: no such session, or fewer than one worker.
+        IncompatibleError: a session that is there was made by another front-end or odometry.
         StorageFullError: no space is left; what was finished is kept.
         SequenceError: a file cannot be written.
     """
@@ -140,9 +143,24 @@ def _is_done(task: _Task) -> bool:
         return False
     log = FrameLog(task.target)
     try:
+        if log.complete:
+            _check_made_by(task, log)
         return log.complete
     finally:
         log.close()
+
+
+def _check_made_by(task: _Task, log: FrameLog) -> None:
+    """Refuses logs of other settings: a campaign is of one make, or its sessions do not compare."""
+    for what, made, wanted in (
+        ("front-end", log.header.frontend, Frontend(task.settings.frontend).hash),
+        ("odometry", log.header.odometry, config_hash(task.settings.odometry)),
+    ):
+        if made != wanted:
+            raise IncompatibleError(
+                f"{task.target}: was rendered with another version or other settings of the {what} "
+                f"({made}, now {wanted}); give another --out, or remove the folder to render anew"
+            )
 
 
 def _run_here(tasks: list[_Task], workers: int, advance: Callable[[str], None]) -> int:

@@ -28,7 +28,8 @@ def claims_page(campaigns: Sequence[CampaignResult]) -> str:
     """The tables of all campaigns, as Markdown. Intervals are 90 %, by bootstrap over sessions."""
     lines: list[str] = []
     for campaign in campaigns:
-        lines += [f"## {campaign.name}", "", *_policies(campaign), "", *_claims(campaign), ""]
+        lines += [f"## {campaign.name}", "", *_left_out(campaign)]
+        lines += [*_policies(campaign), "", *_claims(campaign), ""]
         lines += [*sweep_tables(campaign), *_guided(campaign)]
         if not campaign.with_truth:
             lines += [
@@ -36,6 +37,23 @@ def claims_page(campaigns: Sequence[CampaignResult]) -> str:
                 "",
             ]
     return "\n".join(lines)
+
+
+def _left_out(campaign: CampaignResult) -> list[str]:
+    """What was run on some sessions only: tables compare on the same sessions."""
+    fewer: dict[str, list[int]] = {}
+    for one, sessions in campaign.left_out.items():
+        what = f"Np = {one.lanes_text}" if one.sessions is None else "Fig. 9"
+        fewer.setdefault(f"{one.label} ({what})", []).append(sessions)
+    if not fewer:
+        return []
+    told = ", ".join(f"{what} on {min(counts)}" for what, counts in fewer.items())
+    all_sessions = max((len(one.sessions) for one in campaign.memo.values()), default=0)
+    return [
+        f"Not in these tables, since run on fewer than {all_sessions} sessions: {told}. The same "
+        "command without --only-folds completes them; --only-folds shows the folds that have them.",
+        "",
+    ]
 
 
 def _policies(campaign: CampaignResult) -> list[str]:
@@ -83,7 +101,7 @@ def _policies(campaign: CampaignResult) -> list[str]:
     driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
     found_again = "no relocalisation" if campaign.relocaliser is None else campaign.relocaliser
     title = (
-        f"Np = {campaign.few_lanes}, Nr = 1, T = 10; {count} held-out sessions, "
+        f"Np = {campaign.few_lanes}, Nr = {campaign.rounds}, T = 10; {count} held-out sessions, "
         f"{driven / 1e3:.1f} km, unguided, {found_again}"
     )
     return [title, "", *table(head, rows)]
@@ -317,7 +335,7 @@ def _guided_and_not(
     pairs = []
     for policy in campaign.policies:
         live, memo = (
-            campaign.live.get(Configuration(policy, campaign.few_lanes)),
+            campaign.live.get(Configuration(policy, campaign.few_lanes, campaign.rounds)),
             campaign.get(policy),
         )
         if live is not None and memo is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from typing import Any
 
@@ -130,19 +130,21 @@ def sweep(
         limited = [np for np in lanes if np != UNLIMITED]
         add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)
     if "path" in policies:
-        add(Configuration("path", few, 1, T) for T in T_SWEEP)
-        add(Configuration("path", np, paths=PathKinds.MATCHED) for np in lanes)
+        add(Configuration("path", few, rounds[0], T) for T in T_SWEEP)
+        add(Configuration("path", np, rounds[0], paths=PathKinds.MATCHED) for np in lanes)
     for policy in PATH_POLICIES:
         if policy in policies:
-            add([Configuration(policy, few, radius=Radius.BASIN)])
-            add([Configuration(policy, few, paths=PathKinds.MATCHED)])
+            add([Configuration(policy, few, rounds[0], radius=Radius.BASIN)])
+            add([Configuration(policy, few, rounds[0], paths=PathKinds.MATCHED)])
     return tuple(found)
 
 
-def map_sizes(policies: Sequence[str], lanes: int, sessions: int) -> tuple[Configuration, ...]:
+def map_sizes(
+    policies: Sequence[str], lanes: int, sessions: int, rounds: int = 1
+) -> tuple[Configuration, ...]:
     """[L15] Fig. 9: each policy in the map as it was after each training session but the last."""
     return tuple(
-        replace(Configuration(policy, lanes), sessions=count)
+        Configuration(policy, lanes, rounds, sessions=count)
         for count in range(1, sessions)
         for policy in policies
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -14,7 +15,7 @@ from engram.experience.model import Session
 from engram.frontend import DescriptorKind
 from engram.geometry import SE3, StereoCamera
 from engram.sequences import FrameLog, LoggedFrame
-from engram.sequences.trajectories import Trajectory, read_truth
+from engram.sequences.trajectories import Trajectory, read_truth, truth_path
 from engram.simulation import Campaign, Size, campaign_named
 
 
@@ -27,9 +28,9 @@ class EvaluatedDrive:
         session: its session.
         camera: its camera.
         descriptor: kind of its descriptors.
-        frontend: hash of the front-end that made it.
-        has_truth: whether its true poses stand beside it; those of all drives of an evaluation
-            are in one world frame.
+        frontend, odometry: hashes of the front-end and the odometry that made it.
+        truth_hash: of its true poses, which stand beside it; None where there are none. Those of
+            all drives of an evaluation are in one world frame.
     """
 
     path: Path
@@ -37,12 +38,23 @@ class EvaluatedDrive:
     camera: StereoCamera
     descriptor: DescriptorKind
     frontend: str
-    has_truth: bool
+    odometry: str
+    truth_hash: str | None
 
     @property
     def name(self) -> str:
-        """For people and files."""
+        """For people; several drives may have the same."""
         return self.path.stem
+
+    @property
+    def key(self) -> str:
+        """For files and tasks: no two drives of an evaluation have the same."""
+        return f"{self.name}-{self.session.id.hex[-12:]}"
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether its true poses are known."""
+        return self.truth_hash is not None
 
     def frames(self) -> list[LoggedFrame]:
         """All its frames, in memory."""
@@ -95,8 +107,13 @@ class DriveSet:
 
     @property
     def hash(self) -> str:
-        """Changes with any drive and with the front-end that made it: what caches are kept by."""
-        return config_hash({str(one.session.id): one.frontend for one in self.drives})
+        """Changes with any drive, what made it, and its truth: what caches are kept by."""
+        return config_hash(
+            {
+                str(one.session.id): (one.frontend, one.odometry, one.truth_hash)
+                for one in self.drives
+            }
+        )
 
 
 def open_campaign(text: str, campaigns: Path, size: Size = Size.STANDARD) -> DriveSet:
@@ -170,7 +187,17 @@ def _drive(path: Path) -> EvaluatedDrive:
             log.camera,
             log.header.descriptor,
             log.header.frontend,
-            path.with_suffix(".truth.txt").exists(),
+            log.header.odometry,
+            _hash_of(truth_path(path)),
         )
     finally:
         log.close()
+
+
+def _hash_of(path: Path) -> str | None:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise SequenceError(f"{path}: cannot be read: {error.strerror or error}") from error

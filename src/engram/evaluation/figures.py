@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,14 @@ from engram.evaluation.configurations import (
 )
 from engram.evaluation.summary import CURVE_AT_M, CampaignResult, ConfigurationResult
 from engram.evaluation.sweeps import by_lanes, by_map_size
-from engram.measures import FORMULAS, Estimator, Interval, SessionSums
+from engram.measures import (
+    FORMULAS,
+    Estimator,
+    Interval,
+    SessionSums,
+    Statistic,
+    difference,
+)
 from engram.viewing import Line, Panel, draw_bars, draw_curves
 
 _P_GT_10M = "P(no match for > 10 m), %"
@@ -38,22 +46,30 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
             draw_curves(shown, out / name, title)
             written.append(out / name)
 
-    np_title = "failure against the number of lanes, Nr = 1, T = 10"
-    draw("fig09_map_size.png", map(_map_size, campaigns), "failure as the map grows, Np = 2")
-    draw("fig10_candidates.png", map(_candidates, campaigns), "candidates along one lap")
+    few = ", ".join(sorted({f"Np = {one.few_lanes}, Nr = {one.rounds}" for one in campaigns}))
+    rounds = ", ".join(sorted({f"Nr = {one.rounds}" for one in campaigns}))
+    np_title = f"failure against the number of lanes, {rounds}, T = 10"
+    draw("fig09_map_size.png", map(_map_size, campaigns), f"failure as the map grows, {few}")
+    draw("fig10_candidates.png", map(_candidates, campaigns), "candidates along an ordinary lap")
     draw("fig11_lanes.png", [_lanes(one, _p_gt_10m) for one in campaigns], np_title)
     draw(
         "fig11_lanes_not_localised.png",
-        [_lanes(one, lambda r: r.not_localised, _NOT_LOCALISED) for one in campaigns],
+        [_lanes(one, _missed, _NOT_LOCALISED) for one in campaigns],
         np_title,
     )
+    draw("fig11_lanes_against_distance.png", map(_against_distance, campaigns), np_title)
     for estimator in Estimator:
         draw(
             f"fig12_curves_{estimator.value}.png",
-            [_curves(one, lanes, estimator) for lanes in (2, 4) for one in campaigns],
-            f"failure curves; P(X ≥ x) = {FORMULAS[estimator]}",
+            [_curves(one, twice, estimator) for twice in (1, 2) for one in campaigns],
+            f"failure curves, {rounds}; P(X ≥ x) = {FORMULAS[estimator]}",
         )
-    draw("fig13_T.png", map(_sensitivity, campaigns), "sensitivity of path to T, Np = 2")
+    draw(
+        "fig12_curves_lost_scaled.png",
+        [_curves(one, twice, Estimator.LOST, scaled=True) for twice in (1, 2) for one in campaigns],
+        f"failure curves, {rounds}; {FORMULAS[Estimator.LOST]} · share of route not localised",
+    )
+    draw("fig13_T.png", map(_sensitivity, campaigns), f"sensitivity of path to T, {few}")
     for campaign in campaigns:
         written += _draw_costs(out, campaign)
     return written
@@ -63,6 +79,10 @@ def _p_gt_10m(result: ConfigurationResult) -> SessionSums:
     return result.failure(10.0)
 
 
+def _missed(result: ConfigurationResult) -> SessionSums:
+    return result.not_localised
+
+
 def _map_size(campaign: CampaignResult) -> Panel | None:
     """[L15] Fig. 9: P(> 10 m) against nodes, after each training session."""
     lines = []
@@ -70,7 +90,7 @@ def _map_size(campaign: CampaignResult) -> Panel | None:
         results = by_map_size(campaign, policy)
         if len(results) > 1:
             nodes = np.array([np.mean([s.nodes for s in one.sessions]) for one in results])
-            lines.append(_line(campaign, policy, nodes, results, _p_gt_10m))
+            lines.append(_line(campaign, policy, nodes, map(_p_gt_10m, results)))
     return Panel(campaign.name, "nodes in the map", _P_GT_10M, lines) if lines else None
 
 
@@ -97,25 +117,63 @@ def _lanes(
     for policy, paths in [*variants, ("path", PathKinds.MATCHED)]:
         results = by_lanes(campaign, policy, paths)
         if len(results) > 1:
-            x = np.array([_lanes_place(one.configuration.lanes) for one in results])
             label = results[0].configuration.label
-            lines.append(_line(campaign, label, x, results, measure))
+            lines.append(_lanes_line(campaign, label, results, map(measure, results)))
+    return _lanes_panel(campaign, y_label, lines)
+
+
+def _against_distance(campaign: CampaignResult) -> Panel | None:
+    """Paired: what makes a session hard for all drops out."""
+    nearest = {one.configuration.lanes: one for one in by_lanes(campaign, "distance")}
+    lines = []
+    for policy in campaign.policies:
+        results = [
+            one
+            for one in by_lanes(campaign, policy)
+            if one.configuration.lanes in nearest and policy != "distance"
+        ]
+        if len(results) > 1:
+            gaps = (
+                difference(one.not_localised, nearest[one.configuration.lanes].not_localised)
+                for one in results
+            )
+            lines.append(_lanes_line(campaign, policy, results, gaps))
+    label = "route not localised less distance's, points"
+    return _lanes_panel(campaign, label, lines, signed=True)
+
+
+def _lanes_line(
+    campaign: CampaignResult,
+    label: str,
+    results: Sequence[ConfigurationResult],
+    statistics: Iterable[Statistic],
+) -> Line:
+    x = np.array([_lanes_place(one.configuration.lanes) for one in results])
+    line = _line(campaign, label, x, statistics)
+    return replace(line, loose_end=bool(x[-1] == _BEYOND))
+
+
+def _lanes_panel(
+    campaign: CampaignResult, y_label: str, lines: Sequence[Line], *, signed: bool = False
+) -> Panel | None:
     places = sorted({float(x) for line in lines for x in line.x})
     ticks = [(x, "∞" if x == _BEYOND else f"{x:.0f}") for x in places]
-    return Panel(campaign.name, "Np", y_label, lines, ticks) if lines else None
+    return Panel(campaign.name, "Np", y_label, lines, ticks, signed=signed) if lines else None
 
 
 def _lanes_place(lanes: int) -> float:
     return _BEYOND if lanes == UNLIMITED else float(lanes)
 
 
-def _curves(campaign: CampaignResult, lanes: int, estimator: Estimator) -> Panel | None:
-    """[L15] Fig. 12: P(X ≥ x)."""
-    lines = []
+def _curves(
+    campaign: CampaignResult, twice: int, estimator: Estimator, *, scaled: bool = False
+) -> Panel | None:
+    """[L15] Fig. 12: P(X ≥ x), under the few lanes or twice as many."""
+    lines, lanes = [], twice * campaign.few_lanes
     for policy in campaign.policies:
         result = campaign.get(policy, lanes)
         if result is not None:
-            bands = result.curve(campaign.resamples, estimator)
+            bands = result.curve(campaign.resamples, estimator, scaled=scaled)
             y, low, high = (100 * band for band in bands)
             lines.append(Line(policy, CURVE_AT_M, y, low, high, marks=False))
     title = f"{campaign.name}, Np = {lanes}"
@@ -131,8 +189,8 @@ def _sensitivity(campaign: CampaignResult) -> Panel | None:
     places = np.arange(len(found), dtype=np.float64)
     ticks = [(float(x), str(one.configuration.T)) for x, one in zip(places, found, strict=True)]
     lines = [
-        _line(campaign, "P(> 10 m)", places, found, _p_gt_10m),
-        _line(campaign, "route not localised", places, found, lambda r: r.not_localised),
+        _line(campaign, "P(> 10 m)", places, map(_p_gt_10m, found)),
+        _line(campaign, "route not localised", places, map(_missed, found)),
     ]
     return Panel(campaign.name, "T", "%", lines, ticks)
 
@@ -141,11 +199,10 @@ def _line(
     campaign: CampaignResult,
     label: str,
     x: NDArray[np.float64],
-    results: Sequence[ConfigurationResult],
-    measure: Callable[[ConfigurationResult], SessionSums],
+    statistics: Iterable[Statistic],
 ) -> Line:
     """In per cent, with a 90 % band over sessions."""
-    bands: list[Interval] = [campaign.resamples.interval(measure(one)) for one in results]
+    bands: list[Interval] = [campaign.resamples.interval(one) for one in statistics]
     columns = [[getattr(band, name) for band in bands] for name in ("estimate", "low", "high")]
     y, low, high = (100 * np.array(column) for column in columns)
     return Line(label, x, y, low, high)
@@ -182,5 +239,6 @@ def _draw_costs(out: Path, campaign: CampaignResult) -> list[Path]:
     if not found:
         return []
     path = out / f"costs_{campaign.name}.png"
-    draw_bars(bars, path, f"{campaign.name}, Np = {campaign.few_lanes}, Nr = 1")
+    title = f"{campaign.name}, Np = {campaign.few_lanes}, Nr = {campaign.rounds}"
+    draw_bars(bars, path, title)
     return [path]

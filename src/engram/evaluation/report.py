@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from engram.errors import InputError
 from engram.evaluation.building import write_json
 from engram.evaluation.claims import claims_page
 from engram.evaluation.figures import draw_figures
 from engram.evaluation.running import Plan
-from engram.evaluation.summary import collect
+from engram.evaluation.summary import CampaignResult, collect
 from engram.evaluation.tables import session_rows, summary_rows, write_csv
+from engram.evaluation.writing import writing
 
 
 def write_report(out: Path, plans: Sequence[Plan]) -> list[Path]:
@@ -24,17 +26,31 @@ def write_report(out: Path, plans: Sequence[Plan]) -> list[Path]:
         The files written.
 
     Raises:
+        InputError: nothing was run of a campaign, or the folder cannot be written.
+        StorageFullError: no space is left.
         MissingExtraError: Matplotlib is not installed; the tables are written by then.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    campaigns = [collect(plan) for plan in plans]
+    campaigns = [_with_results(plan) for plan in plans]
     tables = {
         "summary.csv": [row for one in campaigns for row in summary_rows(one)],
         "sessions.csv": [row for one in campaigns for row in session_rows(one)],
     }
-    for name, rows in tables.items():
-        write_csv(out / name, rows)
-    write_json(out / "configuration.json", [plan.configuration() for plan in plans])
-    (out / "claims.md").write_text(claims_page(campaigns), encoding="utf-8")
-    files = [out / name for name in (*tables, "configuration.json", "claims.md")]
-    return files + draw_figures(out, campaigns)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        for name, rows in tables.items():
+            write_csv(out / name, rows)
+        write_json(out / "configuration.json", [plan.configuration() for plan in plans])
+        (out / "claims.md").write_text(claims_page(campaigns), encoding="utf-8")
+        files = [out / name for name in (*tables, "configuration.json", "claims.md")]
+        return files + draw_figures(out, campaigns)
+
+
+def _with_results(plan: Plan) -> CampaignResult:
+    found = collect(plan)
+    if not found.memo and not found.live:
+        raise InputError(
+            f"of {plan.drives.name} nothing was run with these options in {plan.work}; give "
+            "--work, --folds, --seed and the settings as when it was run, or leave out "
+            "--report-only"
+        )
+    return found

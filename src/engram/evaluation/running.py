@@ -36,6 +36,7 @@ from engram.evaluation.lockstep import Runs
 from engram.evaluation.memo import MatchMemo
 from engram.evaluation.store import joined, missing, only, read_runs, write_runs
 from engram.evaluation.tasks import Task, run_tasks
+from engram.evaluation.writing import writing
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher, Matcher
 from engram.ranking import POLICIES
@@ -129,7 +130,7 @@ class Plan:
         Maps and matches serve every relocaliser, results are its own.
         """
         with_it = "" if self.options.relocaliser is None else f"-{self.options.relocaliser}"
-        return self.work / f"{mode}{with_it}-{self.drives.drives[session].name}.npz"
+        return self.work / f"{mode}{with_it}-{self.drives.drives[session].key}.npz"
 
     def configuration(self) -> dict[str, Any]:
         """The resolved configuration, kept with the results."""
@@ -163,9 +164,10 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
         __version__,
     )
     folder = work / f"{file_name(drives.name)}-{config_hash(depends)}"
-    folder.mkdir(parents=True, exist_ok=True)
     plan = Plan(drives, settings, options, folder)
-    write_json(folder / "configuration.json", plan.configuration())
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "configuration.json", plan.configuration())
     return plan
 
 
@@ -181,11 +183,12 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
         advance: called once per task with a word; see `task_count`.
 
     Raises:
-        MapError: a map cannot be written.
-        SequenceError: a drive cannot be read.
+        MapError: a map cannot be written, or no space is left.
+        InputError: a drive cannot be read, or results cannot be written.
     """
     try:
-        run_tasks(_tasks(plan), workers, advance)
+        with writing(plan.work):
+            run_tasks(_tasks(plan), workers, advance)
     finally:
         _earlier_maps.close()
 
@@ -240,7 +243,9 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
     whole = missing(done, sweep(options.policies, options.lanes, options.rounds))
     earlier: list[Configuration] = []
     if options.map_sizes:
-        wanted = map_sizes(options.policies, options.few_lanes, len(fold.training))
+        wanted = map_sizes(
+            options.policies, options.few_lanes, len(fold.training), options.rounds[0]
+        )
         earlier = missing(done, wanted)
     if not (whole or earlier):
         return
@@ -250,7 +255,7 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
         config = plan.settings.localiser.matcher
         memo = MatchMemo(
             FrameMatcher(newest.store.frames, config),
-            plan.work / f"memo-{drive.name}.matches.npz",
+            plan.work / f"memo-{drive.key}.matches.npz",
             matcher_hash(config),
         )
         frames = drive.frames()
@@ -302,7 +307,8 @@ def _run_live(plan: Plan, fold: Fold, session: int) -> None:
     path = plan.runs_path(session, "live")
     done = read_runs(path)
     policies = [one for one in plan.options.policies if one not in _BOUNDS]
-    wanted = missing(done, [Configuration(one, plan.options.few_lanes) for one in policies])
+    few, rounds = plan.options.few_lanes, plan.options.rounds[0]
+    wanted = missing(done, [Configuration(one, few, rounds) for one in policies])
     if not wanted:
         return
     frames = plan.drives.drives[session].frames()

@@ -28,6 +28,7 @@ from engram.measures import (
     failure_sums,
     longest_gap_m,
     not_localised_sums,
+    product,
 )
 from engram.ranking import POLICIES
 
@@ -99,15 +100,27 @@ class ConfigurationResult:
         return SessionSums(np.array([p[0][0] for p in parts]), np.array([p[1] for p in parts]))
 
     def curve(
-        self, resamples: Resamples, estimator: Estimator = Estimator.ROUTE
+        self,
+        resamples: Resamples,
+        estimator: Estimator = Estimator.ROUTE,
+        *,
+        scaled: bool = False,
     ) -> tuple[Array, Array, Array]:
-        """P(X ≥ x) at `CURVE_AT_M` with the ends of its interval, (X,) each."""
+        """P(X ≥ x) at `CURVE_AT_M` with the ends of its interval, (X,) each.
+
+        Args:
+            resamples: draws of sessions.
+            estimator: of P.
+            scaled: times the share of the route that is not localised (SPEC §8).
+        """
         parts = [failure_sums(one, CURVE_AT_M, estimator) for one in self.drives]
         below = np.array([part[1] for part in parts])
-        bands = [
-            resamples.interval(SessionSums(np.array([part[0][k] for part in parts]), below))
+        sums = [
+            SessionSums(np.array([part[0][k] for part in parts]), below)
             for k in range(len(CURVE_AT_M))
         ]
+        missed = self.not_localised
+        bands = [resamples.interval(product(one, missed) if scaled else one) for one in sums]
         return (
             np.array([band.estimate for band in bands]),
             np.array([band.low for band in bands]),
@@ -176,10 +189,12 @@ class CampaignResult:
         live: guided and unmemoised, of fewer sessions, by configuration.
         with_truth: whether pose errors are known.
         seed: of the bootstrap.
-        few_lanes: Np of the figures that show one budget.
+        few_lanes, rounds: Np and Nr of the figures that show one budget.
         relocaliser: what found the lost; None for nothing.
         lap: per-frame candidates and possible successes of one session ([L15] Fig. 10); None
             where that was not run.
+        left_out: configurations that were run on fewer sessions than others, with how many; they
+            are in no table.
     """
 
     name: str
@@ -188,8 +203,10 @@ class CampaignResult:
     with_truth: bool
     seed: int
     few_lanes: int
+    rounds: int
     relocaliser: str | None
     lap: Lap | None
+    left_out: Mapping[Configuration, int]
 
     @cached_property
     def resamples(self) -> Resamples:
@@ -201,7 +218,8 @@ class CampaignResult:
         self, policy: str, lanes: int | None = None, **other: Any
     ) -> ConfigurationResult | None:
         """The result of a configuration; None where it was not run."""
-        return self.memo.get(Configuration(policy, lanes or self.few_lanes, **other))
+        one = Configuration(policy, lanes or self.few_lanes, **{"rounds": self.rounds, **other})
+        return self.memo.get(one)
 
     @property
     def policies(self) -> list[str]:
@@ -231,15 +249,17 @@ def collect(plan: Plan) -> CampaignResult:
     """Reads what was run of a plan; what the folder holds beyond what the plan asks is left out.
 
     So is, while a plan is not done, what was not run in all sessions that were begun: every table
-    compares configurations on the same sessions.
+    compares configurations on the same sessions. `CampaignResult.left_out` tells of it.
     """
     options = plan.options
     wanted = set(sweep(options.policies, options.lanes, options.rounds))
-    for fold in plan.folds:
-        wanted.update(map_sizes(options.policies, options.few_lanes, len(fold.training)))
+    for fold in plan.run_folds:
+        wanted.update(
+            map_sizes(options.policies, options.few_lanes, len(fold.training), options.rounds[0])
+        )
     by_mode: dict[str, dict[Configuration, list[SessionResult]]] = {"memo": {}, "live": {}}
-    lap: Lap | None = None
-    for fold in plan.folds:
+    laps: list[Lap] = []
+    for fold in plan.run_folds:
         built = built_map(plan, fold)
         for session in fold.held_out:
             for mode, found in by_mode.items():
@@ -253,8 +273,8 @@ def collect(plan: Plan) -> CampaignResult:
                     nodes = built.sessions[count - 1].nodes
                     result = session_result(runs, row, session, fold.number, nodes)
                     found.setdefault(one, []).append(result)
-                if lap is None and mode == "memo":
-                    lap = _lap(runs, plan.drives.drives[session].name)
+                if mode == "memo":
+                    laps += _lap(runs, plan.drives.drives[session].name)
     memo, live = (
         {
             one: ConfigurationResult(one, sessions)
@@ -263,6 +283,7 @@ def collect(plan: Plan) -> CampaignResult:
         }
         for found in by_mode.values()
     )
+    begun = by_mode["memo"]
     return CampaignResult(
         plan.drives.name,
         memo,
@@ -270,8 +291,10 @@ def collect(plan: Plan) -> CampaignResult:
         plan.drives.has_truth,
         options.seed,
         options.few_lanes,
+        options.rounds[0],
         options.relocaliser,
-        lap,
+        _ordinary(laps),
+        {one: len(begun[one]) for one in begun if one not in memo},
     )
 
 
@@ -296,12 +319,18 @@ def session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) ->
     )
 
 
-def _lap(runs: Runs, name: str) -> Lap | None:
-    """From the run that attempted every candidate."""
+def _lap(runs: Runs, name: str) -> list[Lap]:
+    """From the run that attempted every candidate; empty where there is none."""
     if EVERYTHING not in runs.configurations:
-        return None
+        return []
     row = runs.configurations.index(EVERYTHING)
-    return Lap(name, np.cumsum(runs.step_m), runs.candidates[row], runs.succeeded[row])
+    return [Lap(name, np.cumsum(runs.step_m), runs.candidates[row], runs.succeeded[row])]
+
+
+def _ordinary(laps: Sequence[Lap]) -> Lap | None:
+    """That which is neither easy nor hard: the median, by how many candidates match."""
+    by_matches = sorted(laps, key=lambda one: (float(one.succeeded.mean()), one.name))
+    return by_matches[len(laps) // 2] if laps else None
 
 
 def _over(above: float, below: float) -> float:

@@ -34,14 +34,24 @@ def by_map_size(campaign: CampaignResult, policy: str) -> list[ConfigurationResu
 
 
 def by_lanes(
-    campaign: CampaignResult, policy: str, paths: PathKinds = PathKinds.ALL, rounds: int = 1
+    campaign: CampaignResult,
+    policy: str,
+    paths: PathKinds = PathKinds.ALL,
+    rounds: int | None = None,
 ) -> list[ConfigurationResult]:
-    """A policy under each number of lanes, fewest first ([L15] Fig. 11)."""
+    """A policy under each number of lanes, fewest first ([L15] Fig. 11).
+
+    Args:
+        campaign: all results.
+        policy: key of `POLICIES`.
+        paths: which entries count in path memory.
+        rounds: Nr; None for that of the other figures.
+    """
+    nr = campaign.rounds if rounds is None else rounds
     found = [
         one
         for one in campaign.memo.values()
-        if one.configuration
-        == Configuration(policy, one.configuration.lanes, rounds=rounds, paths=paths)
+        if one.configuration == Configuration(policy, one.configuration.lanes, nr, paths=paths)
     ]
     return sorted(found, key=lambda one: one.configuration.lanes)
 

@@ -5,8 +5,10 @@ from engram.measures.bootstrap import (
     Interval,
     Resamples,
     SessionSums,
+    Statistic,
     difference,
     excess_ratio,
+    product,
     ratio,
 )
 from engram.measures.comparison import beats
@@ -36,6 +38,7 @@ __all__ = [
     "PoseErrors",
     "Resamples",
     "SessionSums",
+    "Statistic",
     "beats",
     "difference",
     "excess_ratio",
@@ -48,6 +51,7 @@ __all__ = [
     "longest_gap_m",
     "not_localised_sums",
     "pose_errors",
+    "product",
     "ratio",
     "route_m",
     "route_not_localised",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from engram.errors import InputError
 
 Array = NDArray[np.float64]
+# (N, S) weights of the sessions → (N,) values.
+Statistic: TypeAlias = Callable[[Array], Array]
 
 # Intervals are stated at this level throughout ("90 % interval").
 LEVEL = 0.9
@@ -54,7 +57,7 @@ class Resamples:
         shares = np.full(sessions, 1.0 / sessions)
         return Resamples(rng.multinomial(sessions, shares, resamples).astype(np.float64))
 
-    def interval(self, statistic: Callable[[Array], Array], level: float = LEVEL) -> Interval:
+    def interval(self, statistic: Statistic, level: float = LEVEL) -> Interval:
         """The percentile interval of a statistic.
 
         Args:
@@ -103,17 +106,22 @@ class SessionSums:
         return float(self(np.ones((1, len(self.numerator))))[0])
 
 
-def difference(a: SessionSums, b: SessionSums) -> Callable[[Array], Array]:
+def difference(a: SessionSums, b: SessionSums) -> Statistic:
     """A − b, paired: both under the same draws of the same sessions."""
     return lambda weights: a(weights) - b(weights)
 
 
-def ratio(a: SessionSums, b: SessionSums, added: float = 0.0) -> Callable[[Array], Array]:
+def product(a: SessionSums, b: SessionSums) -> Statistic:
+    """A · B, paired."""
+    return lambda weights: a(weights) * b(weights)
+
+
+def ratio(a: SessionSums, b: SessionSums, added: float = 0.0) -> Statistic:
     """(a + added) ÷ (b + added), paired; infinite where only b is 0, NaN where both are."""
     return lambda weights: _divided(a(weights) + added, b(weights) + added)
 
 
-def excess_ratio(a: SessionSums, b: SessionSums, bound: SessionSums) -> Callable[[Array], Array]:
+def excess_ratio(a: SessionSums, b: SessionSums, bound: SessionSums) -> Statistic:
     """(a − bound) ÷ (b − bound), paired: how many times more a loses than it must.
 
     What falls below the bound counts as reaching it.

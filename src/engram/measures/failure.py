@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from engram.errors import InputError
 from engram.measures.bootstrap import SessionSums
@@ -23,13 +23,24 @@ class Drive:
 
     Attributes:
         step_m: (F,) float64, distance driven from the previous frame to this one, >= 0.
-        matched: (F,) bool, whether this frame was localised.
+        matched: (F,) bool, or numbers 0 and 1: whether this frame was localised.
+
+    Raises:
+        InputError: they are not two arrays of one length, or hold anything else.
     """
 
     step_m: NDArray[np.float64]
     matched: NDArray[np.bool_]
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "step_m", _numbers("step_m", self.step_m))
+        matched = np.asarray(self.matched)
+        if matched.dtype != np.bool_:
+            numbers = _numbers("matched", matched)
+            if not np.isin(numbers, (0.0, 1.0)).all():
+                raise InputError("a drive's matched must be true or false, or 0 or 1, everywhere")
+            matched = numbers.astype(np.bool_)
+        object.__setattr__(self, "matched", matched)
         if self.step_m.shape != self.matched.shape or self.step_m.ndim != 1:
             raise InputError(
                 f"a drive needs two arrays of one length, not shapes {self.step_m.shape} and "
@@ -39,9 +50,18 @@ class Drive:
             raise InputError("a drive's steps must be finite and >= 0 metres")
 
 
+def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"a drive's {name} must be an array of numbers") from None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Gaps:
     """The distances between successive matches; start and end of a session close a gap.
+
+    A match in the very place where the session starts or ends makes no gap there.
 
     Attributes:
         length_m: (G,) float64.
@@ -62,10 +82,13 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
         positions = np.cumsum(drive.step_m)
         ends = np.flatnonzero(drive.matched)
         marks = np.concatenate([[0.0], positions[ends], positions[-1:]])
-        lengths.extend(np.diff(marks))
+        length_m = np.diff(marks)
         # Between two matches `i < j` lie `j - i - 1` frames without one.
-        rows = np.concatenate([[-1], ends, [len(positions)]])
-        failed.extend(np.diff(rows) > 1)
+        without = np.diff(np.concatenate([[-1], ends, [len(positions)]])) > 1
+        real = np.ones(len(length_m), dtype=bool)
+        real[[0, -1]] = (length_m[[0, -1]] > 0) | without[[0, -1]]
+        lengths.extend(length_m[real])
+        failed.extend(without[real])
     return Gaps(np.array(lengths, dtype=np.float64), np.array(failed, dtype=bool))
 
 

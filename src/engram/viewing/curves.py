@@ -29,6 +29,7 @@ class Line:
         x, y: (N,) float64.
         low, high: (N,) float64, ends of a confidence band; None for none.
         marks: whether the points are marked.
+        loose_end: the last stretch is dotted: what lies between is not known, or without limit.
     """
 
     label: str
@@ -37,6 +38,7 @@ class Line:
     low: Array | None = None
     high: Array | None = None
     marks: bool = True
+    loose_end: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +49,8 @@ class Panel:
         title, x_label, y_label: words beside it.
         lines: what is drawn.
         x_ticks: places of ticks and what stands there; None for Matplotlib's own.
-        least_y: the ordinate is logarithmic from here on; None for a linear one from 0.
+        least_y: the ordinate is logarithmic from here on; None for a linear one.
+        signed: whether values below 0 are usual; else a linear ordinate begins at 0.
     """
 
     title: str
@@ -56,6 +59,7 @@ class Panel:
     lines: Sequence[Line]
     x_ticks: Sequence[tuple[float, str]] | None = None
     least_y: float | None = None
+    signed: bool = False
 
 
 @dataclass(slots=True)
@@ -85,34 +89,44 @@ def draw_curves(panels: Sequence[Panel], path: Path, title: str) -> None:
     handles: dict[str, Any] = {}
     for one, panel in zip(axes, panels, strict=True):
         for line in panel.lines:
-            colour, style = looks.of(line.label)
-            if line.low is not None and line.high is not None:
-                one.fill_between(line.x, line.low, line.high, color=colour, alpha=0.12, linewidth=0)
-            (handle,) = one.plot(
-                line.x,
-                line.y,
-                style,
-                color=colour,
-                marker="o" if line.marks else None,
-                markersize=3,
-                linewidth=1.3,
-            )
+            handle = _draw_line(one, line, *looks.of(line.label))
             handles.setdefault(line.label, handle)
-        if panel.least_y is None:
-            one.set_ylim(0, None)
-        else:
-            one.set_yscale("log", nonpositive="clip")
-            one.set_ylim(panel.least_y, None)
-            one.yaxis.set_major_formatter("{x:g}")  # 100, 10, 1 rather than powers of ten
-        if panel.x_ticks is not None:
-            one.set_xticks([at for at, _ in panel.x_ticks], [text for _, text in panel.x_ticks])
-        one.set_title(panel.title, fontsize=10)
-        one.set_xlabel(panel.x_label)
-        one.set_ylabel(panel.y_label)
-        one.grid(alpha=0.3)
+        _draw_axes(one, panel)
     figure.legend(list(handles.values()), list(handles), loc="outside right center", fontsize=8)
     figure.suptitle(title, fontsize=11)
     save(figure, path)
+
+
+def _draw_line(axes: Any, line: Line, colour: str, style: str) -> Any:
+    """With its band; returns what the legend shows."""
+    if line.low is not None and line.high is not None:
+        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.08, linewidth=0)
+        for edge in (line.low, line.high):  # bands of many lines hide each other, edges do not
+            axes.plot(line.x, edge, color=colour, alpha=0.25, linewidth=0.5)
+    marker = "o" if line.marks else None
+    end = len(line.x) - 1 if line.loose_end else len(line.x)
+    drawn = {"color": colour, "marker": marker, "markersize": 3, "linewidth": 1.3}
+    (handle,) = axes.plot(line.x[:end], line.y[:end], style, **drawn)
+    if line.loose_end:
+        axes.plot(line.x[-2:], line.y[-2:], ":", **drawn)
+    return handle
+
+
+def _draw_axes(axes: Any, panel: Panel) -> None:
+    if panel.least_y is not None:
+        axes.set_yscale("log", nonpositive="clip")
+        axes.set_ylim(panel.least_y, None)
+        axes.yaxis.set_major_formatter("{x:g}")  # 100, 10, 1 rather than powers of ten
+    elif panel.signed:
+        axes.axhline(0.0, color="grey", linewidth=0.8)
+    else:
+        axes.set_ylim(0, None)
+    if panel.x_ticks is not None:
+        axes.set_xticks([at for at, _ in panel.x_ticks], [text for _, text in panel.x_ticks])
+    axes.set_title(panel.title, fontsize=10)
+    axes.set_xlabel(panel.x_label)
+    axes.set_ylabel(panel.y_label)
+    axes.grid(alpha=0.3)
 
 
 def draw_bars(

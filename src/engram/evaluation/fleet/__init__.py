@@ -1,7 +1,7 @@
 """[G16]'s experiments: building in parallel, sharing, downloads, orders of merging (SPEC §8)."""
 
 from engram.evaluation.fleet.arms import ARMS, Arm
-from engram.evaluation.fleet.experiments import fleet_tasks
+from engram.evaluation.fleet.experiments import fleet_tasks, run_fleet
 from engram.evaluation.fleet.plan import FleetOptions, FleetPlan, Protocol, make_fleet_plan
 from engram.evaluation.fleet.report import write_fleet_report
 
@@ -13,5 +13,6 @@ __all__ = [
     "Protocol",
     "fleet_tasks",
     "make_fleet_plan",
+    "run_fleet",
     "write_fleet_report",
 ]

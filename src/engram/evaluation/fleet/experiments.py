@@ -9,10 +9,11 @@ in the end, both robots having driven in a copy.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from engram.drive.live import ignore
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.fleet.arms import Arm
 from engram.evaluation.fleet.orders import try_orders
@@ -21,7 +22,8 @@ from engram.evaluation.fleet.stages import measure_stages
 from engram.evaluation.fleet.steps import download_for_foray, localise_in, map_drives, merge
 from engram.evaluation.fleet.trials import try_downloads_for
 from engram.evaluation.folds import Fold
-from engram.evaluation.tasks import Task
+from engram.evaluation.tasks import Task, run_tasks
+from engram.evaluation.writing import writing
 
 SINGLE = "single"
 DOCKED = "docked"
@@ -31,6 +33,22 @@ SHARED = "shared"
 def merged_name(groups: int, merges: int) -> str:
     """The centre that so many of the groups' maps were merged into."""
     return f"merged{groups}-{merges}" if merges else f"group{groups}-0"
+
+
+def run_fleet(plan: FleetPlan, workers: int = 1, advance: Callable[[str], None] = ignore) -> None:
+    """Runs what is missing of a study.
+
+    Args:
+        plan: what to run.
+        workers: processes.
+        advance: called once per task with a word; see `fleet_tasks`.
+
+    Raises:
+        MapError: a map cannot be written, or no space is left.
+        InputError: a drive cannot be read, or results cannot be written.
+    """
+    with writing(plan.work):
+        run_tasks(fleet_tasks(plan), workers, advance)
 
 
 def fleet_tasks(plan: FleetPlan) -> list[Task]:
@@ -158,7 +176,7 @@ class _Tasks:
         """Fig. 9's table: downloads of the shared map for each held-out drive's own hour."""
         for drive in self._plan.held_out(self._fold)[: self._plan.options.tried]:
             work = partial(try_downloads_for, *self._about, SHARED, drive)
-            yield self._task(f"downloads {drive.name}", work, [SHARED], "downloads", alone=True)
+            yield self._task(f"downloads {drive.key}", work, [SHARED], "downloads", alone=True)
 
     def _orders(self) -> Iterator[Task]:
         """Fig. 10: the groups in all orders."""
@@ -190,7 +208,7 @@ class _Tasks:
     def _localised(self, names: Sequence[str]) -> Iterator[Task]:
         for drive in self._plan.held_out(self._fold):
             work = partial(localise_in, *self._about, drive, names)
-            yield self._task(f"localise {drive.name} in {','.join(names)}", work, names, "localise")
+            yield self._task(f"localise {drive.key} in {','.join(names)}", work, names, "localise")
 
     def _task(
         self, name: str, work: object, needs: Sequence[str], word: str = "", *, alone: bool = False

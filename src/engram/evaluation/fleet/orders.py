@@ -47,7 +47,7 @@ class _Judge:
         config = settings.localiser.matcher
         return MatchMemo(
             FrameMatcher(opened.store.frames, config),
-            self._plan.folder(self._arm, self._fold) / f"memo-{drive.name}.matches.npz",
+            self._plan.folder(self._arm, self._fold) / f"memo-{drive.key}.matches.npz",
             matcher_hash(config),
         )
 

@@ -19,6 +19,7 @@ from engram.evaluation.drives import DriveSet, EvaluatedDrive
 from engram.evaluation.fleet.arms import ARMS, Arm
 from engram.evaluation.folds import Fold, check_only, chosen, split
 from engram.evaluation.running import file_name
+from engram.evaluation.writing import writing
 from engram.frontend.matching import matcher_hash
 from engram.localiser import RELOCALISERS
 
@@ -238,8 +239,9 @@ def make_fleet_plan(
     )
     for fold in plan.folds:
         plan.protocol(fold)  # raises where there are too few
-    plan.work.mkdir(parents=True, exist_ok=True)
-    write_json(plan.work / "configuration.json", plan.configuration())
+    with writing(plan.work):
+        plan.work.mkdir(parents=True, exist_ok=True)
+        write_json(plan.work / "configuration.json", plan.configuration())
     return plan
 
 

@@ -14,6 +14,7 @@ from engram.evaluation.fleet.results import ArmResult
 from engram.evaluation.fleet.stages import stages_path
 from engram.evaluation.fleet.tables import fleet_rows, order_rows
 from engram.evaluation.tables import write_csv
+from engram.evaluation.writing import writing
 
 
 def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
@@ -27,16 +28,18 @@ def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
         The files written.
 
     Raises:
+        StorageFullError, InputError: the folder cannot be written.
         MissingExtraError: Matplotlib is not installed; the tables are written by then.
     """
-    out.mkdir(parents=True, exist_ok=True)
     arms = [ArmResult(plan, arm) for plan in plans for arm in plan.arms]
-    write_csv(out / "summary.csv", [row for arm in arms for row in fleet_rows(arm)])
-    write_csv(out / "orders.csv", [row for arm in arms for row in order_rows(arm)])
-    write_json(out / "configuration.json", [_configuration(plan) for plan in plans])
-    (out / "claims.md").write_text(fleet_claims_page(arms), encoding="utf-8")
     names = ("summary.csv", "orders.csv", "configuration.json", "claims.md")
-    return [out / name for name in names] + draw_fleet_figures(out, arms)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        write_csv(out / "summary.csv", [row for arm in arms for row in fleet_rows(arm)])
+        write_csv(out / "orders.csv", [row for arm in arms for row in order_rows(arm)])
+        write_json(out / "configuration.json", [_configuration(plan) for plan in plans])
+        (out / "claims.md").write_text(fleet_claims_page(arms), encoding="utf-8")
+        return [out / name for name in names] + draw_fleet_figures(out, arms)
 
 
 def _configuration(plan: FleetPlan) -> dict[str, object]:

@@ -45,12 +45,12 @@ def map_path(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> Path:
 
 def runs_path(plan: FleetPlan, arm: Arm, fold: Fold, name: str, drive: EvaluatedDrive) -> Path:
     """How a held-out drive was localised in a map."""
-    return plan.folder(arm, fold) / f"runs-{name}-{drive.name}.npz"
+    return plan.folder(arm, fold) / f"runs-{name}-{drive.key}.npz"
 
 
 def field_path(plan: FleetPlan, arm: Arm, fold: Fold, name: str, drive: EvaluatedDrive) -> Path:
     """How a drive was localised while it was mapped."""
-    return plan.folder(arm, fold) / f"field-{name}-{drive.name}.npz"
+    return plan.folder(arm, fold) / f"field-{name}-{drive.key}.npz"
 
 
 def map_drives(
@@ -189,7 +189,7 @@ def localise_in(
         with open_map(map_path(plan, arm, fold, name)) as opened:
             memo = MatchMemo(
                 FrameMatcher(opened.store.frames, config),
-                plan.folder(arm, fold) / f"memo-{drive.name}.matches.npz",
+                plan.folder(arm, fold) / f"memo-{drive.key}.matches.npz",
                 matcher_hash(config),
             )
             runs = localise_held_out(

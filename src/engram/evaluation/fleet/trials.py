@@ -85,7 +85,7 @@ class TriedDownload:
 
 def trials_path(plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive) -> Path:
     """Where the trials of one held-out drive are kept."""
-    return plan.folder(arm, fold) / f"downloads-{drive.name}.json"
+    return plan.folder(arm, fold) / f"downloads-{drive.key}.json"
 
 
 def try_downloads_for(
