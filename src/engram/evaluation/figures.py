@@ -127,11 +127,7 @@ def _against_distance(campaign: CampaignResult) -> Panel | None:
     nearest = {one.configuration.lanes: one for one in by_lanes(campaign, "distance")}
     lines = []
     for policy in campaign.policies:
-        results = [
-            one
-            for one in by_lanes(campaign, policy)
-            if one.configuration.lanes in nearest and policy != "distance"
-        ]
+        results = [one for one in by_lanes(campaign, policy) if one.configuration.lanes in nearest]
         if len(results) > 1:
             gaps = (
                 difference(one.not_localised, nearest[one.configuration.lanes].not_localised)
