@@ -45,9 +45,11 @@ def test_a_lost_robot_asks_for_more(inliers: int, accepted: bool, waits: bool) -
 
 @pytest.mark.parametrize(
     ("offset_m", "sigma_m", "accepted"),
-    [(0.99, 0.0, True), (1.01, 0.0, False), (3.9, 1.0, True), (4.1, 1.0, False)],
+    [(0.49, 0.0, True), (0.51, 0.0, False), (3.4, 1.0, True), (3.6, 1.0, False)],
 )
-def test_position_must_agree_within_a_metre_and_three_sigma(offset_m, sigma_m, accepted) -> None:
+def test_position_must_agree_within_half_a_metre_and_three_sigma(
+    offset_m, sigma_m, accepted
+) -> None:
     found = match(SE3.exp([offset_m, 0, 5, 0, 0, 0]), 100)
     assert accept(found, prediction(sigma_m), CONFIG) is accepted
 
@@ -62,9 +64,9 @@ def test_a_match_that_does_not_know_where_it_is_is_none(sigma_m: float, accepted
 
 @pytest.mark.parametrize(
     ("turn_deg", "sigma_deg", "accepted"),
-    [(9.9, 0, True), (10.1, 0, False), (24.9, 5, True), (25.1, 5, False)],
+    [(4.9, 0, True), (5.1, 0, False), (19.9, 5, True), (20.1, 5, False)],
 )
-def test_heading_must_agree_within_ten_degrees_and_three_sigma(
+def test_heading_must_agree_within_five_degrees_and_three_sigma(
     turn_deg, sigma_deg, accepted
 ) -> None:
     turned = SE3.exp([0, 0, 5, 0, 0, 0]) @ SE3.exp([0, 0, 0, 0, np.deg2rad(turn_deg), 0])

@@ -59,6 +59,7 @@ class LoopConfig:
             What stands beside one of them is then out of the other's sight, or far ahead: half of
             all landmarks of a street are within 10 m.
         confirm_within_m: a match that nothing confirmed within this distance is dropped.
+        certain_m: standard deviation past which the chains between two matches confirm nothing.
     """
 
     attempts: int = 8
@@ -67,12 +68,15 @@ class LoopConfig:
     own_exclusion_m: float = 30.0
     confirm_after_m: float = 8.0
     confirm_within_m: float = 30.0
+    certain_m: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("attempts", "answer_after_frames"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 1")
-        for name in ("near_m", "own_exclusion_m", "confirm_after_m", "confirm_within_m"):
+        for name in (
+            "near_m", "own_exclusion_m", "confirm_after_m", "confirm_within_m", "certain_m",
+        ):  # fmt: skip
             if not 0 <= getattr(self, name) < np.inf:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 0")
 
@@ -188,7 +192,7 @@ class LoopSearch:
         sigma_yaw_rad = float(np.sqrt(covariance[4, 4]))
         prediction = Prediction(carried.node_from_live, sigma_m, sigma_yaw_rad)
         # Places that a long chain joins would agree with anything.
-        certain = sigma_m <= self._acceptance.slack_m
+        certain = sigma_m <= self.config.certain_m
         return certain and agrees(known[0] @ second.a_from_b, prediction, self._acceptance)
 
     def _news(self, node: Node) -> NDArray[np.bool_]:
