@@ -49,6 +49,16 @@ def main() -> None:
     except (EngramError, VerbInterruptedError) as error:
         _complain(error)
         sys.exit(_status_of(error))
+    except AttributeError as error:  # after an update whose C++ part was not built
+        if getattr(error.obj, "__name__", "") != "engram._core":
+            raise
+        _complain(
+            EngramError(
+                f"the compiled core is older than the program: it has no {error.name}; build it "
+                "again: make setup, or pip install ."
+            )
+        )
+        sys.exit(EXIT_BAD_INPUT)
     sys.exit(code)
 
 
