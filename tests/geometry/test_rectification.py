@@ -159,3 +159,11 @@ def test_what_makes_no_pair_is_refused(change: dict, fact: str) -> None:
 def test_what_is_no_camera_is_refused(change: dict) -> None:
     with pytest.raises(CalibrationError):
         replace(BROWN, **change)
+
+
+def test_a_lens_that_bends_everything_out_of_sight_is_refused() -> None:
+    for coefficients in ((-0.28, 0.07, 1e200, 0.0), (-0.28, 0.07, 0.0, 1e200)):
+        raw = calibration(BROWN)
+        right = replace(raw.right, coefficients=coefficients)
+        with pytest.raises(CalibrationError, match="leaves no image"):
+            rectify(replace(raw, right=right))

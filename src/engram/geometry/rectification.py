@@ -166,6 +166,7 @@ def rectify(calibration: RawStereoCalibration) -> Rectification:
     _check_pair(calibration)
     try:
         rotations, projections = _stereo_rectify(calibration)
+        _check_rectified(rotations, projections)
         tables = [
             _table(camera, rotation, projection)
             for camera, rotation, projection in zip(
@@ -198,6 +199,19 @@ def _check_pair(calibration: RawStereoCalibration) -> None:
         raise CalibrationError(
             f"the right camera stands at ({offset}) m of the left one: x must be positive and the "
             "largest part; swap the two cameras or correct the extrinsics"
+        )
+
+
+def _check_rectified(
+    rotations: list[NDArray[np.float64]], projections: list[NDArray[np.float64]]
+) -> None:
+    """OpenCV answers a lens that bends everything out of sight with infinities or a focal of 0."""
+    finite = all(np.isfinite(one).all() for one in (*rotations, *projections))
+    if not (finite and all(one[0, 0] > 0 and one[1, 1] > 0 for one in projections)):
+        raise CalibrationError(
+            "the stereo calibration leaves no image to rectify: focal lengths of "
+            f"{', '.join(f'{one[0, 0]:.6g}' for one in projections)} px come of it; check the "
+            "distortion coefficients"
         )
 
 
