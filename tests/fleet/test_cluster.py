@@ -13,6 +13,7 @@ from engram.errors import SequenceError, WorkerError
 from engram.fleet import cluster
 from engram.fleet.cluster import map_groups_on_cluster
 from engram.fleet.group_mapping import GroupTask
+from engram.fleet.workers import WORDS_AT_ONCE
 from engram.store import MapStore
 
 from .builds import options
@@ -74,13 +75,15 @@ def test_frames_are_told_while_a_group_is_mapped(scheduler, tmp_path, logs):
 def test_ctrl_c_is_heard_within_a_group_and_the_worker_stops(
     scheduler, tmp_path, logs, monkeypatch
 ):
-    asked, given_up, may_go_on = [], threading.Event(), threading.Event()
+    asked, mapped = [], []
+    given_up, may_go_on = threading.Event(), threading.Event()
     really = cluster.map_group_far_away
 
     def slow(task, advance):
         def held(word):
-            if asked:
-                may_go_on.wait()  # until the client is gone
+            mapped.append(word)
+            if len(mapped) > WORDS_AT_ONCE:  # the client was told of those before
+                may_go_on.wait()  # until it is gone
             advance(word)
 
         try:
@@ -101,7 +104,7 @@ def test_ctrl_c_is_heard_within_a_group_and_the_worker_stops(
     while any(one.state == "executing" for one in list(states.values())):
         may_go_on.wait(0.01)  # the scheduler tells the worker in its own time
     may_go_on.set()
-    given_up.wait()
+    assert given_up.wait(60)
     assert not list(tmp_path.iterdir())
 
 
