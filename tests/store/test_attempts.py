@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -69,6 +71,19 @@ def test_attempts_come_back(count, seed):
 def test_packing_what_was_unpacked_changes_nothing(seed):
     bodies = pack(table(200, seed))
     assert pack(unpack_all(bodies)) == bodies
+
+
+def test_the_order_of_policies_is_of_no_account():
+    written = table(200)
+    place = [2, 0, 1]
+    other = replace(
+        written,
+        policy=np.argsort(place).astype(np.int32)[written.policy],
+        policies=tuple(written.policies[at] for at in place),
+    )
+    assert_close(other, written)
+    assert pack(other) == pack(written)
+    assert concatenate([other]).policies == concatenate([written]).policies
 
 
 def test_long_sessions_are_split_where_indices_end():

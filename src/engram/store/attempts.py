@@ -88,8 +88,8 @@ _decoder = msgspec.msgpack.Decoder(_Body)
 
 
 def concatenate(tables: list[AttemptTable]) -> AttemptTable:
-    """All rows in order, one list of policies."""
-    policies = tuple(dict.fromkeys(name for table in tables for name in table.policies))
+    """All rows in order, one list of policies, by their names."""
+    policies = tuple(sorted({name for table in tables for name in table.policies}))
     index = {name: at for at, name in enumerate(policies)}
     columns = {
         name: np.concatenate([np.empty(0, kind), *(table.columns[name] for table in tables)])
@@ -184,6 +184,9 @@ def _pack_body(table: AttemptTable, rows: slice) -> bytes:
     columns = {name: values[rows] for name, values in table.columns.items()}
     nodes = np.unique(np.concatenate([columns["reference"], columns["node"]]))
     used, policy = np.unique(table.policy[rows], return_inverse=True)
+    # By their names: equal attempts are equal bodies, whatever else was loaded with them.
+    policies = sorted(table.policies[at] for at in used)
+    policy = np.array([policies.index(table.policies[at]) for at in used])[policy]
     base = int(columns["iteration"].astype(np.int64).min())
     packed = np.empty(len(policy), _PACKED)
     packed["iteration"] = columns["iteration"].astype(np.int64) - base
@@ -200,7 +203,7 @@ def _pack_body(table: AttemptTable, rows: slice) -> bytes:
     body = _Body(
         version=_VERSION,
         base=base,
-        policies=[table.policies[at] for at in used],
+        policies=policies,
         nodes=nodes.astype("<i8").tobytes(),
         rows=packed.tobytes(),
     )
