@@ -145,3 +145,57 @@ def test_bad_meshes_are_refused() -> None:
             _add(scene, Mesh(**{**fields, name: value}))
     with pytest.raises(ValueError, match="no such mesh"):
         scene.remove_mesh(0)
+
+
+def test_what_is_in_use_or_gone_cannot_be_removed() -> None:
+    scene, texture = _scene()
+    mesh = _add(scene, _random_quads(np.random.default_rng(1), 3, texture))
+    with pytest.raises(ValueError, match="on a mesh"):
+        scene.remove_texture(texture)
+    scene.remove_mesh(mesh)
+    with pytest.raises(ValueError, match="no such mesh"):
+        scene.remove_mesh(mesh)
+    scene.remove_texture(texture)
+    for gone in (texture, -1, 99):
+        with pytest.raises(ValueError, match="no such texture"):
+            scene.remove_texture(gone)
+    scene.render(_CAMERA, _NORTH, np.zeros(3), _light())
+    texture = scene.add_texture(sheet(0.5))
+    again = _random_quads(np.random.default_rng(2), 3, texture)
+    assert _add(scene, again) != _add(scene, again)
+
+
+def test_moving_things_take_their_textures_with_them() -> None:
+    scene, texture = _scene()
+    moving = _random_quads(np.random.default_rng(1), 3, texture)
+    fields = (moving.vertices, moving.uv, moving.textures, moving.flags, moving.tint, moving.glow)
+    scene.set_moving(*fields, moving.kinds)
+    with pytest.raises(ValueError, match="on a mesh"):
+        scene.remove_texture(texture)
+    scene.set_moving(*(field[:0] for field in fields), moving.kinds[:0])
+    scene.remove_texture(texture)
+
+
+@pytest.mark.parametrize("threads", [0, -1, 257, 2**30])
+def test_threads_are_not_without_number(threads: int) -> None:
+    scene, _ = _scene()
+    with pytest.raises(ValueError, match="1 to 256"):
+        scene.render(_CAMERA, _NORTH, np.zeros(3), _light(), threads)
+
+
+def test_what_is_not_finite_is_refused() -> None:
+    scene, texture = _scene()
+    good = _random_quads(np.random.default_rng(1), 3, texture)
+    for name in ("uv", "tint", "glow"):
+        fields = {key: getattr(good, key) for key in Mesh.__slots__}
+        fields[name] = np.full_like(fields[name], np.inf)
+        with pytest.raises(ValueError, match="finite"):
+            _add(scene, Mesh(**fields))
+    for change in ({"sun": np.full(3, np.nan, np.float32)}, {"fog_per_m": np.nan}):
+        with pytest.raises(ValueError, match="light: must be finite"):
+            _light(**change)
+    with pytest.raises(ValueError, match="lamps must be finite"):
+        scene.set_lamps(np.full((1, 5), np.nan, np.float32))
+    camera = _core.RenderCamera(60.0, 60.0, np.nan, 23.5, 64, 48, 0.3)
+    with pytest.raises(ValueError, match="camera: must be finite"):
+        scene.render(camera, _NORTH, np.zeros(3), _light())

@@ -8,10 +8,12 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <exception>
 #include <limits>
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <system_error>
 #include <thread>
 
 #include <nanobind/stl/pair.h>
@@ -38,23 +40,41 @@ constexpr float kFarthest_m = 600;
 constexpr float kCell_m = 6; // surfaces within one are culled together
 constexpr int kChunkMost = 96;
 constexpr int kSlots = 1 << (31 - kIndexBits);
+constexpr int kThreadsMost = 256;
 
-// Runs task(0 … count − 1) on some threads, this one among them.
+// Runs task(0 … count − 1) on some threads, this one among them; throws what the first of them
+// threw, once all have ended.
 template <class Task> void parallel(int threads, int count, Task task) {
   threads = std::max(1, std::min(threads, count));
-  std::vector<std::thread> others;
+  std::vector<std::exception_ptr> failures(threads);
   const auto share = [&](int first) {
-    for (int i = first; i < count; i += threads)
-      task(i);
+    try {
+      for (int i = first; i < count; i += threads)
+        task(i);
+    } catch (...) {
+      failures[first] = std::current_exception();
+    }
   };
-  for (int t = 1; t < threads; ++t)
-    others.emplace_back(share, t);
+  std::vector<std::thread> others;
+  others.reserve(threads - 1);
+  int shared = 1;
+  try {
+    for (; shared < threads; ++shared)
+      others.emplace_back(share, shared);
+  } catch (const std::system_error &) { // no more threads are to be had: this one does the rest
+  }
   share(0);
+  for (; shared < threads; ++shared)
+    share(shared);
   for (std::thread &other : others)
     other.join();
+  for (const std::exception_ptr &failure : failures)
+    if (failure)
+      std::rethrow_exception(failure);
 }
 
 struct StoredMesh {
+  bool stands = false; // else its number is free
   std::vector<float> vertices;
   std::vector<Surface> surfaces;
   std::vector<int32_t> objects;
@@ -63,7 +83,8 @@ struct StoredMesh {
 
 struct StoredTexture {
   std::vector<uint8_t> bytes;
-  Texture levels;
+  Texture levels;       // none: its number is free
+  int64_t surfaces = 0; // that it is on
 };
 
 struct StoredLamp {
@@ -83,6 +104,10 @@ struct MeshArrays {
   Input<int32_t, 1> objects;
 };
 
+bool all_finite(const float *values, size_t count) {
+  return std::all_of(values, values + count, [](float value) { return std::isfinite(value); });
+}
+
 void check_mesh(const MeshArrays &in, const std::vector<StoredTexture> &textures) {
   const size_t count = in.vertices.shape(0);
   if (in.vertices.shape(1) != 4 || in.vertices.shape(2) != 3)
@@ -101,9 +126,11 @@ void check_mesh(const MeshArrays &in, const std::vector<StoredTexture> &textures
         textures[texture].levels.level_count == 0)
       throw nb::value_error("mesh: a texture number is unknown");
   }
-  for (size_t i = 0; i < 12 * count; ++i)
-    if (!std::isfinite(in.vertices.data()[i]))
-      throw nb::value_error("mesh: a vertex is not finite");
+  if (!all_finite(in.vertices.data(), 12 * count))
+    throw nb::value_error("mesh: a vertex is not finite");
+  if (!all_finite(in.uv.data(), 8 * count) || !all_finite(in.tint.data(), count) ||
+      !all_finite(in.glow.data(), count))
+    throw nb::value_error("mesh: uv, tint and glow must be finite");
 }
 
 // Newell's normal: also right where two vertices coincide.
@@ -205,6 +232,7 @@ StoredMesh stored(const MeshArrays &in) {
     order[i] = {cell_of(in.vertices.data() + 12 * i, i), i};
   std::sort(order.begin(), order.end());
   StoredMesh mesh;
+  mesh.stands = true;
   mesh.vertices.reserve(12 * count);
   int32_t first = 0;
   for (size_t k = 0; k < count; ++k) {
@@ -243,15 +271,12 @@ public:
   }
 
   int32_t add_texture(const Image &image, bool coverage);
-  void remove_texture(int32_t texture) {
-    textures_.at(texture) = StoredTexture{{}, {}};
-    free_textures_.push_back(texture);
-  }
+  void remove_texture(int32_t texture);
   int32_t add_mesh(MeshArrays in);
   void remove_mesh(int32_t mesh);
   void set_moving(const MeshArrays &in) {
     check_mesh(in, textures_);
-    meshes_[0] = stored(in);
+    put(0, stored(in));
   }
   void set_lamps(const Input<float, 2> &lamps);
   auto render(const Camera &camera, const Input<double, 2> &rotation,
@@ -261,6 +286,7 @@ public:
   size_t bytes() const;
 
 private:
+  void put(int32_t slot, StoredMesh mesh);
   View view_of(const Camera &camera, const double *rotation, const double *centre, int eye,
                int samples) const;
   void point_at_meshes();
@@ -358,6 +384,16 @@ int32_t Scene::add_texture(const Image &image, bool coverage) {
   return slot;
 }
 
+void Scene::remove_texture(int32_t texture) {
+  if (texture < 0 || static_cast<size_t>(texture) >= textures_.size() ||
+      textures_[texture].levels.level_count == 0)
+    throw nb::value_error("scene: no such texture");
+  if (textures_[texture].surfaces > 0)
+    throw nb::value_error("scene: the texture is on a mesh; remove the mesh first");
+  textures_[texture] = StoredTexture{};
+  free_textures_.push_back(texture);
+}
+
 int32_t Scene::add_mesh(MeshArrays in) {
   check_mesh(in, textures_);
   if (free_meshes_.empty() && meshes_.size() >= kSlots)
@@ -365,26 +401,37 @@ int32_t Scene::add_mesh(MeshArrays in) {
   StoredMesh mesh = stored(in);
   maps_stand_ = false;
   if (free_meshes_.empty()) {
-    meshes_.push_back(std::move(mesh));
-    return static_cast<int32_t>(meshes_.size()) - 1;
+    meshes_.emplace_back();
+    free_meshes_.push_back(static_cast<int32_t>(meshes_.size()) - 1);
   }
   const int32_t slot = free_meshes_.back();
   free_meshes_.pop_back();
-  meshes_[slot] = std::move(mesh);
+  put(slot, std::move(mesh));
   return slot;
 }
 
 void Scene::remove_mesh(int32_t mesh) {
-  if (mesh < 1 || static_cast<size_t>(mesh) >= meshes_.size())
+  if (mesh < 1 || static_cast<size_t>(mesh) >= meshes_.size() || !meshes_[mesh].stands)
     throw nb::value_error("scene: no such mesh");
-  meshes_[mesh] = StoredMesh{};
+  put(mesh, {});
   free_meshes_.push_back(mesh);
   maps_stand_ = false;
+}
+
+// In place of what stood there; textures know how many surfaces they are on.
+void Scene::put(int32_t slot, StoredMesh mesh) {
+  for (const Surface &surface : meshes_[slot].surfaces)
+    --textures_[surface.texture].surfaces;
+  for (const Surface &surface : mesh.surfaces)
+    ++textures_[surface.texture].surfaces;
+  meshes_[slot] = std::move(mesh);
 }
 
 void Scene::set_lamps(const Input<float, 2> &lamps) {
   if (lamps.shape(1) != 5)
     throw nb::value_error("lamps must have shape (N, 5): x, y, z, power, range");
+  if (!all_finite(lamps.data(), lamps.size()))
+    throw nb::value_error("lamps must be finite");
   lamps_.clear();
   for (size_t i = 0; i < lamps.shape(0); ++i) {
     const float *row = lamps.data() + 5 * i;
@@ -728,6 +775,9 @@ void check_pose(const Camera &camera, const Input<double, 2> &rotation,
   if (!(camera.fx > 0 && camera.fy > 0) || camera.width < 1 || camera.height < 1 ||
       camera.width > 4096 || camera.height > 4096)
     throw nb::value_error("camera: focal lengths must be > 0 and sides 1 to 4096 px");
+  const float values[] = {camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m};
+  if (!all_finite(values, std::size(values)))
+    throw nb::value_error("camera: must be finite");
 }
 
 Light make_light(const Input<float, 1> &sun, const Input<float, 2> &vehicle, float sun_power,
@@ -735,6 +785,11 @@ Light make_light(const Input<float, 1> &sun, const Input<float, 2> &vehicle, flo
                  float haze, float wet, float snow, float headlights, float windows) {
   if (sun.shape(0) != 3 || vehicle.shape(0) != 3 || vehicle.shape(1) != 3)
     throw nb::value_error("light: sun must have shape (3,) and vehicle (3, 3)");
+  const float values[] = {sun_power, sky_power, cloud, cloud_x, cloud_y,    fog_per_m,
+                          haze,      wet,       snow,  headlights, windows};
+  if (!all_finite(values, std::size(values)) || !all_finite(sun.data(), 3) ||
+      !all_finite(vehicle.data(), 9))
+    throw nb::value_error("light: must be finite");
   Light light = {};
   std::copy_n(sun.data(), 3, light.sun);
   std::copy_n(vehicle.data(), 9, light.vehicle);
@@ -813,6 +868,8 @@ void bind_render(nb::module_ &module) {
           [](Scene &scene, const Camera &camera, Input<double, 2> rotation,
              Input<double, 1> position, const Light &light, int threads) {
             check_pose(camera, rotation, position);
+            if (threads < 1 || threads > kThreadsMost)
+              throw nb::value_error("render: threads must be 1 to 256");
             return scene.render(camera, rotation, position, light, threads);
           },
           "camera"_a, "rotation"_a, "position"_a, "light"_a, "threads"_a = 1)

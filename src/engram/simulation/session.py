@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from engram.errors import ConfigError
 from engram.frontend import StereoPair
 from engram.geometry import SE3, StereoCamera
 from engram.simulation.camera_model import CameraModel
@@ -23,6 +24,8 @@ from engram.simulation.textures import Style
 from engram.simulation.town import Today, Town
 from engram.simulation.truth import FrameTruth
 
+_MOST_THREADS = 256  # of the core
+
 
 class SimulatedDrive:
     """A session of a campaign, rendered as it is iterated over.
@@ -33,13 +36,15 @@ class SimulatedDrive:
     Args:
         campaign: what to drive through.
         session: number of the drive.
-        threads: of the renderer.
+        threads: of the renderer, 1 to 256.
 
     Raises:
-        ConfigError: no such session.
+        ConfigError: no such session, or another number of threads.
     """
 
     def __init__(self, campaign: Campaign, session: int, threads: int = 1) -> None:
+        if not 1 <= threads <= _MOST_THREADS:
+            raise ConfigError(f"threads is {threads}, must be 1 to {_MOST_THREADS}")
         self.campaign = campaign
         self.plan: SessionPlan = campaign.session(session)
         self.robot: Robot = robot_named(self.plan.robot)
