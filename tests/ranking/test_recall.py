@@ -25,6 +25,7 @@ from engram.experience.path_memory import PathMemory
 from engram.ranking import Lessons, PastAttempts
 from engram.ranking.lessons import UNKNOWN_BASE
 from engram.ranking.recall import RECALL, RecallPolicy
+from engram.ranking.run import RunLog
 from engram.ranking.synthetic import SyntheticPlace
 
 SESSIONS = 4
@@ -210,24 +211,35 @@ class TestPicking:
         # Before the robot counts as lost, though all that it knows speaks against it.
         assert driven_m < 10
 
-    @pytest.mark.parametrize(("sigma_m", "all_are_tried"), [(7.0, True), (0.2, False)])
+    @pytest.mark.parametrize(
+        ("lanes", "elsewhere", "sigma_m", "all_are_tried"),
+        [
+            (2, 0, 7.0, True),
+            (2, 0, 0.2, False),
+            (2, 62, 7.0, True),  # as many as a relocaliser may try in every frame
+            (1, 0, 7.0, True),
+            (1, 31, 7.0, True),
+        ],
+    )
     def test_a_robot_that_lost_its_place_tries_every_candidate(
-        self, sigma_m: float, all_are_tried: bool
+        self, lanes: int, elsewhere: int, sigma_m: float, all_are_tried: bool
     ) -> None:
-        """Thirty nodes over 29 m, of which none matches; two lanes, and as many frames."""
-        count, driven_m = 30, 0.0
-        run: list[tuple[float, int, float, bool]] = []
+        """Thirty nodes over 29 m, of which none matches; as many picks of each kind."""
+        count, log, driven_m = 30, RunLog(), 0.0
         tried: set[int] = set()
-        for _ in range(count):
+        for _ in range(2 * count // lanes + 2):
             context = make_context(
-                candidates=range(count), along_m=np.arange(float(count)), sessions=3, run=run
+                candidates=range(count), along_m=np.arange(float(count)), sessions=3
             )
             near = dataclasses.replace(context.neighbourhood, sigma_m=np.full(count, sigma_m))
-            context = dataclasses.replace(context, neighbourhood=near, run=run_of(run, driven_m))
+            context = dataclasses.replace(context, neighbourhood=near, run=log.attempts(driven_m))
             picks = nodes_of(context)
             assert sorted(picks) == list(range(count))
-            tried |= set(picks[:2])
-            run += [(driven_m, node, 0.9, False) for node in picks[:2]]
+            tried |= set(picks[:lanes])
+            nodes = [*picks[:lanes], *range(count, count + elsewhere)]
+            rates = np.r_[np.full(lanes, 0.9), np.full(elsewhere, np.nan)]
+            failed = [False] * len(nodes)
+            log.add(driven_m, nodes, 5 * (1 - rates), rates, failed, [0] * len(nodes), 300)
             driven_m += 0.7
         assert (tried == set(range(count))) is all_are_tried
 

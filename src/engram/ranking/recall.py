@@ -158,21 +158,25 @@ class RecallPolicy:
 
         A robot that has lost its place would try the same few nodes for ever, those where it
         believes to be. Where they are expected more vaguely than a match bears, every second one is
-        of those that were tried least often of late. Tells by row, too, whose place is by turn.
+        of those that were tried least often of late, in every second frame the first: a robot that
+        has one attempt a frame must not stay with the best. Tells by row, too, whose place is by
+        turn.
         """
         near = context.neighbourhood
         vague = near.sigma_m[order] > prior_basin_m(context.basin.focal_px)
         by_turn = np.zeros(len(order), dtype=np.bool_)
         if not vague.any():
             return order, by_turn
-        lately = context.run.newest(_MOST_ATTEMPTS).nodes
-        tried = np.bincount(lately, minlength=len(context.graph))[near.nodes[order]]
+        run = context.run.newest(_MOST_ATTEMPTS)
+        tried = np.bincount(run.nodes, minlength=len(context.graph))[near.nodes[order]]
         turns = order[np.argsort(np.where(vague, tried, 0), kind="stable")]
-        mixed = np.stack([order, turns], axis=1).ravel()
+        turn_first = run.frames % 2
+        pair = [turns, order] if turn_first else [order, turns]
+        mixed = np.stack(pair, axis=1).ravel()
         _, first = np.unique(mixed, return_index=True)
         first.sort()
         picks: NDArray[np.int64] = mixed[first]
-        by_turn[picks] = first % 2 == 1
+        by_turn[picks] = first % 2 != turn_first
         return picks, by_turn
 
     def _costs_and_prior(

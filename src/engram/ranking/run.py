@@ -28,6 +28,7 @@ class RunAttempts:
         accepted: (R,) bool.
         inliers: (R,) int64.
         landmarks: (R,) int64, landmarks of the live frame.
+        frames: how many frames of the session anything was attempted in, from its beginning.
     """
 
     driven_m: float
@@ -38,6 +39,7 @@ class RunAttempts:
     accepted: NDArray[np.bool_]
     inliers: NDArray[np.int64]
     landmarks: NDArray[np.int64]
+    frames: int = 0
 
     @staticmethod
     def none() -> RunAttempts:
@@ -58,10 +60,14 @@ class RunAttempts:
         return len(self.nodes)
 
     def newest(self, count: int) -> RunAttempts:
-        """The last `count` of them at most."""
-        if len(self) <= count:
+        """The last `count` of them at most that tell something.
+
+        A failure without a prediction does not: a lost robot has dozens in every frame.
+        """
+        telling = np.flatnonzero(self.accepted | ~np.isnan(self.distance_m))
+        if len(telling) == len(self) <= count:
             return self
-        last = slice(len(self) - count, None)
+        last = telling[-count:]
         return RunAttempts(
             self.driven_m,
             self.at_m[last],
@@ -71,6 +77,7 @@ class RunAttempts:
             self.accepted[last],
             self.inliers[last],
             self.landmarks[last],
+            self.frames,
         )
 
     def decay(self, length_m: float) -> NDArray[np.float64]:
@@ -91,6 +98,7 @@ class RunLog:
     def __init__(self) -> None:
         self._columns = _columns(64)
         self._start = self._end = 0
+        self._frames = 0
 
     def add(
         self,
@@ -104,6 +112,7 @@ class RunLog:
     ) -> None:
         """Remember the attempts of one frame; see `RunAttempts` for what the arguments mean."""
         count = len(nodes)
+        self._frames += count > 0
         if self._end + count > len(self._columns[0]):
             self._make_room(driven_m, count)
         place = slice(self._end, self._end + count)
@@ -118,7 +127,12 @@ class RunLog:
         Views: what is behind them is written once and never changed.
         """
         self._forget(driven_m)
-        return RunAttempts(driven_m, *(column[self._start : self._end] for column in self._columns))
+        at_m, nodes, distance_m, rates, accepted, inliers, landmarks = (
+            column[self._start : self._end] for column in self._columns
+        )
+        return RunAttempts(
+            driven_m, at_m, nodes, distance_m, rates, accepted, inliers, landmarks, self._frames
+        )
 
     def _forget(self, driven_m: float) -> None:
         at_m = self._columns[0][self._start : self._end]
