@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from engram.geometry import SE3
-from engram.localiser import driven_steps_m
+from engram.localiser import driven_steps_m, shared_out
 from engram.localiser.gaps import GapFiller
 from engram.odometry import OdometryStatus, OdometryStep
 
@@ -114,7 +114,15 @@ def test_a_robot_that_sets_off_is_believed_in_the_end() -> None:
 def test_what_was_driven_blindly_counts() -> None:
     odometry = [FIRST, ahead(0.5), BLIND, DARK, ahead(1.0)]
     stamps_ns = [0, 100 * MS, 200 * MS, 300 * MS, 400 * MS]
-    np.testing.assert_allclose(driven_steps_m(odometry, stamps_ns), [0.0, 0.5, 0.5, 0.0, 1.0])
+    np.testing.assert_allclose(driven_steps_m(odometry, stamps_ns), [0.0, 0.5, 0.5, 0.5, 0.5])
+
+
+def test_way_past_frames_of_no_use_is_theirs() -> None:
+    """By time; before the first usable frame nothing is known of it, nor after the last."""
+    usable = [False, True, False, False, True, True, False]
+    stamps_ns = [stamp * MS for stamp in (0, 100, 200, 400, 500, 600, 700)]
+    found = shared_out([0, 0, 0, 0, 2.0, 0.5, 0], usable, stamps_ns)
+    np.testing.assert_allclose(found, [0, 0, 0.5, 1.0, 0.5, 0.5, 0], atol=1e-12)
 
 
 def going(gaps: GapFiller, steps: int = 3) -> int:

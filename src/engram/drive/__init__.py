@@ -18,7 +18,7 @@ from engram.drive.localising import LocaliseOptions, LocaliseRun
 from engram.drive.mapping import MapOptions, MapReport, map_drive
 from engram.drive.opened_map import LiveRobot, OpenMap, open_map
 from engram.drive.pictures import PictureWriter
-from engram.drive.results import FrameResult, summarise
+from engram.drive.results import FrameResult, measured, summarise
 from engram.drive.session import DriveSequence, open_drive, session_of_drive
 from engram.drive.settings import Settings, load_settings
 from engram.drive.simulating import SimulateReport, campaign_folder, simulate
@@ -55,6 +55,7 @@ __all__ = [
     "map_drive",
     "map_log",
     "map_tags",
+    "measured",
     "open_drive",
     "open_map",
     "revert_revision",

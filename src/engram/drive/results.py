@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from engram.geometry import SE3
-from engram.localiser import Localisation, LocalisationStatus
+from engram.localiser import Localisation, LocalisationStatus, shared_out
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 
 
@@ -33,15 +33,6 @@ class FrameResult:
     def ms(self) -> float:
         """Time of all stages together."""
         return sum(self.stage_ms.values())
-
-    @property
-    def step_m(self) -> float:
-        """Distance driven since the frame before; guessed where odometry failed.
-
-        What is lost with the motion is driven all the same: without it the worst stretches of a
-        drive would count as nothing.
-        """
-        return self.localisation.moved_m
 
     @property
     def localised(self) -> bool:
@@ -68,12 +59,24 @@ class FrameResult:
         }
 
 
+def measured(found: Sequence[Localisation]) -> Drive:
+    """What the measures need of a drive's localisations.
+
+    Steps that odometry could not measure are guessed, and those past frames of no use are shared
+    among them: without these the worst stretches of a drive would count as nothing.
+    """
+    steps_m = shared_out(
+        [one.moved_m for one in found],
+        [one.usable for one in found],
+        [one.stamp_ns for one in found],
+    )
+    localised = [one.status is LocalisationStatus.LOCALISED for one in found]
+    return Drive(steps_m, np.array(localised, np.bool_))
+
+
 def summarise(results: Sequence[FrameResult]) -> dict[str, Any]:
     """The summary that ``localise --json`` prints; every figure is defined in SPEC §8."""
-    drive = Drive(
-        np.array([result.step_m for result in results], dtype=np.float64),
-        np.array([result.localised for result in results], dtype=bool),
-    )
+    drive = measured([result.localisation for result in results])
     count = max(len(results), 1)
     statuses = [result.localisation.status for result in results]
     return {

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.drive import OpenMap, Settings, live_frames, open_drive, session_of_drive
+from engram.drive import OpenMap, Settings, live_frames, measured, open_drive, session_of_drive
 from engram.drive.session import DriveSequence
 from engram.errors import ConfigError, RefusedError
 from engram.experience.model import SessionId
 from engram.fleet.report import HeldOutFigures, HeldOutReport
-from engram.localiser import Budget, LocalisationStatus
+from engram.localiser import Budget, Localisation
 from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
 from engram.store import MapStore
 
@@ -134,14 +134,12 @@ def localise_drive(
         live=session_of_drive(sequence).id,
         clock=sequence.info,
     )
-    step_m, matched = [], []
+    found: list[Localisation] = []
     with localiser, closing(live_frames(sequence, settings)) as frames:
         for live in frames:
-            found = localiser.localise(live.frame, live.odometry)
-            step_m.append(found.moved_m)
-            matched.append(found.status is LocalisationStatus.LOCALISED)
-            advance(found.status.value)
-    return Drive(np.array(step_m, np.float64), np.array(matched, np.bool_))
+            found.append(localiser.localise(live.frame, live.odometry))
+            advance(found[-1].status.value)
+    return measured(found)
 
 
 def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:

@@ -22,6 +22,7 @@ from engram.drive import (
     LocaliseRun,
     OpenMap,
     Settings,
+    measured,
     session_of_drive,
 )
 from engram.experience.clock import hour_of_day
@@ -156,7 +157,7 @@ def try_downloads(
                         drive=str(session.id),
                         start_h=hour,
                         report=report,
-                        steps=_steps(results),
+                        steps=measured([one.localisation for one in results]),
                         ms_per_frame=_ms(results),
                         lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
                         lookups=len(lookups),
@@ -220,13 +221,6 @@ def _localised(run: LocaliseRun, frames: int, progress: Progress) -> list[FrameR
             results.append(result)
             advance(result.localisation.status.value)
         return results
-
-
-def _steps(results: Sequence[FrameResult]) -> Drive:
-    return Drive(
-        np.array([one.step_m for one in results], np.float64),
-        np.array([one.localised for one in results], np.bool_),
-    )
 
 
 def _ms(results: Sequence[FrameResult]) -> float:

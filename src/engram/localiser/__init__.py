@@ -11,7 +11,7 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
-from engram.localiser.gaps import GapFiller, Motion, driven_steps_m
+from engram.localiser.gaps import GapFiller, Motion, driven_steps_m, shared_out
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
 from engram.localiser.place_book import PlaceBook, Searched
@@ -56,5 +56,6 @@ __all__ = [
     "best_places",
     "driven_steps_m",
     "plausible",
+    "shared_out",
     "spread",
 ]

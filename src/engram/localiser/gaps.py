@@ -10,7 +10,7 @@ and the robot counts as lost.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,9 +70,33 @@ def driven_steps_m(
         odometry: (F) steps, each ending in one frame.
         stamps_ns: (F) stamps of these frames.
     """
-    gaps = GapFiller()
-    motions = (gaps.motion(step, stamp) for step, stamp in zip(odometry, stamps_ns, strict=True))
-    return np.array([0.0 if one is None else one.prev_from_curr.distance_m for one in motions])
+    gaps, steps, stamps = GapFiller(), list(odometry), list(stamps_ns)
+    motions = (gaps.motion(step, stamp) for step, stamp in zip(steps, stamps, strict=True))
+    moved_m = [0.0 if one is None else one.prev_from_curr.distance_m for one in motions]
+    usable = [one.status is not OdometryStatus.UNUSABLE_FRAME for one in steps]
+    return shared_out(moved_m, usable, stamps)
+
+
+def shared_out(
+    moved_m: Sequence[float], usable: Sequence[bool], stamps_ns: Sequence[int]
+) -> NDArray[np.float64]:
+    """Distances of steps, (F,) metres, when each frame bears its own part of the way.
+
+    What was driven past frames of no use is known at the next usable one. It is shared among all
+    of them by time: way on which a robot saw nothing was not localised (SPEC §8), whatever came
+    after. What was driven after the last usable frame is not known.
+
+    Args:
+        moved_m: (F) distances since the usable frame before, 0 at frames of no use.
+        usable: (F) whether each frame is.
+        stamps_ns: (F), rising.
+    """
+    steps_m, seen = np.array(moved_m, np.float64), np.array(usable, np.bool_)
+    if seen.all() or not seen.any():
+        return steps_m
+    since_ns = np.array([stamp - stamps_ns[0] for stamp in stamps_ns], np.float64)
+    driven_m = np.interp(since_ns, since_ns[seen], np.cumsum(steps_m)[seen])
+    return np.diff(driven_m, prepend=driven_m[0]).clip(0.0)
 
 
 class GapFiller:

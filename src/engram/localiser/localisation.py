@@ -109,6 +109,8 @@ class Localisation:
         candidates: nodes that could have been tried.
         open_loop_m: distance driven on odometry alone since the last match.
         moved_m: distance since the usable frame before; guessed where odometry failed.
+        usable: whether the frame was of any use; what was moved until one that was not stands with
+            the next that is.
         position: the best estimate, measured or carried on by odometry; None while `LOST` with
             no estimate.
         new_place: probability, before matching, that the frame shows nothing of the map; None
@@ -124,6 +126,7 @@ class Localisation:
     candidates: int
     open_loop_m: float
     moved_m: float = 0.0
+    usable: bool = True
     node: NodeId | None = None
     node_stamp_ns: int | None = None
     node_from_live: SE3 | None = None

@@ -532,6 +532,7 @@ class Localiser:
             attempts=len(self._outcomes),
             candidates=0 if neighbourhood is None else len(neighbourhood),
             moved_m=0.0 if self._motion is None else self._motion.prev_from_curr.distance_m,
+            usable=odometry.status is not OdometryStatus.UNUSABLE_FRAME,
             open_loop_m=self._open_loop_m,
             position=self.position,
             new_place=self._new_place,

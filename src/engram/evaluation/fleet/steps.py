@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from engram.drive import MapReport, open_map
+from engram.drive import MapReport, measured, open_map
 from engram.evaluation.building import build_map
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.fleet.arms import Arm
@@ -31,7 +29,6 @@ from engram.experience.model import path_id
 from engram.fleet import DownloadOptions, download, merge_maps, silent
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
-from engram.measures import Drive
 from engram.store import MapStore
 
 # Stages that are the robot's own business, whatever map it has.
@@ -75,10 +72,7 @@ def map_drives(
     path.parent.mkdir(parents=True, exist_ok=True)
 
     def look_at(drive: EvaluatedDrive, report: MapReport) -> None:
-        steps = Drive(
-            np.array([one.step_m for one in report.results], np.float64),
-            np.array([one.localised for one in report.results], np.bool_),
-        )
+        steps = measured([one.localisation for one in report.results])
         frame_ms = [
             sum(ms for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP)
             for one in report.results
