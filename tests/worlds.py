@@ -176,6 +176,7 @@ def make_context(
     sessions=1,
     run=(),
     hour=None,
+    day=None,
     hours=None,
     words=None,
     live_words=None,
@@ -205,6 +206,7 @@ def make_context(
         seed=seed,
         run=run_of(run),
         hour=hour,
+        day=day,
         background=Background(
             SessionTimes(records),
             lessons_of(graph, lessons),

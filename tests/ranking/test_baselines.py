@@ -11,6 +11,7 @@ from engram.errors import ConfigError
 from engram.experience.model import PathEntry, PathEntryKind, path_id
 from engram.ranking import POLICIES, Foreseen, RunLog, policy_named
 from engram.ranking.bandit import session_tallies
+from engram.ranking.time_of_day import TimeOfDayPolicy
 
 
 def order_of(name: str, context) -> list[int]:
@@ -59,14 +60,25 @@ class TestTimeOfDay:
             sessions=3,
             hour=9.0,
             hours=[None, 9.0 + 24, 9.0],
-            stamp_ns=int(50 * 3.6e12),
+            day=50 / 24,
         )
         assert order_of("time-of-day", context) == [1, 2, 0]
 
     def test_without_a_clock_of_its_own_the_youngest_comes_first(self) -> None:
         context = make_context(
-            candidates=[0, 1], sessions=2, hours=[9.0, 9.0 + 24], stamp_ns=int(50 * 3.6e12)
+            candidates=[0, 1, 2], sessions=3, hours=[9.0, 9.0 + 24, None], day=50 / 24
         )
+        assert order_of("time-of-day", context) == [1, 0, 2]
+
+    def test_without_a_date_of_its_own_the_newest_comes_first(self) -> None:
+        context = make_context(
+            candidates=[0, 1, 2], sessions=3, hours=[9.0, 9.0 + 48, 9.0 + 24], stamp_ns=1000
+        )
+        assert order_of("time-of-day", context) == [1, 2, 0]
+        assert TimeOfDayPolicy().reasons(context).terms["days apart"].tolist() == [2.0, 0.0, 1.0]
+
+    def test_without_any_clock_the_nearest_comes_first(self) -> None:
+        context = make_context(candidates=[0, 1], along_m=[2.0, 1.0], sessions=2)
         assert order_of("time-of-day", context) == [1, 0]
 
 

@@ -59,6 +59,11 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     return 0.0 if wrapped >= _HOURS_PER_DAY else wrapped
 
 
+def day_of(source: Clocked, stamp_ns: int) -> float | None:
+    """Days since 1970 at a stamp, with their fraction; None for a clock that is not UTC."""
+    return stamp_ns / (_HOURS_PER_DAY * _NS_PER_HOUR) if source.clock is Clock.UTC else None
+
+
 def check_longitude(longitude_deg: float | None) -> None:
     """Refuse what is no longitude.
 

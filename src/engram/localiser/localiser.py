@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.experience.basin import MatchBasin
-from engram.experience.clock import Clocked, hour_of_day
+from engram.experience.clock import Clocked, day_of, hour_of_day
 from engram.experience.graph import ExperienceGraph
 from engram.experience.model import (
     ENGRAM_NAMESPACE,
@@ -351,6 +351,7 @@ class Localiser:
             foresee=lambda: self._foresee(live, neighbourhood),
             run=self._run.attempts(self._driven_m),
             hour=None if self._clock is None else hour_of_day(self._clock, live.stamp_ns),
+            day=None if self._clock is None else day_of(self._clock, live.stamp_ns),
             background=self._background,
             live_words=self._words_of(live),
         )

@@ -52,6 +52,7 @@ class RankingContext:
             policies, asks (SPEC §4). None where it cannot be known.
         run: this run's attempts, with where they were made and how likely they were.
         hour: hour of day of the live frame in [0, 24); None where it is not known.
+        day: its date, days since 1970; None where its clock is not UTC.
         background: what is known of the map's sessions and nodes.
         live_words: gives the distinct words (n,) int32 of the live frame, rising; None where
             there is no vocabulary. Costs time only when called.
@@ -69,6 +70,7 @@ class RankingContext:
     foresee: Callable[[], Foreseen] | None = None
     run: RunAttempts = field(default_factory=RunAttempts.none)
     hour: float | None = None
+    day: float | None = None
     background: Background = field(default_factory=Background)
     live_words: Callable[[], NDArray[np.int32]] | None = None
 

@@ -9,14 +9,13 @@ from engram.ranking.context import RankingContext, round_robin
 from engram.ranking.reasons import Reasons
 from engram.ranking.times import hour_difference
 
-_NS_PER_DAY = 86_400_000_000_000
-
 
 class TimeOfDayPolicy:
     """By difference in hour of day, then by age, experiences round robin (SPEC §4).
 
     Experiences whose hour is unknown stand behind those of any known hour; if the live frame's
-    own is unknown, none has a difference and age alone decides.
+    own is unknown, none has a difference and age alone decides. A frame of unknown date counts as
+    of the day of the newest drive.
     """
 
     name = "time-of-day"
@@ -38,7 +37,9 @@ class TimeOfDayPolicy:
     def _differences(context: RankingContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(Y,) hours, 0 to 12, and days."""
         sessions, times = context.sessions, context.background.times
-        age_days = np.abs(context.stamp_ns / _NS_PER_DAY - times.days(context.graph, sessions))
+        days = times.days(context.graph, sessions)
+        today = np.fmax.reduce(days, initial=-np.inf) if context.day is None else context.day
+        age_days = np.abs(today - days)
         if context.hour is None:
             return np.zeros(len(sessions)), age_days
         return hour_difference(times.hours(context.graph, sessions), context.hour), age_days

@@ -7,11 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.clock import hour_of_day
+from engram.experience.clock import day_of, hour_of_day
 from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Clock, Session, SessionId
-
-_NS_PER_DAY = 86_400_000_000_000
+from engram.experience.model import Session, SessionId
 
 
 class SessionTimes:
@@ -30,8 +28,8 @@ class SessionTimes:
     def add(self, session: Session) -> None:
         """Makes a session known."""
         hour = hour_of_day(session, session.start_ns)
-        day = session.start_ns / _NS_PER_DAY if session.clock is Clock.UTC else np.nan
-        self._known[session.id] = (np.nan if hour is None else hour, day)
+        day = day_of(session, session.start_ns)
+        self._known[session.id] = (_number(hour), _number(day))
         self._columns = np.zeros((0, 2))
 
     def hours(self, graph: ExperienceGraph, numbers: NDArray[np.int32]) -> NDArray[np.float64]:
@@ -50,6 +48,10 @@ class SessionTimes:
             rows = [self._known.get(graph.session(number), unknown) for number in known]
             self._columns = np.concatenate([self._columns, np.array(rows).reshape(-1, 2)])
         return self._columns[numbers]
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
 
 
 def hour_difference(hours: NDArray[np.float64], hour: float) -> NDArray[np.float64]:
