@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from engram.drive import OpenMap, Settings
+from engram.errors import MapCorruptError
 from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
@@ -129,6 +130,45 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
             assert [one.accepted for one in made] == foreseen.accepted[order].tolist()
             assert [one.match.inliers for one in made] == foreseen.inliers[order].tolist()
     assert policy.seen[-1][0].accepted.any()
+
+
+class _Damaged(FrameMatcher):
+    """The landmarks of the map's first node cannot be read."""
+
+    threads = False
+
+    def __init__(self, opened: OpenMap) -> None:
+        super().__init__(opened.store.frames, Settings().localiser.matcher)
+        self.first = opened.graph.node(0).id
+
+    def match(self, live, live_id, node, guide):
+        if node == self.first:
+            raise MapCorruptError("damaged")
+        return super().match(live, live_id, node, guide)
+
+
+def test_what_is_damaged_is_foreseen_to_fail(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)[:2]
+    policy = _Foreseeing()
+    monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
+    with (
+        OpenMap(MapStore.open(path)) as opened,
+        opened.localiser(
+            live[0].frame.camera,
+            Settings(),
+            policy=policy.name,
+            relocaliser=None,
+            matcher=_Damaged(opened),
+        ) as localiser,
+    ):
+        localiser.start_at(Position.at(opened.graph.node(0).id))
+        found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+        assert found[0].damaged == (opened.graph.node(0).id,)
+    foreseen = policy.seen[0][0]
+    assert foreseen.accepted.any()
+    assert not foreseen.accepted.all()
 
 
 class _All:

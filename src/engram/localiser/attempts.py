@@ -206,16 +206,21 @@ class Attempter:
         self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate], ranks: range
     ) -> list[Outcome]:
         def attempt(rank: int) -> Outcome:
-            try:
-                return self._attempt(live, live_id, candidates[rank], rank)
-            except MapCorruptError:
-                return Outcome(candidates[rank], rank, NO_MATCH, accepted=False, damaged=True)
+            return self._attempt(live, live_id, candidates[rank], rank)
 
         if self._pool is None or len(ranks) == 1:
             return [attempt(rank) for rank in ranks]
         return list(self._pool.map(attempt, ranks))
 
     def _attempt(self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int) -> Outcome:
+        try:
+            return self._attempt_undamaged(live, live_id, candidate, rank)
+        except MapCorruptError:
+            return Outcome(candidate, rank, NO_MATCH, accepted=False, damaged=True)
+
+    def _attempt_undamaged(
+        self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int
+    ) -> Outcome:
         prediction = candidate.prediction
         if prediction is None:
             return self._attempt_lost(live, live_id, candidate, rank)
