@@ -22,6 +22,7 @@ def town(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_policy_is_explained(engram, street: Path, town: Path, policy: str) -> None:
     ran = engram("explain", town, street, "--frame", 6, "--policy", policy, "--json")
     assert ran.status == 0
+    assert "NaN" not in ran.out, "which is no JSON"
     found = ran.json
     assert (found["frame"], found["policy"], found["status"]) == (6, policy, "localised")
     candidates = found["candidates"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -100,7 +101,9 @@ class ExplainedCandidate:
             "success_rate": self.success_rate,
             "chance": self.chance,
             "by_turn": self.by_turn,
-            "terms": self.terms,
+            "terms": {
+                name: value if math.isfinite(value) else None for name, value in self.terms.items()
+            },
             "attempted": self.attempted,
             "would_match": self.would_match,
             "inliers": self.inliers,
