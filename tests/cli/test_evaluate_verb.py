@@ -13,6 +13,9 @@ import pytest
         (("--redo", "path", "--report-only"), "--report-only runs nothing"),
         (("--policies", "distanec"), "no ranking policy 'distanec'"),
         (("--only-folds", "5"), "5"),
+        (("hamlet",), "campaign 'hamlet' is given twice"),
+        (("--relocaliser", "fabmapp"), "relocaliser 'fabmapp' is unknown"),
+        (("--lanes", "0,-1"), "--lanes '0,-1': must be numbers from 1 on"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_is_run(
@@ -22,6 +25,21 @@ def test_what_makes_no_sense_is_refused_before_anything_is_run(
     assert ran.status == 2
     assert said in ran.err
     assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("hamlett", "hamlett"),
+        ("hamlet@x", "the seed after @ must be a whole number"),
+        ("hamlet@-1", "-1"),
+    ],
+)
+def test_a_campaign_that_is_none_is_told_as_such(engram, tmp_path: Path, name: str, said: str):
+    ran = engram("evaluate", "ranking", name, "--campaigns", tmp_path / "none")
+    assert ran.status == 2
+    assert said in ran.err
+    assert ("whole number" in ran.err) == ("whole number" in said)
 
 
 def test_a_campaigns_name_is_the_campaign_though_a_folder_has_it_too(

@@ -272,6 +272,29 @@ def test_logs_without_truth_are_localised_and_have_no_errors(tmp_path: Path) -> 
     assert "no truth" in (tmp_path / "out" / "claims.md").read_text()
 
 
+def test_a_drive_with_truth_among_others_without_is_localised(tmp_path: Path) -> None:
+    """Where it is is known, but not from which node: it starts where it matches."""
+    drives = write_campaign(tmp_path / "logs", (0, 0, 0))
+    for one in drives.drives[1:]:
+        truth_path(one.path).unlink()
+    drives = DriveSet("some", drives_of([one.path for one in drives.drives]))
+    options = few_options(policies=("distance",), lanes=(2,), folds=3, only_folds=(0, 1, 2, 1))
+    plan = make_plan(drives, Settings(), options, tmp_path / "work")
+    assert [one.number for one in plan.run_folds] == [0, 1, 2]
+    run(plan)
+    for session in range(3):
+        runs = read_runs(plan.runs_path(session, "memo"))
+        assert runs is not None
+        assert runs.matched.mean() > 0.8
+
+
+def test_bad_truth_is_told_before_anything_is_built(tmp_path: Path) -> None:
+    drives = write_campaign(tmp_path / "logs", (0, 0))
+    truth_path(drives.drives[1].path).write_text("1.0 2.0 three\n")
+    with pytest.raises(SequenceError, match=r"001\.truth\.txt"):
+        drives_of([one.path for one in drives.drives])
+
+
 def test_what_cannot_be_evaluated_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no ranking policy 'nearest'"):
         few_options(policies=("nearest",))

@@ -256,9 +256,12 @@ def _tell_files(files: list[Path], seconds: float, *, as_json: bool) -> None:
 def _drive_sets(drives: list[str], size: str, campaigns: Path | None) -> list[DriveSet]:
     """Each name of a campaign is one; all frame logs together are one."""
     from engram.cli.simulation import campaigns_folder, size_named
+    from engram.errors import ConfigError
     from engram.evaluation import DriveSet, drives_of, open_campaign
 
     names = [one for one in drives if _names_campaign(one)]
+    if twice := [one for one in set(names) if names.count(one) > 1]:
+        raise ConfigError(f"campaign {twice[0]!r} is given twice; give it once")
     logs = [Path(one) for one in drives if one not in names]
     folder = campaigns or campaigns_folder()
     sets = [open_campaign(name, folder, size_named(size)) for name in names]
@@ -293,9 +296,13 @@ def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -
 
 
 def _lanes(text: str) -> tuple[int, ...]:
+    from engram.errors import ConfigError
     from engram.evaluation import UNLIMITED
 
-    return tuple(one or UNLIMITED for one in _numbers(text, "--lanes"))
+    lanes = _numbers(text, "--lanes")
+    if min(lanes) < 0:
+        raise ConfigError(f"--lanes {text!r}: must be numbers from 1 on, or 0 for unlimited")
+    return tuple(one or UNLIMITED for one in lanes)
 
 
 def _only(folds: str | None) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ from engram.evaluation.configurations import (
     Configuration,
     PathKinds,
     Radius,
+    lanes_text,
 )
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
 from engram.evaluation.sweeps import sweep_tables
@@ -101,8 +102,8 @@ def _policies(campaign: CampaignResult) -> list[str]:
     driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
     found_again = "no relocalisation" if campaign.relocaliser is None else campaign.relocaliser
     title = (
-        f"Np = {campaign.few_lanes}, Nr = {campaign.rounds}, T = 10; {count} held-out sessions, "
-        f"{driven / 1e3:.1f} km, unguided, {found_again}"
+        f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}, T = 10; "
+        f"{count} held-out sessions, {driven / 1e3:.1f} km, unguided, {found_again}"
     )
     return [title, "", *table(head, rows)]
 

@@ -73,7 +73,7 @@ class Configuration:
     @property
     def lanes_text(self) -> str:
         """Np for tables."""
-        return "unlimited" if self.lanes == UNLIMITED else str(self.lanes)
+        return lanes_text(self.lanes)
 
     @property
     def label(self) -> str:
@@ -148,3 +148,8 @@ def map_sizes(
         for count in range(1, sessions)
         for policy in policies
     )
+
+
+def lanes_text(lanes: int) -> str:
+    """Np for people."""
+    return "unlimited" if lanes == UNLIMITED else str(lanes)

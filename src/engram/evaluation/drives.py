@@ -66,7 +66,7 @@ class EvaluatedDrive:
 
     def truth(self) -> Truth | None:
         """Its true poses; None where they are not known."""
-        return _truth(self.path) if self.has_truth else None
+        return None if self.truth_hash is None else _truth(self.path, self.truth_hash)
 
 
 class Truth:
@@ -83,7 +83,8 @@ class Truth:
 
 
 @lru_cache(maxsize=256)
-def _truth(path: Path) -> Truth | None:
+def _truth(path: Path, content: str) -> Truth | None:
+    del content  # another content is another truth to remember
     trajectory = read_truth(path)
     return None if trajectory is None else Truth(trajectory)
 
@@ -130,9 +131,10 @@ def open_campaign(text: str, campaigns: Path, size: Size = Size.STANDARD) -> Dri
     """
     name, _, seed = text.partition("@")
     try:
-        campaign = campaign_named(name, int(seed or 1), size)
+        number = int(seed or 1)
     except ValueError:
         raise ConfigError(f"campaign {text!r}: the seed after @ must be a whole number") from None
+    campaign = campaign_named(name, number, size)
     paths = campaign_logs(campaign, campaigns)
     missing = [path for path in paths if not path.exists()]
     if missing:
@@ -154,7 +156,8 @@ def drives_of(paths: Sequence[Path]) -> tuple[EvaluatedDrive, ...]:
     """Frame logs as drives, in the order of time.
 
     Raises:
-        SequenceError: one is no frame log, was not recorded to its end, or is there twice.
+        SequenceError: one is no frame log, was not recorded to its end, is there twice, or its
+            truth cannot be read.
         IncompatibleError: they have different kinds of descriptors.
     """
     drives = sorted((_drive(path) for path in paths), key=lambda d: (d.session.start_ns, d.name))
@@ -181,7 +184,7 @@ def _drive(path: Path) -> EvaluatedDrive:
             raise SequenceError(
                 f"{path}: was not recorded to its end; give the same extract or simulate again"
             )
-        return EvaluatedDrive(
+        drive = EvaluatedDrive(
             path,
             session_of_drive(log),
             log.camera,
@@ -192,6 +195,8 @@ def _drive(path: Path) -> EvaluatedDrive:
         )
     finally:
         log.close()
+    drive.truth()  # what is wrong with it is to be told now, not once a map is built
+    return drive
 
 
 def _hash_of(path: Path) -> str | None:

@@ -13,6 +13,7 @@ from engram.evaluation.configurations import (
     T_SWEEP,
     UNLIMITED,
     PathKinds,
+    lanes_text,
 )
 from engram.evaluation.summary import CURVE_AT_M, CampaignResult, ConfigurationResult
 from engram.evaluation.sweeps import by_lanes, by_map_size
@@ -46,7 +47,7 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
             draw_curves(shown, out / name, title)
             written.append(out / name)
 
-    few = ", ".join(sorted({f"Np = {one.few_lanes}, Nr = {one.rounds}" for one in campaigns}))
+    few = ", ".join(sorted(set(map(_budget, campaigns))))
     rounds = ", ".join(sorted({f"Nr = {one.rounds}" for one in campaigns}))
     np_title = f"failure against the number of lanes, {rounds}, T = 10"
     draw("fig09_map_size.png", map(_map_size, campaigns), f"failure as the map grows, {few}")
@@ -73,6 +74,10 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
     for campaign in campaigns:
         written += _draw_costs(out, campaign)
     return written
+
+
+def _budget(campaign: CampaignResult) -> str:
+    return f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}"
 
 
 def _p_gt_10m(result: ConfigurationResult) -> SessionSums:
@@ -237,6 +242,6 @@ def _draw_costs(out: Path, campaign: CampaignResult) -> list[Path]:
     if not found:
         return []
     path = out / f"costs_{campaign.name}.png"
-    title = f"{campaign.name}, Np = {campaign.few_lanes}, Nr = {campaign.rounds}"
+    title = f"{campaign.name}, {_budget(campaign)}"
     draw_bars(bars, path, title)
     return [path]

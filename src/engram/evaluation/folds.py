@@ -46,7 +46,7 @@ def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
 
 def chosen(folds: tuple[Fold, ...], only: tuple[int, ...]) -> tuple[Fold, ...]:
     """Some folds by their numbers; all where none is named."""
-    return tuple(folds[number] for number in only) if only else folds
+    return tuple(folds[number] for number in sorted(set(only))) if only else folds
 
 
 def check_only(only: tuple[int, ...], folds: int) -> None:

@@ -27,7 +27,8 @@ def localise_held_out(
 ) -> Runs:
     """Localises a drive with every configuration, from the node nearest by truth.
 
-    Where truth is not known it starts at its first frame that matches any node.
+    Where truth is not known, its own or that of every node, it starts at its first frame that
+    matches any node.
 
     Args:
         opened: the map; it stays as it is.
@@ -41,10 +42,9 @@ def localise_held_out(
     """
     nodes, truth = true_nodes(opened, training), drive.truth()
     first = None if truth is None else truth.at(frames[0].frame.stamp_ns)
-    if first is not None:
-        position = nodes.start(first)
-        start = None if position is None else (0, position)
-    else:
+    position = None if first is None else nodes.start(first)
+    start = None if position is None else (0, position)
+    if start is None:
         config = settings.localiser
         start = start_by_matching(
             opened,

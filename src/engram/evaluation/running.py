@@ -38,7 +38,7 @@ from engram.evaluation.store import joined, missing, only, read_runs, write_runs
 from engram.evaluation.tasks import Task, run_tasks
 from engram.evaluation.writing import writing
 from engram.frontend.matching import matcher_hash
-from engram.localiser import FrameMatcher, Matcher
+from engram.localiser import RELOCALISERS, FrameMatcher, Matcher
 from engram.ranking import POLICIES
 from engram.sequences import LoggedFrame
 from engram.store import MapStore
@@ -83,6 +83,10 @@ class RankingOptions:
                 raise ConfigError(
                     f"no ranking policy '{policy}'; there are: {', '.join(sorted(POLICIES))}"
                 )
+        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+            )
         for name, values in (("lanes", self.lanes), ("rounds", self.rounds)):
             if not values or min(values) < 1:
                 raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")

@@ -284,6 +284,9 @@ def collect(plan: Plan) -> CampaignResult:
         for found in by_mode.values()
     )
     begun = by_mode["memo"]
+    # Where folds differ in size, the largest maps of some have no counterpart in the others.
+    least = min(len(fold.training) for fold in plan.run_folds)
+    common = [one for one in begun if one.sessions is None or one.sessions < least]
     return CampaignResult(
         plan.drives.name,
         memo,
@@ -294,7 +297,7 @@ def collect(plan: Plan) -> CampaignResult:
         options.rounds[0],
         options.relocaliser,
         _ordinary(laps),
-        {one: len(begun[one]) for one in begun if one not in memo},
+        {one: len(begun[one]) for one in common if one not in memo},
     )
 
 

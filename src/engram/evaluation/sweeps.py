@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from engram.evaluation.configurations import UNLIMITED, Configuration, PathKinds
+from engram.evaluation.configurations import Configuration, PathKinds, lanes_text
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
 from engram.evaluation.wording import table
 
@@ -83,7 +83,7 @@ def _budgets(
     lanes = sorted({one for results in found.values() for one in results})
     if not lanes:
         return []
-    head = ["Np", *("unlimited" if one == UNLIMITED else str(one) for one in lanes)]
+    head = ["Np", *map(lanes_text, lanes)]
     rows = [
         [label, *(measure(results[one]) if one in results else "–" for one in lanes)]
         for label, results in found.items()
@@ -108,7 +108,7 @@ def _sizes(campaign: CampaignResult) -> list[str]:
     for policy, results in found.items():
         known = {one.configuration.sessions: one for one in results}
         rows.append([policy, *(_p_gt_10m(known[one]) if one in known else "–" for one in wanted)])
-    title = f"P(> 10 m) as the map grows, Np = {campaign.few_lanes}, %"
+    title = f"P(> 10 m) as the map grows, Np = {lanes_text(campaign.few_lanes)}, %"
     return [title, "", *table(head, rows), ""]
 
 
