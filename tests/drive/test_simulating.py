@@ -1,5 +1,6 @@
 """Rendering campaigns to disk."""
 
+import multiprocessing
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 
 from engram.drive import Settings, campaign_folder, simulate
-from engram.errors import ConfigError, IncompatibleError, SequenceError
+from engram.errors import ConfigError, IncompatibleError, SequenceError, WorkerError
 from engram.frontend import FrontendConfig
 from engram.sequences import FrameLog, SimulatedSequence, open_sequence, session_of
 from engram.sequences.identity import first_pair_hash
@@ -78,6 +79,24 @@ def test_a_killed_run_is_taken_up_again(short: Campaign, tmp_path: Path) -> None
     assert log.complete
     assert len(log) == len(SimulatedSequence(short, 0))
     log.close()
+
+
+def test_a_worker_that_dies_is_told_and_the_same_call_goes_on(
+    short: Campaign, tmp_path: Path
+) -> None:
+    def kill(_: str) -> None:
+        for child in multiprocessing.active_children():
+            child.kill()
+
+    with pytest.raises(WorkerError, match=r"a worker of 2 died .* fewer --workers"):
+        simulate(short, tmp_path, workers=2, advance=kill)
+    report = simulate(short, tmp_path, workers=2)
+    assert report.rendered + report.already_there == 3
+    for file in report.files:
+        log = FrameLog(file)
+        assert log.complete
+        assert len(log) == len(SimulatedSequence(short, 0))
+        log.close()
 
 
 def test_images_in_kitti_layout_read_back_as_rendered(short: Campaign, tmp_path: Path) -> None:

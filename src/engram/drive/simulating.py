@@ -7,6 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from queue import Empty
@@ -19,7 +20,13 @@ from engram.config import config_hash
 from engram.drive.extracting import extract_log
 from engram.drive.live import ignore
 from engram.drive.settings import Settings
-from engram.errors import ConfigError, IncompatibleError, SequenceError, StorageFullError
+from engram.errors import (
+    ConfigError,
+    IncompatibleError,
+    SequenceError,
+    StorageFullError,
+    WorkerError,
+)
 from engram.frontend import Frontend
 from engram.geometry import SE3
 from engram.sequences import FrameLog, SimulatedSequence
@@ -103,6 +110,7 @@ def simulate(
         IncompatibleError: a session that is there was made by another front-end or odometry.
         StorageFullError: no space is left; what was finished is kept.
         SequenceError: a file cannot be written.
+        WorkerError: a worker died, perhaps for want of memory; finished sessions are kept.
     """
     if workers < 1:
         raise ConfigError(f"workers is {workers}, must be >= 1")
@@ -173,13 +181,18 @@ def _run_in_workers(tasks: list[_Task], workers: int, advance: Callable[[str], N
     context = multiprocessing.get_context("spawn")
     words: multiprocessing.Queue[str] = context.Queue()
     with ProcessPoolExecutor(workers, context, _remember_queue, (words,)) as pool:
-        pending: set[Future[int]] = {pool.submit(_render_in_worker, task) for task in tasks}
         frames = 0
         try:
+            pending: set[Future[int]] = {pool.submit(_render_in_worker, task) for task in tasks}
             while pending:
                 done, pending = wait(pending, _PENDING_S, FIRST_COMPLETED)
                 _pass_on(words, advance)
                 frames += sum(future.result() for future in done)
+        except BrokenProcessPool as error:
+            raise WorkerError(
+                f"a worker of {workers} died (out of memory?); give the same command again, "
+                "perhaps with fewer --workers; finished sessions are kept"
+            ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
