@@ -23,11 +23,13 @@ from engram.evaluation import (
     write_report,
 )
 from engram.evaluation.configurations import map_sizes, sweep
+from engram.evaluation.figures import POLICY_COLOURS, draw_figures
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.store import only, read_runs, write_runs
 from engram.evaluation.summary import collect
 from engram.experience.model import Clock, Session, SessionId
 from engram.frontend import DescriptorKind
+from engram.ranking import POLICIES
 from synthetic_world import CAMERA
 
 FRAMES = 400
@@ -179,6 +181,33 @@ def test_every_figure_is_drawn(out: Path) -> None:
         "fig13_T.png",
         "costs_made-up.png",
     }
+
+
+def test_a_policy_has_one_colour_in_all_figures(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from matplotlib import pyplot
+
+    looks: dict[str, set[tuple[str, str]]] = {}
+
+    def keep(figure, path: Path) -> None:
+        for legend in figure.legends:
+            for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
+                look = (handle.get_color(), handle.get_linestyle())
+                looks.setdefault(text.get_text(), set()).add(look)
+        pyplot.close(figure)
+
+    monkeypatch.setattr("engram.viewing.curves.save", keep)
+    draw_figures(tmp_path, [collect(plan)])
+    assert looks["recall"] == {("black", "-")}
+    assert looks["path, matched only"] == {(POLICY_COLOURS["path"], "--")}
+    for policy in MISSES:
+        assert looks[policy] == {(POLICY_COLOURS[policy], "-")}
+
+
+def test_every_policy_has_a_colour_of_its_own() -> None:
+    assert POLICY_COLOURS.keys() == POLICIES.keys()
+    assert len(set(POLICY_COLOURS.values())) == len(POLICIES)
 
 
 def test_claims_stand_beside_what_was_measured(out: Path) -> None:

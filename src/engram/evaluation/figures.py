@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from engram.evaluation.configurations import (
     T_SWEEP,
     UNLIMITED,
+    Configuration,
     PathKinds,
     lanes_text,
 )
@@ -31,6 +32,23 @@ _P_GT_10M = "P(no match for > 10 m), %"
 _NOT_LOCALISED = "route not localised, %"
 # Unlimited lanes stand one step behind the last number.
 _BEYOND = 20.0
+# A policy has one colour in all figures, whichever others are drawn beside it.
+POLICY_COLOURS = {
+    "distance": "C0",
+    "path": "C1",
+    "path-literal": "C2",
+    "random": "C3",
+    "oracle": "C4",
+    "time-of-day": "C5",
+    "bag-of-words": "C6",
+    "collaborative": "C7",
+    "nearest-of-each": "C8",
+    "bandit": "C9",
+    "recall": "black",
+}
+_LOOKS = {policy: (colour, "-") for policy, colour in POLICY_COLOURS.items()} | {
+    Configuration("path", paths=PathKinds.MATCHED).label: (POLICY_COLOURS["path"], "--")
+}
 
 
 def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
@@ -44,7 +62,7 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult]) -> list[Path]:
     def draw(name: str, panels: Iterable[Panel | None], title: str) -> None:
         shown = [panel for panel in panels if panel is not None and panel.lines]
         if shown:
-            draw_curves(shown, out / name, title)
+            draw_curves(shown, out / name, title, _LOOKS)
             written.append(out / name)
 
     few = ", ".join(sorted(set(map(_budget, campaigns))))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 # Matplotlib's ten and black, then other line styles.
 _COLOURS = (*(f"C{number}" for number in range(10)), "black")
 _STYLES = ("-", "--", ":")
+_LOOKS = tuple((colour, style) for style in _STYLES for colour in _COLOURS)
 _PANELS_IN_A_ROW = 4
 
 
@@ -62,21 +64,31 @@ class Panel:
     signed: bool = False
 
 
-@dataclass(slots=True)
-class _Looks:
-    """Which label looks how."""
-
-    known: dict[str, tuple[str, str]] = field(default_factory=dict)
-
-    def of(self, label: str) -> tuple[str, str]:
-        if label not in self.known:
-            style, colour = divmod(len(self.known), len(_COLOURS))
-            self.known[label] = (_COLOURS[colour], _STYLES[style % len(_STYLES)])
-        return self.known[label]
+def _looks(
+    panels: Sequence[Panel], fixed: Mapping[str, tuple[str, str]]
+) -> dict[str, tuple[str, str]]:
+    """Colour and style of each label; what has none of its own gets what is left, in turn."""
+    labels = list(dict.fromkeys(line.label for panel in panels for line in panel.lines))
+    looks = {label: fixed[label] for label in labels if label in fixed}
+    free = [look for look in _LOOKS if look not in looks.values()] or list(_LOOKS)
+    others = [label for label in labels if label not in looks]
+    return looks | {label: free[k % len(free)] for k, label in enumerate(others)}
 
 
-def draw_curves(panels: Sequence[Panel], path: Path, title: str) -> None:
+def draw_curves(
+    panels: Sequence[Panel],
+    path: Path,
+    title: str,
+    looks: Mapping[str, tuple[str, str]] = MappingProxyType({}),
+) -> None:
     """Draws panels into an image file, up to four in a row, with one legend.
+
+    Args:
+        panels: what is drawn.
+        path: image file.
+        title: over the picture.
+        looks: label → Matplotlib's colour and line style, for labels that are to look alike in
+            several pictures.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.
@@ -85,11 +97,11 @@ def draw_curves(panels: Sequence[Panel], path: Path, title: str) -> None:
     columns = -(-len(panels) // rows)
     width = max(4.6 * columns, 6.5) + 2.0
     figure, axes = subplots(len(panels), width=width, height=4.2 * rows, rows=rows)
-    looks = _Looks()
+    look_of = _looks(panels, looks)
     handles: dict[str, Any] = {}
     for one, panel in zip(axes, panels, strict=True):
         for line in panel.lines:
-            handle = _draw_line(one, line, *looks.of(line.label))
+            handle = _draw_line(one, line, *look_of[line.label])
             handles.setdefault(line.label, handle)
         _draw_axes(one, panel)
     figure.legend(list(handles.values()), list(handles), loc="outside right center", fontsize=8)

@@ -1,0 +1,50 @@
+"""Which line looks how."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.viewing import Line, Panel, draw_curves
+
+
+def legend_of(
+    monkeypatch: pytest.MonkeyPatch, labels: list[str], looks: dict[str, tuple[str, str]]
+) -> dict[str, tuple[str, str]]:
+    from matplotlib import pyplot
+
+    shown: dict[str, tuple[str, str]] = {}
+
+    def keep(figure, path: Path) -> None:
+        [legend] = figure.legends
+        for handle, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
+            shown[text.get_text()] = (handle.get_color(), handle.get_linestyle())
+        pyplot.close(figure)
+
+    monkeypatch.setattr("engram.viewing.curves.save", keep)
+    line = np.arange(2.0)
+    panel = Panel("", "", "", [Line(label, line, line) for label in labels])
+    draw_curves([panel], Path("unused.png"), "", looks)
+    return shown
+
+
+def test_labels_without_a_look_take_what_the_picture_has_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks = {"a": ("C1", "-"), "b": ("C0", "-"), "absent": ("C2", "-")}
+    shown = legend_of(monkeypatch, ["new", "b", "a", "newer"], looks)
+    assert shown == {
+        "a": ("C1", "-"),
+        "b": ("C0", "-"),
+        "new": ("C2", "-"),
+        "newer": ("C3", "-"),
+    }
+
+
+def test_many_labels_get_other_line_styles_and_begin_anew(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shown = legend_of(monkeypatch, [f"{k:02d}" for k in range(40)], {})
+    assert shown["10"] == ("black", "-")
+    assert shown["11"] == ("C0", "--")
+    assert shown["33"] == ("C0", "-")
