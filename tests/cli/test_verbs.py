@@ -206,6 +206,8 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("simulate", "atlantis"), "atlantis"),
         (("simulate", "hamlet", "--size", "huge"), "huge"),
         (("simulate", "hamlet", "--sessions", "one"), "one"),
+        (("simulate", "hamlet", "--sessions", ""), "--sessions ''"),
+        (("simulate", "hamlet", "--sessions", "0,"), "--sessions '0,'"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_status_two(

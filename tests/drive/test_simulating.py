@@ -48,6 +48,14 @@ def test_what_is_there_is_not_rendered_again(short: Campaign, tmp_path: Path) ->
     assert Path(report.files[0]).read_bytes() == before
 
 
+def test_a_session_that_is_named_twice_is_rendered_once(short: Campaign, tmp_path: Path) -> None:
+    words: list[str] = []
+    report = simulate(short, tmp_path, sessions=[2, 0, 2], advance=words.append)
+    assert report.rendered == 2
+    assert [Path(file).name[:3] for file in report.files] == ["000", "002"]
+    assert len(words) == report.frames == 2 * len(SimulatedSequence(short, 0))
+
+
 def test_what_another_front_end_made_is_not_taken_for_this_ones(
     short: Campaign, tmp_path: Path
 ) -> None:

@@ -52,7 +52,8 @@ def simulate(
     from engram.simulation import SimulatedDrive, campaign_named
 
     chosen = campaign_named(campaign, seed, size_named(size))
-    numbers = _numbers(sessions) if sessions else list(range(len(chosen.sessions)))
+    every = list(range(len(chosen.sessions)))
+    numbers = every if sessions is None else _numbers(sessions)
     total = sum(len(SimulatedDrive(chosen, number)) for number in numbers)
     with progress(f"simulate {campaign}", total) as advance:
         report = render(
@@ -92,9 +93,13 @@ def size_named(text: str) -> Size:
 
 
 def _numbers(text: str) -> list[int]:
+    """Each once: a session named twice would be rendered by two workers into one file."""
     from engram.errors import ConfigError
 
     try:
-        return [int(part) for part in text.split(",")]
+        return sorted({int(part) for part in text.split(",")})
     except ValueError:
-        raise ConfigError(f"--sessions {text!r}: expected numbers joined by commas") from None
+        raise ConfigError(
+            f"--sessions {text!r}: expected numbers joined by commas, such as 0,3; leave the "
+            "option out for all sessions"
+        ) from None

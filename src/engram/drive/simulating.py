@@ -100,7 +100,8 @@ def simulate(
         campaign: what to render.
         out: folder; the campaign gets its own below it (`campaign_folder`).
         images: KITTI layout instead of frame logs.
-        sessions: numbers of the sessions wanted; None for all.
+        sessions: numbers of the sessions wanted, each once however often it is named; None for
+            all.
         workers: processes; each renders one session at a time and holds about 0.7 GB.
         settings: of front-end and odometry; None for the defaults.
         advance: called with a session's name, once per pair that is rendered or was there already.
@@ -117,7 +118,8 @@ def simulate(
     folder = campaign_folder(out, campaign)
     report = SimulateReport(str(folder))
     tasks = []
-    for number in range(len(campaign.sessions)) if sessions is None else sessions:
+    every = range(len(campaign.sessions))
+    for number in every if sessions is None else sorted(set(sessions)):
         task = _task(campaign, number, folder, images, settings or Settings())
         report.files.append(str(task.target))
         if _is_done(task):
