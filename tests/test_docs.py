@@ -50,6 +50,38 @@ def test_every_link_to_a_file_leads_somewhere() -> None:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+def sections_of_the_method() -> dict[str, str]:
+    """Number → what stands below the heading."""
+    parts = re.split(r"^## (\d+)\. .*$", (ROOT / "docs/method.md").read_text(), flags=re.M)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def cited_sections(text: str) -> Iterator[tuple[str, str]]:
+    """Section and item of citations such as "SPEC §3.6, §4", "SPEC §2.1–2.3", "SPEC §7 MERGE 3"."""
+    for numbers, merge in re.findall(
+        r"SPEC §(\d[\d.]*(?:(?:, §|–)\d[\d.]*)*)(?: MERGE (\d))?", text
+    ):
+        for section, item in re.findall(r"(\d+)(?:\.(\d+))?", numbers):
+            yield section, item or merge
+
+
+def test_every_section_that_is_cited_is_in_the_method() -> None:
+    sections = sections_of_the_method()
+    assert "".join(sections) == "123456789"
+    cited = [
+        (path, section, item)
+        for folder in ("src", "benchmarks", "tests")
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in {".py", ".hpp", ".cpp"} and path != Path(__file__)
+        for section, item in cited_sections(path.read_text())
+    ]
+    assert len(cited) > 100  # the pattern still meets them
+    for path, section, item in cited:
+        where = f"{path.relative_to(ROOT)}: SPEC §{section}"
+        assert section in sections, where
+        assert not item or re.search(rf"^{item}\. ", sections[section], re.M), f"{where}.{item}"
+
+
 def test_the_example_of_the_readme_runs(
     street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
