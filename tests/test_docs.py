@@ -82,6 +82,16 @@ def test_every_section_that_is_cited_is_in_the_method() -> None:
         assert not item or re.search(rf"^{item}\. ", sections[section], re.M), f"{where}.{item}"
 
 
+def test_every_class_that_the_architecture_names_is_there() -> None:
+    source = "\n".join(path.read_text() for path in (ROOT / "src/engram").rglob("*.py"))
+    page = (ROOT / "docs/architecture.md").read_text()
+    named = re.findall(r"`([A-Z]\w*[a-z]\w*)(?:\.(\w+))?`", page)
+    assert ("FrameReader", "hold") in named
+    for name, member in named:
+        assert re.search(rf"^class {name}\b", source, re.M), name
+        assert re.search(rf"^    (?:def )?{member}\b", source, re.M), f"{name}.{member}"
+
+
 def test_the_example_of_the_readme_runs(
     street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
