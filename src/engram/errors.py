@@ -16,7 +16,7 @@
     │   └── StorageFullError     no space left: free some; nothing committed is lost
     ├── IncompatibleError        two things that are each fine do not fit together
     ├── RefusedError             a result did not pass the gate that was asked for
-    ├── WorkerError              workers of a build or rendering died: look at memory and disk
+    ├── WorkerError              workers died, or cannot be reached: look at memory and disk
     └── MissingExtraError        an optional dependency: the message names the pip command
 
 Not localising is never an error: it is a status of the result.
@@ -80,7 +80,7 @@ class RefusedError(EngramError):
 
 
 class WorkerError(EngramError):
-    """Workers of a build or a rendering died, or cannot be reached."""
+    """Workers of a build, a rendering or an evaluation died, or cannot be reached."""
 
 
 class MissingExtraError(EngramError, ImportError):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +13,7 @@ from typing import Any
 
 import cv2
 
-from engram.errors import ConfigError
+from engram.errors import ConfigError, WorkerError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +46,7 @@ def run_tasks(tasks: Sequence[Task], workers: int, advance: Callable[[str], None
 
     Raises:
         ConfigError: there is no worker.
+        WorkerError: a worker died.
         EngramError: whatever a task raised; the tasks that were done stay done.
     """
     if workers < 1:
@@ -68,6 +70,11 @@ def run_tasks(tasks: Sequence[Task], workers: int, advance: Callable[[str], None
                         future.result()
                         done.add(task.name)
                         advance(task.word)
+        except BrokenProcessPool as error:
+            raise WorkerError(
+                f"a worker of {workers} died (out of memory?); give the same command again, "
+                "perhaps with fewer --workers; what was done is kept"
+            ) from error
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise

@@ -15,7 +15,7 @@ from engram.fleet.stock import Mask, Stock
 
 Array = NDArray[np.float64]
 
-# SPEC §4's feasibility study: a map decays with the hour, inliers 138 to 28 within five hours.
+# A first study of the towns: a map decays with the hour, inliers 138 to 28 within five hours.
 _DECAY_H = 5.0
 _HOUR_BINS = 13
 # So many attempts' worth of belief in the average, before a pair of sessions speaks for itself.
