@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import shutil
 from pathlib import Path
@@ -9,12 +10,13 @@ from pathlib import Path
 import pytest
 
 from engram.drive import Settings, map_drive, open_drive, session_of_drive
-from engram.errors import ConfigError, MapError
-from engram.fleet import building
+from engram.errors import ConfigError, InputError, MapError, StorageFullError
+from engram.fleet import building, find_best_order
 from engram.fleet.scratch import BuildPlan, Scratch, build_folder, sessions_of
 from engram.store import MapStore
 
-from .builds import build, map_in_this_process, options
+from .builds import build, judge, map_in_this_process, options
+from .robots import OPTIONS
 
 
 class KilledError(Exception):
@@ -171,3 +173,41 @@ def test_a_folder_without_a_plan_is_not_taken_for_a_build(tmp_path):
     (build_folder(centre) / "build.json").write_text("[")
     with pytest.raises(ConfigError, match=r"build\.json cannot be read"):
         Scratch(centre)
+
+
+def test_a_folder_that_is_not_there_is_not_made(tmp_path, logs):
+    (tmp_path / "afile").touch()
+    for folder in ("nowhere", "afile"):
+        with pytest.raises(InputError, match=rf"{folder} is no folder; make it first"):
+            build(tmp_path / folder / "centre.engram", logs, "a", groups=1)
+    assert [one.name for one in tmp_path.iterdir()] == ["afile"]
+
+
+def test_a_file_where_the_builds_folder_should_be_is_named_and_stays(tmp_path, logs):
+    centre = tmp_path / "centre.engram"
+    build_folder(centre).write_text("mine")
+    with pytest.raises(MapError, match=r"centre\.engram\.build: Not a directory; a build keeps"):
+        build(centre, logs, "a", groups=1)
+    assert build_folder(centre).read_text() == "mine"
+    with pytest.raises(MapError, match="Not a directory"):
+        find_best_order(
+            [Path(logs["a"])],
+            build_folder(centre) / "orders",
+            Settings(),
+            OPTIONS,
+            judge(logs["held-out"]),
+            None,
+        )
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"), [(errno.ENOSPC, StorageFullError), (errno.EROFS, MapError)]
+)
+def test_what_the_disk_refuses_is_an_error_of_maps(tmp_path, monkeypatch, number, kind):
+    def refuse(path, *_, **__):
+        raise OSError(number, "refused", str(path))
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    with pytest.raises(kind, match=r"build\.json\.part: (no space|refused)") as raised:
+        Scratch(tmp_path / "centre.engram").begin(BuildPlan([["a"]], [], "", {}, {}))
+    assert type(raised.value) is kind

@@ -18,6 +18,7 @@ from engram.errors import ConfigError, MapError
 from engram.experience.model import SessionId
 from engram.fleet.docking import merge_maps
 from engram.fleet.gate import GateOptions, localise_drive
+from engram.fleet.keeping import keeping
 from engram.fleet.merging import Progress
 from engram.fleet.replay import MergeOptions
 from engram.measures import Drive, failure_curve, failure_route, route_not_localised
@@ -281,11 +282,13 @@ def find_best_order(
     Raises:
         ConfigError: more groups than all orders of them could be tried, or a drive that judges is
             in one of the maps.
-        MapError: the root was written to meanwhile.
+        MapError: the root was written to meanwhile, or the folder cannot be written.
+        StorageFullError: no space is left.
         KeyboardInterrupt: a merge was interrupted.
     """
     check_countable(len(maps))
-    folder.mkdir(parents=True, exist_ok=True)
+    with keeping(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     search = _Search(maps, folder, settings, merging, judge, root)
     with progress("try orders", math.factorial(len(maps))) as advance:
         search.below((), root, advance)
@@ -336,8 +339,9 @@ class _Search:
         )
         self._sequences = [open_drive(path) for path in judge.drives]
         self._reported = [open_drive(path) for path in judge.reported]
-        for left in (*folder.glob("order-*.engram*"), *folder.glob(".order-*.new")):
-            left.unlink()  # by a run that was killed
+        with keeping(folder):
+            for left in (*folder.glob("order-*.engram*"), *folder.glob(".order-*.new")):
+                left.unlink()  # by a run that was killed
 
     def below(
         self, prefix: tuple[int, ...], merged: Path | None, advance: Callable[[str], None]
@@ -428,8 +432,9 @@ class _Search:
     def _keep(self, step: _Step) -> None:
         path = self._path(step.order)
         draft = path.with_suffix(".part")
-        draft.write_text(json.dumps({"depends": self._depends, **asdict(step)}))
-        draft.replace(path)
+        with keeping(self._folder):
+            draft.write_text(json.dumps({"depends": self._depends, **asdict(step)}))
+            draft.replace(path)
 
     def _known_from(self, prefix: tuple[int, ...]) -> list[_Step] | None:
         """All steps from a prefix on, if earlier runs made them by the same; else None."""
@@ -445,7 +450,8 @@ class _Search:
         path = self._path(order)
         if not path.exists():
             return None
-        values = json.loads(path.read_text())
+        with keeping(self._folder):
+            values = json.loads(path.read_text())
         if values.get("depends") != self._depends:
             return None
         result = values["result"]
@@ -478,8 +484,9 @@ class _Intermediate:
         self._remove()
 
     def _remove(self) -> None:
-        for beside in self._path.parent.glob(f"{self._path.name}*"):
-            beside.unlink()
+        with keeping(self._path.parent):
+            for beside in self._path.parent.glob(f"{self._path.name}*"):
+                beside.unlink()
 
 
 def _tree(prefix: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:

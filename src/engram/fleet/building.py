@@ -24,6 +24,7 @@ from engram.fleet.best_order import (
 )
 from engram.fleet.cluster import map_groups_on_cluster
 from engram.fleet.docking import merge_maps
+from engram.fleet.drafts import check_parent
 from engram.fleet.group_mapping import GroupResult, GroupTask, fetched
 from engram.fleet.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.merging import Progress, silent
@@ -200,10 +201,12 @@ def build_map(
     Raises:
         ConfigError: the groups do not fit the drives, another build lies there unfinished, there
             are too many groups for all orders, or a drive that judges them is not held out.
+        InputError: the folder of the centre is not there.
         WorkerError: workers died again and again.
-        EngramError: a drive or a map cannot be used.
+        EngramError: a drive or a map cannot be used, or what is done not be kept.
     """
     started = time.perf_counter()
+    check_parent(centre)
     looked_at = _look_at(drives)
     scratch = Scratch(centre)
     known = _known_sessions(scratch)

@@ -11,6 +11,7 @@ from uuid import uuid4
 
 from engram.errors import EngramError, MissingExtraError, WorkerError
 from engram.fleet.group_mapping import GroupResult, GroupTask, map_group_far_away
+from engram.fleet.keeping import keeping
 from engram.fleet.workers import LISTEN_S, MAX_RETRIES, WORDS_AT_ONCE
 
 if TYPE_CHECKING:
@@ -148,7 +149,8 @@ def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, b
 def _keep(path: Path, content: bytes) -> None:
     """The group's map, whole or not at all, in place of what another worker left half done."""
     draft = path.with_name(f"{path.name}.part")
-    draft.write_bytes(content)
-    for suffix in ("", "-wal", "-shm"):  # another map's log would be taken for its own
-        path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
-    draft.replace(path)
+    with keeping(path.parent):
+        draft.write_bytes(content)
+        for suffix in ("", "-wal", "-shm"):  # another map's log would be taken for its own
+            path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
+        draft.replace(path)

@@ -20,7 +20,7 @@ from engram.errors import InputError
 from engram.experience.model import Edge, PathId, path_id
 from engram.fleet.bridges import close_gaps, components
 from engram.fleet.coverage import Coverage, expected_missed
-from engram.fleet.drafts import draft_folder
+from engram.fleet.drafts import check_parent, draft_folder
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
 from engram.fleet.selections import SELECTIONS, Selection, check_options, coverage_for
@@ -135,8 +135,7 @@ def download(
     check_options(options)
     if out.exists() or out.is_symlink():
         raise InputError(f"{out} exists already; choose another name")
-    if not out.parent.is_dir():
-        raise InputError(f"{out.parent} is no folder; make it first")
+    check_parent(out)
     with MapStore.open(centre, at=at) as store:
         stock = Stock(store)
         if not len(stock):

@@ -13,6 +13,16 @@ from pathlib import Path
 from engram.errors import InputError, MapError
 
 
+def check_parent(path: Path) -> None:
+    """Refuses a file to be whose folder is not there: a mistyped one is not to be made.
+
+    Raises:
+        InputError: the folder of the file is not there.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"{path.parent} is no folder; make it first")
+
+
 @contextmanager
 def draft_folder(path: Path) -> Iterator[Path]:
     """A folder of its own in the file system of a file to be; it goes away with what it holds.
@@ -21,8 +31,7 @@ def draft_folder(path: Path) -> Iterator[Path]:
         InputError: the folder of the file is not there.
         MapError: it cannot be written to.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"{path.parent} is no folder; make it first")
+    check_parent(path)
     try:
         folder = tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent)
     except OSError as error:

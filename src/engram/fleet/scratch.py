@@ -11,6 +11,7 @@ from typing import Any
 from engram.errors import ConfigError, MapError
 from engram.fleet.best_order import BestOrder
 from engram.fleet.group_mapping import GroupResult
+from engram.fleet.keeping import keeping
 from engram.store import MapStore
 
 
@@ -81,6 +82,9 @@ class Scratch:
 
     Its plan is the first thing that is written and the last that is removed, so that what lies
     beside it is always known to belong to it.
+
+    All that it does raises MapError where the folder cannot be read or written, and
+    StorageFullError where no space is left.
     """
 
     def __init__(self, centre: Path) -> None:
@@ -109,11 +113,13 @@ class Scratch:
         elif self.plan is None:
             self._check_empty()
         elif self.plan.same_groups(plan):
-            self._merging_path.unlink(missing_ok=True)
+            with keeping(self.folder):
+                self._merging_path.unlink(missing_ok=True)
         else:
             self._check_in_centre(self.plan)
             self._clear()
-        self.folder.mkdir(parents=True, exist_ok=True)
+        with keeping(self.folder):
+            self.folder.mkdir(exist_ok=True)
         self._write_plan(plan)
 
     def finish(self) -> None:
@@ -136,8 +142,9 @@ class Scratch:
         """What a complete build was killed before removing."""
         if self.plan is not None and self.plan.complete and not self.plan.kept:
             self._clear()
-            self._plan_path.unlink()
-            self.folder.rmdir()
+            with keeping(self.folder):
+                self._plan_path.unlink()
+                self.folder.rmdir()
             self.plan = None
 
     def group(self, number: int) -> Path:
@@ -212,9 +219,10 @@ class Scratch:
 
     def _check_empty(self) -> None:
         """Nothing that a new build would take for its own."""
-        if not self.folder.exists():
-            return
-        strange = [one.name for one in self.folder.iterdir() if one.suffix != ".part"]
+        with keeping(self.folder):
+            if not self.folder.exists():
+                return
+            strange = [one.name for one in self.folder.iterdir() if one.suffix != ".part"]
         if strange:
             raise ConfigError(
                 f"{self.folder} holds {sorted(strange)[0]}, but no plan of a build; delete the "
@@ -233,11 +241,12 @@ class Scratch:
 
     def _clear(self) -> None:
         """Everything but the plan; results before the maps that they tell of."""
-        for path in sorted(self.folder.iterdir(), key=lambda one: one.suffix != ".json"):
-            if path.is_dir():
-                shutil.rmtree(path)
-            elif path != self._plan_path:
-                path.unlink()
+        with keeping(self.folder):
+            for path in sorted(self.folder.iterdir(), key=lambda one: one.suffix != ".json"):
+                if path.is_dir():
+                    shutil.rmtree(path)
+                elif path != self._plan_path:
+                    path.unlink()
 
 
 def sessions_of(centre: Path) -> frozenset[str]:
@@ -267,5 +276,6 @@ def _read_json(path: Path) -> dict[str, Any]:
 def _write_json(path: Path, values: dict[str, Any]) -> None:
     """In one step: a killed build leaves no half file."""
     draft = path.with_name(f"{path.name}.part")
-    draft.write_text(json.dumps(values), encoding="utf-8")
-    draft.replace(path)
+    with keeping(path.parent):
+        draft.write_text(json.dumps(values), encoding="utf-8")
+        draft.replace(path)
