@@ -127,6 +127,14 @@ class TestRevert:
         assert store.load().nodes == tuple(two[1].nodes)
         assert MapStore.check(location).problems == ()
 
+    def test_what_others_get_back_is_counted_by_itself(self, store, two):
+        nothing = {"edges": 0, "path_entries": 0, "omissions": 0}
+        assert store.revert(1, author="me").regained_by_others == nothing
+        undone = store.revert(3, author="me")
+        assert undone.lost_by_others == nothing
+        # The first drive's two edges and the second one's tie; all entries of the first.
+        assert undone.regained_by_others == {"edges": 3, "path_entries": 3, "omissions": 0}
+
     def test_a_dry_run_tells_and_writes_nothing(self, store, two, location):
         before = store.content_hash()
         done = store.revert(1, author="me", dry_run=True)

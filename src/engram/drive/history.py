@@ -136,6 +136,7 @@ class RevertReport:
             "reverted": self.reverted.number,
             "revision": None if revision is None else revision.number,
             "lost_by_others": dict(self.reverted.lost_by_others),
+            "regained_by_others": dict(self.reverted.regained_by_others),
             "difference": self.difference.to_dict(),
         }
 
@@ -149,19 +150,19 @@ class RevertReport:
             f"nodes      {told['nodes']['before']} → {told['nodes']['after']}",
             f"components {told['components']['before']} → {told['components']['after']}",
         ]
-        lost = [
-            f"{count} {name.replace('_', ' ')}"
-            for name, count in self.reverted.lost_by_others.items()
-            if count
-        ]
-        if lost:
-            lines.append(
-                f"other revisions had built on it: {', '.join(lost)} of theirs disappear with it"
-            )
+        if lost := _rows_text(self.reverted.lost_by_others):
+            lines.append(f"other revisions had built on it: {lost} of theirs disappear with it")
+        if regained := _rows_text(self.reverted.regained_by_others):
+            lines.append(f"of other revisions, {regained} are seen again")
         if told["components"]["after"] > told["components"]["before"]:
             lines.append("the map falls into more pieces: robots cannot be carried between them")
         lines.append(f"to undo: engram revert MAP {revision.number}" if revision else "dry run")
         return "\n".join(lines)
+
+
+def _rows_text(counts: Mapping[str, int]) -> str:
+    """How many rows of which tables, those without any left out."""
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
 
 
 def revert_revision(

@@ -43,8 +43,9 @@ class Reverted:
         number: the revision that was taken back.
         revision: the new one that does it; None where nothing was written.
         before, after: the map without and with it.
-        lost_by_others: how many rows of other revisions, by table, are no longer seen, since they
-            refer to nodes that are hidden now.
+        lost_by_others: how many rows of other revisions, by table, are no longer seen: they refer
+            to nodes that are hidden now, or the revision had shown them again.
+        regained_by_others: how many, by table, are seen again.
     """
 
     number: int
@@ -52,6 +53,7 @@ class Reverted:
     before: MapContents
     after: MapContents
     lost_by_others: Mapping[str, int]
+    regained_by_others: Mapping[str, int]
 
 
 def hidden_row(keys: KeyBook, revision_key: int, table: Table, target: int, *, hide: bool) -> Row:
@@ -189,17 +191,17 @@ def _invert_hidden(
 
 def compare(connection: Connection, number: int, before: View, after: View) -> Reverted:
     """The map without and with a revert that is not committed yet."""
-    lost = {
-        str(table.name): _of_others(connection, before, table, number)
-        - _of_others(connection, after, table, number)
-        for table in (edges, path_entries, omissions)
-    }
-    return Reverted(number, None, load(connection, before), load(connection, after), lost)
+    lost, regained = {}, {}
+    for table in (edges, path_entries, omissions):
+        # By row, not by count: what goes and what comes back must not cancel.
+        old, new = (_of_others(connection, view, table, number) for view in (before, after))
+        lost[str(table.name)] = len(old - new)
+        regained[str(table.name)] = len(new - old)
+    contents = load(connection, before), load(connection, after)
+    return Reverted(number, None, *contents, lost, regained)
 
 
-def _of_others(connection: Connection, view: View, table: Table, number: int) -> int:
-    """How many rows are seen that the revision did not bring."""
+def _of_others(connection: Connection, view: View, table: Table, number: int) -> set[int]:
+    """Keys of the rows that are seen and that the revision did not bring."""
     rows = view.select(table).where(func.coalesce(revisions.c.number, 0) != number)
-    return connection.execute(
-        select(func.count()).select_from(rows.order_by(None).subquery())
-    ).scalar_one()
+    return set(connection.execute(rows.with_only_columns(table.c.key).order_by(None)).scalars())
