@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from engram.drive import MapOptions, Settings, map_drive, open_drive
+from engram.drive import MapOptions, Settings, extract_log, map_drive, open_drive
+from engram.errors import SequenceError
 
 KEYS = {
     "out", "policy", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",
@@ -21,6 +22,24 @@ def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     sequence = open_drive(street, start="2026-03-01T09:30:00", longitude_deg=0.0)
     map_drive(path, sequence, Settings(), MapOptions())
     return path
+
+
+@pytest.fixture(scope="module")
+def night(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same street by night, of which the centre has seen nothing."""
+    log = tmp_path_factory.mktemp("drives") / "night.framelog"
+    sequence = open_drive(street, robot="r2", start="2026-03-02T22:30:00", longitude_deg=0.0)
+    extract_log(sequence, log, Settings())
+    return log
+
+
+@pytest.fixture(scope="module")
+def morning(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The street in the centre's morning."""
+    log = tmp_path_factory.mktemp("drives") / "morning.framelog"
+    sequence = open_drive(street, robot="r2", start="2026-03-02T09:30:00", longitude_deg=0.0)
+    extract_log(sequence, log, Settings())
+    return log
 
 
 def test_it_writes_a_map_and_says_what_it_promises(engram, centre: Path, tmp_path: Path) -> None:
@@ -45,6 +64,49 @@ def test_a_promise_is_held_against_a_drive(
     assert mine["missed"] == whole["missed"] == 0.0
     # One drive says little of the next: what it saved is believed to serve it half of the time.
     assert 0.3 < mine["expected_missed"] < 0.7
+
+
+def test_a_drive_that_cannot_be_opened_fails_before_anything_is_written(
+    engram, centre: Path, street: Path, tmp_path: Path
+) -> None:
+    checks = ("--check", street, "--check", tmp_path / "nope.framelog")
+    ran = engram("download", centre, tmp_path / "a.engram", *checks)
+    assert ran.status == 2
+    assert "nope.framelog" in ran.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_drive_for_whose_hour_there_is_nothing_is_a_row_of_its_own(
+    engram, centre: Path, morning: Path, night: Path, tmp_path: Path
+) -> None:
+    asked = ("--policy", "tod", "--start", "9:30", "--check", morning, "--check", night)
+    ran = engram("download", centre, tmp_path / "a.engram", *asked, "--json")
+    assert ran.status == 0
+    mine, whole, left_out = ran.json["check"]
+    assert (mine["name"], mine["drives"], whole["name"], whole["drives"]) == ("tod", 1, "copy", 1)
+    assert (left_out["name"], left_out["drive"]) == ("tod", str(night))
+    assert left_out["start_h"] == pytest.approx(22.5, abs=0.01)
+    assert "no node was saved within 180 minutes of 22:" in left_out["why"]
+    text = engram("download", centre, tmp_path / "b.engram", *asked).out
+    assert f"left out {night}, of 22.5 h: no node was saved" in text
+
+
+def test_a_check_that_fails_leaves_the_download_and_its_report(
+    engram, centre: Path, street: Path, tmp_path: Path, monkeypatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise SequenceError("the drive went away")
+
+    monkeypatch.setattr("engram.fleet.try_downloads", fail)
+    ran = engram("download", centre, tmp_path / "a.engram", "--check", street, "--json")
+    assert ran.status == 2
+    assert set(ran.json) == KEYS | {"error"}
+    assert ran.json["error"] == {"kind": "SequenceError", "message": "the drive went away"}
+    assert engram("check", tmp_path / "a.engram").status == 0
+    ran = engram("download", centre, tmp_path / "b.engram", "--check", street)
+    assert ran.status == 2
+    assert "expected share of the way without a match" in ran.out
+    assert "went away" in ran.err
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from engram.cli import options
+from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.errors import EngramError
 
 if TYPE_CHECKING:
-    from engram.fleet import DownloadOptions
+    from engram.drive import Settings
+    from engram.fleet import DownloadOptions, LeftOut, TrialSummary
 
 
 def download(
@@ -95,7 +99,8 @@ def download(
     """Write the part of a centre that a robot needs for its next mission, as a map of its own.
 
     Times are hours of day at the place: mean solar time where longitudes are known, else civil
-    time. The robot drives with the download alone, adds to it, and hands it back to `merge`.
+    time. The robot drives with the download alone, adds to it, and hands it back to `merge`. Where
+    a --check fails after OUT was written, OUT stays and is told of.
 
     \b
     Examples:
@@ -106,7 +111,8 @@ def download(
       engram download centre.engram r1.engram --policy tod --start 9:30 --check monday.framelog
     """
     from engram.cli.progress import progress
-    from engram.fleet import DownloadOptions, TrialSummary, bytes_from_text, hour_from_text
+    from engram.drive import load_settings
+    from engram.fleet import DownloadOptions, bytes_from_text, hour_from_text
     from engram.fleet import download as send
 
     asked = DownloadOptions(
@@ -125,41 +131,62 @@ def download(
         radius_m=radius,
         thumbnails=thumbnails,
     )
+    drives = _looked_at(check or [])
+    settings = load_settings(config)
     report = send(centre, out, asked, at=at, progress=progress)
-    held_out = _check(centre, asked, check or [], lanes, rounds, at, config) if check else []
+    if not as_json:
+        typer.echo(report.text())
+    try:
+        tried, left_out = _check(centre, asked, drives, settings, lanes, rounds, at)
+    except EngramError as error:
+        raise PartlyDoneError(error, {**report.to_dict(), "check": []}) from error
+    except KeyboardInterrupt:
+        stopped = VerbInterruptedError(f"interrupted; {out} is whole")
+        raise PartlyDoneError(stopped, {**report.to_dict(), "check": []}) from None
     if as_json:
-        print(json.dumps({**report.to_dict(), "check": held_out}))
+        rows = [*map(asdict, tried), *(one.to_dict() for one in left_out)]
+        print(json.dumps({**report.to_dict(), "check": rows}))
         return
-    typer.echo(report.text())
-    for one in held_out:
-        typer.echo(TrialSummary(**one).text())
+    for line in (*(one.text() for one in tried), *(one.text() for one in left_out)):
+        typer.echo(line)
+
+
+def _looked_at(drives: list[Path]) -> dict[str, Path]:
+    """By session; what cannot be opened shall not fail behind a download that is written."""
+    from engram.drive import open_drive, session_of_drive
+
+    return {str(session_of_drive(open_drive(drive)).id): drive for drive in drives}
 
 
 def _check(
     centre: Path,
     asked: DownloadOptions,
-    drives: list[Path],
+    drives: dict[str, Path],
+    settings: Settings,
     lanes: int,
     rounds: int,
     at: str | None,
-    config: Path | None,
-) -> list[dict[str, Any]]:
-    """What such downloads promised held-out drives, and what came of it."""
-    from dataclasses import asdict
+) -> tuple[list[TrialSummary], list[LeftOut]]:
+    """What such downloads promised held-out drives and what came of it, and drives left out."""
     from functools import partial
 
     from engram.cli.progress import progress
-    from engram.drive import LocaliseOptions, load_settings, open_drive
+    from engram.drive import LocaliseOptions, open_drive
     from engram.fleet import DownloadOptions, summarise_trials, try_downloads
 
-    wanted = {asked.policy: asked, "copy": DownloadOptions()}
+    left_out: list[LeftOut] = []
+
+    def note(one: LeftOut) -> None:
+        left_out.append(replace(one, drive=str(drives[one.drive])))
+
     trials = try_downloads(
         centre,
-        wanted,
-        [partial(open_drive, drive) for drive in drives],
-        load_settings(config),
+        {asked.policy: asked, "copy": DownloadOptions()},
+        [partial(open_drive, drive) for drive in drives.values()],
+        settings,
         LocaliseOptions(lanes=lanes, rounds=rounds),
         progress,
         at=at,
+        left_out=note,
     )
-    return [asdict(one) for one in summarise_trials(trials)]
+    return summarise_trials(trials), left_out

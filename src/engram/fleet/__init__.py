@@ -20,7 +20,7 @@ from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment, string_segments
 from engram.fleet.selections import SELECTIONS
-from engram.fleet.trial import Trial, TrialSummary, summarise_trials, try_downloads
+from engram.fleet.trial import LeftOut, Trial, TrialSummary, summarise_trials, try_downloads
 
 __all__ = [
     "GROUPINGS",
@@ -36,6 +36,7 @@ __all__ = [
     "GroupTask",
     "HandedIn",
     "JudgeOptions",
+    "LeftOut",
     "MergeOptions",
     "MergeReport",
     "OrderResult",

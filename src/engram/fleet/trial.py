@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from engram.drive import (
     measured,
     session_of_drive,
 )
+from engram.errors import ConfigError, InputError
 from engram.experience.clock import hour_of_day
 from engram.experience.model import Node, Session
 from engram.fleet.downloading import DownloadReport, download
@@ -107,6 +108,32 @@ class TrialSummary:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A drive for which some options found nothing to send.
+
+    Attributes:
+        name: of the options.
+        drive: session of the drive, as text.
+        start_h: the drive's hour of day; None if it is not known.
+        why: what was not found.
+    """
+
+    name: str
+    drive: str
+    start_h: float | None
+    why: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def text(self) -> str:
+        """One line for people."""
+        hour = "" if self.start_h is None else f", of {self.start_h:.1f} h"
+        return f"{self.name:16s} left out {self.drive}{hour}: {self.why}"
+
+
 def try_downloads(
     centre: Path,
     wanted: Mapping[str, DownloadOptions],
@@ -117,6 +144,7 @@ def try_downloads(
     *,
     at: int | str | None = None,
     start: Callable[[OpenMap], Position | None] = lambda _: None,
+    left_out: Callable[[LeftOut], None] | None = None,
 ) -> list[Trial]:
     """Download for each drive in each way, and localise it there without writing anything.
 
@@ -129,43 +157,66 @@ def try_downloads(
         progress: shows how it goes.
         at: revision of the centre; None for the newest.
         start: where a drive begins in a download; None if nobody knows: it begins lost.
+        left_out: is told of a drive for which one of the options fits nothing; it is tried in
+            none of the others then, so that all are of the same drives. None for an error.
 
     Raises:
-        InputError: a drive's options fit nothing.
+        InputError: a drive's options fit nothing, and nobody is told.
         MapError: the centre cannot be read, or a download not be written.
     """
-    trials = []
+    trials: list[Trial] = []
     with tempfile.TemporaryDirectory(prefix="engram-trial-") as folder:
         for open_drive in drives:
-            session = session_of_drive(open_drive())
+            sequence = open_drive()
+            session = session_of_drive(sequence)
             hour = hour_of_day(session, session.start_ns)
+            own: list[Trial] = []
             for number, (name, asked) in enumerate(wanted.items()):
                 options = asked if hour is None else replace(asked, **_when(session, hour))
                 out = Path(folder) / f"{session.id}-{number}.engram"
-                report = download(centre, out, options, at=at, progress=progress)
-                sequence = open_drive()
-                with LocaliseRun(out, sequence, settings, localise) as run:
+                try:
+                    report = download(centre, out, options, at=at, progress=progress)
+                except ConfigError:
+                    raise
+                except InputError as error:
+                    if left_out is None:
+                        raise
+                    left_out(LeftOut(name, str(session.id), hour, str(error)))
+                    own = []
+                    break
+                with LocaliseRun(out, open_drive(), settings, localise) as run:
                     position = start(run.opened)
                     if position is not None:
                         run.localiser.start_at(position)
                     results = _localised(run, len(sequence), progress)
                     nodes = list(run.opened.graph.nodes)
-                lookups = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
-                trials.append(
-                    Trial(
-                        name=name,
-                        drive=str(session.id),
-                        start_h=hour,
-                        report=report,
-                        steps=measured([one.localisation for one in results]),
-                        ms_per_frame=_ms(results),
-                        lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
-                        lookups=len(lookups),
-                        nodes=nodes,
-                    )
-                )
+                own.append(_trial(name, session, hour, report, results, nodes))
                 out.unlink()
+            trials += own
     return trials
+
+
+def _trial(
+    name: str,
+    session: Session,
+    hour: float | None,
+    report: DownloadReport,
+    results: Sequence[FrameResult],
+    nodes: Sequence[Node],
+) -> Trial:
+    """What came of a drive in a download."""
+    lookups = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
+    return Trial(
+        name=name,
+        drive=str(session.id),
+        start_h=hour,
+        report=report,
+        steps=measured([one.localisation for one in results]),
+        ms_per_frame=_ms(results),
+        lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
+        lookups=len(lookups),
+        nodes=nodes,
+    )
 
 
 def _when(session: Session, hour: float) -> dict[str, Any]:
