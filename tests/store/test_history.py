@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from engram.errors import InputError, RevisionError
-from engram.experience.model import EdgeKind
+from engram.experience.model import EdgeKind, PathEntry, PathEntryKind, path_id
 from engram.store import MapStore, SessionState
 from engram.store.schema import FORMAT_VERSION
 
@@ -215,6 +215,21 @@ class TestRevert:
         # The match hangs on a node that is gone; the second session stands by itself.
         assert store.load().sessions == (two[1].session,)
         assert_same_edges(store.load().edges, two[1].edges[:-1])
+
+    def test_an_entry_that_was_superseded_is_not_counted(self, store, two):
+        nodes = two[0].nodes[0], two[1].nodes[0]
+        # Written again where nobody saw it, since its node was hidden; then both can be seen.
+        for at, node in enumerate(nodes):
+            if at:
+                store.revert(1, author="me")
+            with store.begin_revision(author="me", message="more", configuration={}) as bulk:
+                path, kind = path_id(two[1].session.id), PathEntryKind.MATCHED
+                bulk.add_path_entry(PathEntry(path, 9, node.id, kind, node.stamp_ns))
+                bulk.commit()
+        store.revert(4, author="me")
+        entries = store.load().path_entries
+        assert [one.node for one in entries if one.sequence == 9] == [nodes[1].id]
+        assert store.info().path_entries == len(entries) == 7
 
     def test_not_while_a_session_is_written(self, store, two):
         begin(store, session("robot-3"))

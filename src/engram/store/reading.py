@@ -163,7 +163,7 @@ def info(connection: Connection, view: View, *, format_version: int, size_bytes:
         nodes=node_count(connection, view),
         edges=sum(by_kind.values()),
         edges_of_kind={str(kind): count for kind, count in by_kind.items() if count},
-        path_entries=_count(connection, view.select(path_entries)),
+        path_entries=_count(connection, _entry_places(view)),
         attempts=int(connection.execute(counted).scalar() or 0),
         mapped_m=mapped_m,
         size_bytes=size_bytes,
@@ -307,6 +307,12 @@ def _path_entries(
     return tuple(
         path_entry_from_row(row, path_ids[row["path"]], node_ids[row["node"]]) for row in rows
     )
+
+
+def _entry_places(view: View) -> Select[Any]:
+    """Path and sequence of the entries that are seen, once each: newer ones supersede older."""
+    seen = view.select(path_entries).order_by(None)
+    return seen.with_only_columns(path_entries.c.path, path_entries.c.sequence).distinct()
 
 
 def _attempts(
