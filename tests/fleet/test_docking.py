@@ -7,6 +7,7 @@ import random
 import select
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 from dataclasses import replace
@@ -22,6 +23,7 @@ from engram.errors import (
     ConfigError,
     IncompatibleError,
     InputError,
+    MapCorruptError,
     MapError,
     NotAMapError,
     RefusedError,
@@ -166,7 +168,15 @@ class TestRefused:
 
     def test_landmarks_that_were_damaged_on_the_way(self, tmp_path, centre, fleet):
         robot = damaged(fleet["longer"][0], tmp_path / "damaged.engram")
-        self.refuses(centre, robot, MapError)
+        self.refuses(centre, robot, MapError, str(robot))
+
+    def test_a_row_that_was_damaged_on_the_way(self, tmp_path, centre, fleet):
+        robot = tmp_path / "damaged.engram"
+        MapStore.copy(fleet["longer"][0], robot)
+        with sqlite3.connect(robot) as connection:
+            connection.execute("UPDATE edges SET a_from_b = zeroblob(96) WHERE key = 2")
+        connection.close()
+        self.refuses(centre, robot, MapCorruptError, f"{robot}: table edges")
 
     def test_a_map_that_does_not_fit_a_centre_of_an_older_format(self, tmp_path, fleet):
         centre = tmp_path / "centre.engram"

@@ -237,6 +237,21 @@ class TestCheckNamesTableUuidAndFact:
         with MapStore.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
             store.load()
 
+    def test_whoever_meets_damage_is_told_the_map_once(self, broken, sound):
+        node = sound[1][1].nodes[2]
+        with MapStore.open(broken) as store:
+            change(broken, "UPDATE nodes SET stamp_ns = 0 WHERE uuid = ?", node.id.bytes)
+            for read in (
+                store.load,
+                store.content_hash,
+                lambda: store.frames.frame(node.id),
+                lambda: list(store.frames.stored([node])),
+            ):
+                with pytest.raises(MapCorruptError) as raised:
+                    read()
+                assert str(raised.value).startswith(f"{broken.resolve()}: table nodes: {node.id}")
+                assert str(raised.value).count(broken.name) == 1
+
     def test_a_missing_node(self, broken, sound):
         node = sound[1][0].nodes[1].id
         change(broken, "DELETE FROM nodes WHERE uuid = ?", node.bytes)

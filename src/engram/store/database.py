@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Protocol
 
 from sqlalchemy import Connection, Executable, Select, Table
 
+from engram.errors import MapCorruptError
 from engram.store.lock import Holder
+
+
+@contextmanager
+def damage_named(name: str) -> Iterator[None]:
+    """Says of which map it is what finds its rows damaged: rows do not know, and maps are many.
+
+    Args:
+        name: path or address of the map.
+
+    Raises:
+        MapCorruptError: as it was raised within, with the name before it, once.
+    """
+    try:
+        yield
+    except MapCorruptError as error:
+        if str(error).startswith(name):
+            raise
+        raise MapCorruptError(f"{name}: {error}") from error
 
 
 class Lock(Protocol):
@@ -27,7 +46,8 @@ class Lock(Protocol):
 class Database(Protocol):
     """Connections, transactions, errors and the few statements that differ between databases.
 
-    All errors that a connection raises inside `reading` and `writing` come out as `MapError`s.
+    All errors that a connection raises inside `reading` and `writing` come out as `MapError`s,
+    and a `MapCorruptError` that is raised there bears the map's name.
     """
 
     @property

@@ -17,7 +17,7 @@ from engram.experience.model import Node, NodeId
 from engram.frontend import DescriptorKind, Frame, FrameStatus
 from engram.geometry import StereoCamera
 from engram.store.blob import blob_hash, decode_landmarks, decode_thumbnail, is_intact
-from engram.store.database import Database
+from engram.store.database import Database, damage_named
 from engram.store.reading import load_cameras, load_frontends
 from engram.store.records import StoredNode
 from engram.store.rows import Row, verified
@@ -70,7 +70,8 @@ class FrameReader:
                 if node in self._cache:
                     self._cache.move_to_end(node)
                 return frame
-        frame = self._read(node)
+        with damage_named(self._database.name):
+            frame = self._read(node)
         self._remember(node, frame)
         return frame
 
@@ -110,7 +111,9 @@ class FrameReader:
             for one in batch:
                 if one.id.bytes not in found:
                     raise InputError(f"the map has no node {one.id}")
-                yield self._stored_node(one, found[one.id.bytes])
+                with damage_named(self._database.name):
+                    stored = self._stored_node(one, found[one.id.bytes])
+                yield stored
 
     def decode(self, stored: StoredNode) -> Frame:
         """The frame of a stored node.

@@ -39,6 +39,7 @@ from engram.errors import (
     NotAMapError,
     StorageFullError,
 )
+from engram.store.database import damage_named
 from engram.store.lock import Holder
 from engram.store.raising import raise_tables
 from engram.store.rows import sealed
@@ -116,7 +117,7 @@ class PostgresDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for selects."""
-        with _translated(self.name), self._engine.connect() as connection:
+        with damage_named(self.name), _translated(self.name), self._engine.connect() as connection:
             yield connection
 
     def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
@@ -127,7 +128,7 @@ class PostgresDatabase:
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """One durable transaction."""
-        with _translated(self.name), self._engine.begin() as connection:
+        with damage_named(self.name), _translated(self.name), self._engine.begin() as connection:
             yield connection
 
     def lock_for_writing(self) -> AdvisoryLock:

@@ -45,6 +45,7 @@ from engram.errors import (
     NotAMapError,
     StorageFullError,
 )
+from engram.store.database import damage_named
 from engram.store.lock import Holder, WriterLock, current_holder
 from engram.store.raising import raise_tables
 from engram.store.rows import sealed
@@ -110,7 +111,7 @@ class SqliteDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for selects."""
-        with _translated(self.name), self._reader.connect() as connection:
+        with damage_named(self.name), _translated(self.name), self._reader.connect() as connection:
             yield connection
 
     def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
@@ -138,7 +139,7 @@ class SqliteDatabase:
         """One transaction, durable when the block is left."""
         if self._writer is None:
             self._writer = _engine(_uri(self.path, "mode=rw"), _prepare_writer)
-        with _translated(self.name), self._writer.begin() as connection:
+        with damage_named(self.name), _translated(self.name), self._writer.begin() as connection:
             yield connection
 
     def lock_for_writing(self) -> WriterLock:
