@@ -170,6 +170,22 @@ def test_two_kinds_of_descriptor_do_not_mix(engram, street: Path, town: Path, tm
         assert "teblid" in ran.json["error"]["message"]
 
 
+def test_a_kind_of_descriptor_that_is_insisted_on_is_not_passed_over(
+    engram, street: Path, town: Path, tmp_path: Path
+) -> None:
+    log, new = tmp_path / "brief.framelog", tmp_path / "new.engram"
+    assert engram("extract", street, log).status == 0
+    ran = engram("map", new, log, "--descriptor", "teblid")
+    assert ran.status == 2
+    assert "has brief descriptors, not teblid" in ran.err
+    assert "extract it again with --descriptor teblid" in ran.err
+    assert not new.exists()
+    ran = engram("map", town, street, "--robot", "r2", "--descriptor", "teblid", "--json")
+    assert ran.json["error"]["kind"] == "ConfigError"
+    assert "map the drive into another map" in ran.json["error"]["message"]
+    assert engram("map", new, log, "--descriptor", "brief").status == 0
+
+
 def test_simulate_refuses_a_drive_that_is_not_there(engram, tmp_path: Path) -> None:
     ran = engram("simulate", "hamlet", "--sessions", "9", "--out", tmp_path)
     assert ran.status == 2

@@ -60,7 +60,8 @@ def map_(
     )
     asked = MapOptions(policy=policy, lanes=lanes, rounds=rounds, deadline_ms=deadline)
     with progress("map", len(sequence)) as advance:
-        report = map_drive(map_path, sequence, load_settings(config, descriptor), asked, advance)
+        settings = load_settings(config, descriptor)
+        report = map_drive(map_path, sequence, settings, asked, advance, descriptor=descriptor)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

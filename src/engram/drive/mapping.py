@@ -20,8 +20,9 @@ from engram.drive.place_words import keep_missing_words
 from engram.drive.results import FrameResult, damage_warning, summarise
 from engram.drive.session import DriveSequence, session_of_drive
 from engram.drive.settings import Settings
+from engram.errors import ConfigError
 from engram.experience.model import PathEntryKind, Session
-from engram.frontend import Frame, Frontend
+from engram.frontend import DescriptorKind, Frame, Frontend
 from engram.geometry import StereoCamera
 from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Position
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
@@ -125,6 +126,7 @@ def map_drive(
     options: MapOptions,
     advance: Callable[[str], None] = ignore,
     start: Position | None = None,
+    descriptor: str | None = None,
 ) -> MapReport:
     """Adds a drive to a map, which is made if there is none.
 
@@ -138,16 +140,25 @@ def map_drive(
         options: how it is mapped.
         advance: called once per frame with a word on how it went.
         start: where the robot stands before its first frame, if that is known.
+        descriptor: kind of descriptor that somebody insists on; None for the frame log's, the
+            map's or that of the settings, whichever is known first.
 
     Raises:
-        ConfigError: the policy is unknown, or looks ahead.
+        ConfigError: the policy is unknown, or looks ahead; or the frame log or the map has another
+            kind of descriptor than was insisted on.
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; what came before is saved.
     """
     check_for_robot(options.policy)
+    if descriptor is not None and isinstance(sequence, FrameLog):
+        mend = f"extract it again with --descriptor {descriptor}"
+        _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
     session = session_of_drive(sequence)
     report = MapReport(session)
     with WritableMapStore.opened_or_created(map_path) as store:
+        if descriptor is not None:
+            mend = "map the drive into another map"
+            _check_descriptor(descriptor, store.descriptor(), str(map_path), mend)
         state = store.session_state(session.id)
         if state is SessionState.COMMITTED:
             report.known = True
@@ -178,6 +189,19 @@ def map_drive(
             )
     report.skipped = sequence.skipped
     return report
+
+
+def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend: str) -> None:
+    """What somebody insists on is not passed over in silence.
+
+    Raises:
+        ConfigError: there is another kind already.
+    """
+    if found is not None and found != asked:
+        raise ConfigError(
+            f"{what} has {found} descriptors, not {asked} as --descriptor asks for; leave that "
+            f"out, or {mend}"
+        )
 
 
 def _begin(
