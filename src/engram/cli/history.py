@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from engram.cli import options
+from engram.errors import ConfigError
 
 Revision = Annotated[str, typer.Argument(metavar="REV", help="A revision: 7, a tag, head, head~2.")]
 Author = Annotated[
@@ -122,6 +123,7 @@ def tag(
     from engram.drive.history import delete_tag, map_tags, tag_dict, tag_revision
 
     if name is None:
+        _check_only_listing({"--delete": delete, "--move": move, "--message": bool(message)})
         tags = map_tags(map_path)
         if as_json:
             print(json.dumps(tags))
@@ -141,6 +143,16 @@ def tag(
     else:
         what = "is no longer" if delete else "is"
         typer.echo(f"revision {done['revision']} {what} tagged {done['name']}")
+
+
+def _check_only_listing(given: dict[str, bool]) -> None:
+    """Without a name tags are listed: what would change one is not passed over in silence.
+
+    Raises:
+        ConfigError: an option is given that needs a name.
+    """
+    for flag in (flag for flag, is_given in given.items() if is_given):
+        raise ConfigError(f"{flag} needs the NAME of a tag: engram tag MAP NAME {flag}")
 
 
 def revert(

@@ -14,6 +14,8 @@ from engram.experience.graph import ExperienceGraph
 from engram.experience.model import Session, SessionId
 
 STRETCH_M = 50.0
+# Shorter ones are finer than nodes lie, and their numbers would overflow.
+_LEAST_STRETCH_M = 1.0
 # A node in the very place of another is still one step away.
 _LEAST_STEP_M = 1e-3
 
@@ -49,10 +51,12 @@ def regions_of(
         stretch_m: length of a stretch, metres.
 
     Raises:
-        InputError: the length is not positive.
+        InputError: the length is below 1 m, or not finite.
     """
-    if not (np.isfinite(stretch_m) and stretch_m > 0):
-        raise InputError(f"a stretch is {stretch_m} m long, must be > 0")
+    if not (np.isfinite(stretch_m) and stretch_m >= _LEAST_STRETCH_M):
+        raise InputError(
+            f"a stretch is {stretch_m} m long, must be finite and >= {_LEAST_STRETCH_M:g} m"
+        )
     component = graph.components()
     stretch = np.zeros(len(graph), np.int32)
     oldest = []
