@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
 import pytest
 
 from engram.drive import Settings, map_drive, open_drive, session_of_drive
-from engram.errors import ConfigError, InputError, MapError, StorageFullError
+from engram.errors import ConfigError, InputError, MapError, MapLockedError, StorageFullError
 from engram.fleet import building, find_best_order
 from engram.fleet.scratch import BuildPlan, Scratch, build_folder, sessions_of
 from engram.store import MapStore
@@ -181,6 +182,23 @@ def test_a_folder_that_is_not_there_is_not_made(tmp_path, logs):
         with pytest.raises(InputError, match=rf"{folder} is no folder; make it first"):
             build(tmp_path / folder / "centre.engram", logs, "a", groups=1)
     assert [one.name for one in tmp_path.iterdir()] == ["afile"]
+
+
+def test_of_two_builds_into_one_centre_the_second_is_told_who_builds(tmp_path, logs, monkeypatch):
+    centre = tmp_path / "centre.engram"
+    refused = []
+
+    def meanwhile(*arguments):
+        monkeypatch.setattr(building, "map_groups", map_in_this_process)
+        with pytest.raises(MapLockedError) as raised:
+            build(centre, logs, "a", groups=1)
+        refused.append(str(raised.value))
+        map_in_this_process(*arguments)
+
+    monkeypatch.setattr(building, "map_groups", meanwhile)
+    build(centre, logs, "a", groups=1)
+    assert f"centre.engram is being built by process {os.getpid()} on " in refused[0]
+    assert "nothing new" in build(centre, logs, "a", groups=1).text()
 
 
 def test_a_file_where_the_builds_folder_should_be_is_named_and_stays(tmp_path, logs):

@@ -30,7 +30,7 @@ from engram.fleet.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.merging import Progress, silent
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
-from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sessions_of
+from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sessions_of, sole_builder
 from engram.fleet.workers import map_groups
 from engram.store import MapStore
 
@@ -202,12 +202,29 @@ def build_map(
         ConfigError: the groups do not fit the drives, another build lies there unfinished, there
             are too many groups for all orders, or a drive that judges them is not held out.
         InputError: the folder of the centre is not there.
+        MapLockedError: somebody else builds into this centre.
         WorkerError: workers died again and again.
         EngramError: a drive or a map cannot be used, or what is done not be kept.
     """
     started = time.perf_counter()
     check_parent(centre)
     looked_at = _look_at(drives)
+    with sole_builder(centre):
+        report = _build(centre, looked_at, settings, options, progress, keep=keep)
+    report.seconds = time.perf_counter() - started
+    return report
+
+
+def _build(
+    centre: Path,
+    looked_at: Sequence[Drive],
+    settings: Settings,
+    options: BuildOptions,
+    progress: Progress,
+    *,
+    keep: bool,
+) -> BuildReport:
+    """The build, where nobody else builds into the centre."""
     scratch = Scratch(centre)
     known = _known_sessions(scratch)
     grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
@@ -232,7 +249,6 @@ def build_map(
             scratch.finish()
         else:
             scratch.remove_leftovers()
-    report.seconds = time.perf_counter() - started
     return report
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from engram.errors import ConfigError, MapError
+from engram.errors import ConfigError, MapError, MapLockedError
 from engram.fleet.best_order import BestOrder
 from engram.fleet.group_mapping import GroupResult
 from engram.fleet.keeping import keeping
 from engram.store import MapStore
+from engram.store.lock import WriterLock, current_holder
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +78,31 @@ class MergingBegun:
 def build_folder(centre: Path) -> Path:
     """Where the intermediate maps of a build lie."""
     return centre.with_name(f"{centre.name}.build")
+
+
+@contextmanager
+def sole_builder(centre: Path) -> Iterator[None]:
+    """Nobody else builds into a centre meanwhile: two would map into the same groups' maps.
+
+    The lock lies beside the folder, not in it, for the folder comes and goes; it is gone with its
+    process, so that a build that was killed can go on at once.
+
+    Raises:
+        MapLockedError: somebody else does; names process and host.
+        MapError: the lock cannot be made there.
+    """
+    folder = build_folder(centre)
+    try:
+        lock = WriterLock(folder)
+    except MapLockedError as error:
+        raise MapLockedError(
+            f"{centre} is being built by {current_holder(folder) or 'another process'}; wait until "
+            "it is done, or build another one"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 class Scratch:
