@@ -16,7 +16,7 @@ from engram.fleet.group_mapping import GroupTask
 from engram.fleet.workers import WORDS_AT_ONCE
 from engram.store import MapStore
 
-from .builds import options
+from .builds import build, options
 
 dask = pytest.importorskip("dask", reason="the extra `cluster` is not installed")
 distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
@@ -132,6 +132,26 @@ def test_a_scheduler_that_is_lost_is_told(scheduler, tmp_path, logs, monkeypatch
 
     with pytest.raises(WorkerError, match="was lost, and group 0 with it"):
         run(scheduler, tmp_path, [logs["a"]], close)
+
+
+@pytest.mark.parametrize(
+    ("address", "says"),
+    [
+        ("nonsense", "'nonsense' is no address of a scheduler"),
+        ("carrier-pigeon://10.0.0.5:8786", "is no address of a scheduler"),
+        ("tcp://127.0.0.1:1", "does not answer"),
+    ],
+)
+def test_a_scheduler_that_cannot_be_is_told_before_anything_is_begun(
+    tmp_path, logs, monkeypatch, address, says
+):
+    made = []
+    monkeypatch.setattr(cluster, "_CONNECT_S", 1)
+    monkeypatch.setattr(distributed.Client, "__init__", lambda *_, **__: made.append(address))
+    with pytest.raises(WorkerError, match=says):
+        build(tmp_path / "centre.engram", logs, "a", groups=1, scheduler=address)
+    assert made == []
+    assert not (tmp_path / "centre.engram.build").exists()
 
 
 def test_what_dask_raises_is_told_as_an_error_of_workers():

@@ -22,7 +22,7 @@ from engram.fleet.best_order import (
     find_best_order,
     order_costs,
 )
-from engram.fleet.cluster import map_groups_on_cluster
+from engram.fleet.cluster import check_scheduler, map_groups_on_cluster
 from engram.fleet.docking import merge_maps
 from engram.fleet.drafts import check_parent
 from engram.fleet.group_mapping import GroupResult, GroupTask, fetched
@@ -236,6 +236,8 @@ def _build(
         str(centre), left_out=[drive.name for drive in looked_at if drive.session.id in known]
     )
     if grouped:
+        if options.scheduler is not None:
+            check_scheduler(options.scheduler)
         scratch.begin(_plan(grouped, known, settings, options, keep=keep))
         try:
             _map_and_merge(scratch, grouped, settings, options, progress, report)

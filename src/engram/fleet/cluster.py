@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 from collections.abc import Callable, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 from uuid import uuid4
@@ -78,6 +79,39 @@ def map_groups_on_cluster(
                 advance(word)
 
 
+def check_scheduler(scheduler: str) -> None:
+    """Asks a scheduler whether it is there, before anything is begun.
+
+    No client is made for that: one that was made in vain tries for half a minute to say goodbye.
+
+    Raises:
+        MissingExtraError: Dask is not installed.
+        WorkerError: the address is none, or nobody answers there.
+    """
+    try:
+        from distributed import Security
+        from distributed.comm import connect
+    except ImportError as error:
+        raise _missing() from error
+
+    async def greet() -> None:
+        ways = Security().get_connection_args("client")
+        comm = await connect(scheduler, timeout=_CONNECT_S, **ways)
+        await comm.close()
+
+    try:
+        # On a thread of its own: the caller's may run an event loop, as in a notebook.
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(lambda: asyncio.run(greet())).result()
+    except OSError as error:
+        raise _silent(scheduler, error) from error
+    except Exception as error:  # each of Dask's ways to connect has errors of its own
+        raise WorkerError(
+            f"{scheduler!r} is no address of a scheduler that can be used ({error}); one is like "
+            "tcp://10.0.0.5:8786"
+        ) from error
+
+
 def _connected(scheduler: str) -> Client:
     """A client of its own, which is nobody's default.
 
@@ -88,13 +122,23 @@ def _connected(scheduler: str) -> Client:
     try:
         from distributed import Client
     except ImportError as error:
-        raise MissingExtraError(
-            "building on a cluster needs Dask: pip install 'engram[cluster]'"
-        ) from error
+        raise _missing() from error
+    check_scheduler(scheduler)
     try:
         return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise WorkerError(f"the scheduler at {scheduler} does not answer: {error}") from error
+        raise _silent(scheduler, error) from error
+
+
+def _missing() -> MissingExtraError:
+    return MissingExtraError("building on a cluster needs Dask: pip install 'engram[cluster]'")
+
+
+def _silent(scheduler: str, error: Exception) -> WorkerError:
+    return WorkerError(
+        f"the scheduler at {scheduler} does not answer ({error}); look whether it runs and can be "
+        "reached from here"
+    )
 
 
 def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
