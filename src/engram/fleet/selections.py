@@ -219,9 +219,10 @@ def _near_start(stock: Stock, options: DownloadOptions) -> tuple[Mask, int]:
     allowed_h = options.window_min / 60
     sent = np.nan_to_num(apart, nan=np.inf) <= allowed_h + _ROUNDING_H
     if not sent.any():
+        minutes = round(60 * options.start_h) % (24 * 60)
         raise InputError(
             f"no node was saved within {allowed_h * 60:.0f} minutes of "
-            f"{int(options.start_h)}:{round(options.start_h % 1 * 60):02d}; widen the --window"
+            f"{minutes // 60}:{minutes % 60:02d}; widen the --window"
         )
     return sent, int(np.isnan(hours).sum())
 
