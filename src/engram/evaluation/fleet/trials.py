@@ -105,10 +105,13 @@ def try_downloads_for(
         progress=silent,
         start=partial(_start, plan, fold, drive),
     )
-    first = [COPY]
+    found, refused = trials({COPY: DownloadOptions(COPY)}), {}
     if hour_of_day(drive.session, drive.session.start_ns) is not None:
-        first += _BY_HOUR
-    found = trials({one: DownloadOptions(one) for one in first})
+        for one in _BY_HOUR:
+            try:
+                found += trials({one: DownloadOptions(one)})
+            except InputError as error:  # nothing was driven at such an hour
+                refused[one] = str(error)
     sizes = {one.name: one.report.size_bytes for one in found}
     budgets = {QUARTER: sizes[COPY] // 4, TENTH: sizes[COPY] // 10}
     budgets |= {
@@ -116,7 +119,6 @@ def try_downloads_for(
         for asked, like in ((AS_TOD, TOD), (AS_TOD_PATHS, TOD_PATHS))
         if like in sizes
     }
-    refused = {}
     for one, room in budgets.items():
         try:
             found += trials({one: DownloadOptions("budget", budget_bytes=room)})
