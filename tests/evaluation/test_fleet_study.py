@@ -12,7 +12,7 @@ import pytest
 from tests.evaluation.campaigns import write_campaign
 
 from engram.drive import Settings, open_map
-from engram.errors import ConfigError
+from engram.errors import ConfigError, InputError
 from engram.evaluation import DriveSet
 from engram.evaluation.fleet import (
     FleetOptions,
@@ -20,6 +20,7 @@ from engram.evaluation.fleet import (
     Protocol,
     fleet_tasks,
     make_fleet_plan,
+    trials,
     write_fleet_report,
 )
 from engram.evaluation.fleet.experiments import pair_merges
@@ -187,6 +188,30 @@ def test_downloads_are_tried_for_as_many_held_out_drives_as_asked_for(plan: Flee
             assert {*names, *kept["refused"]} >= {"budget 1/4", "budget 1/10", "budget as tod"}
             for one in kept["tried"]:
                 assert one["nodes"] <= one["united"] <= one["of_nodes"]
+
+
+def test_where_one_download_finds_nothing_the_others_are_tried(
+    plan: FleetPlan, tmp_path: Path, monkeypatch
+) -> None:
+    """As where nobody drove at the hour of a held-out drive."""
+    other, (arm,), fold = replace(plan, work=tmp_path), plan.arms, plan.folds[0]
+    shutil.copytree(plan.folder(arm, fold), other.folder(arm, fold))
+    drive = plan.held_out(fold)[0]
+    trials.trials_path(other, arm, fold, drive).unlink()
+    tried = trials.try_downloads
+
+    def none_by_hour(centre, wanted, **options):
+        if "tod+paths" in wanted:
+            raise InputError("no epoch has data")
+        return tried(centre, wanted, **options)
+
+    monkeypatch.setattr(trials, "try_downloads", none_by_hour)
+    trials.try_downloads_for(other, arm, fold, "shared", drive)
+    kept = json.loads(trials.trials_path(other, arm, fold, drive).read_text())
+    assert kept["refused"]["tod+paths"] == "no epoch has data"
+    names = [one["name"] for one in kept["tried"]]
+    assert names[:2] == ["copy", "tod"]
+    assert not {"tod+paths", "budget as tod+paths"} & set(names)
 
 
 def test_held_out_validation_and_groups_of_the_orders_are_apart(plan: FleetPlan) -> None:
