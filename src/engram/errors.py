@@ -22,6 +22,8 @@
 Not localising is never an error: it is a status of the result.
 """
 
+import errno
+
 
 class EngramError(Exception):
     """Base of all errors that Engram raises on purpose."""
@@ -85,3 +87,13 @@ class WorkerError(EngramError):
 
 class MissingExtraError(EngramError, ImportError):
     """An optional dependency is not installed."""
+
+
+def storage_full(error: OSError, where: object) -> StorageFullError | None:
+    """What to raise where the file system says that no space is left; None where it says else."""
+    if error.errno not in {errno.ENOSPC, errno.EDQUOT}:
+        return None
+    return StorageFullError(
+        f"{where}: no space is left; free some and give the same command again: what was finished "
+        "is kept"
+    )

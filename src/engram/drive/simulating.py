@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import multiprocessing
 import os
 from collections.abc import Callable, Sequence
@@ -26,6 +25,7 @@ from engram.errors import (
     SequenceError,
     StorageFullError,
     WorkerError,
+    storage_full,
 )
 from engram.frontend import Frontend
 from engram.geometry import SE3
@@ -301,9 +301,6 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def _cannot_write(path: Path, error: OSError) -> SequenceError | StorageFullError:
-    if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-        return StorageFullError(
-            f"{path}: no space is left; free some and give the same command again: finished "
-            "sessions are kept"
-        )
-    return SequenceError(f"{path}: cannot be written: {error.strerror}")
+    return storage_full(error, path) or SequenceError(
+        f"{path}: cannot be written: {error.strerror}"
+    )

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engram.errors import InputError, StorageFullError
+from engram.errors import InputError, storage_full
 
 
 @contextmanager
@@ -22,9 +21,6 @@ def writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         where = error.filename or folder
-        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            raise StorageFullError(
-                f"{where}: no space is left; free some and give the same command again: what was "
-                "finished is kept"
-            ) from error
+        if full := storage_full(error, where):
+            raise full from error
         raise InputError(f"{where}: cannot be written: {error.strerror or error}") from error

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engram.errors import MapError, StorageFullError
+from engram.errors import MapError, storage_full
 
 
 @contextmanager
@@ -22,11 +21,8 @@ def keeping(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         where = error.filename or folder
-        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
-            raise StorageFullError(
-                f"{where}: no space is left; free some and give the same command again: what was "
-                "done is kept"
-            ) from error
+        if full := storage_full(error, where):
+            raise full from error
         raise MapError(
             f"{where}: {error.strerror or error}; a build keeps its maps in {folder}: it must be a "
             "folder that can be written to, or one that can be made there"
