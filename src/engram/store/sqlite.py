@@ -28,12 +28,15 @@ from sqlalchemy import (
     insert,
     text,
 )
+from sqlalchemy.dialects import registry
 from sqlalchemy.dialects import sqlite as sqlite_dialect
 from sqlalchemy.dialects.sqlite import Insert
+from sqlalchemy.dialects.sqlite.pysqlite import SQLiteDialect_pysqlite
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import QueuePool
 from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.compiler import SQLCompiler
+from sqlalchemy.util import LRUCache
 
 from engram import __version__
 from engram.errors import (
@@ -312,11 +315,37 @@ def _connect(uri: str, prepare: Callable[[sqlite3.Connection], None]) -> sqlite3
     return connection
 
 
+class _MapDialect(SQLiteDialect_pysqlite):
+    """SQLite's dialect, equal for all maps: a statement is compiled once, not for every map.
+
+    SQLAlchemy keys compiled statements by the engine's dialect. A process that opens many small
+    maps would spend half of its time on compiling the same statements again.
+    """
+
+    supports_statement_cache = True
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+
+registry.register("engrammap", __name__, _MapDialect.__name__)
+_COMPILED: LRUCache[Any, Any] = LRUCache(500)
+
+
 def _engine(uri: str, prepare: Callable[[sqlite3.Connection], None]) -> Engine:
     def connect() -> sqlite3.Connection:
         return _connect(uri, prepare)
 
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, max_overflow=-1)
+    engine = create_engine(
+        "engrammap://",
+        creator=connect,
+        poolclass=QueuePool,
+        max_overflow=-1,
+        execution_options={"compiled_cache": _COMPILED},
+    )
     if prepare is _prepare_writer:
         # Take the write lock at once: a transaction that upgrades later can fail half way.
         @event.listens_for(engine, "begin")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_, select
 
@@ -34,6 +35,7 @@ class View:
         seen = committed if self.own is None else or_(committed, revisions.c.key == self.own)
         return select(revisions.c.key).where(seen)
 
+    @lru_cache(maxsize=256)  # noqa: B019  (views are values; building one statement takes 1 ms)
     def select(self, table: Table) -> Select[tuple[object, ...]]:
         """All columns of the rows that are seen.
 
