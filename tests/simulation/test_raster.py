@@ -86,7 +86,7 @@ def _light(**changes: object) -> _core.Light:
     return _core.Light.of(**{**values, **changes})
 
 
-def _floor_and_roof(texture: int, roof: bool) -> Mesh:
+def _floor_and_roof(texture: int, roof: bool, flags: SurfaceFlag = SurfaceFlag.TWO_SIDED) -> Mesh:
     builder = MeshBuilder()
     square = [(0, 1), (1, 1), (1, 0), (0, 0)]
     builder.quad(
@@ -94,30 +94,39 @@ def _floor_and_roof(texture: int, roof: bool) -> Mesh:
     )
     if roof:
         corners = [(2, 6, 3), (6, 6, 3), (6, 10, 3), (2, 10, 3)]
-        builder.quad(corners, square, texture, Kind.BUILDING, SurfaceFlag.TWO_SIDED)
+        builder.quad(corners, square, texture, Kind.BUILDING, flags)
     return builder.build()
 
 
-def test_a_roof_throws_its_shadow_where_the_sun_sends_it() -> None:
-    sun = np.array([0.6, 0.0, 0.8], np.float32)  # from the east: shadows lie 0.75 h to the west
+def _ground_dimmed(roof_flags: SurfaceFlag, at: tuple[float, float], **light: object) -> float:
+    """The ground's luminance at (east, north) with a roof at (4, 8) over that without."""
     eye = np.array([0.0, -4.0, 1.7])
     found = []
     for roof in (False, True):
         scene, texture = _scene()
-        _add(scene, _floor_and_roof(texture, roof))
-        found.append(scene.render(_CAMERA, _NORTH, eye, _light(sun=sun, sun_power=3.0))[0][0])
-    lit, shaded = found
+        _add(scene, _floor_and_roof(texture, roof, roof_flags))
+        found.append(scene.render(_CAMERA, _NORTH, eye, _light(**light))[0][0])
+    forward, down = at[1] - eye[1], eye[2]
+    column = round(31.5 + 60 * (at[0] - eye[0]) / forward)
+    row = round(23.5 + 60 * down / forward)
+    return float(found[1][row, column] / found[0][row, column])
 
-    def ratio_at(x: float, y: float) -> float:
-        forward, down = y - eye[1], eye[2]
-        column = round(31.5 + 60 * (x - eye[0]) / forward)
-        row = round(23.5 + 60 * down / forward)
-        return float(shaded[row, column] / lit[row, column])
 
+def test_a_roof_throws_its_shadow_where_the_sun_sends_it() -> None:
+    sun = np.array([0.6, 0.0, 0.8], np.float32)  # from the east: shadows lie 0.75 h to the west
+    roof = SurfaceFlag.TWO_SIDED
     # Under the sun's ray through the roof's middle; half of the light is haze's.
-    assert ratio_at(4 - 2.25, 8.0) < 0.65
-    assert ratio_at(-2.5, 8.0) > 0.95
-    assert ratio_at(-1.5, 4.0) > 0.95
+    assert _ground_dimmed(roof, (4 - 2.25, 8.0), sun=sun, sun_power=3.0) < 0.65
+    assert _ground_dimmed(roof, (-2.5, 8.0), sun=sun, sun_power=3.0) > 0.95
+    assert _ground_dimmed(roof, (-1.5, 4.0), sun=sun, sun_power=3.0) > 0.95
+
+
+def test_a_roof_hides_the_sky_from_the_ground_below_and_a_slender_thing_does_not() -> None:
+    sun = np.array([0.6, 0.0, 0.8], np.float32)
+    slender = SurfaceFlag.TWO_SIDED | SurfaceFlag.SLENDER
+    assert _ground_dimmed(SurfaceFlag.TWO_SIDED, (4.0, 8.0)) < 0.8
+    assert _ground_dimmed(slender, (4.0, 8.0)) == pytest.approx(1.0, abs=1e-6)
+    assert _ground_dimmed(slender, (4 - 2.25, 8.0), sun=sun, sun_power=3.0) < 0.8  # a shadow, still
 
 
 def test_the_right_eye_sees_things_further_left() -> None:

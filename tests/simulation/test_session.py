@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tests.simulation.conftest import small
 
 from engram.errors import ConfigError
-from engram.simulation import Campaign, Kind, SimulatedDrive, campaign_named
+from engram.simulation import Campaign, Kind, SimulatedDrive, Size, campaign_named
 from engram.simulation.camera_model import Lens
 
 
@@ -161,3 +161,15 @@ def test_campaigns_of_few_drives_meet_sun_and_rain(name: str, seed: int) -> None
     assert drawn["overcast"] in (1, 2)
     assert 1 <= drawn["rain"] + drawn["showers"] + drawn["damp"] <= 3
     assert drawn["rain"] + drawn["showers"] >= 1
+
+
+@given(seed=st.integers(0, 2**31 - 1), size=st.sampled_from(Size))
+@settings(max_examples=20)
+def test_begbroke24h_is_as_wet_by_night_as_by_day(seed: int, size: Size) -> None:
+    whole = campaign_named("begbroke24h", seed, size).sessions
+    by_day = [one for one in whole if 6 <= one.start.hour < 18]
+    shares = [
+        np.mean([one.weather in ("rain", "showers") for one in part])
+        for part in (by_day, [one for one in whole if one not in by_day])
+    ]
+    assert np.allclose(shares, 0.22, atol=0.05)

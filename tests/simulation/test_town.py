@@ -4,7 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
@@ -114,6 +114,14 @@ def test_clouds_open_and_close_along_the_way() -> None:
     assert (power > 0.9 * power.max()).any()
     changes = int((np.abs(np.diff(power > power.max() / 2))).sum())
     assert 2 <= changes <= 20
+
+
+@given(seed=st.integers(0, 2**31 - 1), weather=st.sampled_from(sorted(WEATHERS)))
+@settings(max_examples=50)
+def test_the_sky_does_not_jump_along_the_way(seed: int, weather: str) -> None:
+    conditions = Conditions(datetime(2025, 7, 1, 12, tzinfo=UTC), weather, seed)
+    sky = np.array([conditions.at(0.7 * k, 0.14 * k).sky_power for k in range(600)])
+    assert np.abs(np.diff(np.log(sky))).max() < 0.05
 
 
 def test_lamps_are_on_by_night_and_off_by_day() -> None:

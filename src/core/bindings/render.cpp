@@ -576,7 +576,8 @@ void Scene::build_openness() {
   openness_.resize(heights.size());
   const auto order = in_window(window, 1, static_cast<int>(meshes_.size()));
   ENGRAM_CALL(raster_window, mesh_table_.data(), texture_table_.data(), order.data(),
-              static_cast<int32_t>(order.size() / 2), window, kNoShadow | kCutout, heights.data());
+              static_cast<int32_t>(order.size() / 2), window, kNoShadow | kCutout | kSlender,
+              heights.data());
   ENGRAM_CALL(openness_of, heights.data(), window.width, window.height, kOpennessCell_m,
               openness_.data());
   openness_map_.share = openness_.data();

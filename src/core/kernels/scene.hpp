@@ -16,6 +16,7 @@ enum SurfaceFlag : uint32_t {
   kNoShadow = 1u << 4, // throws no shadow
   kRoad = 1u << 5,     // ground that traffic drives on: wheel tracks in snow
   kCrossroad = 1u << 6, // ground where it crosses: snow is worn all over
+  kSlender = 1u << 7,   // throws shadows, but hides next to nothing of the sky: posts, limbs
 };
 
 // One convex planar polygon of four vertices (a triangle repeats one). Texture coordinates are

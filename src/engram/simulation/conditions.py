@@ -39,10 +39,10 @@ WEATHERS: dict[str, Weather] = {
     "broken": Weather(cloud=0.55, changes=0.45),
     "overcast": Weather(cloud=1.0, fog_per_m=0.0008),
     "fog": Weather(cloud=1.0, fog_per_m=0.035),
-    "rain": Weather(cloud=1.0, fog_per_m=0.006, rain=0.8, wet=1.0),
-    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.002, rain=0.5, wet=0.7),
+    "rain": Weather(cloud=1.0, fog_per_m=0.006, rain=0.88, wet=1.0),
+    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.002, rain=0.58, wet=0.7),
     "damp": Weather(cloud=0.9, changes=0.2, fog_per_m=0.001, wet=0.7),
-    "snow": Weather(cloud=1.0, fog_per_m=0.008, snow=0.95),
+    "snow": Weather(cloud=1.0, fog_per_m=0.010, snow=0.95),
     "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.45),
 }
 
@@ -142,7 +142,7 @@ class Conditions:
         return Moment(
             sun_direction=sun if sun[2] > 0 else np.array([0.0, 0.0, 1.0]),
             sun_power=clear_sun_power(float(sun[2])) * (1 - shade),
-            sky_power=clear * (1 + 0.9 * cloud - 0.45 * (rain > 0)),
+            sky_power=clear * (1 + 0.9 * cloud - 0.45 * _darkening(rain)),
             cloud=cloud,
             cloud_shift=(0.31 * elapsed_s + 17.0 * (self.seed % 97), 0.07 * elapsed_s),
             fog_per_m=weather.fog_per_m * (1 + 0.5 * swing * (weather.fog_per_m > 0.01)),
@@ -166,6 +166,11 @@ def _drift(seed: int, driven_m: float) -> float:
     phases = rng.uniform(0, 2 * np.pi, 3)
     waves = np.sin(2 * np.pi * driven_m / lengths_m + phases)
     return float(np.tanh(0.9 * waves.sum()))
+
+
+def _darkening(rain: float) -> float:
+    """How much of a rain cloud stands overhead, 0…1: all of it before the rain is half as hard."""
+    return min(rain / 0.4, 1.0)
 
 
 def _shade(cloud: float, drift: float) -> float:

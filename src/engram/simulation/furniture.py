@@ -164,7 +164,8 @@ def add_post(
 ) -> None:
     """A square post on a point (3,)."""
     centre = foot + _up(tall_m / 2)
-    builder.box(centre, _upright(half_m, tall_m), texture, kind, tint=tint)
+    flags = SurfaceFlag.SLENDER if half_m <= 0.2 else SurfaceFlag.PLAIN
+    builder.box(centre, _upright(half_m, tall_m), texture, kind, flags=flags, tint=tint)
 
 
 def add_lamp(builder: MeshBuilder, materials: Materials, foot: Vector, arm: Vector) -> Vector:
@@ -174,9 +175,10 @@ def add_lamp(builder: MeshBuilder, materials: Materials, foot: Vector, arm: Vect
     head = foot + arm * 1.3 + _up(LAMP_HEIGHT_M + 0.1)
     middle = foot + arm * 0.65 + _up(LAMP_HEIGHT_M + 0.06)
     axes = np.array([arm * 0.65, side * 0.035, [0, 0, 0.035]])
-    builder.box(middle, axes, materials.metal, Kind.FURNITURE, faces="ewnstd")
+    slender = SurfaceFlag.SLENDER
+    builder.box(middle, axes, materials.metal, Kind.FURNITURE, flags=slender, faces="ewnstd")
     axes = np.array([arm * 0.32, side * 0.11, [0, 0, 0.05]])
-    builder.box(head, axes, materials.metal, Kind.FURNITURE, faces="ewnst")
+    builder.box(head, axes, materials.metal, Kind.FURNITURE, flags=slender, faces="ewnst")
     light = head - _up(0.055)
     corners = [light - axes[0] + axes[1], light + axes[0] + axes[1]]
     corners += [light + axes[0] - axes[1], light - axes[0] - axes[1]]
@@ -234,7 +236,8 @@ def _add_limb(
     across *= half_m / np.linalg.norm(across)
     other = np.cross(along, across) / np.linalg.norm(along)
     axes = [across, other, along / 2]
-    wood.box((start + end) / 2, axes, materials.bark, Kind.VEGETATION, faces="ewns")
+    slender = SurfaceFlag.SLENDER
+    wood.box((start + end) / 2, axes, materials.bark, Kind.VEGETATION, flags=slender, faces="ewns")
 
 
 def add_hedge(

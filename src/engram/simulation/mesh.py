@@ -21,6 +21,7 @@ class SurfaceFlag(IntFlag):
     NO_SHADOW = 16
     ROAD = 32
     CROSSROAD = 64
+    SLENDER = 128
 
 
 class Kind(IntEnum):

@@ -333,7 +333,8 @@ def carriageway(
         rows, columns = rng.integers(20, 160), rng.integers(12, 70)
         albedo[top : top + rows, left : left + columns] *= rng.uniform(0.6, 1.4)
     for _ in range(int(per_m2 / 9)):
-        steps = rng.normal(0, 12, (12, 2))
+        heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.5, 12))
+        steps = 15 * np.column_stack([np.cos(heading), np.sin(heading)])
         crack = np.cumsum(np.vstack([[rng.integers(0, w), rng.integers(0, h)], steps]), 0)
         points = [crack.astype(np.int32)]
         cv2.polylines(albedo, points, False, 0.05, 1)
