@@ -1,7 +1,7 @@
 """Random small maps handed in to a centre: what must hold whatever they look like (SPEC §7).
 
-    python benchmarks/merge_graphs.py                          # 10,000 cases
-    python benchmarks/merge_graphs.py --cases 200 --workers 2
+    python benchmarks/merge_graphs.py                                   # 10,000 cases
+    python benchmarks/merge_graphs.py --first 2000 --cases 500          # some of them
 
 A case is a few robots' maps: drives past places of a road in one of two looks, strung by
 odometry with holes and branches, tied here and there; some robots went out with the map of another
@@ -13,7 +13,10 @@ For each case:
 - nodes that hang together in a robot's map do so in the centre, and it falls into no more parts
   than both had before;
 - handing any map in again changes nothing;
-- maps of the same content, written in another order, give the same centre.
+- maps of the same content, written in another order, give the same centre;
+- a download from it, by a policy drawn at random, is sound, falls into no more parts than the centre
+  makes of the same nodes, has the same bytes when it is made again, and changes nothing when it is
+  handed back.
 
 Prints every violation with its seed, and exits with 1 if there is one.
 """
@@ -27,15 +30,17 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from engram.drive import OpenMap, Settings
+from engram.errors import InputError
 from engram.experience.model import (
     Attempt,
+    Clock,
     Edge,
     EdgeKind,
     Node,
@@ -46,7 +51,14 @@ from engram.experience.model import (
     SessionId,
     path_id,
 )
-from engram.fleet import MergeOptions, MergeReport, merge_maps
+from engram.fleet import (
+    DownloadOptions,
+    MergeOptions,
+    MergeReport,
+    download,
+    merge_maps,
+    silent,
+)
 from engram.fleet.attempts import from_records
 from engram.geometry import SE3
 from engram.store import MapStore
@@ -54,6 +66,8 @@ from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_by
 
 OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")
 PLACES, APPEARANCES, LANDMARKS = 16, 2, 70
+# Drives set out some hours apart, at all hours of day.
+APART_NS = 5 * 3600 * 10**9
 SIGMA = np.diag([0.02**2] * 3 + [0.003**2] * 3)
 
 
@@ -103,8 +117,9 @@ def blob_of(place: int, appearance: int, look: int) -> bytes:
 
 def add_drive(made: RandomMap, number: int, rng: random.Random) -> None:
     """One drive past a stretch of the road, saved here and there."""
-    start_ns = 1_000_000_000 * (number + 1)
+    start_ns = APART_NS * (number + 1)
     drive = drive_of(f"r{rng.randrange(3)}", start_ns, str(number))
+    drive = replace(drive, clock=Clock.UTC, longitude_deg=0.0)
     made.sessions.append(drive)
     first, appearance = rng.randrange(PLACES), rng.randrange(APPEARANCES)
     own: list[NodeId] = []
@@ -219,7 +234,20 @@ def remembered(path: Path) -> Counter[tuple[SessionId, int, int, bool, int]]:
     return Counter(zip(sessions, *(column.tolist() for column in columns), strict=True))
 
 
-def violations(seed: int) -> Iterator[str]:
+@dataclass
+class Case:
+    """What one case came to.
+
+    Attributes:
+        violations: in words.
+        sent: by which policy a download was made; "" where nothing fitted it.
+    """
+
+    violations: list[str]
+    sent: str = ""
+
+
+def violations(seed: int, case: Case) -> Iterator[str]:
     """What does not hold for one case."""
     fleet = random_fleet(seed)
     with tempfile.TemporaryDirectory(prefix="engram-graphs-") as made:
@@ -247,6 +275,7 @@ def violations(seed: int) -> Iterator[str]:
         if problems := MapStore.check(centre).problems:
             yield f"the centre is not sound: {problems}"
         yield from _again(centre, robots)
+        yield from _downloads(centre, seed, case)
         for number, content in enumerate(fleet):
             other = folder / f"twin-{number}.engram"
             write(content, other, order=seed + 1)
@@ -263,17 +292,60 @@ def _again(centre: Path, robots: list[Path]) -> Iterator[str]:
             yield f"handing in {number} again changes the centre: {report.to_dict()}"
 
 
+def _downloads(centre: Path, seed: int, case: Case) -> Iterator[str]:
+    rng = random.Random(seed)
+    ours, _ = parts(centre)
+    options = _mission(rng, centre, sorted(ours))
+    copies = [centre.with_name(f"download-{number}.engram") for number in range(2)]
+    try:
+        for copy in copies:
+            download(centre, copy, options, progress=silent)
+    except InputError:
+        return  # the centre has nothing for that hour, or the budget is too small for one node
+    case.sent = options.policy
+    if copies[0].read_bytes() != copies[1].read_bytes():
+        yield f"{options}: made again it has other bytes"
+    if problems := MapStore.check(copies[0]).problems:
+        yield f"{options}: not sound: {problems}"
+    with OpenMap(MapStore.open(copies[0])) as opened:
+        sent = [node.id for node in opened.graph.nodes]
+        apart = int(opened.graph.components().max(initial=-1)) + 1
+    if apart > len({ours[node] for node in sent}):
+        yield f"{options}: {apart} parts of {len(sent)} nodes, where the centre has fewer"
+    known = content_hash(centre)
+    merged(centre, copies[0])
+    if content_hash(centre) != known:
+        yield f"{options}: handing it back changes the centre"
+
+
+def _mission(rng: random.Random, centre: Path, nodes: list[NodeId]) -> DownloadOptions:
+    policy = rng.choice(["copy", "tod", "paths", "tod+paths", "budget", "region"])
+    hour = float(rng.randrange(24))
+    if policy == "region" and nodes:
+        return DownloadOptions(policy, near=(str(rng.choice(nodes)),), radius_m=3.0)
+    if policy == "budget":
+        size = rng.randrange(centre.stat().st_size // 2, centre.stat().st_size)
+        return DownloadOptions(policy, start_h=hour, end_h=hour, budget_bytes=size)
+    if policy == "tod":
+        return DownloadOptions(policy, start_h=hour)
+    if policy in ("paths", "tod+paths"):
+        return DownloadOptions(policy, start_h=hour, epoch_min=360.0)
+    return DownloadOptions(policy)
+
+
 def content_hash(path: Path) -> str:
     with MapStore.open(path) as store:
         return store.content_hash()
 
 
-def told(seed: int) -> list[str]:
+def told(seed: int) -> Case:
     """For a pool of processes."""
+    case = Case([])
     try:
-        return list(violations(seed))
+        case.violations.extend(violations(seed, case))
     except Exception as error:  # a crash is a violation
-        return [f"{type(error).__name__}: {error}"]
+        case.violations.append(f"{type(error).__name__}: {error}")
+    return case
 
 
 def main() -> None:
@@ -284,14 +356,16 @@ def main() -> None:
     asked = parser.parse_args()
     seeds = range(asked.first, asked.first + asked.cases)
     found = 0
+    sent: Counter[str] = Counter()
     with ProcessPoolExecutor(asked.workers) as pool:
-        for seed, words in zip(seeds, pool.map(told, seeds, chunksize=4), strict=True):
-            for word in words:
+        for seed, case in zip(seeds, pool.map(told, seeds, chunksize=4), strict=True):
+            sent[case.sent or "nothing fitted"] += 1
+            for word in case.violations:
                 found += 1
                 print(f"seed {seed}: {word}", flush=True)
             if (seed - asked.first + 1) % 500 == 0:
                 print(f"{seed - asked.first + 1} cases, {found} violations", flush=True)
-    print(f"{asked.cases} cases, {found} violations")
+    print(f"{asked.cases} cases, {found} violations; downloads: {dict(sent.most_common())}")
     sys.exit(found > 0)
 
 

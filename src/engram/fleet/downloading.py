@@ -379,7 +379,8 @@ def _report(
         info = written.info()
         content_hash = written.content_hash()
     ends = np.array(
-        [(stock.index[edge.a], stock.index[edge.b]) for edge in (*stock.edges, *done.bridges)]
+        [(stock.index[edge.a], stock.index[edge.b]) for edge in (*stock.edges, *done.bridges)],
+        np.int64,
     ).reshape(-1, 2)
     inner = ends[sent[ends].all(axis=1)]
     return DownloadReport(
