@@ -14,8 +14,8 @@ For each case:
   than both had before;
 - handing any map in again changes nothing;
 - maps of the same content, written in another order, give the same centre;
-- a download from it, by a policy drawn at random, is sound, falls into no more parts than the centre
-  makes of the same nodes, has the same bytes when it is made again, and changes nothing when it is
+- a download from it, by a policy drawn at random, is sound, falls into no more parts than the same
+  nodes do in the centre, has the same bytes when it is made again, and changes nothing when it is
   handed back.
 
 Prints every violation with its seed, and exits with 1 if there is one.
