@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from datetime import timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +23,11 @@ from engram.evaluation.store import read_runs
 from engram.measures import Drive, route_not_localised
 from engram.simulation import Campaign, Size, campaign_named
 from engram.simulation.calibration import LOOP_M, Row
+from engram.simulation.campaigns import by_day
 
 LAPS = 40
 # The laps whose five folds leave 20 to build from.
 _EARLY_LAPS = 25
-_SUMMER_TIME = timedelta(hours=1)
 _EVERYTHING = Configuration("distance", UNLIMITED)
 # Counts only, more of them than there are candidates, one after another: the first success ends it.
 _EXHAUSTIVE = MapOptions(policy="distance", lanes=1, rounds=UNLIMITED, relocaliser="fabmap")
@@ -99,7 +99,7 @@ def _result(plan: Plan) -> MonthResult:
         one.share_localised for fold in plan.folds for one in built_map(plan, fold).sessions
     ]
     held_out: list[Drive] = []
-    by_day: list[Drive] = []
+    of_day: list[Drive] = []
     candidates, succeeded = [], []
     for number, lap in enumerate(plan.drives.drives):
         runs = read_runs(plan.runs_path(number, "memo"))
@@ -107,8 +107,8 @@ def _result(plan: Plan) -> MonthResult:
             raise SequenceError(f"{lap.path}: was not localised; run the same again")
         row = runs.configurations.index(_EVERYTHING)
         held_out.append(Drive(runs.step_m, runs.matched[row]))
-        if 7 <= _local_hour(lap.session.start_ns) < 19:
-            by_day.append(held_out[-1])
+        if by_day(datetime.fromtimestamp(lap.session.start_ns / 1e9, UTC)):
+            of_day.append(held_out[-1])
         candidates.append(runs.candidates[row])
         succeeded.append(runs.succeeded[row])
     tried = np.concatenate(candidates)
@@ -116,13 +116,9 @@ def _result(plan: Plan) -> MonthResult:
         saved=1 - float(np.mean(localised)),
         candidates=float(tried.mean()),
         can_succeed=float(np.concatenate(succeeded).sum() / max(tried.sum(), 1)),
-        fails_by_day=route_not_localised(by_day),
+        fails_by_day=route_not_localised(of_day),
         fails=route_not_localised(held_out),
     )
-
-
-def _local_hour(start_ns: int) -> float:
-    return (start_ns / 3.6e12 + _SUMMER_TIME.total_seconds() / 3600) % 24
 
 
 def month_laps(folder: Path, campaign: Campaign) -> list[Path]:

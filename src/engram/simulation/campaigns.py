@@ -158,7 +158,7 @@ def _dealt(rng: np.random.Generator, count: int) -> list[str]:
     return [str(names[k]) for k in rng.permutation(dealt)]
 
 
-def _by_day(start: datetime) -> bool:
+def by_day(start: datetime) -> bool:
     """Whether a drive sets out between 7 and 19 h, summer time."""
     return 7 <= (start + _SUMMER_TIME).hour < 19
 
@@ -215,8 +215,8 @@ def _begbroke(seed: int, size: Size) -> Campaign:
     """107 laps in two months, 7 h to 19 h local; at standard size begbroke24h's by day."""
     if size is Size.STANDARD:
         whole = _begbroke24h(seed, size)
-        by_day = tuple(one for one in whole.sessions if _by_day(one.start))
-        return replace(whole, name="begbroke", sessions=by_day)
+        laps = tuple(lap for lap in whole.sessions if by_day(lap.start))
+        return replace(whole, name="begbroke", sessions=laps)
     rng = np.random.default_rng([seed, 0xBE6])
     starts = _spread(rng, datetime(2025, 6, 1, tzinfo=UTC), 61, 107, (6.0, 18.0))
     sessions = _planned(
@@ -232,7 +232,7 @@ def _begbroke24h(seed: int, size: Size) -> Campaign:
     first = datetime(2025, 8, 6, tzinfo=UTC)
     minutes = np.arange(count) * 30 * 24 * 60 / count + rng.uniform(-12, 12, count) + 15
     starts = [first + timedelta(minutes=round(float(m))) for m in minutes]
-    day = [_by_day(start) for start in starts]
+    day = [by_day(start) for start in starts]
     of_day, of_night = iter(_dealt(rng, sum(day))), iter(_dealt(rng, count - sum(day)))
     weathers = [next(of_day if light else of_night) for light in day]
     sessions = _planned("begbroke24h", seed, starts, weathers, ["wildcat"] * count, [False] * count)
