@@ -35,23 +35,13 @@ class View:
         seen = committed if self.own is None else or_(committed, revisions.c.key == self.own)
         return select(revisions.c.key).where(seen)
 
-    @lru_cache(maxsize=256)  # noqa: B019  (views are values; building one statement takes 1 ms)
     def select(self, table: Table) -> Select[tuple[object, ...]]:
         """All columns of the rows that are seen.
 
         Ordered by their revision's place in history, then by key: of rows that supersede each
         other the newest is last.
         """
-        query = (
-            select(*table.columns)
-            .select_from(table.join(revisions, revisions.c.key == table.c.revision))
-            .where(table.c.revision.in_(self.revision_keys()))
-            .where(table.primary_key.columns[0].not_in(self.hidden_keys(table)))
-            .order_by(place_in_history(), table.primary_key.columns[0])
-        )
-        for end in sorted(_NODE_COLUMNS & set(table.columns.keys())):
-            query = query.where(table.c[end].not_in(self.hidden_keys(nodes)))
-        return query
+        return _rows_seen(self, table)
 
     def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
         """The rows that are seen, verified, in the order of `select`."""
@@ -74,6 +64,21 @@ class View:
             .subquery()
         )
         return select(latest.c.target).where(latest.c.age == 1, latest.c.hidden == 1)
+
+
+# A map's statements are asked for again and again while it is read: views are values.
+@lru_cache(maxsize=256)
+def _rows_seen(view: View, table: Table) -> Select[tuple[object, ...]]:
+    query = (
+        select(*table.columns)
+        .select_from(table.join(revisions, revisions.c.key == table.c.revision))
+        .where(table.c.revision.in_(view.revision_keys()))
+        .where(table.primary_key.columns[0].not_in(view.hidden_keys(table)))
+        .order_by(place_in_history(), table.primary_key.columns[0])
+    )
+    for end in sorted(_NODE_COLUMNS & set(table.columns.keys())):
+        query = query.where(table.c[end].not_in(view.hidden_keys(nodes)))
+    return query
 
 
 def place_in_history() -> ColumnElement[int]:
