@@ -217,3 +217,55 @@ def test_a_clock_that_goes_back_before_the_first_measurement_moves_nobody() -> N
     gaps.motion(BLIND, 0)
     motion = gaps.motion(ahead(0.5), 100 * MS)
     np.testing.assert_allclose(motion.prev_from_curr.translation, [0, 0, 0.5])
+
+
+def turning(degrees: float, sigma_m: float, sigma_deg: float) -> OdometryStep:
+    """Half a metre ahead and a turn, so well measured."""
+    pose = SE3.exp([0.0, 0.0, 0.5, 0.0, np.deg2rad(degrees), 0.0])
+    covariance = np.diag([sigma_m**2] * 3 + [np.deg2rad(sigma_deg) ** 2] * 3)
+    return OdometryStep(OdometryStatus.OK, pose, covariance, 20)
+
+
+def test_a_vague_step_before_a_gap_hardly_turns_the_robot() -> None:
+    gaps = GapFiller()
+    now = going(gaps)
+    gaps.motion(BLIND, now + 100 * MS)
+    vague = gaps.motion(turning(8.0, 0.3, 4.0), now + 200 * MS)
+    assert vague.guessed_m == 0  # the best that is known of that step
+    guess = gaps.motion(BLIND, now + 300 * MS)
+    assert 0.0 < np.rad2deg(guess.prev_from_curr.angle_rad) < 1.0
+    sharp = GapFiller()
+    now = going(sharp)
+    sharp.motion(turning(8.0, 0.01, 0.1), now + 100 * MS)
+    guess = sharp.motion(BLIND, now + 200 * MS)
+    assert np.rad2deg(guess.prev_from_curr.angle_rad) == pytest.approx(8.0, abs=0.1)
+
+
+def test_a_vague_speed_is_learnt_only_where_none_or_an_old_one_is_known() -> None:
+    vague = OdometryStep(
+        OdometryStatus.OK, SE3(np.eye(3), np.array([0.0, 0.0, 0.3])), np.eye(6) * 0.1**2, 20
+    )
+    fresh = GapFiller()
+    fresh.motion(FIRST, 0)
+    fresh.motion(vague, 100 * MS)
+    assert fresh.motion(BLIND, 200 * MS).prev_from_curr.distance_m == pytest.approx(0.3)
+    gaps = GapFiller()
+    now = going(gaps)
+    guesses_m = []
+    for step in range(16):
+        gaps.motion(vague, now + 200 * step * MS + 100 * MS)
+        guess = gaps.motion(BLIND, now + 200 * step * MS + 200 * MS)
+        guesses_m.append(guess.prev_from_curr.distance_m)
+    np.testing.assert_allclose(guesses_m[:10], 0.5)
+    np.testing.assert_allclose(guesses_m[-3:], 0.3)
+
+
+def test_a_robot_that_seems_to_stop_among_missing_steps_is_doubted_by_its_speed() -> None:
+    gaps = GapFiller()
+    now = going(gaps)
+    motions = [gaps.motion(ahead(0.0), now + k * 100 * MS) for k in range(1, 11)]
+    stood = [one for one in motions if one.guessed_m == 0]
+    assert len(stood) == 6  # four were impossible
+    # Four of ten steps are missing, and each of them was half a metre.
+    sigma_m = [np.sqrt(one.covariance[2, 2]) for one in stood]
+    np.testing.assert_allclose(sigma_m, 0.5 * np.sqrt(0.4), rtol=1e-3)

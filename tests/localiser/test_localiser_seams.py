@@ -214,3 +214,34 @@ def test_a_lost_robot_has_a_budget_of_its_own_and_a_matcher_that_gives_up_sooner
     assert replace(config, matcher=replace(config.matcher, max_hypotheses=7)).lost_matcher == (
         replace(config.lost_matcher, max_hypotheses=7)
     )
+
+
+def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
+    tmp_path: Path,
+) -> None:
+    """What it sees contradicts what it expects, again and again in the same way."""
+    path = tmp_path / "town.engram"
+    world, road = World(60.0), np.arange(0.0, 45.0, 0.7)
+    map_simulated(path, drive(world, road))
+    live = drive(world, road, seed=1, start_ns=10**15)[:40]
+    with (
+        OpenMap(MapStore.open(path)) as opened,
+        opened.localiser(
+            live[0].frame.camera,
+            Settings(),
+            policy="distance",
+            budget=Budget(20, 1),
+            relocaliser=None,
+        ) as localiser,
+    ):
+        nodes = sorted(opened.graph.nodes, key=lambda node: node.stamp_ns)
+        localiser.start_at(Position.at(nodes[4].id))  # some four metres too far on
+        found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+    where = [k for k, one in enumerate(found) if one.node is not None]
+    # Lost after ten metres; a second witness must be four metres on.
+    assert 20 <= where[0] <= 26
+    assert where == list(range(where[0], 40))
+    for k in where:
+        node = next(n for n in range(len(nodes)) if nodes[n].id == found[k].node)
+        ahead_m = 0.7 * k - nodes[node].driven_m
+        np.testing.assert_allclose(found[k].node_from_live.translation[2], ahead_m, atol=0.3)

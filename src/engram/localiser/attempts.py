@@ -36,6 +36,7 @@ class Candidate:
         prediction: where the live camera is expected; None when relocalising.
         guided: whether matching uses the prediction (a named step of its own, SPEC §3.2).
         row: its row in the neighbourhood; None when relocalising.
+        doubted: whether the robot is lost, so that the prediction may be wrong.
     """
 
     index: int
@@ -43,6 +44,7 @@ class Candidate:
     prediction: Prediction | None
     guided: bool
     row: int | None
+    doubted: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +56,7 @@ class Outcome:
         rank: its place in the order, from 0.
         match: with what it has in common with the live frame.
         accepted: whether that is a localisation.
-        plausible: whether it would be one if another frame agreed; only where nothing was expected.
+        plausible: whether it would be one if another frame agreed; only of lost robots.
         damaged: whether the node's landmarks could not be read, so that there is nothing to match.
     """
 
@@ -226,7 +228,13 @@ class Attempter:
             return self._attempt_lost(live, live_id, candidate, rank)
         guide = prediction if candidate.guided else None
         match = self._matcher.match(live, live_id, candidate.node, guide)
-        return Outcome(candidate, rank, match, accept(match, prediction, self._acceptance))
+        if accept(match, prediction, self._acceptance):
+            return Outcome(candidate, rank, match, accepted=True)
+        if not candidate.doubted:
+            return Outcome(candidate, rank, match, accepted=False)
+        spread = partial(self._matcher.spread, live, live_id, candidate.node, match)
+        waits = plausible(match, spread, self._acceptance)
+        return Outcome(candidate, rank, match, accepted=False, plausible=waits)
 
     def _attempt_lost(
         self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int

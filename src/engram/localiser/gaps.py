@@ -25,9 +25,14 @@ _NS_PER_S = 1e9
 # ones are in bends.
 _SIGMA_PER_M = 0.5
 _SIGMA_RAD_PER_M = float(np.deg2rad(2.5))
-# The speed is the median of so many steps: before odometry fails it is often wrong already. The
-# turn is that of the last step, for a bend is short.
+# The speed is the median of so many steps: before odometry fails it is often wrong already.
 _STEPS = 5
+# They are measured this much better than a guess knows them. On wet drives of `village` half of the
+# guess's standard deviation takes the ways of 20 m that are further off than three standard
+# deviations and half a metre from 1.9 to 0 %, a quarter of it knows bends too late.
+_BETTER_THAN_A_GUESS = 0.5
+# Nothing is known of the turn, (rad/s)².
+_ANY_TURN = 1e4
 # A car brakes with up to 8 m/s², a drone turns about with 10.
 _GREATEST_ACCELERATION_M_S2 = 10.0
 # The speed is known after so many measurements.
@@ -119,7 +124,10 @@ class GapFiller:
     def __init__(self) -> None:
         # (3,) m/s each, in the camera that they begin in; the newest last.
         self._velocities: deque[NDArray[np.float64]] = deque(maxlen=_STEPS)
+        # Measurements at a stretch that were too vague to tell the speed by.
+        self._unlearnt = 0
         self._turn_per_s = np.zeros(3)
+        self._turn_variance = _ANY_TURN
         self._stamp_ns: int | None = None
         # Distance of the gap so far.
         self._gap_m = 0.0
@@ -129,6 +137,8 @@ class GapFiller:
         self._believed_ns: int | None = None
         # Whether each of the newest steps was missing.
         self._missing: deque[bool] = deque(maxlen=_NEWEST_STEPS)
+        # What the newest steps would have been at the speed that was known.
+        self._guessed_m_per_s: deque[float] = deque(maxlen=_NEWEST_STEPS)
         # How long the robot has moved at a speed that is not known yet.
         self._unknown_s = 0.0
 
@@ -147,6 +157,8 @@ class GapFiller:
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         guess = self._guess(seconds)
+        if seconds > 0:
+            self._guessed_m_per_s.append(guess.prev_from_curr.distance_m / seconds)
         if (
             measured is None
             or covariance is None
@@ -162,14 +174,30 @@ class GapFiller:
         self._gap_m = 0.0
         self._believed_ns = stamp_ns
         if seconds > 0:
-            twist_per_s = measured.log() / seconds
-            self._velocities.append(twist_per_s[:3])
-            self._turn_per_s = twist_per_s[3:]
+            self._learn(measured, covariance, seconds)
         if any(self._missing):
-            covariance = covariance + self._doubt(guess, measured)
+            covariance = covariance + self._doubt(measured, seconds)
         if self._unknown_s and seconds > 0:
             return self._made_up_for(measured, covariance, seconds)
         return Motion(measured, covariance)
+
+    def _learn(self, measured: SE3, covariance: NDArray[np.float64], seconds: float) -> None:
+        """Speed and turn for guesses to come; vague steps say little of them."""
+        twist_per_s, step_m = measured.log() / seconds, measured.distance_m
+        guessed_m = max(_SIGMA_PER_M * step_m, _LEAST_SIGMA_M)
+        sharp = _sigma_m(covariance) <= _BETTER_THAN_A_GUESS * guessed_m
+        self._unlearnt = 0 if sharp else self._unlearnt + 1
+        # A vague speed is better than an old one, or none.
+        if sharp or not self._velocities or self._unlearnt > _NEWEST_STEPS:
+            self._velocities.append(twist_per_s[:3])
+        # From one step to the next the turn changes by as much as a guess of it is wrong: the rest
+        # is a Kalman filter.
+        change_rad = max(_SIGMA_RAD_PER_M * step_m, _LEAST_SIGMA_RAD)
+        expected = self._turn_variance + (change_rad / seconds) ** 2
+        measured_to = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) / seconds**2
+        gain = expected / (expected + measured_to)
+        self._turn_per_s = self._turn_per_s + gain * (twist_per_s[3:] - self._turn_per_s)
+        self._turn_variance = (1.0 - gain) * expected
 
     def _made_up_for(
         self, measured: SE3, covariance: NDArray[np.float64], seconds: float
@@ -185,9 +213,12 @@ class GapFiller:
         carried = adjoint @ covariance @ adjoint.T
         return Motion(before @ measured, carried + steps**2 * covariance + np.diag(wrong**2))
 
-    def _doubt(self, guess: Motion, measured: SE3) -> NDArray[np.float64]:
-        """(6, 6) what a measured step among missing ones is to be doubted by."""
-        step_m = max(measured.distance_m, guess.prev_from_curr.distance_m)
+    def _doubt(self, measured: SE3, seconds: float) -> NDArray[np.float64]:
+        """(6, 6) what a measured step among missing ones is to be doubted by.
+
+        A robot that seems to have stopped is doubted by the speed that it had before.
+        """
+        step_m = max(measured.distance_m, max(self._guessed_m_per_s, default=0.0) * seconds)
         share = sum(self._missing) / _NEWEST_STEPS
         variances = np.repeat([step_m**2, (_SIGMA_RAD_PER_M * step_m) ** 2], 3)
         return np.diag(share * variances)

@@ -435,11 +435,13 @@ class Localiser:
     def _predicted(self, neighbourhood: Neighbourhood, row: int) -> Candidate:
         index = int(neighbourhood.nodes[row])
         prediction = Prediction.of(neighbourhood, row)
+        doubted = self._lost
         guided = (
-            prediction.sigma_m < self.config.guide_below_m
+            not doubted
+            and prediction.sigma_m < self.config.guide_below_m
             and prediction.sigma_yaw_rad < self.config.guide_below_rad
         )
-        return Candidate(index, self._graph.node(index).id, prediction, guided, row)
+        return Candidate(index, self._graph.node(index).id, prediction, guided, row, doubted)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Those of nodes that can be read; the others are told, and not attempted again."""
