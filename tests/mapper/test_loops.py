@@ -119,3 +119,26 @@ def test_places_that_cannot_be_read_close_no_loop(path: Path, monkeypatch) -> No
     mapped = map_simulated(path, drive(RING, places, drift=DRIFT), closes_loops=True)
     assert len(mapped.steps) == len(places)
     assert loop_edges(path, mapped) == []
+
+
+def test_a_road_that_looks_like_the_metres_before_carries_no_mapping_robot_back(
+    path: Path,
+) -> None:
+    """Six metres look like those four metres before them, while an experience is being saved."""
+    road, places = World(120.0, seed=6), np.arange(0.0, 100.0, 0.7)
+    first = map_simulated(path, drive(road, np.arange(0.0, 110.0, 0.7)))
+    looks = np.where((places < 15) | ((places > 20) & (places < 25)), 0, 1)
+    seen = [
+        replace(one, frame=see(road, road.pose_at(at - 4.0), one.frame.stamp_ns))
+        if 36.5 <= at < 42.5
+        else one
+        for at, one in zip(places, drive(road, places, looks, start_ns=10**15, seed=1), strict=True)
+    ]
+    second = map_simulated(path, seen, name="r2", closes_loops=True)
+    truth = first.saved | second.saved
+    with MapStore.open(path) as store:
+        edges = OpenMap(store).graph.edges
+    assert any(edge.kind is EdgeKind.PROXIMITY for edge in edges)
+    for edge in edges:
+        true = truth[edge.a].inverse() @ truth[edge.b]
+        assert np.linalg.norm(edge.a_from_b.translation - true.translation) < 1.0

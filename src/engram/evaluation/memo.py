@@ -75,8 +75,10 @@ class MatchMemo:
             return Spread(0.0, 0.0)
         key = (live.stamp_ns, node)
         if key not in self._spreads:
+            started = thread_time()
             whole = self._matcher.match(live, live_id, node, None)
             self._spreads[key] = self._matcher.spread(live, live_id, node, whole)
+            self.seconds += thread_time() - started
         return self._spreads[key]
 
     def prefetch(self, nodes: list[NodeId]) -> None:

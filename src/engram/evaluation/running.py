@@ -38,7 +38,7 @@ from engram.evaluation.store import joined, missing, only, read_runs, write_runs
 from engram.evaluation.tasks import Task, run_tasks
 from engram.evaluation.writing import writing
 from engram.frontend.matching import matcher_hash
-from engram.localiser import RELOCALISERS, FrameMatcher, Matcher
+from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
 from engram.ranking import POLICIES
 from engram.sequences import LoggedFrame
 from engram.store import MapStore
@@ -165,6 +165,7 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
         options.folds,
         options.seed,
         matcher_hash(settings.localiser.matcher),
+        METHOD_VERSION,
         __version__,
     )
     folder = work / f"{file_name(drives.name)}-{config_hash(depends)}"

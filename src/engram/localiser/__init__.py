@@ -23,10 +23,11 @@ from engram.localiser.relocalisation import (
     best_places,
     spread,
 )
-from engram.localiser.settings import LocaliserConfig
+from engram.localiser.settings import METHOD_VERSION, LocaliserConfig
 from engram.localiser.walk import Walk
 
 __all__ = [
+    "METHOD_VERSION",
     "RELOCALISERS",
     "UNNAMED_LIVE_SESSION",
     "AcceptanceConfig",

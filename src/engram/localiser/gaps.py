@@ -27,10 +27,12 @@ _SIGMA_PER_M = 0.5
 _SIGMA_RAD_PER_M = float(np.deg2rad(2.5))
 # The speed is the median of so many steps: before odometry fails it is often wrong already.
 _STEPS = 5
-# They are measured this much better than a guess knows them. On wet drives of `village` half of the
-# guess's standard deviation takes the ways of 20 m that are further off than three standard
-# deviations and half a metre from 1.9 to 0 %, a quarter of it knows bends too late.
-_BETTER_THAN_A_GUESS = 0.5
+# A step tells the speed when its standard deviation is below this share of its own length: in rain
+# and by night steps that are wrong are too short, and vaguer than they are long. Half of what a
+# guess is wrong by takes the ways of 20 m on wet drives of `village` that are further off than is
+# forgiven (`benchmarks/dead_reckoning.py`) from 1.9 to 0 %; held against the length of the guess
+# instead, 2 % are; with half of that again bends are known too late.
+_SHARP = 0.5 * _SIGMA_PER_M
 # Nothing is known of the turn, (rad/s)².
 _ANY_TURN = 1e4
 # A car brakes with up to 8 m/s², a drone turns about with 10.
@@ -157,7 +159,7 @@ class GapFiller:
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         guess = self._guess(seconds)
-        if seconds > 0:
+        if seconds > 0 and self._knows_speed:
             self._guessed_m_per_s.append(guess.prev_from_curr.distance_m / seconds)
         if (
             measured is None
@@ -184,14 +186,14 @@ class GapFiller:
     def _learn(self, measured: SE3, covariance: NDArray[np.float64], seconds: float) -> None:
         """Speed and turn for guesses to come; vague steps say little of them."""
         twist_per_s, step_m = measured.log() / seconds, measured.distance_m
-        guessed_m = max(_SIGMA_PER_M * step_m, _LEAST_SIGMA_M)
-        sharp = _sigma_m(covariance) <= _BETTER_THAN_A_GUESS * guessed_m
+        sharp = _sigma_m(covariance) <= max(_SHARP * step_m, 0.5 * _LEAST_SIGMA_M)
         self._unlearnt = 0 if sharp else self._unlearnt + 1
-        # A vague speed is better than an old one, or none.
-        if sharp or not self._velocities or self._unlearnt > _NEWEST_STEPS:
+        # A vague speed is better than none, or an old one.
+        if sharp or not self._knows_speed or self._unlearnt > _STEPS:
             self._velocities.append(twist_per_s[:3])
         # From one step to the next the turn changes by as much as a guess of it is wrong: the rest
-        # is a Kalman filter.
+        # is a Kalman filter. After a gap it is not taken to have changed by more: that would hang
+        # the next guesses on the first vague step.
         change_rad = max(_SIGMA_RAD_PER_M * step_m, _LEAST_SIGMA_RAD)
         expected = self._turn_variance + (change_rad / seconds) ** 2
         measured_to = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) / seconds**2
@@ -228,9 +230,16 @@ class GapFiller:
         self._vague = self._vague + 1 if vague else 0
         return vague and self._vague <= _STEPS
 
+    @property
+    def _knows_speed(self) -> bool:
+        return len(self._velocities) >= _STEPS_TO_KNOW_SPEED
+
     def _impossible(self, measured: SE3, covariance: NDArray[np.float64], seconds: float) -> bool:
-        """Whether no robot changes its speed so much since it was last known."""
-        if len(self._velocities) < _STEPS_TO_KNOW_SPEED or seconds <= 0:
+        """Whether no robot changes its speed so much since a motion was last believed.
+
+        The speed is that of the newest sharp step: what a vague one says may be the rain's.
+        """
+        if not self._knows_speed or seconds <= 0:
             return False
         assert self._stamp_ns is not None
         assert self._believed_ns is not None

@@ -435,12 +435,12 @@ class Localiser:
     def _predicted(self, neighbourhood: Neighbourhood, row: int) -> Candidate:
         index = int(neighbourhood.nodes[row])
         prediction = Prediction.of(neighbourhood, row)
-        doubted = self._lost
         guided = (
-            not doubted
-            and prediction.sigma_m < self.config.guide_below_m
+            prediction.sigma_m < self.config.guide_below_m
             and prediction.sigma_yaw_rad < self.config.guide_below_rad
         )
+        # A robot that saves nodes knows its place by them: to close loops asks for better proof.
+        doubted = self._lost and not (self.certain and self._own_session is not None)
         return Candidate(index, self._graph.node(index).id, prediction, guided, row, doubted)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:

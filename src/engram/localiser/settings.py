@@ -11,6 +11,10 @@ from engram.frontend.matching import MatcherConfig
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.ranking import RecentConfig
 
+# Raise it whenever drives are localised or mapped otherwise with equal settings: studies that were
+# kept under another one are not gone on with.
+METHOD_VERSION = 1
+
 
 @dataclass(frozen=True, slots=True)
 class LocaliserConfig:

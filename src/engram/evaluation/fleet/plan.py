@@ -21,7 +21,7 @@ from engram.evaluation.folds import Fold, check_only, chosen, split
 from engram.evaluation.running import file_name
 from engram.evaluation.writing import writing
 from engram.frontend.matching import matcher_hash
-from engram.localiser import RELOCALISERS
+from engram.localiser import METHOD_VERSION, RELOCALISERS
 
 EXPERIMENTS = (7, 8, 9, 10)
 # Source: SPEC §8, [G16] §VI: docking after log 7; 4 groups of 9 logs for the orders.
@@ -232,6 +232,7 @@ def make_fleet_plan(
         options.seed,
         options.relocaliser,
         matcher_hash(settings.localiser.matcher),
+        METHOD_VERSION,
         __version__,
     )
     plan = FleetPlan(
