@@ -49,8 +49,11 @@ def ways(drive: EvaluatedDrive, length: int) -> Iterator[tuple[float, float, flo
         motions.append(gaps.motion(logged.odometry, logged.frame.stamp_ns))
         poses.append(truth.at(logged.frame.stamp_ns))
     for start in range(0, len(poses) - length, EVERY):
-        steps = [one for one in motions[start + 1 : start + length + 1] if one is not None]
-        world_from_start, world_from_end = poses[start], poses[start + length]
+        end = start + length
+        if motions[end] is None or (start > 0 and motions[start] is None):
+            continue  # a frame of no use: the next step spans it
+        steps = [one for one in motions[start + 1 : end + 1] if one is not None]
+        world_from_start, world_from_end = poses[start], poses[end]
         if world_from_start is None or world_from_end is None:
             continue
         if any(not np.isfinite(one.guessed_m) for one in steps):
@@ -80,6 +83,9 @@ def main() -> None:
     print(f"{asked.campaign}: {len(wanted)} drives in {asked.weather}")
     for length in LENGTHS:
         found = np.array([way for drive in wanted for way in ways(drive, length)])
+        if len(found) == 0:
+            print(f"{length:3} frames: no way")
+            continue
         off_m, sigma_m, off_rad, sigma_rad = found.T
         beyond = (off_m > accepted.slack_m + 3 * sigma_m) | (
             off_rad > accepted.slack_rad + 3 * sigma_rad

@@ -38,7 +38,7 @@ def localise_held_out(
         configurations: what to run.
         settings: the resolved configuration.
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
-        relocaliser: key of `RELOCALISERS`; None leaves the lost dead-reckoning.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
     """
     nodes, truth = true_nodes(opened, training), drive.truth()
     first = None if truth is None else truth.at(frames[0].frame.stamp_ns)

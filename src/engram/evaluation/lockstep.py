@@ -165,7 +165,7 @@ def run_in_step(
         configurations: what to run.
         settings: the resolved configuration.
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
-        relocaliser: key of `RELOCALISERS`; None leaves the lost dead-reckoning.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
         cost_so_far: seconds spent in making matches; left out of `step_ms`.
     """
     frames = situation.frames

@@ -60,7 +60,7 @@ class RankingOptions:
         map_sizes: whether earlier revisions are run too ([L15] Fig. 9).
         live_folds: folds whose sessions are also run guided and without memo, at Np = 2: that
             confirms the order of policies and gives milliseconds per frame.
-        relocaliser: key of `RELOCALISERS`; None leaves the lost dead-reckoning (SPEC §8).
+        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near (SPEC §8).
         build: how the maps are built.
         only_folds: numbers of the folds that are run; empty for all. What is run of the others
             later joins it.

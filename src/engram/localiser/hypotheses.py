@@ -1,7 +1,8 @@
-"""Where a lost robot may be by matches that are too weak to be believed one by one.
+"""Where a lost robot may be by matches that are not believed one by one.
 
-A weak match may be right, and it may be two cars that stand alike in two streets. Right ones agree
-with each other while the robot drives on: the position of the first, carried on by odometry,
+They are too weak, or contradict where the robot believes to be: that speaks against strong ones
+too. Such a match may be right, and it may be two cars that stand alike in two streets. Right ones
+agree with each other while the robot drives on: the position of the first, carried on by odometry,
 predicts where the second is found. So a weak match waits, the nodes near it are attempted with the
 frames to come, and when another match some way on agrees, that one is believed.
 """

@@ -76,7 +76,8 @@ class Localiser:
         frames: where the landmarks of nodes come from.
         policy: orders the candidates.
         budget: how much may be attempted per frame.
-        relocaliser: finds a lost robot; None leaves it dead-reckoning with a growing radius.
+        relocaliser: finds a lost robot; None leaves it to the nodes near its dead reckoning, within
+            a growing radius.
         basin: the match basin of this session's camera.
         live: the live session; its UUID seeds the matcher, so that the same drive gives the same
             results.
