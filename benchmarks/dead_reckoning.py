@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from engram.cli.simulation import campaigns_folder
 from engram.evaluation.drives import EvaluatedDrive, open_campaign
+from engram.experience.model import node_id
 from engram.geometry import SE3
-from engram.localiser import AcceptanceConfig, GapFiller, Motion
+from engram.localiser import AcceptanceConfig, GapFiller, Motion, Position
 
 LENGTHS, EVERY = (7, 14, 28), 7
 
@@ -58,17 +59,15 @@ def ways(drive: EvaluatedDrive, length: int) -> Iterator[tuple[float, float, flo
             continue
         if any(not np.isfinite(one.guessed_m) for one in steps):
             continue  # the robot counts as lost
-        pose, covariance = SE3.identity(), np.zeros((6, 6))
+        there = Position.at(node_id(drive.session.id, 0))
         for one in steps:
-            adjoint = pose.adjoint()
-            covariance = covariance + adjoint @ one.covariance @ adjoint.T
-            pose = pose @ one.prev_from_curr
-        true = world_from_start.inverse() @ world_from_end
+            there = there.carried_on(one.prev_from_curr, one.covariance)
+        pose, true = there.node_from_live, world_from_start.inverse() @ world_from_end
         yield (
             float(np.linalg.norm(pose.translation - true.translation)),
-            widest(at_end(covariance, pose.translation)),
+            widest(at_end(there.covariance, pose.translation)),
             (true.inverse() @ pose).angle_rad,
-            widest(covariance[3:, 3:]),
+            widest(there.covariance[3:, 3:]),
         )
 
 

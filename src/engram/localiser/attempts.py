@@ -36,7 +36,8 @@ class Candidate:
         prediction: where the live camera is expected; None when relocalising.
         guided: whether matching uses the prediction (a named step of its own, SPEC §3.2).
         row: its row in the neighbourhood; None when relocalising.
-        doubted: whether the robot is lost, so that the prediction may be wrong.
+        doubted: whether the prediction may be wrong: the robot is lost, and knows its place by no
+            nodes of its own.
     """
 
     index: int

@@ -28,10 +28,10 @@ _SIGMA_RAD_PER_M = float(np.deg2rad(2.5))
 # The speed is the median of so many steps: before odometry fails it is often wrong already.
 _STEPS = 5
 # A step tells the speed when its standard deviation is below this share of its own length: in rain
-# and by night steps that are wrong are too short, and vaguer than they are long. Half of what a
-# guess is wrong by takes the ways of 20 m on wet drives of `village` that are further off than is
-# forgiven (`benchmarks/dead_reckoning.py`) from 1.9 to 0 %; held against the length of the guess
-# instead, 2 % are; with half of that again bends are known too late.
+# and by night steps that are wrong are mostly too short. Half of what a guess is wrong by takes the
+# ways of 20 m on wet drives of `village` that are further off than is forgiven
+# (`benchmarks/dead_reckoning.py`) from 1.9 to 0 %; held against the length of the guess instead,
+# 2 % are; with half of that again bends are known too late.
 _SHARP = 0.5 * _SIGMA_PER_M
 # Nothing is known of the turn, (rad/s)².
 _ANY_TURN = 1e4

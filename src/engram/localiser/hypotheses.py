@@ -3,7 +3,7 @@
 They are too weak, or contradict where the robot believes to be: that speaks against strong ones
 too. Such a match may be right, and it may be two cars that stand alike in two streets. Right ones
 agree with each other while the robot drives on: the position of the first, carried on by odometry,
-predicts where the second is found. So a weak match waits, the nodes near it are attempted with the
+predicts where the second is found. So it waits, the nodes near it are attempted with the
 frames to come, and when another match some way on agrees, that one is believed.
 """
 
