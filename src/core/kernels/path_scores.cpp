@@ -424,10 +424,15 @@ private:
 };
 
 // Logarithms of n + offset for whole n: candidates with a short history have most of them in
-// common.
+// common, and one frame with the next.
 class Logarithms {
 public:
-  explicit Logarithms(double offset) : offset_(offset), known_(kKept, 0) {}
+  Logarithms(double offset, KnownLogarithms &known) : offset_(offset), known_(known.of) {
+    if (known.of.empty() || known.offset != offset) {
+      known.of.assign(kKept, 0);
+      known.offset = offset;
+    }
+  }
 
   bool keeps(uint64_t n) const { return n < kKept; }
   double argument(uint64_t n) const { return static_cast<double>(n) + offset_; }
@@ -444,7 +449,7 @@ public:
 private:
   static constexpr size_t kKept = 512;
   double offset_;
-  std::vector<double> known_;
+  std::vector<double> &known_;
 };
 
 // log of the product over j of theta_ij where it succeeded, 1 - theta_ij where it failed:
@@ -452,9 +457,10 @@ private:
 // taken out. Equal tallies give equal bits, whichever nodes they come from.
 class Likelihood {
 public:
-  Likelihood(double observed, double alpha)
-      : observed_(observed), of_success_(alpha), of_total_(observed * alpha),
-        of_failure_((observed - 1) * alpha) {}
+  Likelihood(double observed, double alpha, ObservedPaths &known)
+      : observed_(observed), of_success_(alpha, known.of_success),
+        of_total_(observed * alpha, known.of_total),
+        of_failure_((observed - 1) * alpha, known.of_failure) {}
 
   double log(const std::vector<Tally::Entry> &tally) {
     uint64_t all = 0;
@@ -577,8 +583,8 @@ void path_scores(const PathBits &paths, ObservedPaths &known, const int32_t *can
   if (observed > 0)
     outcome_masks(evidence, others, successes, failures);
   const int64_t most = most_paths(paths, candidates, count);
-  Likelihood likelihood(static_cast<double>(observed), evidence.alpha);
-  Logarithms prior(evidence.gamma);
+  Likelihood likelihood(static_cast<double>(observed), evidence.alpha, known);
+  Logarithms prior(evidence.gamma, known.of_prior);
   std::vector<int32_t> list(static_cast<size_t>(most + 4));
   uint64_t succeeded = 0;
   for (int64_t j = 0; j < observed; ++j)

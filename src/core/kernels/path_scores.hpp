@@ -16,12 +16,19 @@ struct PathBits {
   int64_t excluded; // number of a path that does not count, or -1
 };
 
+// Logarithms of n + offset for whole n, each worked out once; 0 where it has not been yet.
+struct KnownLogarithms {
+  double offset = 0;
+  std::vector<double> of;
+};
+
 // Which of the nodes observed lately are on each path, kept from frame to frame: few of them change.
 struct ObservedPaths {
   std::vector<uint64_t> storage; // one row of 512 nodes per path and vector, and an empty one
   int64_t vectors = 0, paths = 0;
   std::vector<int32_t> node_of; // by slot, which is a node's bit in the rows; -1 where it is free
   std::vector<int32_t> slot_of; // by node; -1 where it has none
+  KnownLogarithms of_success, of_total, of_failure, of_prior;
 };
 
 struct PathEvidence {
