@@ -52,6 +52,8 @@ SEARCHED: dict[str, tuple[float, ...]] = {
     "prior_weight": (0.25, 0.5, 1.0, 2.0),
     "memory_m": (2.0, 4.0, 8.0, 16.0),
     "regret": (0.0, 1.0, 2.0, 4.0),
+    "tally": (0.0, 0.25, 0.5, 1.0),
+    "tally_memory_m": (4.0, 8.0, 16.0),
 }
 CHANCES = ("bias", "steepness")
 # Replays start from where the robot truly was: these say nothing there.

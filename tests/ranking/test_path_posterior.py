@@ -1,14 +1,18 @@
 """[L15 §V]: the worked example of SPEC §4, and the kernel against exact fractions."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.reference.path_posterior import posterior, prior_of, theta_row
-from tests.worlds import flat_graph, memory_of, path_uuid
+from tests.worlds import flat_graph, make_context, memory_of, neighbourhood_of, path_uuid
 
 from engram.experience.model import PathEntry, PathEntryKind
 from engram.experience.path_memory import PathMemory
+from engram.ranking.path import PathPolicy
+from engram.ranking.path_literal import PathLiteralPolicy
 
 
 def posterior_of(memory: PathMemory, candidates, observed, outcomes, reference, **options):
@@ -78,6 +82,44 @@ def test_posterior_equals_the_equations_in_exact_fractions(situation) -> None:
     probabilities, _ = posterior_of(memory, candidates, observed, outcomes, reference)
     # Thirty factors of double precision.
     np.testing.assert_allclose(probabilities, [float(p) for p in expected], rtol=1e-11)
+
+
+@given(situations())
+@settings(max_examples=150)
+def test_candidates_stand_by_exact_posteriors_and_equal_ones_by_distance(situation) -> None:
+    _, paths, candidates, observed, outcomes, reference = situation
+    sets = [set(path) for path in paths]
+    expected = posterior(sets, candidates, observed, outcomes, reference)
+    # The later a candidate is named the nearer it is, all of them within the match basin.
+    along_m = 0.01 * np.arange(len(candidates), 0, -1)
+    by_posterior = sorted(range(len(candidates)), key=lambda row: (-expected[row], along_m[row]))
+    context = make_context(
+        paths=paths,
+        candidates=candidates,
+        along_m=along_m,
+        observed=observed,
+        outcomes=outcomes,
+        reference=reference,
+    )
+    assert PathLiteralPolicy().rank(context).tolist() == by_posterior
+    assert PathPolicy().rank(context).tolist() == by_posterior
+
+
+def test_equal_posteriors_whose_logarithms_differ_tie() -> None:
+    """No shared path, or one with each of W: theta is the same."""
+    context = make_context(
+        paths=[[1, 4], [1, 5], [1, 6]],
+        candidates=[0, 1],
+        along_m=[0.1, 0.2],
+        observed=[4, 5, 6],
+        outcomes=[True, True, False],
+    )
+    for policy in (PathLiteralPolicy(), PathPolicy()):
+        assert policy.rank(context).tolist() == [0, 1]
+        nearer = dataclasses.replace(
+            context, neighbourhood=neighbourhood_of([0, 1], np.array([0.2, 0.1]))
+        )
+        assert policy.rank(nearer).tolist() == [1, 0]
 
 
 def test_a_thousand_observations_neither_underflow_nor_overflow() -> None:

@@ -211,6 +211,29 @@ class TestPicking:
         # Before the robot counts as lost, though all that it knows speaks against it.
         assert driven_m < 10
 
+    @pytest.mark.parametrize("step_m", [0.7, 0.0])
+    @pytest.mark.parametrize("inliers", [5, 12, 15, 17, 19])
+    @pytest.mark.parametrize("aside_m", [0.5, 1.0, 1.5, 2.0])
+    def test_what_nearly_matches_for_ever_is_not_tried_for_ever(
+        self, step_m: float, inliers: int, aside_m: float
+    ) -> None:
+        """The nearest node's drive falls short of 20 inliers each time, the other's would match."""
+        log, driven_m, tried = RunLog(), 0.0, []
+        for _ in range(30):
+            context = make_context(candidates=[0, 1], along_m=[0.0, aside_m], sessions=2)
+            context = dataclasses.replace(context, run=log.attempts(driven_m))
+            pick = int(context.neighbourhood.nodes[RecallPolicy().rank(context)[0]])
+            matched = pick == 1
+            rates = context.success_rates()[[pick]]
+            away_m = context.neighbourhood.rms_distance_m[[pick]]
+            count = 40 if matched else inliers
+            log.add(driven_m, [pick], away_m, rates, [matched], [count], 300)
+            tried.append(pick)
+            driven_m += step_m
+        # Once found, what matches is not left again.
+        assert 1 in tried[:12]
+        assert sum(tried[12:]) >= 15
+
     @pytest.mark.parametrize(
         ("lanes", "elsewhere", "sigma_m", "all_are_tried"),
         [

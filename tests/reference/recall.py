@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-NEEDED, PICKS, UNKNOWN_BASE = 20, 8, 0.4
+NEEDED, PICKS, UNKNOWN_BASE, UNTRIED_RATE = 20, 8, 0.4, 0.3
 
 
 def base(graph, attempts, savers) -> list[float]:
@@ -34,6 +34,20 @@ def rms(near, row) -> float:
     return math.hypot(near.distance_m[row], near.sigma_m[row])
 
 
+def tally(context, node, c) -> float:
+    """What a node's drive wins by how often this run matched it."""
+    run, sessions = context.run, context.graph.sessions
+    good = bad = 0.0
+    for k, other in enumerate(run.nodes):
+        if sessions[other] == sessions[node]:
+            weight = math.exp((run.at_m[k] - run.driven_m) / c.tally_memory_m)
+            if run.accepted[k]:
+                good += weight
+            elif not math.isnan(run.rates[k]):
+                bad += weight * run.rates[k]
+    return c.tally * math.log((good + UNTRIED_RATE) / (good + bad + 1) / UNTRIED_RATE)
+
+
 def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(margins)) -> list[int]:
     """Rows best first. `rates` is of `base`, `c` the constants, `basin_m` the shipped one.
 
@@ -55,6 +69,10 @@ def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(mar
         if margin > c.level and not run.accepted[k]:
             continue
         told.append((node, math.exp((run.at_m[k] - run.driven_m) / c.memory_m), margin))
+    costs = [
+        c.distance * rms(near, row) / basin_m - tally(context, node, c)
+        for row, node in enumerate(near.nodes)
+    ]
     left = sorted(
         range(len(near)), key=lambda r: (near.distance_m[r], graph.node(int(near.nodes[r])).id)
     )
@@ -75,10 +93,9 @@ def order(context, rates, c, basin_m, choose=lambda margins, left: np.argmax(mar
                 if session == graph.sessions[node]:
                     weight += c.regret
                     total += c.regret * margin
-            margins.append(total / weight - c.distance * rms(near, row) / basin_m)
+            margins.append(total / weight - costs[row])
         best = left.pop(int(choose(margins, left)))
         picked.append(best)
         if len(picked) < PICKS:
-            cost = c.distance * rms(near, best) / basin_m
-            supposed.append((graph.sessions[near.nodes[best]], math.log(1 / NEEDED) + cost))
+            supposed.append((graph.sessions[near.nodes[best]], math.log(1 / NEEDED) + costs[best]))
     return picked

@@ -3,6 +3,7 @@
 
 #include "bindings/arrays.hpp"
 
+#include <cmath>
 #include <mutex>
 #include <stdexcept>
 #include <string>
@@ -13,6 +14,10 @@ using namespace nb::literals;
 namespace {
 
 using engram::Input;
+
+// Posteriors that are equal on paper tie, though their logarithms were added up from other numbers:
+// 2^-30 is far more than rounding comes to, and far less than a path makes of a difference.
+constexpr double kTieScale = 0x1p30;
 
 engram::PathBits paths_of(const Input<uint64_t, 2> &bits, int64_t path_count, int64_t excluded) {
   const engram::PathBits paths{bits.data(), static_cast<int64_t>(bits.shape(0)),
@@ -141,7 +146,7 @@ auto path_order(Observed &known, const Input<uint64_t, 2> &bits, int64_t path_co
                 static_cast<int64_t>(near.size()), evidence.seen, of_near.data());
     for (size_t i = 0, next = 0; i < count; ++i)
       if (beyond[i] == 0)
-        scores[i] = -of_near[next++];
+        scores[i] = -std::nearbyint(of_near[next++] * kTieScale);
     std::vector<const double *> keys{scores.data(), distance_m.data()};
     if (near.size() < count)
       keys.insert(keys.begin(), beyond.data());

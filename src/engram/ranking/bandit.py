@@ -14,6 +14,8 @@ _MEMORY_M = 8.0
 _PRIOR_SUCCESSES = 0.3
 _PRIOR_ATTEMPTS = 1.0
 _REDUNDANCY = 0.8
+# Of a session that this run has not tried yet.
+PRIOR_RATE = _PRIOR_SUCCESSES / _PRIOR_ATTEMPTS
 
 
 class BanditPolicy:
@@ -28,19 +30,26 @@ class BanditPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        a, b = session_tallies(context, context.run, _MEMORY_M)
-        level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
-        return _pick_diversely(context, level * context.success_rates())
+        rates = session_rates(context, context.run, _MEMORY_M)
+        return _pick_diversely(context, rates * context.success_rates())
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
         a, b = session_tallies(context, context.run, _MEMORY_M)
-        level = (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
+        rates = session_rates(context, context.run, _MEMORY_M)
         meaning = {
             "successes": "of this run on the node's drive, decayed over 8 m",
             "failures": "likewise, each as much as a match was likely",
         }
-        return Reasons({"successes": a, "failures": b}, meaning, level * context.success_rates())
+        return Reasons({"successes": a, "failures": b}, meaning, rates * context.success_rates())
+
+
+def session_rates(
+    context: RankingContext, run: RunAttempts, memory_m: float
+) -> NDArray[np.float64]:
+    """(Y,) (a + 0.3) / (a + b + 1), with a and b of `session_tallies`."""
+    a, b = session_tallies(context, run, memory_m)
+    return (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
 
 
 def session_tallies(

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
 
+# Posteriors that are equal on paper tie, though their logarithms were added up from other numbers;
+# as in the core's `path_order`.
+_TIE_SCALE = 2.0**30
 _MEANING = {
     "score": "log posterior of [L15 §V], up to a common constant",
     "with successes": "paths shared with the nodes matched lately, summed over those",
@@ -32,7 +35,8 @@ class PathLiteralPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        return order_by(context, -self.scores(context, context.neighbourhood.nodes))
+        scores = self.scores(context, context.neighbourhood.nodes)
+        return order_by(context, -np.rint(scores * _TIE_SCALE))
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
@@ -53,7 +57,8 @@ class PathLiteralPolicy:
     def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
         """(N,) log posterior of nodes up to a common constant.
 
-        Nodes that share as many paths with as many of W tie to the last bit.
+        Nodes that share as many paths with as many of W have the same to the last bit; others
+        whose posterior is the same on paper may differ in that, and tie when they are ranked.
         """
         return context.path_memory.scores(
             nodes,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.experience.basin import prior_basin_m
+from engram.ranking.bandit import PRIOR_RATE, session_rates
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.likeness import standard_likenesses
 from engram.ranking.reasons import Reasons
@@ -30,6 +31,9 @@ class RecallConstants:
         prior_weight: how many attempts of this very moment all that past drives say is worth.
         memory_m: metres driven over which an attempt of this run comes to weigh e times less.
         regret: how many attempts of this very moment a pick counts as, supposed to have failed.
+        tally: margin per log of how often this run matched the node's drive, over that of a drive
+            not tried yet.
+        tally_memory_m: metres driven over which an attempt comes to weigh e times less in that.
         likeness: margin per standard deviation that a node looks liker than the others do.
         vague_m: how vaguely even the surest candidate is known, σ, before likeness counts.
         steepness: log odds of a success per margin.
@@ -42,6 +46,8 @@ class RecallConstants:
     prior_weight: float
     memory_m: float
     regret: float
+    tally: float
+    tally_memory_m: float
     likeness: float
     vague_m: float
     steepness: float
@@ -58,6 +64,8 @@ RECALL = RecallConstants(
     prior_weight=0.5,
     memory_m=4.0,
     regret=2.0,
+    tally=0.5,
+    tally_memory_m=8.0,
     likeness=0.4,
     vague_m=0.5,
     steepness=1.8,
@@ -72,6 +80,8 @@ _MEANING = {
     "not know well where it is",
     "past drives": "how past drives fared with the node, as far as this run has not spoken",
     "this run": "how this run fared with the node's drive and the node, over the last metres",
+    "tally": "how often this run matched the node's drive: what keeps failing gives way, however "
+    "nearly it matches",
 }
 # Fewest inliers of a match: SPEC §3. An attempt that came to nothing counts as one.
 _NEEDED = 20
@@ -104,8 +114,9 @@ class RecallPolicy:
 
     Inliers fall exponentially with distance. What is left when that is made up for tells how
     alike the node's drive looks now: this run's attempts say so, the newest loudest, past drives
-    where it has not tried, and words where nobody knows the distance. Each pick is made as if those
-    before it had failed: what would fail with them comes later.
+    where it has not tried, and words where nobody knows the distance. Inliers alone would let a
+    drive that just fails be tried for ever; so its successes and failures count, too. Each pick is
+    made as if those before it had failed: what would fail with them comes later.
 
     Args:
         constants: None for those that ship with the package.
@@ -131,12 +142,13 @@ class RecallPolicy:
         order, margins, first = self._pick(context, canonical, costs, prior)
         rows = np.empty_like(canonical)
         rows[canonical] = np.arange(len(canonical))
-        likeness = self._likeness(context, canonical)
+        likeness, tally = self._likeness(context, canonical), self._tally(context, canonical)
         terms = {
-            "distance": -costs - likeness,
+            "distance": -costs - likeness - tally,
             "likeness": likeness,
             "past drives": prior,
             "this run": first + costs - prior,
+            "tally": tally,
         }
         picks, by_turn = self._in_turns(context, canonical[order])
         return RecallJudgement(
@@ -182,11 +194,11 @@ class RecallPolicy:
     def _costs_and_prior(
         self, context: RankingContext, canonical: NDArray[np.int64]
     ) -> tuple[Array, Array]:
-        """Margins lost by place and looks, and as past drives have them; (Y,), nearest first."""
+        """Margins lost by all else, and as past drives have them; (Y,), nearest first."""
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
         costs = self._cost(context, near.rms_distance_m[canonical])
-        costs -= self._likeness(context, canonical)
+        costs -= self._likeness(context, canonical) + self._tally(context, canonical)
         return costs, c.level + c.lessons * np.log(base / (1 - base))
 
     def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
@@ -199,6 +211,15 @@ class RecallPolicy:
         if len(canonical) == 0 or sigma_m.min() < c.vague_m:
             return np.zeros(len(canonical))
         return np.asarray(c.likeness * standard_likenesses(context)[canonical])
+
+    def _tally(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
+        """Margins won by the rate at which this run matched the drive, (Y,), nearest first.
+
+        Failures add up here as long as they go on, so that no candidate is tried for ever.
+        """
+        c, run = self._constants, context.run.newest(_MOST_ATTEMPTS)
+        rates = session_rates(context, run, c.tally_memory_m)[canonical]
+        return np.asarray(c.tally * np.log(rates / PRIOR_RATE))
 
     def _cost(self, context: RankingContext, distance_m: Array) -> Array:
         """A longer lens sees alike from farther away."""
