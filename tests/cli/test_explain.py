@@ -40,6 +40,7 @@ def test_every_policy_is_explained(engram, street: Path, town: Path, policy: str
         assert distances == sorted(distances)
     if policy.startswith(("path", "recall", "bandit", "bag", "time", "collaborative")):
         assert candidates[0]["terms"]
+    assert bool(found["rule"]) is (policy != "random")
 
 
 def test_text_names_terms_and_outcomes(engram, street: Path, town: Path) -> None:
@@ -47,6 +48,7 @@ def test_text_names_terms_and_outcomes(engram, street: Path, town: Path) -> None
     assert ran.status == 0
     assert "frame 6: localised" in ran.out
     assert "past drives: how past drives fared" in ran.out
+    assert "order: greatest sum first" in ran.out
     assert "matched," in ran.out
     assert "more; --top lists them" in ran.out
 

@@ -285,11 +285,75 @@ def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Pat
     assert found.left_out == {unfinished: SESSIONS - 1}
     write_report(tmp_path / "out", [begun])
     told = (tmp_path / "out" / "claims.md").read_text()
-    assert f"run on fewer than {SESSIONS} sessions: distance (Np = 4) on {SESSIONS - 1}." in told
+    assert f"not run on the same {SESSIONS} sessions: distance (Np = 4) on {SESSIONS - 1}." in told
     # Only the folds that have it: there it is shown.
     other = replace(begun, options=replace(begun.options, only_folds=(1,)))
     assert unfinished in collect(other).memo
     assert not collect(other).left_out
+
+
+def with_runs(plan: Plan, work: Path, mode: str, run: dict[int, tuple[str, ...]]) -> Plan:
+    """A plan of which nothing was run but, in each session, some policies at Np = 2."""
+    shutil.copytree(plan.work, work, ignore=shutil.ignore_patterns(f"{mode}-*"))
+    other = replace(plan, work=work)
+    for session, policies in run.items():
+        configurations = [Configuration(one, 2) for one in policies]
+        write_runs(other.runs_path(session, mode), made_up_runs(session, configurations))
+    return other
+
+
+def test_policies_run_on_different_sessions_are_not_compared(plan: Plan, tmp_path: Path) -> None:
+    first, second = plan.folds[0].held_out, plan.folds[1].held_out
+    assert len(first) == len(second)
+    run = dict.fromkeys(first, ("path", "oracle", "bandit"))
+    run |= dict.fromkeys(second, ("distance", "recall"))
+    found = collect(with_runs(plan, tmp_path / "work", "memo", run))
+    assert {one.policy for one in found.memo} == {"path", "oracle", "bandit"}
+    assert {tuple(k.session for k in one.sessions) for one in found.memo.values()} == {first}
+    assert {one.policy: count for one, count in found.left_out.items()} == {
+        "distance": len(second),
+        "recall": len(second),
+    }
+
+
+def test_one_policy_guided_in_another_fold_hides_no_other(plan: Plan, tmp_path: Path) -> None:
+    first, second = plan.folds[0].held_out, plan.folds[1].held_out
+    run = dict.fromkeys(first, ("path", "distance", "recall")) | dict.fromkeys(second, ("recall",))
+    found = collect(with_runs(plan, tmp_path / "work", "live", run))
+    assert {one.policy for one in found.live} == {"path", "distance", "recall"}
+    assert {tuple(k.session for k in one.sessions) for one in found.live.values()} == {first}
+
+
+def test_what_stands_twice_in_a_file_counts_once(plan: Plan, tmp_path: Path) -> None:
+    run = dict.fromkeys(plan.folds[0].held_out, ("path", "path"))
+    found = collect(with_runs(plan, tmp_path / "work", "memo", run))
+    (result,) = found.memo.values()
+    assert tuple(one.session for one in result.sessions) == plan.folds[0].held_out
+
+
+def test_results_without_the_record_of_their_map_are_told(plan: Plan, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    shutil.copytree(plan.work, work)
+    record = plan.map_path(plan.folds[0]).with_suffix(".json").name
+    (work / record).write_text('{"sessions": [{"nam')
+    with pytest.raises(InputError, match=f"{record} does not tell .* remove both"):
+        collect(replace(plan, work=work))
+    (work / record).unlink()
+    with pytest.raises(InputError, match=f"{record} tells of 0 sessions"):
+        collect(replace(plan, work=work))
+
+
+def test_a_damaged_file_of_results_counts_as_not_run(plan: Plan, tmp_path: Path) -> None:
+    whole = plan.runs_path(0, "live" if 0 in plan.folds[0].held_out else "memo").read_bytes()
+    rng, path = np.random.default_rng(0), tmp_path / "runs.npz"
+    refused = 0
+    for _ in range(300):
+        damaged = bytearray(whole)
+        for at in rng.integers(len(whole), size=4):
+            damaged[at] = rng.integers(256)
+        path.write_bytes(damaged)
+        refused += read_runs(path) is None
+    assert refused > 100
 
 
 def test_nothing_run_is_told_rather_than_reported(plan: Plan, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from tests.evaluation.campaigns import few_options, write_campaign
 
 from engram.drive import Settings, open_map
-from engram.errors import ConfigError, SequenceError
+from engram.errors import ConfigError, MapLockedError, SequenceError
 from engram.evaluation import (
     UNLIMITED,
     Configuration,
@@ -26,6 +26,7 @@ from engram.evaluation import (
     write_report,
 )
 from engram.evaluation.store import read_runs
+from engram.evaluation.writing import alone_in
 from engram.sequences.trajectories import truth_path
 
 
@@ -151,6 +152,20 @@ def test_a_run_that_was_killed_goes_on_to_the_same_end(
     assert len(results(other)) < len(results(plan))
     run(other)
     assert results(other) == results(plan)
+
+
+def test_two_runs_do_not_work_in_one_folder(plan: Plan) -> None:
+    with (
+        alone_in(plan.work),
+        pytest.raises(MapLockedError, match=r"process \d+ on .* evaluates there; wait"),
+    ):
+        run(plan)
+
+
+def test_what_is_named_twice_is_run_once() -> None:
+    options = replace(few_options(), policies=("path", "distance", "path"), lanes=(2, 1, 2))
+    assert options.policies == ("path", "distance")
+    assert options.lanes == (2, 1)
 
 
 def test_more_policies_later_cost_only_what_is_new(plan: Plan, tmp_path: Path) -> None:

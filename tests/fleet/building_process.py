@@ -10,7 +10,7 @@ from pathlib import Path
 
 from engram.drive import Settings
 from engram.fleet import build_map
-from engram.fleet.workers import end_with_parent
+from engram.processes import end_with_parent
 
 from .builds import options
 

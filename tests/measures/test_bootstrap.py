@@ -68,6 +68,11 @@ def test_an_interval_lies_within_the_sessions_extremes(parts) -> None:
     assert shares.min() - slack <= interval.low <= interval.high <= shares.max() + slack
 
 
+def test_draws_of_other_sessions_are_refused() -> None:
+    with pytest.raises(InputError, match="over 3 sessions .* as many sessions as there are"):
+        Resamples.of(2).interval(SessionSums(np.ones(3), np.ones(3)))
+
+
 def test_no_sessions_are_refused() -> None:
     with pytest.raises(InputError, match="0 sessions"):
         Resamples.of(0)

@@ -75,6 +75,8 @@ def _print(found: Explanation, top: int) -> None:
     if not found.candidates:
         typer.echo("there was nothing to order: no position is known, or the frame is unusable")
         return
+    if found.rule:
+        typer.echo(f"  order: {found.rule}")
     for name, meaning in found.meaning.items():
         typer.echo(f"  {name}: {meaning}")
     names = list(found.candidates[0].terms)

@@ -51,6 +51,8 @@ VERBS: dict[str, Callable[..., None]] = {
 
 # Verbs that have verbs below them.
 GROUPS: tuple[typer.Typer, ...] = (evaluate,)
+# What is done is kept as it is done there.
+_GOES_ON = "interrupted; what was done is kept, and the same command goes on"
 
 
 def register(app: typer.Typer) -> None:
@@ -60,18 +62,20 @@ def register(app: typer.Typer) -> None:
     for group in GROUPS:
         for command in group.registered_commands:
             assert command.callback is not None
-            command.callback = _tells_of_interruption(command.callback)
+            command.callback = _tells_of_interruption(command.callback, _GOES_ON)
         app.add_typer(group)
 
 
-def _tells_of_interruption(verb: Callable[..., None]) -> Callable[..., None]:
-    """Ctrl-C where the verb itself has nothing to save: said like any other end without result."""
+def _tells_of_interruption(
+    verb: Callable[..., None], told: str = "interrupted before there was anything to save"
+) -> Callable[..., None]:
+    """Ctrl-C where the verb itself has nothing more to save: said like any other end."""
 
     @functools.wraps(verb)
     def run(*arguments: Any, **options: Any) -> None:
         try:
             verb(*arguments, **options)
         except KeyboardInterrupt:
-            raise VerbInterruptedError("interrupted before there was anything to save") from None
+            raise VerbInterruptedError(told) from None
 
     return run

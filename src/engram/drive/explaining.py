@@ -120,6 +120,7 @@ class Explanation:
         policy: which ordered them.
         status: how the frame was localised.
         meaning: what the terms are, one line each.
+        rule: how they make the order; empty where the policy says no more than its name.
         candidates: best first; none where the robot had no position, or the frame was unusable.
     """
 
@@ -128,6 +129,7 @@ class Explanation:
     policy: str
     status: LocalisationStatus
     meaning: dict[str, str] = field(default_factory=dict)
+    rule: str = ""
     candidates: tuple[ExplainedCandidate, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
@@ -138,6 +140,7 @@ class Explanation:
             "policy": self.policy,
             "status": self.status.value,
             "meaning": self.meaning,
+            "rule": self.rule,
             "candidates": [one.to_dict() for one in self.candidates],
         }
 
@@ -236,7 +239,13 @@ def _explained(
             )
         )
     return Explanation(
-        options.frame, stamp_ns, options.policy, status, reasons.meaning, tuple(candidates)
+        options.frame,
+        stamp_ns,
+        options.policy,
+        status,
+        reasons.meaning,
+        reasons.rule,
+        tuple(candidates),
     )
 
 

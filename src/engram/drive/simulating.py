@@ -29,6 +29,7 @@ from engram.errors import (
 )
 from engram.frontend import Frontend
 from engram.geometry import SE3
+from engram.processes import end_with_parent
 from engram.sequences import FrameLog, SimulatedSequence
 from engram.sequences.trajectories import truth_path, write_tum
 from engram.simulation import WORLD_VERSION, Campaign
@@ -208,6 +209,7 @@ _words: multiprocessing.Queue[str] | None = None
 def _remember_queue(words: multiprocessing.Queue[str]) -> None:
     global _words  # noqa: PLW0603, the one way to hand a queue to a pool's workers
     _words = words
+    end_with_parent()
 
 
 def _render_in_worker(task: _Task) -> int:

@@ -14,6 +14,7 @@ from typing import Any
 from engram.config import to_dict
 from engram.drive import MapOptions, MapReport, OpenMap, Settings, map_drive, open_map
 from engram.drive.live import ignore
+from engram.errors import InputError
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.starting import TrueNodes
 from engram.localiser import Position
@@ -152,12 +153,22 @@ def read_built_map(path: Path) -> BuiltMap:
 
 
 def read_record(path: Path) -> BuiltMap:
-    """What the record beside a map says, without a look at the map."""
+    """What the record beside a map says, without a look at the map.
+
+    Raises:
+        InputError: it is damaged.
+    """
     record = path.with_suffix(".json")
     if not record.exists():
         return BuiltMap(path)
-    known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
-    return BuiltMap(path, [BuiltSession(**one) for one in known])
+    try:
+        known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
+        return BuiltMap(path, [BuiltSession(**one) for one in known])
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{record} does not tell how far {path.name} is ({error}); remove both, and the same "
+            "command builds the map again"
+        ) from error
 
 
 def _start(draft: Path, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> Position | None:

@@ -51,7 +51,7 @@ def _left_out(campaign: CampaignResult) -> list[str]:
     told = ", ".join(f"{what} on {min(counts)}" for what, counts in fewer.items())
     all_sessions = max((len(one.sessions) for one in campaign.memo.values()), default=0)
     return [
-        f"Not in these tables, since run on fewer than {all_sessions} sessions: {told}. The same "
+        f"Not in these tables, since not run on the same {all_sessions} sessions: {told}. The same "
         "command without --only-folds completes them; --only-folds shows the folds that have them.",
         "",
     ]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from shlex import quote
 
 from engram.config import config_hash
 from engram.drive import campaign_folder, session_of_drive
@@ -141,7 +142,7 @@ def open_campaign(text: str, campaigns: Path, size: Size = Size.STANDARD) -> Dri
         raise SequenceError(
             f"campaign {text!r}: {len(missing)} of {len(paths)} sessions are not rendered (the "
             f"first is {missing[0]}); run: engram simulate {campaign.home} --seed "
-            f"{campaign.seed} --size {size.value}"
+            f"{campaign.seed} --size {size.value} --out {quote(str(campaigns))}"
         )
     return DriveSet(text, drives_of(paths))
 

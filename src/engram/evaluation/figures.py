@@ -197,7 +197,7 @@ def _curves(
             bands = result.curve(campaign.resamples, estimator, scaled=scaled)
             y, low, high = (100 * band for band in bands)
             lines.append(Line(policy, CURVE_AT_M, y, low, high, marks=False))
-    title = f"{campaign.name}, Np = {lanes}"
+    title = f"{campaign.name}, Np = {lanes_text(lanes)}"
     return Panel(title, "x, m", "P(X ≥ x), %", lines, least_y=0.01) if lines else None
 
 

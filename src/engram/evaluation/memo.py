@@ -8,7 +8,6 @@ depends on each policy's own prediction and is judged afresh.
 from __future__ import annotations
 
 import os
-import zipfile
 from pathlib import Path
 from time import thread_time
 from typing import Any
@@ -17,6 +16,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.evaluation.store import UNREADABLE
 from engram.experience.model import NodeId
 from engram.frontend import Frame
 from engram.frontend.matching import Match
@@ -124,7 +124,7 @@ class MatchMemo:
             with np.load(self._path) as kept:
                 if int(kept["kind"][0]) == _VERSION and str(kept["matcher"][0]) == self._hash:
                     self._fill({name: kept[name] for name in kept.files})
-        except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile):
+        except UNREADABLE:
             self._frames = {}
 
     def _fill(self, kept: dict[str, NDArray[Any]]) -> None:

@@ -36,7 +36,7 @@ from engram.evaluation.lockstep import Runs
 from engram.evaluation.memo import MatchMemo
 from engram.evaluation.store import joined, missing, only, read_runs, write_runs
 from engram.evaluation.tasks import Task, run_tasks
-from engram.evaluation.writing import writing
+from engram.evaluation.writing import alone_in, writing
 from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
 from engram.ranking import POLICIES
@@ -78,6 +78,9 @@ class RankingOptions:
     only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        for name in ("policies", "lanes", "rounds", "only_folds"):
+            once = tuple(dict.fromkeys(getattr(self, name)))
+            object.__setattr__(self, name, once)  # what is named twice is run once
         for policy in self.policies:
             if policy not in POLICIES:
                 raise ConfigError(
@@ -189,10 +192,11 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
 
     Raises:
         MapError: a map cannot be written, or no space is left.
+        MapLockedError: another run works in the same folder.
         InputError: a drive cannot be read, or results cannot be written.
     """
     try:
-        with writing(plan.work):
+        with writing(plan.work), alone_in(plan.work):
             run_tasks(_tasks(plan), workers, advance)
     finally:
         _earlier_maps.close()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Collection, Iterable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -16,6 +18,19 @@ from engram.evaluation.configurations import Configuration
 from engram.evaluation.lockstep import Runs
 
 _VERSION = 2
+# What NumPy, zip and JSON say of damaged files.
+UNREADABLE = (
+    OSError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    SyntaxError,
+    NotImplementedError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 _PER_FRAME = [one.name for one in fields(Runs) if one.name not in {"configurations", "step_m"}]
 
 
@@ -32,7 +47,7 @@ def read_runs(path: Path) -> Runs | None:
             return Runs(
                 tuple(Configuration.from_dict(one) for one in plain), kept["step_m"], **columns
             )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except UNREADABLE:
         return None
 
 
@@ -71,4 +86,4 @@ def only(runs: Runs, wanted: Collection[Configuration]) -> Runs:
 def missing(runs: Runs | None, wanted: Iterable[Configuration]) -> list[Configuration]:
     """What is wanted and was not run."""
     done = set() if runs is None else set(runs.configurations)
-    return [one for one in wanted if one not in done]
+    return [one for one in dict.fromkeys(wanted) if one not in done]

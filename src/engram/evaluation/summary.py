@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.errors import InputError
+from engram.evaluation.building import BuiltMap
 from engram.evaluation.configurations import (
     EVERYTHING,
     Configuration,
     map_sizes,
     sweep,
 )
+from engram.evaluation.folds import Fold
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.running import Plan, built_map
 from engram.evaluation.store import read_runs
@@ -193,8 +197,8 @@ class CampaignResult:
         relocaliser: what found the lost; None for nothing.
         lap: per-frame candidates and possible successes of one session ([L15] Fig. 10); None
             where that was not run.
-        left_out: configurations that were run on fewer sessions than others, with how many; they
-            are in no table.
+        left_out: configurations that were not run on the same sessions as most, with on how many;
+            they are in no table.
     """
 
     name: str
@@ -245,6 +249,10 @@ class Lap:
     succeeded: NDArray[np.int32]
 
 
+# Of each configuration, by number of session.
+_Found: TypeAlias = dict[Configuration, dict[int, SessionResult]]
+
+
 def collect(plan: Plan) -> CampaignResult:
     """Reads what was run of a plan; what the folder holds beyond what the plan asks is left out.
 
@@ -257,7 +265,7 @@ def collect(plan: Plan) -> CampaignResult:
         wanted.update(
             map_sizes(options.policies, options.few_lanes, len(fold.training), options.rounds[0])
         )
-    by_mode: dict[str, dict[Configuration, list[SessionResult]]] = {"memo": {}, "live": {}}
+    by_mode: dict[str, _Found] = {"memo": {}, "live": {}}
     laps: list[Lap] = []
     for fold in plan.run_folds:
         built = built_map(plan, fold)
@@ -269,21 +277,15 @@ def collect(plan: Plan) -> CampaignResult:
                 for row, one in enumerate(runs.configurations):
                     if one not in wanted:
                         continue
-                    count = len(fold.training) if one.sessions is None else one.sessions
-                    nodes = built.sessions[count - 1].nodes
+                    nodes = _nodes(built, fold, one)
                     result = session_result(runs, row, session, fold.number, nodes)
-                    found.setdefault(one, []).append(result)
+                    found.setdefault(one, {})[session] = result
                 if mode == "memo":
                     laps += _lap(runs, plan.drives.drives[session].name)
-    memo, live = (
-        {
-            one: ConfigurationResult(one, sessions)
-            for one, sessions in found.items()
-            if len(sessions) == max(map(len, found.values()))
-        }
-        for found in by_mode.values()
-    )
     begun = by_mode["memo"]
+    # Guided runs are of some folds only, and a policy may be run in one more: what most have.
+    memo = _on_same(begun, lambda sessions, having: (len(sessions), having))
+    live = _on_same(by_mode["live"], lambda sessions, having: (having, len(sessions)))
     # Where folds differ in size, the largest maps of some have no counterpart in the others.
     least = min(len(fold.training) for fold in plan.run_folds)
     common = [one for one in begun if one.sessions is None or one.sessions < least]
@@ -299,6 +301,38 @@ def collect(plan: Plan) -> CampaignResult:
         _ordinary(laps),
         {one: len(begun[one]) for one in common if one not in memo},
     )
+
+
+def _on_same(
+    found: _Found, worth: Callable[[frozenset[int], int], tuple[int, int]]
+) -> dict[Configuration, ConfigurationResult]:
+    """The configurations that were run on the same sessions, on those: others cannot be compared.
+
+    Which sessions, `worth` says, of a set of them and of how many configurations have them all.
+    """
+    sets = Counter(frozenset(by_session) for by_session in found.values())
+
+    def of(sessions: frozenset[int]) -> tuple[tuple[int, int], list[int]]:
+        having = sum(count for other, count in sets.items() if sessions <= other)
+        return worth(sessions, having), sorted(sessions, reverse=True)
+
+    common = max(sets, key=of, default=frozenset[int]())
+    return {
+        one: ConfigurationResult(one, [by_session[k] for k in by_session if k in common])
+        for one, by_session in found.items()
+        if common <= by_session.keys()
+    }
+
+
+def _nodes(built: BuiltMap, fold: Fold, one: Configuration) -> int:
+    """Nodes of the map that a configuration was run in."""
+    count = len(fold.training) if one.sessions is None else one.sessions
+    if count > len(built.sessions):
+        raise InputError(
+            f"{built.path.with_suffix('.json')} tells of {len(built.sessions)} sessions, and there "
+            f"are results in a map of {count}; give the command again without --report-only"
+        )
+    return built.sessions[count - 1].nodes
 
 
 def session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) -> SessionResult:

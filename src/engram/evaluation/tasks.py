@@ -8,12 +8,12 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import cv2
 
 from engram.errors import ConfigError, WorkerError
+from engram.processes import end_with_parent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,5 +99,10 @@ def _executor(workers: int) -> Iterator[Executor]:
         return
     # Started afresh: a forked child would share the parent's threads half way through.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, partial(cv2.setNumThreads, 1)) as pool:
+    with ProcessPoolExecutor(workers, context, _begin_worker) as pool:
         yield pool
+
+
+def _begin_worker() -> None:
+    end_with_parent()
+    cv2.setNumThreads(1)  # the tasks run side by side

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ import cv2
 
 from engram.errors import EngramError, WorkerError
 from engram.fleet.group_mapping import GroupResult, GroupTask, map_group
+from engram.processes import end_with_parent
 
 # A drive that kills its worker this often will do so again.
 MAX_RETRIES = 3
@@ -129,23 +128,6 @@ def _work(task: GroupTask, path: Path, pipe: Connection) -> None:
     pipe.send(words)
     pipe.send(outcome)
     pipe.close()
-
-
-def end_with_parent() -> None:
-    """Ends this process as soon as its parent is gone, however that was killed.
-
-    A worker left behind would hold the lock of its map, and the build that goes on would meet it.
-    Its map stays sound whenever it ends.
-    """
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        return
-
-    def watch(sentinel: int) -> None:
-        wait([sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
 
 
 def _listen(running: Sequence[_Running], advance: Callable[[str], None]) -> None:

@@ -95,7 +95,16 @@ class SessionSums:
             )
 
     def __call__(self, weights: Array) -> Array:
-        """(N,) the measure under (N, S) weights; NaN where nothing was driven."""
+        """(N,) the measure under (N, S) weights; NaN where nothing was driven.
+
+        Raises:
+            InputError: the weights are of another number of sessions.
+        """
+        if weights.ndim != 2 or weights.shape[1] != len(self.numerator):
+            raise InputError(
+                f"a measure over {len(self.numerator)} sessions cannot be weighed by draws of "
+                f"shape {weights.shape}; draw as many sessions as there are"
+            )
         below = weights @ self.denominator
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray(np.where(below > 0, (weights @ self.numerator) / below, np.nan))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, round_robin
 from engram.ranking.likeness import Likeness
-from engram.ranking.reasons import Reasons
+from engram.ranking.reasons import IN_TURNS, Reasons
 
 # An experience looks like its nodes within so many metres do (SPEC §4).
 _HERE_M = 2.0
@@ -30,7 +30,8 @@ class BagOfWordsPolicy:
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
         meaning = {"likeness": "cosine of the frame's words and those of the node's drive here"}
-        return Reasons({"likeness": experience_similarities(context)}, meaning)
+        rule = f"{IN_TURNS}; likest first within a turn"
+        return Reasons({"likeness": experience_similarities(context)}, meaning, rule=rule)
 
 
 def experience_similarities(context: RankingContext) -> NDArray[np.float64]:

@@ -41,7 +41,13 @@ class BanditPolicy:
             "successes": "of this run on the node's drive, decayed over 8 m",
             "failures": "likewise, each as much as a match was likely",
         }
-        return Reasons({"successes": a, "failures": b}, meaning, rates * context.success_rates())
+        return Reasons(
+            {"successes": a, "failures": b},
+            meaning,
+            rates * context.success_rates(),
+            rule="best chance first; each pick takes from the chances of its own drive's others, "
+            "so that a less likely node of another drive may come before them",
+        )
 
 
 def session_rates(

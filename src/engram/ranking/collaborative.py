@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from engram.experience.model import path_id
 from engram.ranking.context import RankingContext, round_robin
-from engram.ranking.reasons import Reasons
+from engram.ranking.reasons import IN_TURNS, Reasons
 
 # "Decayed with distance" (SPEC §4), by as much as the bandit's memory.
 _DECAY_M = 8.0
@@ -35,7 +35,8 @@ class CollaborativePolicy:
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
         meaning = {"support": "recent matches that lead to the node's drive, by what it saw here"}
-        return Reasons({"support": self._scores(context)}, meaning)
+        rule = f"{IN_TURNS}; most support first within a turn"
+        return Reasons({"support": self._scores(context)}, meaning, rule=rule)
 
     @staticmethod
     def _scores(context: RankingContext) -> NDArray[np.float64]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
+from engram.ranking.reasons import Reasons
 
 
 class DistancePolicy:
@@ -16,3 +17,8 @@ class DistancePolicy:
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
         return order_by(context)
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        meaning = {"metres": "distance of the node from where the robot is believed to be"}
+        return Reasons({"metres": context.neighbourhood.distance_m}, meaning, rule="nearest first")

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, round_robin
+from engram.ranking.reasons import IN_TURNS, Reasons
 
 
 class NearestOfEachPolicy:
@@ -16,3 +17,9 @@ class NearestOfEachPolicy:
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
         return round_robin(context)
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        meaning = {"metres": "distance of the node from where the robot is believed to be"}
+        rule = f"{IN_TURNS}; nearest first within a turn"
+        return Reasons({"metres": context.neighbourhood.distance_m}, meaning, rule=rule)

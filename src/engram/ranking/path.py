@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +27,13 @@ class PathPolicy:
         self._alpha, self._gamma = alpha, gamma
 
     def reasons(self, context: RankingContext) -> Reasons:
-        """See `Explains`; candidates with g below 0.6 stand behind, by distance."""
-        return PathLiteralPolicy(self._alpha, self._gamma).reasons(context)
+        """See `Explains`."""
+        literal = PathLiteralPolicy(self._alpha, self._gamma).reasons(context)
+        rule = (
+            f"highest score first where g is {BASIN_LEVEL:g} or more; behind them the others, "
+            "nearest first"
+        )
+        return replace(literal, rule=rule)
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""

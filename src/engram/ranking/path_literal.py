@@ -52,7 +52,8 @@ class PathLiteralPolicy:
             k = np.array([context.reference], np.int32)
             here = memory.co_occurrence(nodes, k, excluded=context.own_path)
             terms["with k"] = here[:, 0].astype(np.float64)
-        return Reasons(terms, {name: _MEANING[name] for name in terms})
+        meaning = {name: _MEANING[name] for name in terms}
+        return Reasons(terms, meaning, rule="highest score first, of equals the nearest")
 
     def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
         """(N,) log posterior of nodes up to a common constant.

@@ -21,12 +21,20 @@ class Reasons:
         chances: (Y,) float64 of success; None where the policy reckons none.
         by_turn: (Y,) bool, whether a candidate has its place not for its merits, but because its
             turn has come; None where the policy has no turns.
+        rule: how the terms make the order, in plain words.
     """
 
     terms: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     meaning: dict[str, str] = field(default_factory=dict)
     chances: NDArray[np.float64] | None = None
     by_turn: NDArray[np.bool_] | None = None
+    rule: str = ""
+
+
+# What policies have in common that rank experiences.
+IN_TURNS = (
+    "the drives take turns, each with its nearest node, then with its second nearest, and so on"
+)
 
 
 @runtime_checkable

@@ -161,7 +161,14 @@ class RecallPolicy:
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
         judged = self.judge(context)
-        return Reasons(judged.terms, _MEANING, judged.chances, judged.by_turn)
+        return Reasons(
+            judged.terms,
+            _MEANING,
+            judged.chances,
+            judged.by_turn,
+            "greatest sum first; each pick supposes that those before it failed, which takes from "
+            "the others of their drives",
+        )
 
     def _in_turns(
         self, context: RankingContext, order: NDArray[np.int64]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, round_robin
-from engram.ranking.reasons import Reasons
+from engram.ranking.reasons import IN_TURNS, Reasons
 from engram.ranking.times import hour_difference
 
 
@@ -31,7 +31,8 @@ class TimeOfDayPolicy:
             "hours apart": "difference in time of day to the node's drive",
             "days apart": "difference in date",
         }
-        return Reasons({"hours apart": apart_h, "days apart": age_days}, meaning)
+        rule = f"{IN_TURNS}; fewest hours apart first within a turn, then fewest days"
+        return Reasons({"hours apart": apart_h, "days apart": age_days}, meaning, rule=rule)
 
     @staticmethod
     def _differences(context: RankingContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
