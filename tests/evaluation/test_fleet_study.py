@@ -141,6 +141,97 @@ def test_times_are_counts_times_medians(plan: FleetPlan) -> None:
     assert frames == sum(len(drive.frames()) for drive in plan.training(fold.fold))
 
 
+@pytest.mark.parametrize(
+    ("experiments", "maps"),
+    [
+        ((7, 8, 9, 10), ["single"]),
+        ((10, 7), ["single"]),
+        ((8, 9), ["r1-first"]),
+        ((9, 10), ["r1-first"]),
+        ((8, 10), ["orders-0"]),
+        ((8,), []),
+    ],
+)
+def test_medians_are_measured_in_the_first_map_of_what_is_timed(plan, experiments, maps) -> None:
+    asked = replace(plan, options=replace(OPTIONS, experiments=experiments, only_folds=(0,)))
+    needs = [task.needs for task in fleet_tasks(asked) if task.name == "A0 stages"]
+    assert needs == [(f"A0 {name}",) for name in maps]
+
+
+def without(plan: FleetPlan, work: Path, *patterns: str, **options) -> FleetPlan:
+    """A copy of the study that lacks some files, and is asked for something else."""
+    shutil.copytree(plan.work, work)
+    for path in [path for pattern in patterns for path in work.rglob(pattern)]:
+        path.unlink()
+    return replace(plan, work=work, options=replace(OPTIONS, **options))
+
+
+def test_orders_alone_are_timed(plan: FleetPlan, tmp_path: Path) -> None:
+    other = without(plan, tmp_path / "work", "stages.json", experiments=(10,))
+    run(other)
+    stages = ArmResult(other, other.arms[0]).stages
+    assert stages is not None
+    assert stages.frame_ms > 0
+    write_fleet_report(tmp_path / "out", [other])
+    (built,) = [row for row in rows(tmp_path / "out") if row["counted_s"]]
+    assert built["map"] == "one order built sequentially"
+    assert float(built["counted_s"]) > 0
+    (eq_8,) = [row for row in claims(tmp_path / "out") if "by (8)" in row[0]]
+    assert not eq_8[-1].startswith("–")
+
+
+def claims(report: Path) -> list[list[str]]:
+    lines = (report / "claims.md").read_text().splitlines()
+    return [line.strip("| ").split(" | ") for line in lines if line.startswith("|")]
+
+
+def test_what_is_not_timed_is_left_empty(plan: FleetPlan, tmp_path: Path) -> None:
+    """As in the studies of earlier versions, which had no medians without Fig. 7."""
+    write_fleet_report(tmp_path / "out", [without(plan, tmp_path / "work", "stages.json")])
+    table = rows(tmp_path / "out")
+    for column in ("counted_s", "merges_counted_s", "counted_ms_per_frame"):
+        assert {row[column] for row in table} == {""}
+    assert any(float(row["wall_s"]) > 0 for row in table if row["wall_s"])
+    page = claims(tmp_path / "out")
+    by_counts = [row[-1] for row in page if row[0].startswith("time of 2 groups")]
+    assert len(by_counts) == 1
+    assert by_counts[0].startswith("– by counts, ")
+    timed = ("by (8)", "sequential prefix tree", "really built")
+    assert [[row[-1] for row in page if one in row[0]] for one in timed] == [["–"]] * 3
+    assert not (tmp_path / "out" / "fig07_nodes.png").exists()
+    assert (tmp_path / "out" / "fig10_orders.png").exists()
+
+
+@pytest.mark.parametrize("experiment", [7, 8, 9, 10])
+def test_only_what_is_asked_for_is_reported(plan: FleetPlan, tmp_path: Path, experiment) -> None:
+    asked = replace(plan, options=replace(OPTIONS, experiments=(experiment,)))
+    written = write_fleet_report(tmp_path, [asked])
+    assert {row["experiment"] for row in rows(tmp_path)} == {str(experiment)}
+    pictures = {path.name.split("_")[0] for path in written if path.suffix == ".png"}
+    assert pictures == {f"fig{experiment:02d}"} | ({"downloads"} if experiment == 9 else set())
+    assert ("chosen" in (tmp_path / "orders.csv").read_text()) == (experiment == 10)
+    page = (tmp_path / "claims.md").read_text()
+    said = {7: "29.36 %", 8: "the shared map", 9: "`tod`", 10: "22.44 %"}
+    assert [one for one, words in said.items() if words in page] == [experiment]
+
+
+def test_forays_in_copies_alone_are_not_reported(plan: FleetPlan, tmp_path: Path) -> None:
+    """All that Fig. 8 leaves of Fig. 9, and what a run of that leaves that was stopped."""
+    other = without(plan, tmp_path / "work", "field-r2-tod+paths-*", "downloads-*.json")
+    written = write_fleet_report(tmp_path / "out", [other])
+    assert {row["experiment"] for row in rows(tmp_path / "out")} == {"7", "8", "10"}
+    assert not [path for path in written if path.name.startswith(("fig09", "downloads"))]
+
+
+@pytest.mark.parametrize("name", ["r2", "shared"])
+def test_a_comparison_of_maps_is_reported_once_it_is_whole(plan, tmp_path: Path, name) -> None:
+    drive = plan.held_out(plan.folds[0])[0]
+    other = without(plan, tmp_path / "work", f"runs-{name}-{drive.key}.npz")
+    write_fleet_report(tmp_path / "out", [other])
+    assert "8" not in {row["experiment"] for row in rows(tmp_path / "out")}
+    assert not (tmp_path / "out" / "fig08_failure.png").exists()
+
+
 def test_a_finished_study_does_nothing_again(plan: FleetPlan) -> None:
     before = {path: path.stat().st_mtime_ns for path in plan.work.rglob("*.engram")}
     run(plan)
@@ -212,6 +303,38 @@ def test_where_one_download_finds_nothing_the_others_are_tried(
     names = [one["name"] for one in kept["tried"]]
     assert names[:2] == ["copy", "tod"]
     assert not {"tod+paths", "budget as tod+paths"} & set(names)
+
+
+def test_all_downloads_that_are_compared_leave_thumbnails_behind(
+    plan: FleetPlan, tmp_path: Path, monkeypatch
+) -> None:
+    """Else `budget`, which has none, would get more nodes of as many bytes."""
+    other, (arm,), fold = without(plan, tmp_path / "work"), plan.arms, plan.folds[0]
+    drive = plan.held_out(fold)[0]
+    trials.trials_path(other, arm, fold, drive).unlink()
+    tried, with_thumbnails = trials.try_downloads, {}
+
+    def look(centre, wanted, **options):
+        with_thumbnails.update({name: one.with_thumbnails for name, one in wanted.items()})
+        return tried(centre, wanted, **options)
+
+    monkeypatch.setattr(trials, "try_downloads", look)
+    trials.try_downloads_for(other, arm, fold, "shared", drive)
+    names = {"copy", "tod", "tod+paths", "budget 1/4", "budget 1/10"}
+    names |= {"budget as tod", "budget as tod+paths"}
+    assert with_thumbnails == dict.fromkeys(names, False)
+
+
+def test_trials_of_downloads_with_thumbnails_are_made_anew(plan, tmp_path: Path) -> None:
+    other, (arm,), fold = without(plan, tmp_path / "work"), plan.arms, plan.folds[0]
+    drive = plan.held_out(fold)[0]
+    path = trials.trials_path(other, arm, fold, drive)
+    kept = json.loads(path.read_text())
+    del kept["thumbnails"]  # as an earlier version wrote it
+    path.write_text(json.dumps(kept))
+    assert not trials.read_trials(other, arm, fold, drive)
+    trials.try_downloads_for(other, arm, fold, "shared", drive)
+    assert trials.read_trials(other, arm, fold, drive)
 
 
 def test_held_out_validation_and_groups_of_the_orders_are_apart(plan: FleetPlan) -> None:

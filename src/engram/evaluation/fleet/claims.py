@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from engram.evaluation.fleet.experiments import SHARED, SINGLE, merged_name, pair_merges
 from engram.evaluation.fleet.plan import ROBOTS
-from engram.evaluation.fleet.results import ArmResult, FoldResult, InField, Parallel, Time, Trials
+from engram.evaluation.fleet.results import (
+    ArmResult,
+    FoldResult,
+    InField,
+    Parallel,
+    Time,
+    Trials,
+    slowest,
+    total,
+)
 from engram.evaluation.fleet.trials import (
     AS_TOD,
     AS_TOD_PATHS,
@@ -40,7 +49,7 @@ def fleet_claims_page(arms: Sequence[ArmResult]) -> str:
     """The tables of all arms. Intervals are 90 %, paired, by bootstrap over sessions."""
     lines: list[str] = []
     for arm in arms:
-        rows = [*_building(arm), *_sharing(arm), *_downloads(arm), *_orders(arm)]
+        rows = [row for number, of in _ROWS.items() if arm.asked(number) for row in of(arm)]
         title = f"## {arm.plan.drives.name}, arm {arm.arm.letter}: {arm.arm.words}"
         lines += [title, "", *_protocol(arm), "", *table(CLAIM_COLUMNS, rows), ""]
     return "\n".join(lines)
@@ -84,7 +93,7 @@ def _building(arm: ArmResult) -> Iterator[Row]:
             "≤ 45 % (arm A)" if is_main else "–",
             "≤ 30 %" if is_main else "",
             f"{_ratio(parallel, single)}; slowest group alone "
-            f"{_ratio([_slowest(built) for _, built in whole], single)}",
+            f"{_ratio([slowest(built.group_times) for _, built in whole], single)}",
         )
         pairwise = [built.pairwise_time for _, built in whole]
         if is_main and all(pairwise):
@@ -120,19 +129,17 @@ def _whole(arm: ArmResult, groups: int) -> list[tuple[FoldResult, Parallel]]:
     return [(fold, built) for fold, built in found if built is not None]
 
 
-def _slowest(built: Parallel) -> Time:
-    return Time(
-        max(one.counted_s for one in built.group_times),
-        max(one.wall_s for one in built.group_times),
+def _ratio(above: Sequence[Time], below: Sequence[Time]) -> str:
+    """By counts, wall time beside it."""
+    a, b = total(above), total(below)
+    return (
+        f"{_share(a.counted_s, b.counted_s)} by counts, {_share(a.wall_s, b.wall_s)} by the clock"
     )
 
 
-def _ratio(above: Sequence[Time], below: Sequence[Time]) -> str:
-    """By counts, wall time beside it."""
-    counted = [sum(one.counted_s for one in some) for some in (above, below)]
-    wall = [sum(one.wall_s for one in some) for some in (above, below)]
-    by_count = f"{counted[0] / counted[1]:.2%}" if counted[1] else "–"
-    return f"{by_count} by counts, {wall[0] / wall[1]:.2%} by the clock"
+def _share(part: float | None, whole: float | None, form: str = ".2%") -> str:
+    """One by the other; a dash where either was not measured, or nothing was counted."""
+    return "–" if part is None or not whole else f"{part / whole:{form}}"
 
 
 def _sharing(arm: ArmResult) -> Iterator[Row]:
@@ -279,36 +286,46 @@ def _orders(arm: ArmResult) -> Iterator[Row]:
     found = fold.orders()
     if found is None:
         return
-    groups = fold.order_groups()
-    group_s = float(np.mean([fold.time_of(one).counted_s for one in groups]))
-    merges = max(found["merges"], 1)
-    merge_s = fold.counted(found["replayed"], found["attempts"], found["lookups"]) / merges
-    copy_s = found["copy_s"] / max(found["copies"], 1)
-    costs = order_costs(len(groups), group_s, merge_s, copy_s)
+    by_model, by_tree, checked = _order_times(fold, found)
     yield (
-        f"{len(found['orders'])} orders of {len(groups)} groups by (8), against sequential ones",
+        f"{len(found['orders'])} orders of {len(fold.order_groups())} groups by (8), against "
+        "sequential ones",
         "22.44 %",
         "≤ 30 %",
         "≤ 20 %",
-        f"{costs.model_s / costs.sequential_s:.2%}; as a prefix tree "
-        f"{costs.tree_s / costs.sequential_s:.2%} (T_G {group_s:.1f} s, T_M {merge_s:.2f} s by "
-        f"counts, T_C {copy_s:.2f} s)",
+        by_model,
     )
-    yield (
-        "the same against a sequential prefix tree", "–", "printed", "",
-        f"{costs.tree_s / costs.sequential_tree_s:.2%}",
-    )  # fmt: skip
-    built = fold.sessions("orders-sequential")
-    if len(built) == sum(map(len, groups)):
-        rest_s = fold.time_of(built[len(groups[0]) :]).counted_s
+    yield "the same against a sequential prefix tree", "–", "printed", "", by_tree
+    if fold.sequential() is not None:
         yield (
             "one order really built sequentially: time of its later groups ÷ (k − 1)·T_G of (8)",
             "1 (assumed)",
             "checked",
             "",
-            f"{rest_s / ((len(groups) - 1) * group_s):.2f}",
+            checked,
         )
     yield from _spread(found)
+
+
+def _order_times(fold: FoldResult, found: dict[str, Any]) -> tuple[str, str, str]:
+    """By (8), against a prefix tree, and one order really built; dashes for what is not timed."""
+    groups = fold.order_groups()
+    groups_s = total(fold.time_of(one) for one in groups).counted_s
+    merges_s = fold.counted(found["replayed"], found["attempts"], found["lookups"])
+    if groups_s is None or merges_s is None:
+        return "–", "–", "–"
+    group_s, merge_s = groups_s / len(groups), merges_s / max(found["merges"], 1)
+    copy_s = found["copy_s"] / max(found["copies"], 1)
+    costs = order_costs(len(groups), group_s, merge_s, copy_s)
+    built = fold.sequential()
+    rest_s = fold.time_of(built[len(groups[0]) :]).counted_s if built else None
+    return (
+        f"{_share(costs.model_s, costs.sequential_s)}; as a prefix tree "
+        f"{_share(costs.tree_s, costs.sequential_s)} (T_G {group_s:.1f} s, T_M {merge_s:.2f} s by "
+        f"counts, T_C {copy_s:.2f} s)",
+        _share(costs.tree_s, costs.sequential_tree_s),
+        _share(rest_s, (len(groups) - 1) * group_s, ".2f"),
+    )
 
 
 def _spread(found: dict[str, Any]) -> Iterator[Row]:
@@ -322,3 +339,11 @@ def _spread(found: dict[str, Any]) -> Iterator[Row]:
             "",
             f"{values.min():.2%}, {np.median(values):.2%}, {values.max():.2%}; {values[0]:.2%}",
         )
+
+
+_ROWS: dict[int, Callable[[ArmResult], Iterator[Row]]] = {
+    7: _building,
+    8: _sharing,
+    9: _downloads,
+    10: _orders,
+}

@@ -23,11 +23,14 @@ from engram.evaluation.fleet.steps import download_for_foray, localise_in, map_d
 from engram.evaluation.fleet.trials import try_downloads_for
 from engram.evaluation.folds import Fold
 from engram.evaluation.tasks import Task, run_tasks
-from engram.evaluation.writing import writing
+from engram.evaluation.writing import alone_in, writing
 
 SINGLE = "single"
 DOCKED = "docked"
 SHARED = "shared"
+# Whose counts become times. The first of those asked for measures the medians, in its first map:
+# Fig. 7's is of all training drives, so that it comes first.
+_TIMED = (7, 9, 10)
 
 
 def merged_name(groups: int, merges: int) -> str:
@@ -45,9 +48,10 @@ def run_fleet(plan: FleetPlan, workers: int = 1, advance: Callable[[str], None] 
 
     Raises:
         MapError: a map cannot be written, or no space is left.
+        MapLockedError: another run works in the same folder.
         InputError: a drive cannot be read, or results cannot be written.
     """
-    with writing(plan.work):
+    with writing(plan.work), alone_in(plan.work):
         run_tasks(fleet_tasks(plan), workers, advance)
 
 
@@ -123,7 +127,7 @@ class _Tasks:
     def _parallel_building(self) -> Iterator[Task]:
         """Fig. 7: one agent against groups side by side, merged one after another."""
         yield from self._mapped(SINGLE, self._plan.training(self._fold))
-        yield self._task("stages", partial(measure_stages, *self._about, SINGLE), [SINGLE])
+        yield from self._measured(7, SINGLE)
         shown = [SINGLE]
         for groups in self._plan.group_counts(self._fold):
             for number, drives in enumerate(self._plan.groups(self._fold, groups)):
@@ -146,6 +150,7 @@ class _Tasks:
         """Both robots drive by themselves, then dock."""
         for robot, (first, _) in self._plan.forays(self._fold).items():
             yield from self._mapped(f"{robot}-first", first)
+        yield from self._measured(9, f"{ROBOTS[0]}-first")
         yield self._merged(DOCKED, "r1-first", "r2-first")
 
     def _forays(self, policies: Sequence[str]) -> Iterator[Task]:
@@ -184,6 +189,7 @@ class _Tasks:
         names = [f"orders-{number}" for number in range(len(groups))]
         for name, drives in zip(names, groups, strict=True):
             yield from self._mapped(name, drives)
+        yield from self._measured(10, names[0])
         yield self._task("orders", partial(try_orders, *self._about, names), names, "orders")
         in_sequence = [drive for drives in groups for drive in drives]
         yield from self._mapped("orders-sequential", in_sequence)
@@ -201,6 +207,12 @@ class _Tasks:
             work = partial(map_drives, *self._about, name, drives[:count], base)
             yield self._task(step, work, before, f"{name} {count}/{len(drives)}")
             before = [step]
+
+    def _measured(self, experiment: int, name: str) -> Iterator[Task]:
+        """The medians, in an experiment's first map; nothing if another one measures them."""
+        wanted = self._plan.options.experiments
+        if experiment == next((one for one in _TIMED if one in wanted), None):
+            yield self._task("stages", partial(measure_stages, *self._about, name), [name])
 
     def _merged(self, name: str, centre: str, robot: str) -> Task:
         return self._task(name, partial(merge, *self._about, name, centre, robot), [centre, robot])

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from engram.evaluation.fleet.experiments import SHARED, SINGLE, merged_name
 from engram.evaluation.fleet.plan import FORAY_POLICIES, ROBOTS
-from engram.evaluation.fleet.results import ArmResult, FoldResult
-from engram.evaluation.fleet.trials import COPY, TriedDownload
+from engram.evaluation.fleet.results import ArmResult, FoldResult, Time
+from engram.evaluation.fleet.trials import TriedDownload
 from engram.measures import Drive, Resamples, SessionSums, failure_sums, route_not_localised
 from engram.viewing import Line, Panel, draw_bars, draw_curves
 
@@ -22,29 +22,32 @@ _P = "P(X ≥ x), %"
 
 
 def draw_fleet_figures(out: Path, arms: Sequence[ArmResult]) -> list[Path]:
-    """Draws every figure for which results are there; returns the files.
+    """Draws every figure that was asked for and for which results are there; returns the files.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.
     """
     written: list[Path] = []
 
-    def draw(name: str, panels: Sequence[Panel], title: str) -> None:
-        shown = [panel for panel in panels if panel.lines]
+    def draw(number: int, name: str, panel: Callable[[ArmResult], Panel], title: str) -> None:
+        panels = [panel(arm) for arm in arms if arm.asked(number)]
+        shown = [one for one in panels if one.lines]
         if shown:
-            draw_curves(shown, out / name, title)
-            written.append(out / name)
+            path = out / f"fig{number:02d}_{name}.png"
+            draw_curves(shown, path, title)
+            written.append(path)
 
-    draw("fig07_nodes.png", [_nodes(arm) for arm in arms], "size of the map while it is built")
-    draw("fig07_failure.png", [_building(arm) for arm in arms], "failure of held-out drives")
-    draw("fig08_failure.png", [_sharing(arm) for arm in arms], "failure of held-out drives")
-    draw("fig09_nodes.png", [_robots(arm) for arm in arms], "nodes on the robots")
-    draw("fig09_time.png", [_times(arm) for arm in arms], "time of localising, second foray")
-    draw("fig09_failure.png", [_in_field(arm) for arm in arms], "failure in the second foray")
-    draw("fig09_downloads.png", [_downloads(arm) for arm in arms], "held-out drives in downloads")
-    draw("fig10_orders.png", [_orders(arm) for arm in arms], "held-out drives, all orders")
+    draw(7, "nodes", _nodes, "size of the map while it is built")
+    draw(7, "failure", _building, "failure of held-out drives")
+    draw(8, "failure", _sharing, "failure of held-out drives")
+    draw(9, "nodes", _robots, "nodes on the robots")
+    draw(9, "time", _times, "time of localising, second foray")
+    draw(9, "failure", _in_field, "failure in the second foray")
+    draw(9, "downloads", _downloads, "held-out drives in downloads")
+    draw(10, "orders", _orders, "held-out drives, all orders")
     for arm in arms:
-        written += _draw_sizes(out, arm)
+        if arm.asked(9):
+            written += _draw_sizes(out, arm)
     return written
 
 
@@ -55,22 +58,26 @@ def _title(arm: ArmResult) -> str:
 def _nodes(arm: ArmResult) -> Panel:
     """Fig. 7a: nodes against time, by counts, of the first fold that has both."""
     lines: list[Line] = []
-    for fold in arm.folds:
+    for fold in arm.folds if arm.stages else ():
         single, built = fold.single(), fold.parallel(arm.plan.options.groups)
         if single is None or built is None:
             continue
-        x = np.cumsum([fold.time_of([one]).counted_s for one in single])
+        x = np.cumsum(_counted_s(fold.time_of([one]) for one in single))
         lines.append(Line("one agent", x, np.array([one.nodes for one in single], float)))
         for number, sessions in enumerate(built.groups):
-            x = np.cumsum([fold.time_of([one]).counted_s for one in sessions])
+            x = np.cumsum(_counted_s(fold.time_of([one]) for one in sessions))
             y = np.array([one.nodes for one in sessions], float)
             lines.append(Line(f"group {number}", x, y, marks=False))
-        slowest = max(one.counted_s for one in built.group_times)
-        x = slowest + np.cumsum([0.0] + [one.counted_s for one in built.merge_times])
+        merges = np.cumsum(_counted_s(built.merge_times))
+        x = _counted_s(built.group_times).max() + np.array([0.0, *merges])
         y = np.array([built.groups[0][-1].nodes, *(one.nodes for one in built.merges)], float)
         lines.append(Line("merging", x, y))
         break
     return Panel(_title(arm), "s, by counts, on one core", "nodes", lines)
+
+
+def _counted_s(times: Iterable[Time]) -> Array:
+    return np.array([one.counted_s for one in times], np.float64)
 
 
 def _building(arm: ArmResult) -> Panel:
@@ -112,16 +119,15 @@ def _curve(label: str, drives: Sequence[Drive], seed: int) -> Line:
 def _robots(arm: ArmResult) -> Panel:
     """Fig. 9a: nodes on each robot, log by log; between the forays it docks."""
     lines = []
-    fold = next((one for one in arm.folds if one.in_field("r1", COPY)), None)
+    fold = next((one for one in arm.folds if one.forays()), None)
     if fold is not None:
         for robot in ROBOTS:
             first = [one.nodes for one in fold.sessions(f"{robot}-first")]
             for policy in FORAY_POLICIES:
                 second = [one.nodes for one in fold.in_field(robot, policy)]
-                if second:
-                    y = np.array([*first, *second], float)
-                    x = np.arange(1, len(y) + 1, dtype=float)
-                    lines.append(Line(f"{robot}, {policy}", x, y))
+                y = np.array([*first, *second], float)
+                x = np.arange(1, len(y) + 1, dtype=float)
+                lines.append(Line(f"{robot}, {policy}", x, y))
     return Panel(_title(arm), "log", "nodes", lines)
 
 
@@ -140,10 +146,10 @@ def _times(arm: ArmResult) -> Panel:
 def _series(arm: ArmResult, policy: str) -> Array:
     """(robots × folds, logs) ms per frame; (0, 0) where no foray was driven yet."""
     driven = [
-        times
+        [one.ms for one in fold.in_field(robot, policy)]
         for fold in arm.folds
+        if fold.forays()
         for robot in ROBOTS
-        if (times := [one.ms for one in fold.in_field(robot, policy)])
     ]
     logs = min((len(one) for one in driven), default=0)
     return np.array([one[:logs] for one in driven]).reshape(len(driven), logs)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any, TypeAlias
 
 from engram.evaluation.building import BuiltSession, read_record
@@ -13,7 +14,7 @@ from engram.evaluation.configurations import Configuration
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.fleet.arms import Arm
 from engram.evaluation.fleet.experiments import merged_name, pair_merges
-from engram.evaluation.fleet.plan import ROBOTS, FleetPlan
+from engram.evaluation.fleet.plan import FORAY_POLICIES, ROBOTS, FleetPlan
 from engram.evaluation.fleet.records import (
     DownloadRecord,
     MergeRecord,
@@ -35,26 +36,36 @@ class Time:
     """What something took.
 
     Attributes:
-        counted_s: counts of frames, attempts and look-ups × medians measured once.
+        counted_s: counts of frames, attempts and look-ups × medians measured once; None where
+            these were not measured yet.
         wall_s: as it was met, on whatever else the machine did.
     """
 
-    counted_s: float
+    counted_s: float | None
     wall_s: float
 
     def __add__(self, other: Time) -> Time:
-        return Time(self.counted_s + other.counted_s, self.wall_s + other.wall_s)
+        wall_s = self.wall_s + other.wall_s
+        if self.counted_s is None or other.counted_s is None:
+            return Time(None, wall_s)
+        return Time(self.counted_s + other.counted_s, wall_s)
 
 
 # Downloads tried out on held-out drives, by kind.
 Trials: TypeAlias = dict[str, list[tuple[EvaluatedDrive, TriedDownload]]]
 
 
+def total(times: Iterable[Time]) -> Time:
+    """Of things done one after another."""
+    return sum(times, Time(0.0, 0.0))
+
+
 def slowest(times: Iterable[Time]) -> Time:
     """Of things done side by side, by either clock."""
     some = list(times)
+    counted = [one.counted_s for one in some if one.counted_s is not None]
     return Time(
-        max((one.counted_s for one in some), default=0.0),
+        max(counted, default=0.0) if len(counted) == len(some) else None,
         max((one.wall_s for one in some), default=0.0),
     )
 
@@ -125,7 +136,7 @@ class FoldResult:
 
     def __init__(self, plan: FleetPlan, arm: Arm, fold: Fold, stages: StageTimes | None) -> None:
         self.plan, self.arm, self.fold = plan, arm, fold
-        self._stages = stages or StageTimes(0.0, 0.0, 0.0)
+        self._stages = stages
 
     def sessions(self, name: str) -> list[BuiltSession]:
         """How a map was built, drive by drive; empty if it was not."""
@@ -140,7 +151,10 @@ class FoldResult:
         return read_download(self._beside(name, "download"))
 
     def held_out(self, name: str) -> list[SessionResult]:
-        """The held-out drives in a map, as far as they were localised."""
+        """The held-out drives in a map; empty unless all were localised.
+
+        Some of them would stand beside others in another map.
+        """
         found = []
         for number in self.fold.held_out:
             drive = self.plan.drives.drives[number]
@@ -149,7 +163,7 @@ class FoldResult:
                 row = runs.configurations.index(self.arm.configuration)
                 nodes = self.nodes(name)
                 found.append(session_result(runs, row, number, self.fold.number, nodes))
-        return found
+        return found if len(found) == len(self.fold.held_out) else []
 
     def nodes(self, name: str) -> int:
         """Of a map."""
@@ -158,7 +172,7 @@ class FoldResult:
 
     def time_of(self, sessions: Sequence[BuiltSession]) -> Time:
         """What mapping some drives took."""
-        counted = self._stages.seconds(
+        counted = self.counted(
             sum(one.frames for one in sessions),
             sum(one.attempts for one in sessions),
             sum(one.lookups for one in sessions),
@@ -167,7 +181,7 @@ class FoldResult:
 
     def time_of_merge(self, made: MergeRecord) -> Time:
         """What a merge took."""
-        return Time(self._stages.seconds(made.frames, made.attempts, made.lookups), made.seconds)
+        return Time(self.counted(made.frames, made.attempts, made.lookups), made.seconds)
 
     def single(self) -> list[BuiltSession] | None:
         """The single agent's map; None unless it is whole."""
@@ -206,8 +220,20 @@ class FoldResult:
                 found.append(InField(robot, policy, built.nodes, driven, ms, time, built.frames))
         return found if len(found) == len(drives) else []
 
+    def forays(self) -> dict[str, list[InField]]:
+        """Both robots' second forays by policy; none unless they were driven in all policies.
+
+        Fig. 8 needs those in copies only: alone they say nothing of downloads.
+        """
+        driven = {
+            policy: [self.in_field(robot, policy) for robot in ROBOTS] for policy in FORAY_POLICIES
+        }
+        if not all(one for robots in driven.values() for one in robots):
+            return {}
+        return {policy: [*chain.from_iterable(robots)] for policy, robots in driven.items()}
+
     def trials(self) -> Trials:
-        """Downloads tried out on held-out drives, by kind."""
+        """Downloads tried out on held-out drives, by kind; each drive tried all kinds at once."""
         found: Trials = {}
         for drive in self.plan.held_out(self.fold):
             for one in read_trials(self.plan, self.arm, self.fold, drive):
@@ -224,9 +250,15 @@ class FoldResult:
         count = len(self.plan.order_groups(self.fold))
         return [self.sessions(f"orders-{number}") for number in range(count)]
 
-    def counted(self, frames: int, attempts: int, lookups: int) -> float:
-        """Seconds of so many."""
-        return self._stages.seconds(frames, attempts, lookups)
+    def sequential(self) -> list[BuiltSession] | None:
+        """The order that was really built sequentially; None unless it is whole."""
+        sessions = self.sessions("orders-sequential")
+        wanted = sum(len(one) for one in self.plan.order_groups(self.fold))
+        return sessions if len(sessions) == wanted else None
+
+    def counted(self, frames: int, attempts: int, lookups: int) -> float | None:
+        """Seconds of so many; None if no medians were measured."""
+        return None if self._stages is None else self._stages.seconds(frames, attempts, lookups)
 
     def _beside(self, name: str, kind: str) -> Any:
         return map_path(self.plan, self.arm, self.fold, name).with_suffix(f".{kind}.json")
@@ -239,6 +271,10 @@ class ArmResult:
         self.plan, self.arm = plan, arm
         self.stages = read_stages(plan, arm)
         self.folds = [FoldResult(plan, arm, fold, self.stages) for fold in plan.folds]
+
+    def asked(self, experiment: int) -> bool:
+        """Whether an experiment is to be reported on; others left maps that it shares with them."""
+        return experiment in self.plan.options.experiments
 
     @cached_property
     def configuration(self) -> Configuration:
@@ -258,18 +294,16 @@ class ArmResult:
         return [ConfigurationResult(self.configuration, one) for one in found]
 
     def forays(self, policy: str) -> list[InField]:
-        """All drives of all second forays in one kind of download."""
-        return [
-            one for fold in self.folds for robot in ROBOTS for one in fold.in_field(robot, policy)
-        ]
+        """All drives of all second forays in one kind of download, of the folds that have all."""
+        return [one for fold in self.folds for one in fold.forays().get(policy, [])]
 
     def downloads(self, policy: str) -> list[DownloadRecord]:
-        """What the robots took along, of the folds in which they drove in it."""
+        """What the robots took along, of the same folds."""
         found = [
             fold.download(f"{robot}-{policy}-download")
             for fold in self.folds
+            if fold.forays()
             for robot in ROBOTS
-            if fold.in_field(robot, policy)
         ]
         return [one for one in found if one is not None]
 

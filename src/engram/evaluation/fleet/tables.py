@@ -10,7 +10,14 @@ import numpy as np
 from engram.evaluation.building import BuiltSession
 from engram.evaluation.fleet.experiments import SHARED, SINGLE, merged_name, pair_merges
 from engram.evaluation.fleet.plan import FORAY_POLICIES, ROBOTS
-from engram.evaluation.fleet.results import ArmResult, FoldResult, InField, Time, Trials
+from engram.evaluation.fleet.results import (
+    ArmResult,
+    FoldResult,
+    InField,
+    Time,
+    Trials,
+    total,
+)
 from engram.evaluation.fleet.trials import TriedDownload
 from engram.evaluation.summary import ConfigurationResult, SessionResult
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
@@ -29,19 +36,20 @@ def fleet_rows(arm: ArmResult) -> list[Row]:
         rows += _trial_rows(str(fold.fold.number), _flat(fold.trials()))
         rows += _order_rows(fold)
     rows += _pooled_rows(arm)
+    asked = [row for row in rows if arm.asked(row["experiment"])]
     about = {
         "campaign": arm.plan.drives.name,
         "arm": arm.arm.letter,
         "policy": arm.arm.policy,
         "attempts": arm.configuration.budget.attempts if arm.arm.letter != "C" else "all",
     }
-    return [{**about, **row} for row in rows]
+    return [{**about, **row} for row in asked]
 
 
 def order_rows(arm: ArmResult) -> list[Row]:
     """One row per order of merging."""
     found = arm.folds[0].orders()
-    if found is None:
+    if found is None or not arm.asked(10):
         return []
     return [
         {
@@ -74,15 +82,15 @@ def _building_rows(fold: FoldResult) -> Iterator[Row]:
         built = fold.parallel(groups)
         if built is None:
             continue
-        merged = merged_name(groups, groups - 1)
+        merged, merges = merged_name(groups, groups - 1), total(built.merge_times)
         logs = sum(len(one) for one in built.groups)
         yield {
             **_row(7, number, f"{groups} groups"),
             "logs": logs,
             "nodes": built.nodes,
             **_time(built.time),
-            "merges_counted_s": sum(one.counted_s for one in built.merge_times),
-            "merges_wall_s": sum(one.wall_s for one in built.merge_times),
+            "merges_counted_s": merges.counted_s,
+            "merges_wall_s": merges.wall_s,
             **_held_out(fold.held_out(merged)),
         }
         pairwise = built.pairwise_time
@@ -99,17 +107,15 @@ def _building_rows(fold: FoldResult) -> Iterator[Row]:
 
 def _sharing_rows(fold: FoldResult) -> Iterator[Row]:
     """Fig. 8."""
-    for name in (*ROBOTS, SHARED):
-        held_out = fold.held_out(name)
-        if held_out and fold.held_out("r1"):
+    found = {name: fold.held_out(name) for name in (*ROBOTS, SHARED)}
+    if all(found.values()):
+        for name, held_out in found.items():
             row = _row(8, str(fold.fold.number), name)
             yield {**row, "nodes": fold.nodes(name), **_held_out(held_out)}
 
 
 def _forays(fold: FoldResult) -> list[InField]:
-    return [
-        one for policy in FORAY_POLICIES for robot in ROBOTS for one in fold.in_field(robot, policy)
-    ]
+    return [one for some in fold.forays().values() for one in some]
 
 
 def _foray_rows(number: str, forays: Sequence[InField]) -> Iterator[Row]:
@@ -119,13 +125,13 @@ def _foray_rows(number: str, forays: Sequence[InField]) -> Iterator[Row]:
         if not some:
             continue
         frames = sum(one.frames for one in some)
-        counted_s = sum(one.time.counted_s for one in some)
+        counted_s = total(one.time for one in some).counted_s
         yield {
             **_row(9, number, f"foray in {policy}"),
             "logs": len(some),
             "nodes": float(np.mean([one.nodes for one in some])),
             "ms_per_frame": sum(one.ms * one.frames for one in some) / frames,
-            "counted_ms_per_frame": 1e3 * counted_s / frames,
+            "counted_ms_per_frame": None if counted_s is None else 1e3 * counted_s / frames,
             **_failure([one.drive for one in some]),
         }
 
@@ -176,7 +182,7 @@ def _order_rows(fold: FoldResult) -> Iterator[Row]:
         "share_not_localised": float(missed[0]),
         **{f"p_gt_{at:g}m": float(curves[0, round(2 * at)]) for at in _AT_M},
     }
-    built = fold.sessions("orders-sequential")
+    built = fold.sequential()
     if built:
         yield {
             **_row(10, number, "one order built sequentially"),

@@ -1,4 +1,8 @@
-"""Downloads for the hour of each held-out drive, tried out on it ([G16] Fig. 9, SPEC §7)."""
+"""Downloads for the hour of each held-out drive, tried out on it ([G16] Fig. 9, SPEC §7).
+
+All are without thumbnails, so that equal bytes are equal: `budget` sends none unless it is told to,
+the others do, and thumbnails are a tenth of a map.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +97,7 @@ def try_downloads_for(
 ) -> None:
     """All kinds of download of one map for one held-out drive."""
     path = trials_path(plan, arm, fold, drive)
-    if path.exists():
+    if _kept(path) is not None:
         return
     centre = map_path(plan, arm, fold, name)
     trials = partial(
@@ -105,11 +109,11 @@ def try_downloads_for(
         progress=silent,
         start=partial(_start, plan, fold, drive),
     )
-    found, refused = trials({COPY: DownloadOptions(COPY)}), {}
+    found, refused = trials({COPY: _wanted(COPY)}), {}
     if hour_of_day(drive.session, drive.session.start_ns) is not None:
         for one in _BY_HOUR:
             try:
-                found += trials({one: DownloadOptions(one)})
+                found += trials({one: _wanted(one)})
             except InputError as error:  # nothing was driven at such an hour
                 refused[one] = str(error)
     sizes = {one.name: one.report.size_bytes for one in found}
@@ -121,7 +125,7 @@ def try_downloads_for(
     }
     for one, room in budgets.items():
         try:
-            found += trials({one: DownloadOptions("budget", budget_bytes=room)})
+            found += trials({one: _wanted("budget", room)})
         except InputError as error:  # a map so small that a part of it has no room for a node
             refused[one] = str(error)
     own = [
@@ -138,15 +142,15 @@ def try_downloads_for(
         }
         for one in found
     ]
-    write_json(path, {"refused": refused, "tried": tried})
+    write_json(path, {"thumbnails": False, "refused": refused, "tried": tried})
 
 
 def read_trials(
     plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive
 ) -> list[TriedDownload]:
     """The trials of one held-out drive; empty if they are still to be made."""
-    path = trials_path(plan, arm, fold, drive)
-    if not path.exists():
+    kept = _kept(trials_path(plan, arm, fold, drive))
+    if kept is None:
         return []
     return [
         TriedDownload(
@@ -155,8 +159,26 @@ def read_trials(
                 "drive": Drive(np.array(one["drive"][0]), np.array(one["drive"][1], np.bool_)),
             }
         )
-        for one in read_json(path)["tried"]
+        for one in kept
     ]
+
+
+def _wanted(policy: str, budget_bytes: int | None = None) -> DownloadOptions:
+    """As all downloads here are."""
+    return DownloadOptions(policy, budget_bytes=budget_bytes, thumbnails=False)
+
+
+def _kept(path: Path) -> list[dict[str, Any]] | None:
+    """Trials that were made; None if they are still to be made.
+
+    Earlier versions said nothing of thumbnails, and had them in all but `budget`: their trials do
+    not count, so that they are never pooled with those of today.
+    """
+    if not path.exists():
+        return None
+    values = read_json(path)
+    tried: list[dict[str, Any]] = values["tried"]
+    return tried if values.get("thumbnails") is False else None
 
 
 def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: OpenMap) -> Position | None:
