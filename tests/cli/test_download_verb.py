@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -60,7 +61,7 @@ def test_a_promise_is_held_against_a_drive(
         "check"
     ]
     assert (mine["name"], whole["name"]) == ("tod", "copy")
-    # The very drive of which the map was made.
+    # The very images of which the map was made, as of another time.
     assert mine["missed"] == whole["missed"] == 0.0
     # One drive says little of the next: what it saved is believed to serve it half of the time.
     assert 0.3 < mine["expected_missed"] < 0.7
@@ -74,6 +75,22 @@ def test_a_drive_that_cannot_be_opened_fails_before_anything_is_written(
     assert ran.status == 2
     assert "nope.framelog" in ran.err
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("robot", [None, "somebody"])
+def test_a_drive_that_the_centre_holds_is_refused_before_anything_is_written(
+    engram, centre: Path, street: Path, morning: Path, tmp_path: Path, robot: str | None
+) -> None:
+    known = shutil.copy(centre, tmp_path / "centre.engram")
+    map_drive(known, open_drive(morning, robot=robot), Settings(), MapOptions())
+    ran = engram("download", known, tmp_path / "out.engram", "--check", morning)
+    assert ran.status == 2
+    assert f"{morning} is not held out" in ran.err
+    assert "--check" in ran.err
+    assert not (tmp_path / "out.engram").exists()
+    # The revision that is sent did not have it yet.
+    asked = ("download", known, tmp_path / "out.engram", "--at", 1, "--check", morning)
+    assert engram(*asked).status == 0
 
 
 def test_a_drive_for_whose_hour_there_is_nothing_is_a_row_of_its_own(

@@ -81,3 +81,20 @@ def test_build_maps_and_merges(engram, street, tmp_path):
     refused = engram("build", town, street, "--groups", 3)
     assert refused.status == 2
     assert "must be 1 to 1" in refused.err
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        (("--validate", "held-out.framelog"), "--validate judges orders of merging"),
+        (("--judge-at", 10), "--judge-at judges orders of merging"),
+        (("--seed", 0), "--seed is of random grouping"),
+        (("--seed", 7, "--grouping", "by-condition"), "--seed is of random grouping"),
+        (("--best-order",), "name at least one"),
+    ],
+)
+def test_build_refuses_options_that_mean_nothing(engram, street, tmp_path, asked, says):
+    refused = engram("build", tmp_path / "town.engram", street, "--groups", 1, *asked)
+    assert refused.status == 2
+    assert says in refused.err
+    assert list(tmp_path.iterdir()) == []

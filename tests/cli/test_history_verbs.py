@@ -117,6 +117,7 @@ def test_blame_names_robot_session_and_revision(engram, town: Path) -> None:
         (("tag", "TOWN", "7up"), "cannot be a tag"),
         (("tag", "TOWN", "first", 2), "already"),
         (("tag", "TOWN", "other", 5), "not 5"),
+        (("tag", "TOWN", "other", 0), "revisions 1 to 2; 0 is before the first"),
         (("tag", "TOWN", "other", "--delete"), "no tag 'other'"),
         (("tag", "TOWN", "--delete"), "--delete needs the NAME of a tag"),
         (("tag", "TOWN", "--move"), "--move needs the NAME of a tag"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -99,6 +100,25 @@ def test_a_search_that_was_killed_counts_what_it_had_done(tmp_path, maps, logs, 
     assert (again.merges, again.copies) == (2, 4)
     assert again.results == searched[1].results
     assert not list(tmp_path.glob("*.engram*"))
+
+
+@pytest.mark.parametrize("lost", ["all", "half", "spent", "result", "a figure"])
+def test_a_step_that_cannot_be_read_is_made_again(tmp_path, maps, logs, searched, lost):
+    shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "order-1-0.json"
+    content = path.read_text()
+    values = json.loads(content)
+    left = {
+        "all": "",
+        "half": content[: len(content) // 2],
+        "spent": json.dumps(values | {"spent": {"coffee": 1}}),
+        "result": json.dumps(values | {"result": None}),
+        "a figure": json.dumps(values | {"result": {"order": [1, 0]}}),
+    }
+    path.write_text(left[lost])
+    again = search(tmp_path, maps[:2], judge(logs["held-out"]))
+    assert again.results == searched[1].results
+    assert json.loads(path.read_text())["result"] == values["result"]
 
 
 def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):

@@ -18,7 +18,7 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from engram.drive import MapOptions, Settings, map_drive, open_drive
+from engram.drive import MapOptions, Settings, map_drive, open_drive, session_of_drive
 from engram.errors import (
     ConfigError,
     IncompatibleError,
@@ -30,8 +30,8 @@ from engram.errors import (
     SequenceError,
 )
 from engram.experience.model import Clock, SessionId
-from engram.fleet import MergeOptions, merge_maps
-from engram.fleet.gate import what_is_worse
+from engram.fleet import MergeOptions, docking, gate, merge_maps, merging
+from engram.fleet.gate import check_held_out, what_is_worse
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.frontend import DescriptorKind
 from engram.measures import Drive
@@ -107,8 +107,10 @@ def judged(monkeypatch):
 
     def say(*found: Drive) -> None:
         answers = iter([[one] for one in found])
-        named = SimpleNamespace(id=SessionId(uuid4()))
-        monkeypatch.setattr("engram.fleet.gate.Gate._localise", lambda self, store: next(answers))
+        named = SimpleNamespace(id=SessionId(uuid4()), camera="another", start_ns=0)
+        monkeypatch.setattr(
+            "engram.fleet.gate.Gate._localise", lambda self, store, _: next(answers)
+        )
         monkeypatch.setattr("engram.fleet.gate.open_drive", lambda path: path)
         monkeypatch.setattr("engram.fleet.gate.session_of_drive", lambda sequence: named)
 
@@ -392,6 +394,27 @@ class TestGate:
         with pytest.raises(ConfigError, match=r"not held out: .*centre\.engram holds"):
             merged(centre, fleet["longer"][0], require_better=[drive])
 
+    def test_the_name_of_the_robot_does_not_make_a_drive_held_out(self, tmp_path, centre, fleet):
+        drive = frame_log(tmp_path / "drive.framelog", np.arange(0, 8, 0.8), 1, day=8)
+        robot = tmp_path / "robot.engram"
+        renamed = open_drive(drive, robot="somebody")
+        map_drive(robot, renamed, Settings(), MapOptions(relocaliser="exhaustive"))
+        merged(centre, robot)
+        with pytest.raises(ConfigError, match=r"not held out: .*centre\.engram .*somebody"):
+            merged(centre, fleet["longer"][0], require_better=[drive])
+
+    def test_drives_that_begin_at_the_same_time_are_not_the_same(self, tmp_path):
+        """Stamps of many data sets count from 0, and one camera drove all of them."""
+        ours, theirs = (
+            open_drive(frame_log(tmp_path / f"{name}.framelog", np.arange(0, 4, 0.8), name=name))
+            for name in ("ours", "theirs")
+        )
+        sessions = [session_of_drive(theirs)]
+        assert session_of_drive(ours).start_ns == sessions[0].start_ns
+        check_held_out([("ours", ours)], sessions, "a map", "--check")
+        with pytest.raises(ConfigError, match="theirs is not held out: a map holds"):
+            check_held_out([("theirs", theirs)], sessions, "a map", "--check")
+
     def test_the_report_says_what_the_gate_saw(self, tmp_path, centre, fleet, judged):
         judged(BADLY, WELL)
         (report,) = merged(centre, fleet["other"][0], require_better=[tmp_path / "held-out"])
@@ -441,6 +464,97 @@ def test_ctrl_c_ends_a_merge_between_two_nodes_and_the_next_one_completes_it(
     expected = merged(whole, fleet["first"][0], fleet["longer"][0])[-1].content_hash
     assert merged(centre, fleet["longer"][0])[0].content_hash == expected
     assert MapStore.check(centre).abandoned_rows == 0
+
+
+class TestInterrupted:
+    """Ctrl-C where no node is being looked at: at the gate, and in maps with nothing new."""
+
+    @pytest.fixture
+    def held_out(self, tmp_path):
+        return frame_log(tmp_path / "held-out.framelog", np.arange(12, 24, 0.8), 0, day=8)
+
+    @pytest.fixture
+    def pressed(self, monkeypatch):
+        """Presses Ctrl-C when this is called."""
+
+        def press_at(target, name, call=1):
+            really, calls = getattr(target, name), 0
+
+            def pressed(*arguments, **options):
+                nonlocal calls
+                calls += 1
+                if calls == call:
+                    signal.raise_signal(signal.SIGINT)
+                return really(*arguments, **options)
+
+            monkeypatch.setattr(target, name, pressed)
+
+        return press_at
+
+    def test_at_the_gate_between_two_frames(self, monkeypatch, centre, fleet, held_out):
+        before, frames, really = hash_of(centre), 0, docking.Gate.__call__
+
+        def judged(judge, store, robot, advance):
+            def pressing(word):
+                nonlocal frames
+                frames += 1
+                if frames == 3:
+                    signal.raise_signal(signal.SIGINT)
+                advance(word)
+
+            return really(judge, store, robot, pressing)
+
+        monkeypatch.setattr(docking.Gate, "__call__", judged)
+        maps = [fleet[name][0] for name in ("same", "longer")]
+        (report,) = merged(centre, *maps, require_better=[held_out])
+        assert report.interrupted
+        assert frames == 3
+        assert hash_of(centre) == report.content_hash == before
+        assert MapStore.check(centre).problems == ()
+
+    def test_when_the_gate_has_said_yes(self, centre, fleet, held_out, pressed):
+        before = hash_of(centre)
+        pressed(gate, "what_is_worse")
+        (report,) = merged(centre, fleet["longer"][0], require_better=[held_out])
+        assert report.interrupted
+        assert hash_of(centre) == before
+
+    def test_before_the_first_merge(self, centre, fleet, held_out, pressed):
+        before, told = hash_of(centre), []
+        pressed(docking.Gate, "look_at")
+        with pytest.raises(KeyboardInterrupt):
+            merged(centre, fleet["longer"][0], require_better=[held_out], told=told.append)
+        assert told == []
+        assert hash_of(centre) == before
+
+    def test_when_all_nodes_were_looked_at(self, centre, fleet, pressed):
+        before = hash_of(centre)
+        pressed(merging._Merging, "_carry_attempts")
+        (report,) = merged(centre, fleet["longer"][0])
+        assert report.interrupted
+        assert hash_of(centre) == before
+
+    def test_in_a_map_with_nothing_new(self, centre, fleet, pressed):
+        pressed(merging, "notes")
+        (report,) = merged(centre, fleet["first"][0], fleet["longer"][0])
+        assert report.interrupted
+
+    def test_when_a_merge_was_done_the_next_one_is_not_begun(self, centre, fleet, pressed):
+        pressed(merging.BulkWriter, "commit")
+        maps = [fleet[name][0] for name in ("other", "longer")]
+        done, stopped = merged(centre, *maps)
+        assert (done.interrupted, done.revision) == (False, 2)
+        assert stopped.interrupted
+        assert stopped.source == str(maps[1])
+        assert hash_of(centre) == done.content_hash == stopped.content_hash
+
+    def test_when_the_last_merge_was_done_whoever_called_hears_of_it(self, centre, fleet, pressed):
+        told = []
+        pressed(merging.BulkWriter, "commit")
+        with pytest.raises(KeyboardInterrupt):
+            merged(centre, fleet["longer"][0], told=told.append)
+        assert [report.revision for report in told] == [2]
+        assert hash_of(centre) == told[0].content_hash
 
 
 def kill_and_look(tmp_path: Path, fleet: dict, kills: int, seed: int) -> None:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from tests.worlds import attempts_of
 
-from engram.drive import open_map
+from engram.drive import MapOptions, Settings, map_drive, open_drive, open_map
 from engram.experience.model import EdgeKind, PathEntryKind, path_id
-from engram.fleet import Reason, Seed
+from engram.fleet import DownloadOptions, Reason, Seed, download, silent
 from engram.store import MapStore
 
-from .robots import merged, robot_map, truth_of
+from .robots import frame_log, merged, robot_map, truth_of
 
 
 def assert_sound(path) -> None:
@@ -221,3 +221,23 @@ def test_attempts_go_along_to_the_equivalents(tmp_path, fleet):
             assert (now.across_m, now.along_m) == pytest.approx(moved[0, [0, 2]], abs=2e-2)
         else:
             assert now.along_m == pytest.approx(one.along_m, abs=1e-6)
+
+
+def test_nodes_that_a_revert_had_hidden_bring_back_what_joins_them_to_others(tmp_path, fleet):
+    centre, sent = tmp_path / "centre.engram", tmp_path / "sent.engram"
+    first, other = fleet["first"][0], fleet["other"][0]
+    merged(centre, first, other)
+    # A robot drives on in a download, so that its nodes hang on those of `first`.
+    download(centre, sent, DownloadOptions(), progress=silent)
+    drive = frame_log(tmp_path / "drive.framelog", np.arange(8, 40, 0.8), name="r5", day=5)
+    map_drive(sent, open_drive(drive), Settings(), MapOptions(relocaliser="exhaustive"))
+    (before,) = merged(centre, sent)
+    with MapStore.open_for_writing(centre) as store:
+        store.revert(1, author="tests")
+    (report,) = merged(centre, first)
+    with open_map(centre, None) as opened:
+        assert report.components == opened.graph.components().max() + 1 == before.components
+    assert report.taken
+    assert not any("found in the centre" in note for note in report.notes)
+    assert not any("hang together with nothing" in note for note in report.notes)
+    assert_sound(centre)

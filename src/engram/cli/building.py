@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from engram.cli import options
+from engram.errors import ConfigError
+
+if TYPE_CHECKING:
+    from engram.fleet import JudgeOptions
 
 
 def build(
@@ -34,7 +38,9 @@ def build(
             help="chronological, random, by-condition, or a file with one group a line.",
         ),
     ] = "chronological",
-    seed: Annotated[int, typer.Option("--seed", help="Of random grouping.")] = 0,
+    seed: Annotated[
+        int | None, typer.Option("--seed", help="Of random grouping [default: 0].")
+    ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Map on a Dask cluster instead."),
@@ -49,9 +55,14 @@ def build(
         ),
     ] = None,
     judge_at: Annotated[
-        float,
-        typer.Option("--judge-at", metavar="METRES", min=0.0, help="What dead reckoning bears."),
-    ] = 10.0,
+        float | None,
+        typer.Option(
+            "--judge-at",
+            metavar="METRES",
+            min=0.0,
+            help="What dead reckoning bears [default: 10].",
+        ),
+    ] = None,
     keep: Annotated[
         bool,
         typer.Option("--keep", help="Leave the groups' maps in CENTRE.build till the next build."),
@@ -82,20 +93,22 @@ def build(
     """
     from engram.cli.progress import progress
     from engram.drive import MapOptions, load_settings
-    from engram.fleet import BuildOptions, JudgeOptions, MergeOptions, build_map
+    from engram.fleet import BuildOptions, MergeOptions, build_map
 
+    if seed is not None and grouping != "random":
+        raise ConfigError("--seed is of random grouping: leave it out, or give --grouping random")
     found = None if relocaliser == "none" else relocaliser
     asked = BuildOptions(
         workers=workers,
         groups=groups,
         grouping=grouping,
-        seed=seed,
+        seed=0 if seed is None else seed,
         mapping=MapOptions(
             policy=policy, lanes=lanes, rounds=rounds, relocaliser=found, author=author
         ),
         merging=MergeOptions(policy, lanes, rounds, found, author),
         scheduler=scheduler,
-        judge=JudgeOptions(validate or [], judge_at) if best_order or validate else None,
+        judge=_judge(validate or [], judge_at, asked=best_order),
     )
     report = build_map(centre, drives, load_settings(config), asked, keep=keep, progress=progress)
     if as_json:
@@ -104,3 +117,19 @@ def build(
         typer.echo(report.text())
     if report.interrupted:
         raise typer.Exit(130)
+
+
+def _judge(drives: list[Path], judge_at_m: float | None, *, asked: bool) -> JudgeOptions | None:
+    """By what the best order is told; None where it is not searched for.
+
+    Raises:
+        ConfigError: it is searched for without drives; or it is not, and an option means nothing.
+    """
+    from engram.fleet import JudgeOptions
+
+    if asked:
+        return JudgeOptions(drives) if judge_at_m is None else JudgeOptions(drives, judge_at_m)
+    for flag, given in (("--validate", bool(drives)), ("--judge-at", judge_at_m is not None)):
+        if given:
+            raise ConfigError(f"{flag} judges orders of merging: leave it out, or add --best-order")
+    return None

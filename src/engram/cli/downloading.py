@@ -131,7 +131,7 @@ def download(
         radius_m=radius,
         thumbnails=thumbnails,
     )
-    drives = _looked_at(check or [])
+    drives = _looked_at(centre, check or [], at)
     settings = load_settings(config)
     report = send(centre, out, asked, at=at, progress=progress)
     if not as_json:
@@ -151,11 +151,14 @@ def download(
         typer.echo(line)
 
 
-def _looked_at(drives: list[Path]) -> dict[str, Path]:
-    """By session; what cannot be opened shall not fail behind a download that is written."""
+def _looked_at(centre: Path, drives: list[Path], at: str | None) -> dict[str, Path]:
+    """By session; what cannot judge shall not fail behind a download that is written."""
     from engram.drive import open_drive, session_of_drive
+    from engram.fleet.trial import check_not_sent
 
-    return {str(session_of_drive(open_drive(drive)).id): drive for drive in drives}
+    opened = [(drive, open_drive(drive)) for drive in drives]
+    check_not_sent(centre, opened, at)
+    return {str(session_of_drive(sequence).id): drive for drive, sequence in opened}
 
 
 def _check(

@@ -447,19 +447,26 @@ class _Search:
         return known
 
     def _known(self, order: tuple[int, ...]) -> _Step | None:
+        """A step of an earlier run; None without one, and where its file cannot be made sense of.
+
+        A computer that lost power may leave a file empty or in part: the step is made again.
+        """
         path = self._path(order)
         if not path.exists():
             return None
         with keeping(self._folder):
-            values = json.loads(path.read_text())
-        if values.get("depends") != self._depends:
+            content = path.read_bytes()
+        try:
+            values = json.loads(content)
+            if values["depends"] != self._depends:
+                return None
+            result = values["result"]
+            spent = Spent(**values["spent"])
+            step = _Step(order, spent, None if result is None else _order_result(result))
+        except (ValueError, TypeError, KeyError):
             return None
-        result = values["result"]
-        return _Step(
-            order,
-            Spent(**values["spent"]),
-            None if result is None else _order_result(result),
-        )
+        is_whole = (step.result is not None) == (len(order) == len(self._maps))
+        return step if is_whole else None
 
     def _path(self, order: tuple[int, ...]) -> Path:
         return self._folder / f"order-{'-'.join(map(str, order))}.json"

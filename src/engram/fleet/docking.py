@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from engram.drive import Settings
@@ -40,7 +41,8 @@ def merge_maps(
     """Merges robots' maps into a centre, in the order given; the centre is made if there is none.
 
     Each robot's map is one merge: one revision, all or nothing. What was handed in before changes
-    nothing, so an interrupted command is simply given again.
+    nothing, so an interrupted command is simply given again. Ctrl-C waits for the end of the node
+    or of the held-out frame, and undoes the merge that it meets.
 
     Args:
         centre: NAME.engram.
@@ -64,6 +66,8 @@ def merge_maps(
         RefusedError: held-out drives localise worse in the result.
         MapError: a map cannot be read or written. Where a map cannot be opened or its records are
             damaged, nothing was merged; else merges before the failing one stand.
+        KeyboardInterrupt: Ctrl-C met no merge that could be undone: it came before the first one,
+            or when the last one was done.
     """
     if picture is not None:
         check_picture(picture)
@@ -71,21 +75,22 @@ def merge_maps(
     _check_given(centre, robots, gate)
     reports: list[MergeReport] = []
     with _place(centre, dry_run=dry_run) as place:
-        with MapStore.open(place.path) as store:
-            before = store.revision
-            if gate is not None:
-                gate.look_at(store)
-        for robot in robots:
-            started = time.perf_counter()
-            report = _merge_one(place.path, robot, settings, options, progress, gate)
-            report.dry_run = dry_run
-            report.seconds = time.perf_counter() - started
-            if not report.interrupted:
-                place.settle()
-            reports.append(report)
-            told(report)
-            if report.interrupted:
-                break
+        with deferred_interrupt() as raise_if_asked:
+            docking = _Docking(settings, options, progress, gate, raise_if_asked)
+            before = docking.look_at(place.path)
+            for robot in robots:
+                started = time.perf_counter()
+                report = docking.merge(place.path, robot)
+                report.dry_run = dry_run
+                report.seconds = time.perf_counter() - started
+                if not report.interrupted:
+                    place.settle()
+                reports.append(report)
+                told(report)
+                if report.interrupted:
+                    break
+            else:
+                raise_if_asked()
         if picture is not None:
             picture_before_and_after(place.path, before, picture)
     return reports
@@ -97,38 +102,73 @@ def _check_given(centre: Path, robots: Sequence[Path], gate: Gate | None) -> Non
         with MapStore.open(robot) as store:
             if centre.exists() and robot.samefile(centre):
                 raise InputError(f"{robot} is the centre itself; hand in other maps")
-            sessions = [session.id for session in store.load().sessions]
+            sessions = store.load().sessions
         if gate is not None:
             gate.check_held_out(sessions, robot)
     if gate is not None and centre.exists():
         with MapStore.open(centre) as store:
-            gate.check_held_out(store.frontends(), centre)
+            gate.check_held_out(store.load().sessions, centre)
 
 
-def _merge_one(
-    place: Path,
-    robot: Path,
-    settings: Settings,
-    options: MergeOptions,
-    progress: Progress,
-    gate: Gate | None,
-) -> MergeReport:
-    """One merge in a freshly opened centre, so that it does not matter what came before it."""
-    with HandedIn(MapStore.open(robot), str(robot)) as handed_in:
-        _check_before_raising(place, handed_in)
-        with (
-            MapStore.open_for_writing(place) as store,
-            deferred_interrupt() as raise_if_asked,
-        ):
-            resolved = settings.for_descriptor(handed_in.store.descriptor())
-            shown = _interruptible(progress, raise_if_asked)
+@dataclass(frozen=True, slots=True)
+class _Docking:
+    """How each robot's map is merged.
+
+    Attributes:
+        settings, options, progress: see `merge_maps`.
+        gate: that each result must pass; None for none.
+        raise_if_asked: raises KeyboardInterrupt after Ctrl-C. One for all robots: what is pressed
+            when a merge is just done must not be forgotten with it.
+    """
+
+    settings: Settings
+    options: MergeOptions
+    progress: Progress
+    gate: Gate | None
+    raise_if_asked: Callable[[], None]
+
+    def look_at(self, place: Path) -> int:
+        """The centre before the first merge, and how held-out drives fare there.
+
+        Returns:
+            Its revision.
+        """
+        with MapStore.open(place) as store:
+            if self.gate is not None:
+                self.gate.look_at(store, self._hear)
+            return store.revision
+
+    def merge(self, place: Path, robot: Path) -> MergeReport:
+        """One merge in a freshly opened centre, so that it does not matter what came before it."""
+        with HandedIn(MapStore.open(robot), str(robot)) as handed_in:
             try:
-                return merge_map(store, handed_in, resolved, options, shown, gate)
+                self.raise_if_asked()
+                report = self._merged(place, handed_in)
+                if report.revision is None:
+                    self.raise_if_asked()
             except KeyboardInterrupt:
                 report = MergeReport(str(robot), handed_in.content_hash, handed_in.robots)
                 report.interrupted = True
-                report.content_hash = store.content_hash()
-                return report
+                with MapStore.open(place) as store:
+                    report.content_hash = store.content_hash()
+            return report
+
+    def _merged(self, place: Path, robot: HandedIn) -> MergeReport:
+        _check_before_raising(place, robot)
+        with MapStore.open_for_writing(place) as store:
+            return merge_map(
+                store,
+                robot,
+                self.settings.for_descriptor(robot.store.descriptor()),
+                self.options,
+                _interruptible(self.progress, self.raise_if_asked),
+                None if self.gate is None else partial(self.gate, advance=self._hear),
+                self.raise_if_asked,
+            )
+
+    def _hear(self, _: str) -> None:
+        """Ctrl-C is heard between two frames of a held-out drive."""
+        self.raise_if_asked()
 
 
 def _check_before_raising(place: Path, robot: HandedIn) -> None:

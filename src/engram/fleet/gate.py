@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.drive import OpenMap, Settings, live_frames, measured, open_drive, session_of_drive
+from engram.drive.live import ignore
 from engram.drive.session import DriveSequence
 from engram.errors import ConfigError, RefusedError
-from engram.experience.model import SessionId
+from engram.experience.model import Session, session_id
 from engram.fleet.report import HeldOutFigures, HeldOutReport
 from engram.localiser import Budget, Localisation
 from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
+from engram.sequences import FrameLog, first_pair_hash
 from engram.store import MapStore
 
 # SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
@@ -44,6 +46,58 @@ class GateOptions:
     relocaliser: str | None = "fabmap"
 
 
+def check_held_out(
+    drives: Iterable[tuple[Path | str, DriveSequence]],
+    sessions: Iterable[Session],
+    where: Path | str,
+    option: str,
+) -> None:
+    """Refuses to judge by what is judged: a drive localises well in a map of itself.
+
+    A drive that was mapped under another robot's name has another session, and is told all the
+    same: by camera, first stamp and the images of its first frame. First stamps alone would not
+    do, since many data sets count from 0.
+
+    Args:
+        drives: that judge, each with what people call it.
+        sessions: of a map that is judged, or takes part in it.
+        where: the map.
+        option: by which the drives were given.
+
+    Raises:
+        ConfigError: one of them is one of the drives.
+        SequenceError: a drive cannot be read.
+    """
+    sessions = list(sessions)
+    for name, sequence in drives:
+        held = _held(sequence, sessions)
+        if held is not None:
+            raise ConfigError(
+                f"{name} is not held out: {where} holds this very drive (session {held.id} of "
+                f"{held.robot}); give {option} drives that are in none of the maps"
+            )
+
+
+def _held(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
+    """The session that this drive became, whatever the robot was called."""
+    own = session_of_drive(sequence)
+    for one in sessions:
+        if one.id == own.id:
+            return one
+        if (one.camera, one.start_ns) != (own.camera, own.start_ns):
+            continue
+        if one.id == session_id(one.robot, one.camera, one.start_ns, _first_pair(sequence)):
+            return one
+    return None
+
+
+def _first_pair(sequence: DriveSequence) -> str:
+    """`first_pair_hash` of a drive of which `session_of_drive` found that it has a frame."""
+    if isinstance(sequence, FrameLog):
+        return sequence.first_pair_hash
+    return first_pair_hash(next(iter(sequence)))
+
+
 class Gate:
     """Compares how held-out drives localise in the centre before and after.
 
@@ -61,13 +115,12 @@ class Gate:
     ) -> None:
         self._paths = list(drives)
         self._sequences = [open_drive(path) for path in drives]
-        self._sessions = [session_of_drive(sequence).id for sequence in self._sequences]
         self._settings = settings
         self._options = options or GateOptions()
         self._before: list[Drive] | None = None
 
-    def check_held_out(self, sessions: Collection[SessionId], where: Path) -> None:
-        """Refuses to judge by what is judged: a drive localises well in a map of itself.
+    def check_held_out(self, sessions: Iterable[Session], where: Path) -> None:
+        """See the function of this name.
 
         Args:
             sessions: of a map that takes part in the merge.
@@ -76,29 +129,33 @@ class Gate:
         Raises:
             ConfigError: one of them is one of the drives.
         """
-        for path, session in zip(self._paths, self._sessions, strict=True):
-            if session in sessions:
-                raise ConfigError(
-                    f"{path} is not held out: {where} holds this very drive (session {session}); "
-                    "give --require-better drives that are in none of the maps"
-                )
+        drives = zip(self._paths, self._sequences, strict=True)
+        check_held_out(drives, sessions, where, "--require-better")
 
-    def look_at(self, store: MapStore) -> None:
-        """The centre as it is; once, before the first merge."""
-        self._before = self._localise(store)
+    def look_at(self, store: MapStore, advance: Callable[[str], None] = ignore) -> None:
+        """The centre as it is; once, before the first merge.
 
-    def __call__(self, store: MapStore, robot: str) -> HeldOutReport:
+        Args:
+            store: the centre.
+            advance: called once for each frame.
+        """
+        self._before = self._localise(store, advance)
+
+    def __call__(
+        self, store: MapStore, robot: str, advance: Callable[[str], None] = ignore
+    ) -> HeldOutReport:
         """The centre as it would become.
 
         Args:
             store: with what is being merged.
             robot: name of the map that is.
+            advance: called once for each frame.
 
         Raises:
             RefusedError: the drives localise worse in it.
         """
         assert self._before is not None
-        before, after = self._before, self._localise(store)
+        before, after = self._before, self._localise(store, advance)
         names = [path.name for path in self._paths]
         worse = what_is_worse(after, before)
         if worse:
@@ -109,10 +166,11 @@ class Gate:
         self._before = after
         return HeldOutReport(names, _figures(before), _figures(after))
 
-    def _localise(self, store: MapStore) -> list[Drive]:
+    def _localise(self, store: MapStore, advance: Callable[[str], None]) -> list[Drive]:
         opened = OpenMap(store)
         return [
-            localise_drive(opened, one, self._settings, self._options) for one in self._sequences
+            localise_drive(opened, one, self._settings, self._options, advance)
+            for one in self._sequences
         ]
 
 
@@ -121,7 +179,7 @@ def localise_drive(
     sequence: DriveSequence,
     settings: Settings,
     options: GateOptions,
-    advance: Callable[[str], None] = lambda _: None,
+    advance: Callable[[str], None] = ignore,
 ) -> Drive:
     """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
     settings = settings.for_descriptor(opened.descriptor)

@@ -59,6 +59,7 @@ def merge_map(
     options: MergeOptions,
     progress: Progress = silent,
     gate: Gate | None = None,
+    raise_if_asked: Callable[[], None] = lambda: None,
 ) -> MergeReport:
     """Merges one robot's map into the centre: one revision, or none where nothing is new.
 
@@ -70,6 +71,7 @@ def merge_map(
         progress: shows how it goes.
         gate: is shown the result before it becomes part of the centre, with the map's name; it
             says what it found, or raises to refuse it.
+        raise_if_asked: is called where the merge can still be given up, and raises to do so.
 
     Raises:
         IncompatibleError: the map does not fit the centre.
@@ -88,9 +90,11 @@ def merge_map(
         with store.begin_revision(**_about(robot, settings, options)) as writer:
             merging = _Merging(centre, robot, writer, settings, options, report)
             merging.take_over(new, progress)
+            raise_if_asked()
             if gate is not None:
                 writer.flush()
                 report.held_out = gate(store, robot.name)
+                raise_if_asked()
             report.revision = writer.commit().number
         if options.relocaliser in _BY_WORDS:
             keep_words(store, centre, robot, settings.frontend.descriptor)
@@ -179,6 +183,7 @@ class _Merging:
                     self._report.segments.append(replay.segment(session, segment))
                 late += self._unite_path(session, replay)
         self._add_entries(late)
+        self._see_edges_again()
         self._take_known_edges()
         self._join_components()
         self._carry_omissions()
@@ -237,6 +242,15 @@ class _Merging:
                 self._centre.add_entry(new)
                 self._writer.add_path_entry(new)
                 self._report.path_entries += 1
+
+    def _see_edges_again(self) -> None:
+        """A node that a revert had hidden brings back its edges to nodes that stayed."""
+        if not self._writer.shows_again:
+            return
+        self._writer.flush()
+        graph = self._centre.graph
+        edges = self._centre.store.load().edges
+        graph.add_edges([one for one in edges if graph.find_edge(one.a, one.b, one.kind) is None])
 
     def _take_known_edges(self) -> None:
         """What the robot found out about nodes that the centre had: matches between them."""

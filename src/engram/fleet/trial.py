@@ -29,10 +29,12 @@ from engram.errors import ConfigError, InputError
 from engram.experience.clock import hour_of_day
 from engram.experience.model import Node, Session
 from engram.fleet.downloading import DownloadReport, download
+from engram.fleet.gate import check_held_out
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
 from engram.localiser import Position
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+from engram.store import MapStore
 
 OpenDrive = Callable[[], DriveSequence]
 # Stages that are the robot's own business, whatever map it has.
@@ -134,6 +136,26 @@ class LeftOut:
         return f"{self.name:16s} left out {self.drive}{hour}: {self.why}"
 
 
+def check_not_sent(
+    centre: Path, drives: Sequence[tuple[Path | str, DriveSequence]], at: int | str | None = None
+) -> None:
+    """Refuses drives that downloads of a centre may hold: they would do well in any.
+
+    Args:
+        centre: the map.
+        drives: that downloads are to be held against, each with what people call it.
+        at: revision of the centre; None for the newest.
+
+    Raises:
+        ConfigError: the centre holds one of them, under whatever name of the robot.
+        MapError: the centre cannot be read.
+        SequenceError: a drive cannot be read.
+    """
+    if drives:
+        with MapStore.open(centre, at=at) as store:
+            check_held_out(drives, store.load().sessions, centre, "--check")
+
+
 def try_downloads(
     centre: Path,
     wanted: Mapping[str, DownloadOptions],
@@ -161,9 +183,12 @@ def try_downloads(
             none of the others then, so that all are of the same drives. None for an error.
 
     Raises:
+        ConfigError: the centre holds one of the drives itself; nothing was tried.
         InputError: a drive's options fit nothing, and nobody is told.
         MapError: the centre cannot be read, or a download not be written.
     """
+    opened = [open_drive() for open_drive in drives]
+    check_not_sent(centre, [(sequence.info.name, sequence) for sequence in opened], at)
     trials: list[Trial] = []
     with tempfile.TemporaryDirectory(prefix="engram-trial-") as folder:
         for open_drive in drives:

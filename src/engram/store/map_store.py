@@ -637,7 +637,13 @@ class WritableMapStore(MapStore):
         with self._database.writing() as connection:
             number = resolve(connection, named, self._database.name)
             if number == 0:
-                raise RevisionError(f"{self._database.name} has no revision yet to tag")
+                newest = resolve(connection, None, self._database.name)
+                raise RevisionError(
+                    f"{self._database.name} has revisions 1 to {newest}; 0 is before the first and "
+                    "cannot be tagged"
+                    if newest
+                    else f"{self._database.name} has no revision yet to tag"
+                )
             known = load_tags(connection).get(name)
             if known is not None and known.number != number and not move:
                 raise RevisionError(
