@@ -130,19 +130,19 @@ class RecallPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        canonical = order_by(context)
-        costs, prior = self._costs_and_prior(context, canonical)
-        order: NDArray[np.int64] = canonical[self._pick(context, canonical, costs, prior)[0]]
+        canonical, run = order_by(context), context.run.newest(_MOST_ATTEMPTS)
+        costs, prior = self._costs_and_prior(context, canonical, run)
+        order: NDArray[np.int64] = canonical[self._pick(context, canonical, run, costs, prior)[0]]
         return self._in_turns(context, order)[0]
 
     def judge(self, context: RankingContext) -> RecallJudgement:
         """The ranking with its reasons."""
-        c, canonical = self._constants, order_by(context)
-        costs, prior = self._costs_and_prior(context, canonical)
-        order, margins, first = self._pick(context, canonical, costs, prior)
+        c, canonical, run = self._constants, order_by(context), context.run.newest(_MOST_ATTEMPTS)
+        costs, prior = self._costs_and_prior(context, canonical, run)
+        order, margins, first = self._pick(context, canonical, run, costs, prior)
         rows = np.empty_like(canonical)
         rows[canonical] = np.arange(len(canonical))
-        likeness, tally = self._likeness(context, canonical), self._tally(context, canonical)
+        likeness, tally = self._likeness(context, canonical), self._tally(context, canonical, run)
         terms = {
             "distance": -costs - likeness - tally,
             "likeness": likeness,
@@ -199,13 +199,13 @@ class RecallPolicy:
         return picks, by_turn
 
     def _costs_and_prior(
-        self, context: RankingContext, canonical: NDArray[np.int64]
+        self, context: RankingContext, canonical: NDArray[np.int64], run: RunAttempts
     ) -> tuple[Array, Array]:
         """Margins lost by all else, and as past drives have them; (Y,), nearest first."""
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
         costs = self._cost(context, near.rms_distance_m[canonical])
-        costs -= self._likeness(context, canonical) + self._tally(context, canonical)
+        costs -= self._likeness(context, canonical) + self._tally(context, canonical, run)
         return costs, c.level + c.lessons * np.log(base / (1 - base))
 
     def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
@@ -219,12 +219,14 @@ class RecallPolicy:
             return np.zeros(len(canonical))
         return np.asarray(c.likeness * standard_likenesses(context)[canonical])
 
-    def _tally(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
+    def _tally(
+        self, context: RankingContext, canonical: NDArray[np.int64], run: RunAttempts
+    ) -> Array:
         """Margins won by the rate at which this run matched the drive, (Y,), nearest first.
 
         Failures add up here as long as they go on, so that no candidate is tried for ever.
         """
-        c, run = self._constants, context.run.newest(_MOST_ATTEMPTS)
+        c = self._constants
         rates = session_rates(context, run, c.tally_memory_m)[canonical]
         return np.asarray(c.tally * np.log(rates / PRIOR_RATE))
 
@@ -234,10 +236,14 @@ class RecallPolicy:
         return np.asarray(per_m * distance_m)
 
     def _pick(
-        self, context: RankingContext, canonical: NDArray[np.int64], costs: Array, prior: Array
+        self,
+        context: RankingContext,
+        canonical: NDArray[np.int64],
+        run: RunAttempts,
+        costs: Array,
+        prior: Array,
     ) -> tuple[NDArray[np.int64], Array, Array]:
         c, graph = self._constants, context.graph
-        run = context.run.newest(_MOST_ATTEMPTS)
         return _core.recall_order(
             run.nodes,
             run.driven_m - run.at_m,
