@@ -69,7 +69,7 @@ def test_an_interval_lies_within_the_sessions_extremes(parts) -> None:
 
 
 def test_draws_of_other_sessions_are_refused() -> None:
-    with pytest.raises(InputError, match="over 3 sessions .* as many sessions as there are"):
+    with pytest.raises(InputError, match=r"over 3 sessions .* as many sessions as there are"):
         Resamples.of(2).interval(SessionSums(np.ones(3), np.ones(3)))
 
 
