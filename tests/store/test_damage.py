@@ -7,6 +7,7 @@ import errno
 import os
 import shutil
 import sqlite3
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -22,9 +23,10 @@ from engram.errors import (
     MapError,
     MapLockedError,
     NotAMapError,
+    StorageFullError,
 )
 from engram.experience.model import path_id
-from engram.store import MapStore
+from engram.store import MapStore, sqlite
 from engram.store.rows import sealed
 from engram.store.schema import FORMAT_VERSION, edges, nodes, path_entries
 
@@ -403,3 +405,67 @@ def test_a_map_on_read_only_media_is_read(sound, tmp_path_factory):
     assert "read-only" in refusal
     assert sorted(file.name for file in folder.iterdir()) == ["town.engram"]
     folder.chmod(0o755)
+
+
+def test_a_map_written_under_a_reader_without_rights_is_no_damaged_one(sound, tmp_path_factory):
+    """SQLite cannot follow what others write from a folder where nothing can be made."""
+    folder = tmp_path_factory.mktemp("shared")
+    path = shutil.copy(sound[0], folder / "town.engram")
+    for parent in folder.parents[:3]:
+        if parent.owner() == folder.owner():
+            parent.chmod(0o755)
+    folder.chmod(0o555)
+    opened, go_on = folder.parent / "opened", folder.parent / "go-on"
+    for pipe in (opened, go_on):
+        os.mkfifo(pipe)
+        pipe.chmod(0o666)
+
+    def write() -> None:
+        opened.read_bytes()
+        folder.chmod(0o755)
+        with MapStore.open_for_writing(path) as store:
+            store.tag("seen", author="tester")
+        folder.chmod(0o555)
+        go_on.write_bytes(b"")
+
+    def read() -> list[str]:
+        with MapStore.open(path) as store:
+            first = len(store.load().nodes)
+            opened.write_bytes(b"")
+            go_on.read_bytes()
+            try:
+                told = str(len(store.load().nodes))
+            except MapError as error:
+                told = f"{type(error).__name__}: {error}"
+        with MapStore.open(path) as store:
+            return [str(first), told, str(len(store.load().nodes))]
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    first, told, again = in_a_child_without_rights(read)
+    writer.join()
+    folder.chmod(0o755)
+    assert (first, again) == ("6", "6")
+    assert told.startswith("MapError: ")
+    assert "was written since it was opened" in told
+
+
+def test_a_map_on_a_full_disk_is_read(sound, tmp_path, monkeypatch):
+    """There is no room for the file in which readers and writers agree."""
+    path = shutil.copy(sound[0], tmp_path / "town.engram")
+    connect = sqlite._connect
+
+    def no_room(uri: str, prepare: object) -> object:
+        if "immutable" in uri or str(path) not in uri:
+            return connect(uri, prepare)
+        error = sqlite3.OperationalError("disk I/O error")
+        error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE
+        raise error
+
+    monkeypatch.setattr(sqlite, "_connect", no_room)
+    with MapStore.open(path) as store:
+        assert len(store.load().nodes) == 6
+    # A log may hold what the file does not have yet.
+    path.with_name("town.engram-wal").write_bytes(b"something")
+    with pytest.raises(StorageFullError, match="cannot grow"):
+        MapStore.open(path)

@@ -66,6 +66,8 @@ _MAGIC = b"SQLite format 3\x00"
 # Writers hold the file only for a checkpoint; somebody who waits longer than this is stuck.
 _BUSY_TIMEOUT_S = 30.0
 _CACHE_KIB = 8192
+# SQLite then takes no locks, and does not notice what others write.
+_NOBODY_WRITES = "mode=ro&immutable=1"
 _OLDEST_SQLITE = (3, 37, 0)  # knows STRICT tables
 
 
@@ -86,7 +88,9 @@ class SqliteDatabase:
         path = path.resolve()  # one lock per map, whatever links lead to it
         self.path = path
         _check_header(path)
-        self.format_version = _format_version(path)
+        self._uri = _way_of_reading(path)
+        self._as_opened = _state(path) if _is_immutable(self._uri) else None
+        self.format_version = _format_version(path, self._uri)
         self._reader = self._reading_engine()
         self._writer: Engine | None = None
         self._compiled: dict[Select[Any], tuple[str, tuple[str, ...]]] = {}
@@ -114,8 +118,34 @@ class SqliteDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for selects."""
-        with damage_named(self.name), _translated(self.name), self._reader.connect() as connection:
+        with (
+            self._unchanged(),
+            damage_named(self.name),
+            _translated(self.name),
+            self._reader.connect() as connection,
+        ):
             yield connection
+
+    @contextmanager
+    def _unchanged(self) -> Iterator[None]:
+        """What is read is of the file as it was opened, or it is told that it was written since.
+
+        Only where SQLite was told that nobody writes: then it mixes old pages and new ones, which
+        looks like damage, or like nothing at all.
+        """
+        try:
+            yield
+        except MapError as error:
+            self._check_unchanged(error)
+            raise
+        self._check_unchanged(None)
+
+    def _check_unchanged(self, cause: MapError | None) -> None:
+        if self._as_opened is not None and _state(self.path) != self._as_opened:
+            raise MapError(
+                f"{self.name} was written since it was opened, where this user may only read: "
+                "open it again"
+            ) from cause
 
     def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
         """The first row of a select, without SQLAlchemy between: that takes 100 µs a time."""
@@ -124,11 +154,11 @@ class SqliteDatabase:
             assert isinstance(compiled, SQLCompiler)
             self._compiled[query] = (str(compiled), tuple(compiled.positiontup or ()))
         statement, names = self._compiled[query]
-        with _translated(self.name):
+        with self._unchanged(), _translated(self.name):
             try:
                 connection = self._idle.pop()
             except IndexError:
-                connection = _connect(_reading_uri(self.path), self._prepare_reader)
+                connection = _connect(self._uri, self._prepare_reader)
             try:
                 row: tuple[Any, ...] | None = connection.execute(
                     statement, [parameters[name] for name in names]
@@ -189,8 +219,8 @@ class SqliteDatabase:
             InputError: something is there already, or the folder is not.
             MapError: it cannot be written.
         """
-        with _new_file(target) as draft, _translated(str(target)):
-            source = _connect(_reading_uri(self.path), _prepare)
+        with _new_file(target) as draft, self._unchanged(), _translated(str(target)):
+            source = _connect(self._uri, _prepare)
             copy = _connect(_uri(draft, "mode=rwc"), _prepare_writer)
             try:
                 source.backup(copy)
@@ -206,8 +236,8 @@ class SqliteDatabase:
             InputError: something is there already, or the folder is not.
             MapError: it cannot be written.
         """
-        with _new_file(target) as draft, _translated(str(target)):
-            source = _connect(_reading_uri(self.path), _prepare)
+        with _new_file(target) as draft, self._unchanged(), _translated(str(target)):
+            source = _connect(self._uri, _prepare)
             try:
                 source.execute("VACUUM INTO ?", [str(draft)])
             finally:
@@ -251,7 +281,7 @@ class SqliteDatabase:
             self._idle.pop().close()
 
     def _reading_engine(self) -> Engine:
-        return _engine(_reading_uri(self.path), self._prepare_reader)
+        return _engine(self._uri, self._prepare_reader)
 
     def _prepare_reader(self, connection: sqlite3.Connection) -> None:
         """What a map of an older format lacks is seen as empty tables of this connection alone."""
@@ -262,7 +292,7 @@ class SqliteDatabase:
 
     def _raise_format(self) -> None:
         """Bring an older map to the newest format: all of it, in one transaction."""
-        if _format_version(self.path) < FORMAT_VERSION:
+        if _format_version(self.path, self._uri) < FORMAT_VERSION:
             with self.writing() as connection:
                 raise_tables(connection, self.format_version, _free_no_names)
                 connection.execute(text(f"PRAGMA user_version={FORMAT_VERSION}"))
@@ -293,10 +323,41 @@ def _reading_uri(path: Path) -> str:
     """
     if os.access(path, os.W_OK) and os.access(path.absolute().parent, os.W_OK):
         return _uri(path, "mode=rw")
+    return _uri(path, "mode=ro" if _has_log(path) else _NOBODY_WRITES)
+
+
+def _way_of_reading(path: Path) -> str:
+    """`_reading_uri`, or, on a full disk, that of a file that nobody writes.
+
+    The file beside the write-ahead log cannot be made there. Without a log and without a writer
+    there is nothing to coordinate: history stays readable, and a map can be copied elsewhere.
+    """
+    uri = _reading_uri(path)
+    try:
+        _format_version(path, uri)
+    except StorageFullError:
+        if _has_log(path) or current_holder(path) is not None:
+            raise
+        return _uri(path, _NOBODY_WRITES)
+    return uri
+
+
+def _is_immutable(uri: str) -> bool:
+    return uri.endswith(_NOBODY_WRITES)
+
+
+def _has_log(path: Path) -> bool:
     log = path.with_name(path.name + "-wal")
-    if log.exists() and log.stat().st_size:
-        return _uri(path, "mode=ro")
-    return _uri(path, "mode=ro&immutable=1")
+    return log.exists() and log.stat().st_size > 0
+
+
+def _state(path: Path) -> tuple[int, int, int] | None:
+    """Which file stands under a name, and when it was last written; None where none does."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 def _connect(uri: str, prepare: Callable[[sqlite3.Connection], None]) -> sqlite3.Connection:
@@ -374,10 +435,10 @@ def _check_version() -> None:
         )
 
 
-def _format_version(path: Path) -> int:
+def _format_version(path: Path, uri: str) -> int:
     """As SQLite sees it: the write-ahead log may be newer than the file's first page."""
     with _translated(str(path)):
-        connection = _connect(_reading_uri(path), _prepare)
+        connection = _connect(uri, _prepare)
         try:
             return int(connection.execute("PRAGMA user_version").fetchone()[0])
         finally:
