@@ -192,22 +192,33 @@ def success_rates(
 # --- recall
 
 def recall_order(
-    run_nodes: NDArray[np.int32],
-    run_ago_m: NDArray[np.float64],
-    run_margins: NDArray[np.float64],
+    driven_m: float,
+    at_m: NDArray[np.float64],
+    attempted: NDArray[np.int32],
+    distance_m: NDArray[np.float64],
+    rates: NDArray[np.float64],
+    accepted: NDArray[np.bool_],
+    inliers: NDArray[np.int64],
     nodes: NDArray[np.int32],
     costs: NDArray[np.float64],
     prior: NDArray[np.float64],
     sessions: NDArray[np.int32],
     session_count: int,
     *,
+    per_m: float,
+    level: float,
     memory_m: float,
     prior_weight: float,
-    failed: float,
     regret: float,
+    tally: float,
+    tally_memory_m: float,
+    untried_rate: float,
+    untried_count: float,
+    needed: int,
+    attempts: int,
     picks: int,
     shortlist: int,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]: ...
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
 
 # --- path memory
 

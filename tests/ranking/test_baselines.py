@@ -124,7 +124,7 @@ class TestBandit:
             sessions=2,
             run=[(-8.0, 0, 0.5, False), (0.0, 0, 0.9, True), (-4.0, 1, np.nan, False)],
         )
-        successes, failures = session_tallies(context, context.run, 8.0)
+        successes, failures = session_tallies(context)
         np.testing.assert_allclose(successes, [1.0, 0.0])
         # A failure counts as much as a success was likely; without a prediction it says nothing.
         np.testing.assert_allclose(failures, [0.5 * np.exp(-1.0), 0.0])

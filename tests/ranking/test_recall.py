@@ -259,7 +259,7 @@ class TestPicking:
             picks = nodes_of(context)
             assert sorted(picks) == list(range(count))
             tried |= set(picks[:lanes])
-            nodes = [*picks[:lanes], *range(count, count + elsewhere)]
+            nodes = [*picks[:lanes], *(number % count for number in range(elsewhere))]
             rates = np.r_[np.full(lanes, 0.9), np.full(elsewhere, np.nan)]
             failed = [False] * len(nodes)
             log.add(driven_m, nodes, 5 * (1 - rates), rates, failed, [0] * len(nodes), 300)
@@ -298,33 +298,52 @@ class TestPicking:
 def test_arrays_that_do_not_fit_are_refused() -> None:
     one, node = np.zeros(1), np.zeros(1, np.int32)
     good = {
-        "run_nodes": node,
-        "run_ago_m": one,
-        "run_margins": one,
+        "driven_m": 0.0,
+        "at_m": one,
+        "attempted": node,
+        "distance_m": one,
+        "rates": one,
+        "accepted": np.ones(1, np.bool_),
+        "inliers": np.full(1, 30),
         "nodes": node,
         "costs": one,
         "prior": one,
         "sessions": node,
         "session_count": 1,
+        "per_m": 1.0,
+        "level": 0.5,
         "memory_m": 1.0,
         "prior_weight": 1.0,
-        "failed": -1.0,
         "regret": 1.0,
+        "tally": 0.5,
+        "tally_memory_m": 1.0,
+        "untried_rate": 0.3,
+        "untried_count": 1.0,
+        "needed": 20,
+        "attempts": 10,
         "picks": 1,
         "shortlist": 1,
     }
     _core.recall_order(**good)
     for name, bad in (
-        ("run_nodes", np.ones(1, np.int32)),
-        ("run_ago_m", np.zeros(2)),
-        ("run_margins", np.zeros(2)),
+        ("at_m", np.zeros(2)),
+        ("attempted", np.ones(1, np.int32)),
+        ("distance_m", np.zeros(0)),
+        ("rates", np.zeros(2)),
+        ("accepted", np.ones(2, np.bool_)),
+        ("inliers", np.ones(2, np.int64)),
         ("nodes", np.full(1, -1, np.int32)),
         ("costs", np.zeros(2)),
         ("prior", np.zeros(0)),
         ("sessions", np.ones(1, np.int32)),
         ("memory_m", 0.0),
+        ("tally_memory_m", np.nan),
         ("prior_weight", 0.0),
         ("regret", -1.0),
+        ("untried_rate", 0.0),
+        ("untried_count", -1.0),
+        ("needed", 0),
+        ("attempts", -1),
         ("picks", -1),
     ):
         with pytest.raises(ValueError, match="recall_order"):

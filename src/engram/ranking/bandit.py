@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
-from engram.ranking.run import RunAttempts
+
+Array = NDArray[np.float64]
 
 # Source of all four: SPEC §4.
 _MEMORY_M = 8.0
-_PRIOR_SUCCESSES = 0.3
-_PRIOR_ATTEMPTS = 1.0
 _REDUNDANCY = 0.8
-# Of a session that this run has not tried yet.
-PRIOR_RATE = _PRIOR_SUCCESSES / _PRIOR_ATTEMPTS
+# Of a session that this run has not tried yet, and how many attempts that is worth.
+PRIOR_RATE = 0.3
+PRIOR_ATTEMPTS = 1.0
 
 
 class BanditPolicy:
@@ -30,13 +30,11 @@ class BanditPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        rates = session_rates(context, context.run, _MEMORY_M)
-        return _pick_diversely(context, rates * context.success_rates())
+        return _pick_diversely(context, _chances(context, *session_tallies(context)))
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
-        a, b = session_tallies(context, context.run, _MEMORY_M)
-        rates = session_rates(context, context.run, _MEMORY_M)
+        a, b = session_tallies(context)
         meaning = {
             "successes": "of this run on the node's drive, decayed over 8 m",
             "failures": "likewise, each as much as a match was likely",
@@ -44,30 +42,25 @@ class BanditPolicy:
         return Reasons(
             {"successes": a, "failures": b},
             meaning,
-            rates * context.success_rates(),
+            _chances(context, a, b),
             rule="best chance first; each pick takes from the chances of its own drive's others, "
             "so that a less likely node of another drive may come before them",
         )
 
 
-def session_rates(
-    context: RankingContext, run: RunAttempts, memory_m: float
-) -> NDArray[np.float64]:
-    """(Y,) (a + 0.3) / (a + b + 1), with a and b of `session_tallies`."""
-    a, b = session_tallies(context, run, memory_m)
-    return (a + _PRIOR_SUCCESSES) / (a + b + _PRIOR_ATTEMPTS)
-
-
-def session_tallies(
-    context: RankingContext, run: RunAttempts, memory_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Decayed successes and failures (Y,) of a run on the session that saved each candidate."""
-    graph = context.graph
+def session_tallies(context: RankingContext) -> tuple[Array, Array]:
+    """Decayed successes and failures (Y,) of this run on the session that saved each candidate."""
+    graph, run = context.graph, context.run
     attempted, sessions = graph.sessions[run.nodes], context.sessions
-    weights, count = run.decay(memory_m), graph.session_count
+    weights, count = run.decay(_MEMORY_M), graph.session_count
     successes = np.bincount(attempted, weights * run.accepted, count)[sessions]
     failures = np.bincount(attempted, weights * run.failure_weights(), count)[sessions]
     return successes.astype(np.float64), failures.astype(np.float64)
+
+
+def _chances(context: RankingContext, successes: Array, failures: Array) -> Array:
+    rates = (successes + PRIOR_RATE * PRIOR_ATTEMPTS) / (successes + failures + PRIOR_ATTEMPTS)
+    return rates * context.success_rates()
 
 
 def _pick_diversely(context: RankingContext, p: NDArray[np.float64]) -> NDArray[np.int64]:

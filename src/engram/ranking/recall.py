@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.experience.basin import prior_basin_m
-from engram.ranking.bandit import PRIOR_RATE, session_rates
+from engram.ranking.bandit import PRIOR_ATTEMPTS, PRIOR_RATE
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.likeness import standard_likenesses
 from engram.ranking.reasons import Reasons
-from engram.ranking.run import RunAttempts
 
 Array = NDArray[np.float64]
 
@@ -85,7 +84,6 @@ _MEANING = {
 }
 # Fewest inliers of a match: SPEC §3. An attempt that came to nothing counts as one.
 _NEEDED = 20
-_NOTHING = float(np.log(1 / _NEEDED))
 _PICKS = 8
 _SHORTLIST = 32
 # The newest of this run's attempts are enough: 20 m at four attempts every 0.7 m.
@@ -130,24 +128,23 @@ class RecallPolicy:
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        canonical, run = order_by(context), context.run.newest(_MOST_ATTEMPTS)
-        costs, prior = self._costs_and_prior(context, canonical, run)
-        order: NDArray[np.int64] = canonical[self._pick(context, canonical, run, costs, prior)[0]]
+        canonical = order_by(context)
+        costs, prior, _ = self._costs_and_prior(context, canonical)
+        order: NDArray[np.int64] = canonical[self._pick(context, canonical, costs, prior)[0]]
         return self._in_turns(context, order)[0]
 
     def judge(self, context: RankingContext) -> RecallJudgement:
         """The ranking with its reasons."""
-        c, canonical, run = self._constants, order_by(context), context.run.newest(_MOST_ATTEMPTS)
-        costs, prior = self._costs_and_prior(context, canonical, run)
-        order, margins, first = self._pick(context, canonical, run, costs, prior)
+        c, canonical = self._constants, order_by(context)
+        costs, prior, likeness = self._costs_and_prior(context, canonical)
+        order, margins, first, tally = self._pick(context, canonical, costs, prior)
         rows = np.empty_like(canonical)
         rows[canonical] = np.arange(len(canonical))
-        likeness, tally = self._likeness(context, canonical), self._tally(context, canonical, run)
         terms = {
-            "distance": -costs - likeness - tally,
+            "distance": -costs - likeness,
             "likeness": likeness,
             "past drives": prior,
-            "this run": first + costs - prior,
+            "this run": first + costs - prior - tally,
             "tally": tally,
         }
         picks, by_turn = self._in_turns(context, canonical[order])
@@ -199,14 +196,17 @@ class RecallPolicy:
         return picks, by_turn
 
     def _costs_and_prior(
-        self, context: RankingContext, canonical: NDArray[np.int64], run: RunAttempts
-    ) -> tuple[Array, Array]:
-        """Margins lost by all else, and as past drives have them; (Y,), nearest first."""
+        self, context: RankingContext, canonical: NDArray[np.int64]
+    ) -> tuple[Array, Array, Array]:
+        """Margins lost by distance less what looks win, by past drives, by looks; (Y,) each.
+
+        All nearest first.
+        """
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
-        costs = self._cost(context, near.rms_distance_m[canonical])
-        costs -= self._likeness(context, canonical) + self._tally(context, canonical, run)
-        return costs, c.level + c.lessons * np.log(base / (1 - base))
+        likeness = self._likeness(context, canonical)
+        costs = self._per_m(context) * near.rms_distance_m[canonical] - likeness
+        return costs, c.level + c.lessons * np.log(base / (1 - base)), likeness
 
     def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
         """Margins won by looking like the live frame, (Y,), nearest first.
@@ -219,61 +219,39 @@ class RecallPolicy:
             return np.zeros(len(canonical))
         return np.asarray(c.likeness * standard_likenesses(context)[canonical])
 
-    def _tally(
-        self, context: RankingContext, canonical: NDArray[np.int64], run: RunAttempts
-    ) -> Array:
-        """Margins won by the rate at which this run matched the drive, (Y,), nearest first.
-
-        Failures add up here as long as they go on, so that no candidate is tried for ever.
-        """
-        c = self._constants
-        rates = session_rates(context, run, c.tally_memory_m)[canonical]
-        return np.asarray(c.tally * np.log(rates / PRIOR_RATE))
-
-    def _cost(self, context: RankingContext, distance_m: Array) -> Array:
+    def _per_m(self, context: RankingContext) -> float:
         """A longer lens sees alike from farther away."""
-        per_m = self._constants.distance / prior_basin_m(context.basin.focal_px)
-        return np.asarray(per_m * distance_m)
+        return self._constants.distance / prior_basin_m(context.basin.focal_px)
 
     def _pick(
-        self,
-        context: RankingContext,
-        canonical: NDArray[np.int64],
-        run: RunAttempts,
-        costs: Array,
-        prior: Array,
-    ) -> tuple[NDArray[np.int64], Array, Array]:
-        c, graph = self._constants, context.graph
+        self, context: RankingContext, canonical: NDArray[np.int64], costs: Array, prior: Array
+    ) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """Rows of `canonical` best first; margins as picked and at first, and the tally's part."""
+        c, graph, run = self._constants, context.graph, context.run
         return _core.recall_order(
+            run.driven_m,
+            run.at_m,
             run.nodes,
-            run.driven_m - run.at_m,
-            self._margins(context, run),
+            run.distance_m,
+            run.rates,
+            run.accepted,
+            run.inliers,
             context.neighbourhood.nodes[canonical],
             costs,
             prior,
             graph.sessions,
             graph.session_count,
+            per_m=self._per_m(context),
+            level=c.level,
             memory_m=c.memory_m,
             prior_weight=c.prior_weight,
-            failed=_NOTHING,
             regret=c.regret,
+            tally=c.tally,
+            tally_memory_m=c.tally_memory_m,
+            untried_rate=PRIOR_RATE,
+            untried_count=PRIOR_ATTEMPTS,
+            needed=_NEEDED,
+            attempts=_MOST_ATTEMPTS,
             picks=_PICKS,
             shortlist=_SHORTLIST,
         )
-
-    def _margins(self, context: RankingContext, run: RunAttempts) -> Array:
-        """(R,) what this run's attempts would have come to at no distance.
-
-        A match that is refused though it has inliers enough is one of something else. Without a
-        prediction a failure tells nothing, and a success as much as if it had been made here.
-        """
-        told = np.log(np.maximum(run.inliers, 1) / _NEEDED)
-        refused = ~run.accepted & (run.inliers >= _NEEDED)
-        margins = np.where(refused, _NOTHING, told)
-        c, costs = self._constants, self._cost(context, run.distance_m)
-        unknown = np.isnan(run.distance_m)
-        costs[unknown] = np.where(run.accepted[unknown], 0.0, np.nan)
-        margins = margins + costs
-        # From so far away nobody was expected to match.
-        margins[~run.accepted & (margins > c.level)] = np.nan
-        return np.asarray(margins)
