@@ -125,7 +125,7 @@ def map_drive(
     settings: Settings,
     options: MapOptions,
     advance: Callable[[str], None] = ignore,
-    start: Position | None = None,
+    start: Callable[[OpenMap], Position | None] | None = None,
     descriptor: str | None = None,
 ) -> MapReport:
     """Adds a drive to a map, which is made if there is none.
@@ -139,7 +139,8 @@ def map_drive(
         settings: the resolved configuration, kept with the revision.
         options: how it is mapped.
         advance: called once per frame with a word on how it went.
-        start: where the robot stands before its first frame, if that is known.
+        start: asked, with the map open, where the robot stands before its first frame; None where
+            nobody knows. A drive that is resumed knows better.
         descriptor: kind of descriptor that somebody insists on; None for the frame log's, the
             map's or that of the settings, whichever is known first.
 
@@ -173,8 +174,6 @@ def map_drive(
         opened.times.add(session)
         words = _node_words(opened, store, settings, options)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
-            if report.resumed:
-                start = None
             _map_frames(
                 opened,
                 writer,
@@ -184,7 +183,7 @@ def map_drive(
                 options,
                 report,
                 advance,
-                start,
+                None if start is None or report.resumed else start(opened),
                 words,
             )
     report.skipped = sequence.skipped

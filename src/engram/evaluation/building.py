@@ -8,11 +8,12 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from engram.config import to_dict
-from engram.drive import MapOptions, MapReport, OpenMap, Settings, map_drive, open_map
+from engram.drive import MapOptions, MapReport, OpenMap, Settings, map_drive
 from engram.drive.live import ignore
 from engram.errors import InputError
 from engram.evaluation.drives import EvaluatedDrive
@@ -103,7 +104,7 @@ def build_map(
         before = path if built.sessions else base
         if before is not None:
             shutil.copyfile(before, draft)
-        start = _start(draft, drive, (*drives, *known))
+        start = partial(_start, drive=drive, drives=(*drives, *known))
         log = FrameLog(drive.path)
         try:
             report = map_drive(draft, log, settings, options, ignore, start)
@@ -171,20 +172,19 @@ def read_record(path: Path) -> BuiltMap:
         ) from error
 
 
-def _start(draft: Path, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> Position | None:
+def _start(
+    opened: OpenMap, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]
+) -> Position | None:
     """Where the drive begins, by truth; None in an empty map, or where truth is not known."""
     truth = drive.truth()
-    if truth is None or not draft.exists():
+    if truth is None:
         return None
     log = FrameLog(drive.path)
     try:
         first = truth.at(int(log.stamps_ns[0]))
     finally:
         log.close()
-    if first is None:
-        return None
-    with open_map(draft) as opened:
-        return true_nodes(opened, drives).start(first)
+    return None if first is None else true_nodes(opened, drives).start(first)
 
 
 def true_nodes(opened: OpenMap, drives: Sequence[EvaluatedDrive]) -> TrueNodes:
