@@ -32,6 +32,7 @@ from engram.evaluation.configurations import (
 from engram.evaluation.drives import DriveSet
 from engram.evaluation.folds import Fold, check_only, chosen, split
 from engram.evaluation.held_out import localise_held_out
+from engram.evaluation.kept_maps import KeptMaps
 from engram.evaluation.lockstep import Runs
 from engram.evaluation.memo import MatchMemo
 from engram.evaluation.store import joined, missing, only, read_runs, write_runs
@@ -41,7 +42,6 @@ from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
 from engram.ranking import POLICIES
 from engram.sequences import LoggedFrame
-from engram.store import MapStore
 
 # Policies that cannot run without knowing the outcomes.
 _BOUNDS = ("oracle",)
@@ -282,33 +282,8 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
             write_runs(path, done)
 
 
-class _EarlierMaps:
-    """Maps of one fold as of earlier revisions, kept open for the next session of that fold."""
-
-    def __init__(self) -> None:
-        self._path: Path | None = None
-        self._known: dict[int, OpenMap] = {}
-
-    def open(self, path: Path, at: int) -> OpenMap:
-        """The map as of a revision."""
-        if path != self._path:
-            self.close()
-            self._path = path
-        if at not in self._known:
-            # Their landmarks are hardly ever read: the memo asks the newest map.
-            store = MapStore.open(path, at=at, cache_bytes=_SMALL_CACHE_BYTES)
-            self._known[at] = OpenMap(store)
-        return self._known[at]
-
-    def close(self) -> None:
-        """Closes them all."""
-        for opened in self._known.values():
-            opened.close()
-        self._known.clear()
-        self._path = None
-
-
-_earlier_maps = _EarlierMaps()  # one per worker
+# Their landmarks are hardly ever read: the memo asks the newest map.
+_earlier_maps = KeptMaps(files=1, cache_bytes=_SMALL_CACHE_BYTES)  # one per worker
 
 
 def _run_live(plan: Plan, fold: Fold, session: int) -> None:

@@ -19,7 +19,13 @@ from engram.evaluation.fleet.arms import Arm
 from engram.evaluation.fleet.orders import try_orders
 from engram.evaluation.fleet.plan import FORAY_POLICIES, ROBOTS, FleetPlan
 from engram.evaluation.fleet.stages import measure_stages
-from engram.evaluation.fleet.steps import download_for_foray, localise_in, map_drives, merge
+from engram.evaluation.fleet.steps import (
+    download_for_foray,
+    kept_maps,
+    localise_in,
+    map_drives,
+    merge,
+)
 from engram.evaluation.fleet.trials import try_downloads_for
 from engram.evaluation.folds import Fold
 from engram.evaluation.tasks import Task, run_tasks
@@ -51,8 +57,11 @@ def run_fleet(plan: FleetPlan, workers: int = 1, advance: Callable[[str], None] 
         MapLockedError: another run works in the same folder.
         InputError: a drive cannot be read, or results cannot be written.
     """
-    with writing(plan.work), alone_in(plan.work):
-        run_tasks(fleet_tasks(plan), workers, advance)
+    try:
+        with writing(plan.work), alone_in(plan.work):
+            run_tasks(fleet_tasks(plan), workers, advance)
+    finally:
+        kept_maps.close()
 
 
 def fleet_tasks(plan: FleetPlan) -> list[Task]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from engram.drive import MapReport, measured, open_map
+from engram.drive import MapReport, measured
 from engram.evaluation.building import build_map
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.fleet.arms import Arm
@@ -22,6 +22,7 @@ from engram.evaluation.fleet.records import (
 )
 from engram.evaluation.folds import Fold
 from engram.evaluation.held_out import localise_held_out
+from engram.evaluation.kept_maps import KeptMaps
 from engram.evaluation.memo import MatchMemo
 from engram.evaluation.store import joined, missing, read_runs, write_runs
 from engram.experience.clock import hour_of_day
@@ -33,6 +34,8 @@ from engram.store import MapStore
 
 # Stages that are the robot's own business, whatever map it has.
 _BEFORE_THE_MAP = ("read", "frontend", "odometry")
+# The next drive is localised in the same ones.
+kept_maps = KeptMaps(files=6)
 
 
 def map_path(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> Path:
@@ -180,17 +183,17 @@ def localise_in(
         if not wanted:
             continue
         frames = frames or drive.frames()
-        with open_map(map_path(plan, arm, fold, name)) as opened:
-            memo = MatchMemo(
-                FrameMatcher(opened.store.frames, config),
-                plan.folder(arm, fold) / f"memo-{drive.key}.matches.npz",
-                matcher_hash(config),
-            )
-            runs = localise_held_out(
-                opened, drive, frames, plan.training(fold), wanted, plan.settings, memo,
-                plan.options.relocaliser,
-            )  # fmt: skip
-            memo.save()
+        opened = kept_maps.open(map_path(plan, arm, fold, name))
+        memo = MatchMemo(
+            FrameMatcher(opened.store.frames, config),
+            plan.folder(arm, fold) / f"memo-{drive.key}.matches.npz",
+            matcher_hash(config),
+        )
+        runs = localise_held_out(
+            opened, drive, frames, plan.training(fold), wanted, plan.settings, memo,
+            plan.options.relocaliser,
+        )  # fmt: skip
+        memo.save()
         write_runs(path, joined(read_runs(path), runs))
 
 
