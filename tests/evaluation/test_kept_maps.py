@@ -1,6 +1,5 @@
 """Maps that stay open for the next drive."""
 
-import os
 import shutil
 from pathlib import Path
 
@@ -55,7 +54,7 @@ def test_a_map_that_was_made_anew_is_opened_anew(town: Path) -> None:
     opened = kept.open(town)
     draft = town.with_name("draft.engram")
     shutil.copyfile(town, draft)
-    os.replace(draft, town)
+    draft.replace(town)
     assert kept.open(town) is not opened
     kept.close()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from engram.drive import OpenMap
 from engram.store import MapStore
-from engram.store.map_store import DEFAULT_CACHE_BYTES
+from engram.store.frame_reader import DEFAULT_CACHE_BYTES
 
 
 class KeptMaps:

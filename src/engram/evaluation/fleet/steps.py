@@ -35,7 +35,7 @@ from engram.store import MapStore
 # Stages that are the robot's own business, whatever map it has.
 _BEFORE_THE_MAP = ("read", "frontend", "odometry")
 # The next drive is localised in the same ones.
-kept_maps = KeptMaps(files=6)
+kept_maps = KeptMaps(files=6, cache_bytes=64 * 2**20)  # one per worker
 
 
 def map_path(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> Path:
