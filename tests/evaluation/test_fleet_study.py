@@ -20,10 +20,12 @@ from engram.evaluation.fleet import (
     Protocol,
     fleet_tasks,
     make_fleet_plan,
+    steps,
     trials,
     write_fleet_report,
 )
 from engram.evaluation.fleet.experiments import pair_merges
+from engram.evaluation.fleet.records import read_download
 from engram.evaluation.fleet.results import ArmResult
 from engram.evaluation.tasks import run_tasks
 from engram.store import MapStore
@@ -221,6 +223,25 @@ def test_forays_in_copies_alone_are_not_reported(plan: FleetPlan, tmp_path: Path
     written = write_fleet_report(tmp_path / "out", [other])
     assert {row["experiment"] for row in rows(tmp_path / "out")} == {"7", "8", "10"}
     assert not [path for path in written if path.name.startswith(("fig09", "downloads"))]
+
+
+def test_a_robot_that_sets_out_when_nobody_does_takes_more_along(
+    plan: FleetPlan, tmp_path: Path, monkeypatch
+) -> None:
+    """All drives of the campaign were soon after midnight."""
+    other = without(plan, tmp_path / "work", "r1-tod+paths-download.*", "r1-tod-download.*")
+    monkeypatch.setattr(steps, "hour_of_day", lambda *_: 12.5)
+    for fold in other.folds:
+        own, mission = other.forays(fold)["r1"]
+        for policy in ("tod+paths", "tod"):
+            about = (other, other.arms[0], fold, f"r1-{policy}-download")
+            steps.download_for_foray(*about, "docked", policy, own, mission)
+            made = read_download(steps.map_path(*about).with_suffix(".download.json"))
+            assert made is not None
+            assert (made.policy, made.nodes) == ("copy", made.of_nodes)
+    write_fleet_report(tmp_path / "out", [other])
+    claims = (tmp_path / "out" / "claims.md").read_text()
+    assert claims.count("(2 `copy` among 4: nothing had been driven at that hour)") == 2
 
 
 @pytest.mark.parametrize("name", ["r2", "shared"])

@@ -9,6 +9,7 @@ import numpy as np
 
 from engram.evaluation.fleet.experiments import SHARED, SINGLE, merged_name, pair_merges
 from engram.evaluation.fleet.plan import ROBOTS
+from engram.evaluation.fleet.records import DownloadRecord
 from engram.evaluation.fleet.results import (
     ArmResult,
     FoldResult,
@@ -265,7 +266,8 @@ def _forays(arm: ArmResult) -> Iterator[Row]:
             _PAPER_NODES[policy],
             "–",
             "",
-            f"{sent / whole:.1%}; united with the robot's own {united / whole:.1%}",
+            f"{sent / whole:.1%}; united with the robot's own {united / whole:.1%}"
+            + _asked_for_more(taken, policy),
         )
         yield (
             f"route not localised in that foray, `{policy}` against `copy`",
@@ -274,6 +276,15 @@ def _forays(arm: ArmResult) -> Iterator[Row]:
             "",
             f"{against(resamples, a, b)}; {_ms(driven)} against {_ms(copied)} ms a frame",
         )
+
+
+def _asked_for_more(taken: Sequence[DownloadRecord], policy: str) -> str:
+    """Of the robots that could not get what they wanted."""
+    others = [one.policy for one in taken if one.policy != policy]
+    if not others:
+        return ""
+    words = ", ".join(f"{others.count(one)} `{one}`" for one in sorted(set(others)))
+    return f" ({words} among {len(taken)}: nothing had been driven at that hour)"
 
 
 def _ms(forays: Sequence[InField]) -> str:

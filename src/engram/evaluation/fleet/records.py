@@ -44,7 +44,8 @@ class DownloadRecord:
     """One download for a foray.
 
     Attributes:
-        policy: key of `SELECTIONS`.
+        policy: key of `SELECTIONS`; another than was asked for where nothing was driven at that
+            hour.
         start_h: hour of day that it was made for; None if it is not known.
         nodes, of_nodes: sent, and of the centre.
         united: sent, together with what the robot itself had saved and the centre knows.

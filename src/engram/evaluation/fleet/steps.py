@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from engram.drive import MapReport, measured
+from engram.errors import InputError
 from engram.evaluation.building import build_map
 from engram.evaluation.drives import EvaluatedDrive
 from engram.evaluation.fleet.arms import Arm
@@ -27,13 +28,14 @@ from engram.evaluation.memo import MatchMemo
 from engram.evaluation.store import joined, missing, read_runs, write_runs
 from engram.experience.clock import hour_of_day
 from engram.experience.model import path_id
-from engram.fleet import DownloadOptions, download, merge_maps, silent
+from engram.fleet import DownloadOptions, DownloadReport, download, merge_maps, silent
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
 from engram.store import MapStore
 
 # Stages that are the robot's own business, whatever map it has.
 _BEFORE_THE_MAP = ("read", "frontend", "odometry")
+_ASKS_FOR_MORE = {"tod+paths": "tod", "tod": "copy"}
 # The next drive is localised in the same ones.
 kept_maps = KeptMaps(files=6, cache_bytes=64 * 2**20)  # one per worker
 
@@ -156,19 +158,29 @@ def download_for_foray(
     hour = hour_of_day(session, session.start_ns)
     whole = map_path(plan, arm, fold, centre)
     draft = _draft(path)
-    options = DownloadOptions(policy if hour is not None else "copy", start_h=hour, end_h=hour)
-    report = download(whole, draft, options, progress=silent)
+    report = _downloaded(whole, draft, policy if hour is not None else "copy", hour)
     paths = {path_id(one.session.id) for one in own}
     with MapStore.open(whole) as store:
         mine = {node.id for node in store.load().nodes if path_id(node.session) in paths}
     with MapStore.open(draft) as store:
         sent = {node.id for node in store.load().nodes}
     made = DownloadRecord(
-        policy, hour, report.nodes, report.of_nodes, len(mine | sent), report.size_bytes,
+        report.policy, hour, report.nodes, report.of_nodes, len(mine | sent), report.size_bytes,
         report.of_bytes,
     )  # fmt: skip
     write_record(record, made)
     draft.replace(path)
+
+
+def _downloaded(whole: Path, draft: Path, policy: str, hour: float | None) -> DownloadReport:
+    """What a robot gets: where nothing was driven at such an hour it asks for more."""
+    try:
+        options = DownloadOptions(policy, start_h=hour, end_h=hour)
+        return download(whole, draft, options, progress=silent)
+    except InputError:
+        if policy not in _ASKS_FOR_MORE:
+            raise
+        return _downloaded(whole, draft, _ASKS_FOR_MORE[policy], hour)
 
 
 def localise_in(
