@@ -275,9 +275,9 @@ def test_a_study_that_was_stopped_comes_to_the_same_maps(campaign, plan, tmp_pat
 
     other = make_fleet_plan(campaign, Settings(), replace(OPTIONS, experiments=(7,)), tmp_path)
     tasks = fleet_tasks(other)
-    for steps in range(3, len(tasks), 7):
+    for count in range(3, len(tasks), 7):
         with pytest.raises(StoppedError):
-            run_tasks(tasks, 1, stop_after(steps))
+            run_tasks(tasks, 1, stop_after(count))
     run_tasks(tasks, 1, lambda _: None)
     (arm,) = plan.arms
     for name in ("single", "merged2-1", "pairs2-0-0"):
