@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from engram.drive import Settings
+from engram.drive import MapOptions, Settings, map_drive, open_drive
 from engram.errors import ConfigError, MapError
 from engram.fleet import GateOptions, best_order, building, find_best_order, silent
 from engram.store import MapStore
@@ -133,6 +133,13 @@ def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
     with pytest.raises(ConfigError, match=r"c\.framelog judges .* in .*centre\.engram already"):
         build(centre, logs, "ab", judge=judge(logs["c"]))
     assert not centre.with_name("centre.engram.build").exists()
+
+
+def test_the_name_of_the_robot_does_not_let_a_drive_judge(tmp_path, maps, logs):
+    robot, renamed = tmp_path / "robot.engram", open_drive(logs["held-out"], robot="somebody")
+    map_drive(robot, renamed, Settings(), MapOptions(relocaliser="exhaustive"))
+    with pytest.raises(ConfigError, match=r"held-out\.framelog judges .* of somebody"):
+        search(tmp_path, [maps[0], robot], judge(logs["held-out"]))
 
 
 def test_more_groups_than_can_be_tried_are_refused_before_they_are_mapped(

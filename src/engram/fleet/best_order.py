@@ -15,9 +15,9 @@ import numpy as np
 from engram.config import config_hash, to_dict
 from engram.drive import DriveSequence, OpenMap, Settings, open_drive, session_of_drive
 from engram.errors import ConfigError, MapError
-from engram.experience.model import SessionId
+from engram.experience.model import Session
 from engram.fleet.docking import merge_maps
-from engram.fleet.gate import GateOptions, localise_drive
+from engram.fleet.gate import GateOptions, held_as, localise_drive
 from engram.fleet.keeping import keeping
 from engram.fleet.merging import Progress
 from engram.fleet.replay import MergeOptions
@@ -76,26 +76,29 @@ class JudgeOptions:
         return config_hash([*sessions, self.judge_at_m, to_dict(self.localising)])
 
 
-def check_held_out(judge: JudgeOptions, mapped: Mapping[SessionId, str]) -> None:
+def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -> None:
     """Refuses to judge a map by what it was made of, or by one drive twice.
 
     Args:
         judge: the drives that must be held out.
-        mapped: where each session is that they must not be, in words.
+        mapped: the sessions that none of them must be, and where each is, in words.
 
     Raises:
         ConfigError: a drive is not held out; names it.
         SequenceError: a drive cannot be read.
     """
-    seen = dict(mapped)
+    where = {one.id: words for one, words in mapped}
+    known = [one for one, _ in mapped]
     for path in (*judge.drives, *judge.reported):
-        session = session_of_drive(open_drive(path)).id
-        if session in seen:
+        sequence = open_drive(path)
+        held = held_as(sequence, known)
+        if held is not None:
             raise ConfigError(
-                f"{path} judges the orders of merging, but is {seen[session]}; judge by drives "
-                "that are in no map, and name each once"
+                f"{path} judges the orders of merging, but is {where[held.id]} (session {held.id} "
+                f"of {held.robot}); judge by drives that are in no map, and name each once"
             )
-        seen[session] = f"the same drive as {path}"
+        known.append(session_of_drive(sequence))
+        where[known[-1].id] = f"the same drive as {path}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,11 +329,11 @@ class _Search:
         self._judge = judge
         self._root = root
         self._localise = judge.localise or localise_drive
-        mapped: dict[SessionId, str] = {}
+        mapped: list[tuple[Session, str]] = []
         hashes = []
         for path in (*maps, *([] if root is None else [root])):
             with MapStore.open(path) as store:
-                mapped |= dict.fromkeys(store.frontends(), f"in {path}")
+                mapped += [(one, f"in {path}") for one in store.sessions()]
                 hashes.append(store.content_hash())
         check_held_out(judge, mapped)
         self._root_hash = None if root is None else hashes[-1]

@@ -30,7 +30,7 @@ from engram.fleet.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.merging import Progress, silent
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
-from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sessions_of, sole_builder
+from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sole_builder
 from engram.fleet.workers import map_groups
 from engram.store import MapStore
 
@@ -276,8 +276,10 @@ def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
 
 def _check_judges(judge: JudgeOptions, drives: Sequence[Drive], centre: Path) -> None:
     """Before hours of mapping: what judges the orders must be held out."""
-    mapped = {SessionId(UUID(one)): f"in {centre} already" for one in sessions_of(centre)}
-    mapped |= {drive.session.id: f"{drive.source}, which is to be built from" for drive in drives}
+    mapped = [(one.session, f"{one.source}, which is to be built from") for one in drives]
+    if centre.exists():
+        with MapStore.open(centre) as store:
+            mapped += [(one, f"in {centre} already") for one in store.sessions()]
     check_held_out(judge, mapped)
 
 

@@ -70,7 +70,7 @@ def check_held_out(
     """
     sessions = list(sessions)
     for name, sequence in drives:
-        held = _held(sequence, sessions)
+        held = held_as(sequence, sessions)
         if held is not None:
             raise ConfigError(
                 f"{name} is not held out: {where} holds this very drive (session {held.id} of "
@@ -78,8 +78,12 @@ def check_held_out(
             )
 
 
-def _held(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
-    """The session that this drive became, whatever the robot was called."""
+def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
+    """The session that this drive became, whatever the robot was called; None if it became none.
+
+    Raises:
+        SequenceError: the drive cannot be read.
+    """
     own = session_of_drive(sequence)
     for one in sessions:
         if one.id == own.id:

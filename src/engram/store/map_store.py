@@ -242,6 +242,15 @@ class MapStore:
         with self._database.reading() as connection:
             return reading.load_omissions(connection, self._view)
 
+    def sessions(self) -> tuple[Session, ...]:
+        """The drives that the map knows, by order of their coming.
+
+        Raises:
+            MapCorruptError: a row does not match its checksum.
+        """
+        with self._database.reading() as connection:
+            return reading.load_sessions(connection, self._view)
+
     def frontends(self) -> dict[SessionId, tuple[DescriptorKind, str]]:
         """Descriptor kind and hash of the front-end of each session."""
         with self._database.reading() as connection:

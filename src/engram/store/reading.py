@@ -18,6 +18,7 @@ from engram.experience.model import (
     Omission,
     PathEntry,
     PathId,
+    Session,
     SessionId,
 )
 from engram.frontend import DescriptorKind
@@ -62,23 +63,35 @@ def load(connection: Connection, view: View) -> MapContents:
         MapCorruptError: a row does not match its checksum or points at nothing.
     """
     known_cameras = load_cameras(connection)
-    session_rows = list(view.rows(connection, sessions))
-    session_list = [
-        session_from_row(row, _camera_id(known_cameras, row, "session")) for row in session_rows
-    ]
-    session_ids = {row["key"]: one.id for row, one in zip(session_rows, session_list, strict=True)}
+    session_by_key = _sessions(connection, view, known_cameras)
+    session_ids = {key: one.id for key, one in session_by_key.items()}
     node_rows = list(view.rows(connection, nodes))
     node_list = [_node(row, known_cameras, session_ids) for row in node_rows]
     node_ids = {row["key"]: one.id for row, one in zip(node_rows, node_list, strict=True)}
-    used = {one.camera for one in session_list} | {one.camera for one in node_list}
+    used = {one.camera for one in session_by_key.values()} | {one.camera for one in node_list}
     return MapContents(
         cameras={one.id: one for one in known_cameras.values() if one.id in used},
-        sessions=tuple(session_list),
+        sessions=tuple(session_by_key.values()),
         nodes=tuple(node_list),
         edges=_edges(connection, view, node_ids),
         path_entries=_path_entries(connection, view, node_ids),
         attempts=_attempts(connection, view, list(session_ids), list(node_ids)),
     )
+
+
+def load_sessions(connection: Connection, view: View) -> tuple[Session, ...]:
+    """The drives of the map."""
+    return tuple(_sessions(connection, view, load_cameras(connection)).values())
+
+
+def _sessions(
+    connection: Connection, view: View, known_cameras: dict[int, StereoCamera]
+) -> dict[int, Session]:
+    """By key."""
+    return {
+        row["key"]: session_from_row(row, _camera_id(known_cameras, row, "session"))
+        for row in view.rows(connection, sessions)
+    }
 
 
 def load_cameras(connection: Connection) -> dict[int, StereoCamera]:
