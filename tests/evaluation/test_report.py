@@ -227,6 +227,16 @@ def test_claims_stand_beside_what_was_measured(out: Path) -> None:
         assert f"| {policy} | " in text
 
 
+def test_several_campaigns_are_pooled(plan: Plan, out: Path, tmp_path: Path) -> None:
+    assert "pooled\n" not in (out / "claims.md").read_text()
+    write_report(tmp_path, [plan, plan])
+    text = (tmp_path / "claims.md").read_text()
+    pooled = text[text.index("## All sessions pooled") :]
+    # One block of 20 against 3, in every session of both.
+    told = "5.00 % against 15.00 %, difference -10.00 (-10.00 … -10.00) points"
+    assert f"| `recall` against `distance` | {told} |" in pooled
+
+
 def test_sweeps_are_told_as_tables(out: Path) -> None:
     text = (out / "claims.md").read_text()
     budgets = text[text.index("Route not localised by the number of lanes") :].splitlines()

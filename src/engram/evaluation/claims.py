@@ -17,7 +17,14 @@ from engram.evaluation.configurations import (
 from engram.evaluation.summary import CampaignResult, ConfigurationResult
 from engram.evaluation.sweeps import sweep_tables
 from engram.evaluation.wording import Row, against, percent, table, times
-from engram.measures import Resamples, beats, difference, excess_ratio, ratio
+from engram.measures import (
+    Resamples,
+    SessionSums,
+    beats,
+    difference,
+    excess_ratio,
+    ratio,
+)
 
 # Shares as low as this differ by less than anyone would notice: added to both sides of ratios to
 # the oracle.
@@ -37,7 +44,40 @@ def claims_page(campaigns: Sequence[CampaignResult]) -> str:
                 "The drives have no truth beside them: no pose errors, no false successes.",
                 "",
             ]
-    return "\n".join(lines)
+    return "\n".join([*lines, *_pooled(campaigns)])
+
+
+def _pooled(campaigns: Sequence[CampaignResult]) -> list[str]:
+    """All sessions of several campaigns together: whom our policy beats."""
+    if len(campaigns) < 2:
+        return []
+    rows, ours = [], [one.get(_BEST_KNOWN) for one in campaigns]
+    for other in ("path", "distance", "bandit"):
+        theirs = [one.get(other) for one in campaigns]
+        pairs = [
+            (a, b) for a, b in zip(ours, theirs, strict=True) if a is not None and b is not None
+        ]
+        if len(pairs) < len(campaigns):
+            continue
+        a, b = (_together([pair[side].not_localised for pair in pairs]) for side in (0, 1))
+        resamples = Resamples.of(len(a.numerator), seed=campaigns[0].seed)
+        rows.append((f"`{_BEST_KNOWN}` against `{other}`", against(resamples, a, b)))
+    if not rows:
+        return []
+    names = ", ".join(one.name for one in campaigns)
+    return [
+        "## All sessions pooled",
+        "",
+        *table((f"Np = {campaigns[0].few_lanes}: {names}", "measured"), rows),
+        "",
+    ]
+
+
+def _together(sums: Sequence[SessionSums]) -> SessionSums:
+    return SessionSums(
+        np.concatenate([one.numerator for one in sums]),
+        np.concatenate([one.denominator for one in sums]),
+    )
 
 
 def _left_out(campaign: CampaignResult) -> list[str]:
