@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from engram.cli.simulation import campaigns_folder
 from engram.drive import Settings, open_map
-from engram.errors import InputError
 from engram.evaluation.configurations import Configuration
 from engram.evaluation.drives import open_campaign
 from engram.evaluation.held_out import localise_held_out
@@ -105,7 +104,7 @@ def main() -> None:
     drives = open_campaign(asked.campaign, campaigns_folder())
     plan = make_plan(drives, Settings(), RankingOptions(), asked.work)
     if not all(plan.map_path(fold).exists() for fold in plan.folds):
-        raise InputError(
+        raise SystemExit(
             f"{plan.work} does not hold the maps of all {len(plan.folds)} folds; run "
             f"`engram evaluate ranking {asked.campaign} --work {asked.work}` first"
         )

@@ -171,7 +171,7 @@ def _experience_tracks(
         graph = opened.graph
         tree = graph.chains_from(0)
         tracks = []
-        for session in store.load().sessions:
+        for session in opened.sessions.values():
             number = graph.session_number(session.id)
             if number is None:  # it localised everywhere, and saved nothing
                 continue

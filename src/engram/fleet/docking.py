@@ -107,7 +107,7 @@ def _check_given(centre: Path, robots: Sequence[Path], gate: Gate | None) -> Non
             gate.check_held_out(sessions, robot)
     if gate is not None and centre.exists():
         with MapStore.open(centre) as store:
-            gate.check_held_out(store.load().sessions, centre)
+            gate.check_held_out(store.sessions(), centre)
 
 
 @dataclass(frozen=True, slots=True)

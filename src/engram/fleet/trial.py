@@ -153,7 +153,7 @@ def check_not_sent(
     """
     if drives:
         with MapStore.open(centre, at=at) as store:
-            check_held_out(drives, store.load().sessions, centre, "--check")
+            check_held_out(drives, store.sessions(), centre, "--check")
 
 
 def try_downloads(
