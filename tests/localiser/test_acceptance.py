@@ -10,7 +10,7 @@ from engram.localiser.acceptance import inlier_spread
 from synthetic_world import World, see
 
 CONFIG = AcceptanceConfig()
-WIDE = Spread(0.5, 0.9)
+WIDE = Spread(0.5, 0.9, 10.0)
 
 
 def match(pose: SE3 | None, inliers: int, variance: float = 1e-4) -> Match:
@@ -77,9 +77,9 @@ def test_heading_must_agree_within_five_degrees_and_three_sigma(
 @pytest.mark.parametrize(
     ("spread", "accepted"),
     [
-        (Spread(0.26, 0.41), True),
-        (Spread(0.24, 0.9), False),  # the windows of one house
-        (Spread(0.5, 0.39), False),  # two parked cars, or the road
+        (Spread(0.26, 0.41, 10.0), True),
+        (Spread(0.24, 0.9, 10.0), False),  # the windows of one house
+        (Spread(0.5, 0.39, 10.0), False),  # two parked cars, or the road
     ],
 )
 def test_a_lost_robot_does_not_believe_a_cluster_nor_what_is_low(spread, accepted) -> None:
@@ -110,4 +110,4 @@ def test_spread_is_that_of_the_inliers_alone_in_the_poorer_image() -> None:
     assert spread(near_one).image <= 80 / np.sqrt(480 * 360)
     assert spread(everywhere).height == pytest.approx(1.0)
     assert spread(level).height <= 0.6 / np.ptp(np.percentile(heights_m, [10, 90]))
-    assert inlier_spread(match(None, 0), frame, frame) == Spread(0.0, 0.0)
+    assert inlier_spread(match(None, 0), frame, frame) == Spread(0.0, 0.0, 0.0)

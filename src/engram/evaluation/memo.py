@@ -72,7 +72,7 @@ class MatchMemo:
     def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
         if match.reference_from_live is None:
-            return Spread(0.0, 0.0)
+            return Spread(0.0, 0.0, 0.0)
         key = (live.stamp_ns, node)
         if key not in self._spreads:
             started = thread_time()

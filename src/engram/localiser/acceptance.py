@@ -99,10 +99,12 @@ class Spread:
     Attributes:
         image: share of the image, the geometric mean of that of the width and that of the height.
         height: extent along the camera's y axis, as a share of that of all landmarks of the frame.
+        depth_m: how far in front of the camera their median is.
     """
 
     image: float
     height: float
+    depth_m: float
 
 
 def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bool:
@@ -163,16 +165,17 @@ def _certain(match: Match, config: AcceptanceConfig) -> bool:
 def inlier_spread(match: Match, reference: Frame, live: Frame) -> Spread:
     """Over how much the inliers spread, the smaller of the two images'."""
     if match.inliers == 0:
-        return Spread(0.0, 0.0)
+        return Spread(0.0, 0.0, 0.0)
     spreads = []
     for frame, rows in ((reference, match.reference_rows), (live, match.live_rows)):
         size = (frame.camera.width, frame.camera.height)
         width, height = _extent(frame.landmarks.pixels[rows] / size).tolist()
         height_m = frame.landmarks.points_in_cam[:, 1]
         whole_m = max(float(_extent(height_m)), np.finfo(np.float64).tiny)
-        spreads.append((math.sqrt(width * height), float(_extent(height_m[rows])) / whole_m))
-    image, height = (min(values) for values in zip(*spreads, strict=True))
-    return Spread(image, height)
+        share = float(_extent(height_m[rows])) / whole_m
+        depth_m = float(np.median(frame.landmarks.points_in_cam[rows, 2]))
+        spreads.append((math.sqrt(width * height), share, depth_m))
+    return Spread(*(min(values) for values in zip(*spreads, strict=True)))
 
 
 def _extent(values: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Self
 
 import numpy as np
@@ -55,10 +55,12 @@ class LoopConfig:
             the search radius.
         own_exclusion_m: own nodes saved within the last so many metres close no loop. Source:
             SPEC §3.1.
-        confirm_after_m: two matches confirm each other when they were made at least this far apart.
-            What stands beside one of them is then out of the other's sight, or far ahead: half of
-            all landmarks of a street are within 10 m.
-        confirm_within_m: a match that nothing confirmed within this distance is dropped.
+        confirm_after_m: two matches confirm each other when they were made at least this far apart,
+            or, where the first one saw what is farther away, as far as that. What stands beside one
+            of them is then out of the other's sight: half of all landmarks of a street are within
+            10 m, but two corner houses of a kind may be seen alike from 30 m away on.
+        confirm_after_most_m: as far apart at most.
+        confirm_within_m: a match that nothing confirmed so far past this is dropped.
         certain_m: standard deviation past which the chains between two matches confirm nothing.
     """
 
@@ -67,7 +69,8 @@ class LoopConfig:
     near_m: float = 8.0
     own_exclusion_m: float = 30.0
     confirm_after_m: float = 8.0
-    confirm_within_m: float = 30.0
+    confirm_after_most_m: float = 20.0
+    confirm_within_m: float = 22.0
     certain_m: float = 1.0
 
     def __post_init__(self) -> None:
@@ -75,7 +78,8 @@ class LoopConfig:
             if getattr(self, name) < 1:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 1")
         for name in (
-            "near_m", "own_exclusion_m", "confirm_after_m", "confirm_within_m", "certain_m",
+            "near_m", "own_exclusion_m", "confirm_after_m", "confirm_after_most_m",
+            "confirm_within_m", "certain_m",
         ):  # fmt: skip
             if not 0 <= getattr(self, name) < np.inf:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 0")
@@ -88,6 +92,15 @@ class _Question:
     node: NodeId
     frame: Frame
     news: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Match:
+    """An edge that would close a loop, its inliers, and how far away what they saw is."""
+
+    edge: Edge
+    inliers: int
+    depth_m: float
 
 
 class LoopSearch:
@@ -115,8 +128,8 @@ class LoopSearch:
         self._matcher = matcher
         self._acceptance = acceptance
         self._frames = 0
-        self._asked: deque[tuple[int, Future[Edge | None]]] = deque()
-        self._waiting: list[Edge] = []
+        self._asked: deque[tuple[int, Future[_Match | None]]] = deque()
+        self._waiting: list[_Match] = []
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="engram-loops")
 
     def __enter__(self) -> Self:
@@ -150,30 +163,33 @@ class LoopSearch:
     def _answers_to(self, frame: int) -> list[Edge]:
         edges = []
         while self._asked and self._asked[0][0] <= frame:
-            edge = self._asked.popleft()[1].result()
-            if edge is not None:
-                edges += self._confirmed(edge)
+            match = self._asked.popleft()[1].result()
+            if match is not None:
+                edges += [one.edge for one in self._confirmed(match)]
         return edges
 
-    def _confirmed(self, edge: Edge) -> list[Edge]:
+    def _confirmed(self, match: _Match) -> list[_Match]:
         """The match and those that waited for it; or none, and it waits itself."""
-        here_m = self._driven_m(edge)
+        here_m, within_m = self._driven_m(match.edge), self.config.confirm_within_m
+        passed_m = {one: here_m - self._driven_m(one.edge) for one in self._waiting}
         self._waiting = [
-            one
-            for one in self._waiting
-            if here_m - self._driven_m(one) <= self.config.confirm_within_m
+            one for one, m in passed_m.items() if m <= self._base_line_m(one) + within_m
         ]
         agreeing = [
             one
             for one in self._waiting
-            if here_m - self._driven_m(one) >= self.config.confirm_after_m
-            and self._agree(one, edge)
+            if passed_m[one] >= self._base_line_m(one) and self._agree(one.edge, match.edge)
         ]
         if not agreeing:
-            self._waiting.append(edge)
+            self._waiting.append(match)
             return []
         self._waiting = [one for one in self._waiting if one not in agreeing]
-        return [*agreeing, edge]
+        return [*agreeing, match]
+
+    def _base_line_m(self, match: _Match) -> float:
+        """How far on another match must be that confirms it."""
+        least_m, most_m = self.config.confirm_after_m, self.config.confirm_after_most_m
+        return max(least_m, min(match.depth_m, most_m))
 
     def _driven_m(self, edge: Edge) -> float:
         """How far the robot had come when it saved the new node."""
@@ -212,7 +228,7 @@ class LoopSearch:
         news[near.nodes] = False
         return news
 
-    def _answer(self, question: _Question) -> Edge | None:
+    def _answer(self, question: _Question) -> _Match | None:
         """The best match among the most likely places; None if none is believed."""
         if not question.news.any():
             return None
@@ -223,11 +239,10 @@ class LoopSearch:
         places = [place for place in likeliest if question.news[place]]
         matches = [self._matched(question, place) for place in spread(places, self.config.attempts)]
         believed = [found for found in matches if found is not None]
-        best = max(believed, key=lambda found: found[0], default=None)
-        return None if best is None else best[1]
+        return max(believed, key=lambda found: found.inliers, default=None)
 
-    def _matched(self, question: _Question, place: int) -> tuple[int, Edge] | None:
-        """Inliers and the edge, if the place is matched."""
+    def _matched(self, question: _Question, place: int) -> _Match | None:
+        """The match with a place, if it is believed."""
         known = self._graph.node(place).id
         try:
             match = self._matcher.match(question.frame, question.node, known, None)
@@ -236,10 +251,10 @@ class LoopSearch:
             return None
         if match.reference_from_live is None or match.covariance is None:
             return None
-        over = partial(self._matcher.spread, question.frame, question.node, known, match)
+        over = cache(partial(self._matcher.spread, question.frame, question.node, known, match))
         if not accept_lost(match, over, self._acceptance):
             return None
         edge = Edge(
             known, question.node, EdgeKind.MATCH, match.reference_from_live, match.covariance
         )
-        return match.inliers, edge
+        return _Match(edge, match.inliers, over().depth_m)
