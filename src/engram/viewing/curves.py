@@ -101,7 +101,7 @@ def draw_curves(
     handles: dict[str, Any] = {}
     for one, panel in zip(axes, panels, strict=True):
         for line in panel.lines:
-            handle = _draw_line(one, line, *look_of[line.label])
+            handle = _draw_line(one, line, *look_of[line.label], min(0.08, 0.4 / len(panel.lines)))
             handles.setdefault(line.label, handle)
         _draw_axes(one, panel)
     figure.legend(list(handles.values()), list(handles), loc="outside right center", fontsize=8)
@@ -109,10 +109,10 @@ def draw_curves(
     save(figure, path)
 
 
-def _draw_line(axes: Any, line: Line, colour: str, style: str) -> Any:
-    """With its band; returns what the legend shows."""
+def _draw_line(axes: Any, line: Line, colour: str, style: str, band: float) -> Any:
+    """With its band, as opaque as told; returns what the legend shows."""
     if line.low is not None and line.high is not None:
-        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=0.08, linewidth=0)
+        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=band, linewidth=0)
         for edge in (line.low, line.high):  # bands of many lines hide each other, edges do not
             axes.plot(line.x, edge, color=colour, alpha=0.25, linewidth=0.5)
     marker = "o" if line.marks else None
