@@ -14,7 +14,7 @@ from engram.frontend.matching import Match
 from engram.geometry import SE3, CameraId
 from engram.localiser import AcceptanceConfig, Position
 from engram.localiser.attempts import Candidate, Outcome
-from engram.localiser.hypotheses import Hypotheses, look_alikes_likely
+from engram.localiser.hypotheses import Hypotheses
 from engram.odometry import OdometryStatus, OdometryStep
 
 SESSION = SessionId(UUID(int=1))
@@ -49,15 +49,15 @@ def near(position: Position) -> Neighbourhood:
     )
 
 
-def waiting(*, joins: bool = False) -> Hypotheses:
-    return Hypotheses(GRAPH, near, AcceptanceConfig(), joins=joins)
+def waiting() -> Hypotheses:
+    return Hypotheses(GRAPH, near, AcceptanceConfig())
 
 
-def seen_from(node: int, metres: float, rank: int = 0, depth_m: float = 6.0) -> Outcome:
+def seen_from(node: int, metres: float, rank: int = 0) -> Outcome:
     """A plausible match with a node, from so far beyond it."""
     candidate = Candidate(node, GRAPH.node(node).id, None, guided=False, row=None)
     match = Match(ahead(metres), SURE, 40, NOTHING, NOTHING)
-    return Outcome(candidate, rank, match, accepted=False, plausible=True, depth_m=depth_m)
+    return Outcome(candidate, rank, match, accepted=False, plausible=True)
 
 
 def drive(hypotheses: Hypotheses, metres: float) -> None:
@@ -92,46 +92,6 @@ def test_a_match_that_disagrees_waits_itself(node: int) -> None:
     assert accepted(hypotheses.judge([seen_from(node + 2, 3.9)])) == []
     drive(hypotheses, 5.0)
     assert accepted(hypotheses.judge([seen_from(node + 10, 0.9)])) == [node + 10]
-
-
-def believed_after_m(hypotheses: Hypotheses, every_m: float, depth_m: float) -> float | None:
-    """How far a robot drives that keeps seeing what it saw first, until it believes that."""
-    for driven_m in np.arange(0.0, 40.0, every_m).tolist():
-        node = 10 + round(driven_m)
-        if accepted(hypotheses.judge([seen_from(node, driven_m + 10 - node, depth_m=depth_m)])):
-            return driven_m
-        drive(hypotheses, every_m)
-    return None
-
-
-@pytest.mark.parametrize(
-    ("depth_m", "localises_m", "maps_m"),
-    # The third witness, then what the first one saw, then 20 m, decide.
-    [(2.0, 4.0, 8.0), (11.2, 4.0, 11.5), (30.0, 4.0, 20.0)],
-)
-def test_a_robot_that_would_join_places_asks_for_more(
-    depth_m: float, localises_m: float, maps_m: float
-) -> None:
-    assert believed_after_m(waiting(), 0.5, depth_m) == localises_m
-    assert believed_after_m(waiting(joins=True), 0.5, depth_m) == maps_m
-
-
-def test_two_matches_far_apart_join_nothing() -> None:
-    hypotheses = waiting(joins=True)
-    hypotheses.judge([seen_from(10, 0.5)])
-    drive(hypotheses, 10.0)
-    assert accepted(hypotheses.judge([seen_from(20, 0.5)])) == []
-    drive(hypotheses, 2.0)
-    assert accepted(hypotheses.judge([seen_from(22, 0.5)])) == []
-    drive(hypotheses, 2.0)
-    assert accepted(hypotheses.judge([seen_from(24, 0.5)])) == [24]
-
-
-@pytest.mark.parametrize(("lost_m", "likely"), [(0.0, False), (15.0, False), (300.0, True)])
-def test_look_alikes_are_likely_for_a_robot_that_has_been_lost_for_long(
-    lost_m: float, likely: bool
-) -> None:
-    assert look_alikes_likely(lost_m) == likely
 
 
 def test_the_nodes_that_would_confirm_it_are_told_nearest_first() -> None:

@@ -1,6 +1,6 @@
 """The EBN loop on simulated drives, from the frames to the map on disk."""
 
-from dataclasses import replace
+import dataclasses
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from engram.geometry import SE3
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.store import MapStore
 from mapping_rig import errors_m, localise_simulated, map_simulated
-from synthetic_world import World, drive, see
+from synthetic_world import World, drive
 
 WORLD = World(60.0)
 ROAD = np.arange(0.0, 55.0, 0.7)
@@ -81,36 +81,6 @@ def test_another_appearance_becomes_an_experience_beside_the_known_one(path: Pat
     assert len(set(graph.components().tolist())) == 1
 
 
-def test_streets_that_end_in_a_corner_seen_before_are_not_joined(path: Path) -> None:
-    """A robot that has driven past 50 m of unknown streets sees 10 m of a known one, well."""
-    map_simulated(path, drive(WORLD, ROAD))
-    elsewhere, places = World(90.0, seed=7), np.arange(0.0, 80.0, 0.7)
-    seen = [
-        replace(one, frame=see(WORLD, WORLD.pose_at(at - 30.0), one.frame.stamp_ns))
-        if 50.0 <= at < 60.0
-        else one
-        for at, one in zip(places, drive(elsewhere, places, start_ns=LATER_NS), strict=True)
-    ]
-    mapped = map_simulated(path, seen, "r2")
-    assert "localised" not in mapped.statuses
-    assert len(set(graph_of(path).components().tolist())) == 2
-
-
-def test_streets_that_end_in_a_known_one_are_joined(path: Path) -> None:
-    map_simulated(path, drive(WORLD, ROAD))
-    to_it = drive(World(60.0, seed=7), np.arange(0.0, 50.0, 0.7), start_ns=LATER_NS)
-    last_ns, before_ns = to_it[-1].frame.stamp_ns, to_it[-2].frame.stamp_ns
-    along_it = drive(WORLD, ROAD, seed=1, start_ns=2 * last_ns - before_ns)
-    along_it[0] = replace(along_it[0], odometry=to_it[-1].odometry)
-    seen = to_it + along_it
-    mapped = map_simulated(path, seen, "r2")
-    found = np.array(mapped.statuses) == "localised"
-    assert not found[: len(to_it)].any()
-    # It waits for 20 m at most.
-    assert found[len(to_it) + 36 :].all()
-    assert len(set(graph_of(path).components().tolist())) == 1
-
-
 def test_a_parallel_experience_is_in_the_neighbourhood(path: Path) -> None:
     first = map_simulated(path, drive(WORLD, ROAD))
     seen = drive(WORLD, ROAD, looks(10, 60), seed=1, start_ns=LATER_NS)
@@ -158,12 +128,12 @@ def test_a_drive_closes_its_own_loop(path: Path) -> None:
 def test_unusable_frames_are_neither_saved_nor_matched(path: Path) -> None:
     seen = drive(WORLD, ROAD)
     for i in range(10, 15):
-        dark = replace(seen[i].frame, status=FrameStatus.DARK)
+        dark = dataclasses.replace(seen[i].frame, status=FrameStatus.DARK)
         nothing = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
-        seen[i] = replace(seen[i], frame=dark, odometry=nothing)
+        seen[i] = dataclasses.replace(seen[i], frame=dark, odometry=nothing)
     across = seen[9].world_from_live.inverse() @ seen[15].world_from_live
-    bridging = replace(seen[15].odometry, prev_from_curr=across)
-    seen[15] = replace(seen[15], odometry=bridging)
+    bridging = dataclasses.replace(seen[15].odometry, prev_from_curr=across)
+    seen[15] = dataclasses.replace(seen[15], odometry=bridging)
     mapped = map_simulated(path, seen)
     assert mapped.statuses[10:15] == ["no_odometry"] * 5
     assert not any(step.saved for step in mapped.steps[10:15])
@@ -178,7 +148,7 @@ def test_a_chain_bears_short_gaps_of_odometry_and_breaks_at_long_ones(
     seen = drive(WORLD, ROAD)
     lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
     for i in range(20, 20 + lost):
-        seen[i] = replace(seen[i], odometry=lost_track)
+        seen[i] = dataclasses.replace(seen[i], odometry=lost_track)
     map_simulated(path, seen)
     graph = graph_of(path)
     assert len(set(graph.components().tolist())) == components
@@ -193,7 +163,7 @@ def test_a_short_gap_after_a_long_one_is_borne_again(path: Path) -> None:
     seen = drive(WORLD, ROAD)
     lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
     for i in (*range(20, 32), 33):  # 32 is measured, and saved as a new beginning
-        seen[i] = replace(seen[i], odometry=lost_track)
+        seen[i] = dataclasses.replace(seen[i], odometry=lost_track)
     map_simulated(path, seen)
     assert len(set(graph_of(path).components().tolist())) == 2
 
@@ -225,7 +195,7 @@ def test_a_kidnapped_robot_is_found_again(path: Path) -> None:
     here = drive(WORLD, np.arange(0, 10, 0.4), seed=2, start_ns=LATER_NS)
     there = drive(WORLD, np.arange(35, 45, 0.4), seed=3, start_ns=2 * LATER_NS)
     lost_track = OdometryStep(OdometryStatus.NO_CONSENSUS)
-    there[0] = replace(there[0], odometry=lost_track)
+    there[0] = dataclasses.replace(there[0], odometry=lost_track)
     found = localise_simulated(path, here + there)
     assert all(one.node is not None for one in found[-10:])
     assert errors_m(found, here + there, first.saved).max() < 0.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from time import perf_counter
 from typing import Protocol, Self
 
@@ -36,10 +36,8 @@ class Candidate:
         prediction: where the live camera is expected; None when relocalising.
         guided: whether matching uses the prediction (a named step of its own, SPEC §3.2).
         row: its row in the neighbourhood; None when relocalising.
-        doubted: whether a lone match that nothing else speaks for is not believed: where the
-            prediction may be wrong, since the robot is lost and knows its place by no nodes of its
-            own; and, where there is none, by a robot that joins places for good and has been lost
-            for long.
+        doubted: whether the prediction may be wrong: the robot is lost, and knows its place by no
+            nodes of its own.
     """
 
     index: int
@@ -60,7 +58,6 @@ class Outcome:
         match: with what it has in common with the live frame.
         accepted: whether that is a localisation.
         plausible: whether it would be one if another frame agreed; only of lost robots.
-        depth_m: then, how far away what was matched is (`Spread`); else 0.
         damaged: whether the node's landmarks could not be read, so that there is nothing to match.
     """
 
@@ -69,7 +66,6 @@ class Outcome:
     match: Match
     accepted: bool
     plausible: bool = False
-    depth_m: float = 0.0
     damaged: bool = False
 
 
@@ -237,20 +233,22 @@ class Attempter:
             return Outcome(candidate, rank, match, accepted=True)
         if not candidate.doubted:
             return Outcome(candidate, rank, match, accepted=False)
-        spread = cache(partial(self._matcher.spread, live, live_id, candidate.node, match))
+        spread = partial(self._matcher.spread, live, live_id, candidate.node, match)
         waits = plausible(match, spread, self._acceptance)
-        depth_m = spread().depth_m if waits else 0.0
-        return Outcome(candidate, rank, match, False, waits, depth_m)
+        return Outcome(candidate, rank, match, accepted=False, plausible=waits)
 
     def _attempt_lost(
         self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int
     ) -> Outcome:
         match = self._lost_matcher.match(live, live_id, candidate.node, None)
-        spread = cache(partial(self._lost_matcher.spread, live, live_id, candidate.node, match))
-        found = not candidate.doubted and accept_lost(match, spread, self._acceptance)
-        waits = plausible(match, spread, self._acceptance)
-        depth_m = spread().depth_m if waits else 0.0
-        return Outcome(candidate, rank, match, found, waits, depth_m)
+        spread = partial(self._lost_matcher.spread, live, live_id, candidate.node, match)
+        return Outcome(
+            candidate,
+            rank,
+            match,
+            accept_lost(match, spread, self._acceptance),
+            plausible(match, spread, self._acceptance),
+        )
 
     def foresee(
         self, live: Frame, live_id: NodeId, candidates: Iterable[Candidate]

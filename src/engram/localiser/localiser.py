@@ -39,7 +39,7 @@ from engram.localiser.attempts import (
     best_success,
 )
 from engram.localiser.gaps import GapFiller, Motion
-from engram.localiser.hypotheses import Hypotheses, look_alikes_likely
+from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig
@@ -131,7 +131,7 @@ class Localiser:
             budget.lanes,
             self.config.acceptance,
         )
-        self._hypotheses = Hypotheses(graph, self._near, self.config.acceptance, joins=saves)
+        self._hypotheses = Hypotheses(graph, self._near, self.config.acceptance)
         self._recent = RecentAttempts(self.config.recent)
         self._run = RunLog()
         self.walk = Walk(path_id(self.live))
@@ -400,9 +400,8 @@ class Localiser:
         known = {candidate.index for candidate in ranked}
         budget = self._budget.lost_attempts
         indices = self._hypotheses.nodes_near(_CONFIRMING) + self._proposals(live, budget)
-        doubted = self._own_session is not None and look_alikes_likely(self._open_loop_m)
         proposed = [
-            Candidate(index, self._graph.node(index).id, None, False, None, doubted)
+            Candidate(index, self._graph.node(index).id, None, guided=False, row=None)
             for index in dict.fromkeys(indices)
             if index not in known | self._damaged
         ]

@@ -13,7 +13,7 @@ from engram.ranking import RecentConfig
 
 # Raise it whenever drives are localised or mapped otherwise with equal settings: studies that were
 # kept under another one are not gone on with.
-METHOD_VERSION = 2
+METHOD_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
