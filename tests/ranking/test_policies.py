@@ -202,9 +202,12 @@ def test_path_is_the_formula_within_the_basin_and_distance_beyond(context) -> No
     scores = context.path_memory.scores(
         near.nodes, seen.nodes, seen.succeeded, context.reference, excluded=context.own_path
     )
-    scores[beyond] = 0
-    expected = order_by(context, beyond, -scores)
-    np.testing.assert_array_equal(policy_named("path").rank(context), expected)
+    # The core adds up in another order: what differs in its last bits only may stand in either.
+    scores = np.where(beyond, 0, scores.round(9))
+    order, expected = policy_named("path").rank(context), order_by(context, beyond, -scores)
+    np.testing.assert_array_equal(np.sort(order), np.sort(expected))
+    np.testing.assert_array_equal(scores[order], scores[expected])
+    np.testing.assert_array_equal(order[beyond[order]], expected[beyond[expected]])
 
 
 def test_path_refuses_arrays_that_do_not_fit() -> None:
