@@ -133,10 +133,11 @@ def test_times_are_counts_times_medians(plan: FleetPlan) -> None:
     single = fold.single()
     assert single is not None
     frames, attempts = sum(x.frames for x in single), sum(x.attempts for x in single)
-    lookups = sum(x.lookups for x in single)
+    proposed, lookups = sum(x.proposed for x in single), sum(x.lookups for x in single)
     expected_ms = (
         frames * arm.stages.frame_ms
-        + attempts * arm.stages.attempt_ms
+        + (attempts - proposed) * arm.stages.attempt_ms
+        + proposed * arm.stages.proposed_ms
         + lookups * arm.stages.lookup_ms
     )
     assert fold.time_of(single).counted_s == pytest.approx(expected_ms / 1e3)

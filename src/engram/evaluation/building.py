@@ -37,8 +37,9 @@ class BuiltSession:
         nodes: of the map with it.
         share_localised: of its frames.
         seconds: it took.
-        frames, attempts, lookups: how many frames, match attempts, and frames for which the
-            relocaliser was asked: what it took, on whatever machine.
+        frames, attempts, proposed, lookups: how many frames, match attempts, those of them at nodes
+            proposed to a lost robot, and frames for which the relocaliser was asked: what it took,
+            on whatever machine.
     """
 
     name: str
@@ -48,6 +49,7 @@ class BuiltSession:
     seconds: float
     frames: int = 0
     attempts: int = 0
+    proposed: int = 0
     lookups: int = 0
 
 
@@ -139,6 +141,7 @@ def _built_session(
         round(seconds, 3),
         frames=len(localisations),
         attempts=sum(one.attempts for one in localisations),
+        proposed=sum(one.proposed for one in localisations),
         lookups=sum("places" in one.stage_ms for one in localisations),
     )
 

@@ -139,7 +139,7 @@ class Spent:
     Attributes:
         merges, copies: made.
         merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
-        replayed, attempts, lookups: see `BestOrder`.
+        replayed, attempts, proposed, lookups: see `BestOrder`.
     """
 
     merges: int = 0
@@ -149,6 +149,7 @@ class Spent:
     judge_s: float = 0.0
     replayed: int = 0
     attempts: int = 0
+    proposed: int = 0
     lookups: int = 0
 
 
@@ -163,8 +164,8 @@ class BestOrder:
         merges, copies: made in this search, in all its runs; what an interruption undid is
             counted once.
         merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
-        replayed, attempts, lookups: nodes that were replayed in merging, match attempts, and
-            nodes for which the relocaliser was asked.
+        replayed, attempts, proposed, lookups: nodes that were replayed in merging, match attempts,
+            those of them at proposed nodes, and nodes for which the relocaliser was asked.
     """
 
     results: list[OrderResult] = field(default_factory=list)
@@ -177,6 +178,7 @@ class BestOrder:
     judge_s: float = 0.0
     replayed: int = 0
     attempts: int = 0
+    proposed: int = 0
     lookups: int = 0
 
     def count(self, spent: Spent) -> None:
@@ -223,6 +225,7 @@ class BestOrder:
             "judge_s": self.judge_s,
             "replayed": self.replayed,
             "attempts": self.attempts,
+            "proposed": self.proposed,
             "lookups": self.lookups,
         }
 
@@ -400,6 +403,7 @@ class _Search:
             "merge_s": time.perf_counter() - started,
             "replayed": sum(one.taken + one.omitted for one in report.segments),
             "attempts": report.match_attempts,
+            "proposed": report.proposed_attempts,
             "lookups": report.lookups,
         }
 

@@ -192,6 +192,7 @@ class _Merging:
         self._report.omitted += sum(one.omitted for one in self._report.segments)
         self._report.edges += replay.edges
         self._report.match_attempts = replay.match_attempts
+        self._report.proposed_attempts = replay.proposed_attempts
         self._report.lookups = replay.lookups
 
     def _replay(self, advance: Callable[[str], None]) -> Replay:

@@ -91,6 +91,7 @@ class Replay:
     Attributes:
         edges: how many were written.
         match_attempts: how many were made.
+        proposed_attempts: how many of them at nodes that the relocaliser proposed.
         lookups: for how many frames the relocaliser was asked.
         attempts: those to be remembered, by session, in the order of iterations.
         entries: what the replay matched, by session, in the order of time; not yet numbered.
@@ -108,6 +109,7 @@ class Replay:
     ) -> None:
         self.edges = 0
         self.match_attempts = 0
+        self.proposed_attempts = 0
         self.lookups = 0
         self.attempts: dict[SessionId, list[Attempt]] = {}
         self.entries: dict[SessionId, list[PathEntry]] = {}
@@ -144,6 +146,7 @@ class Replay:
                     self._take(stored, frame, localiser)
                     _count_taken(report, stored, odometry, reason, begins=begins)
                 self.match_attempts += found.attempts
+                self.proposed_attempts += found.proposed
                 self.lookups += "places" in found.stage_ms
                 self._advance("omitted" if found.node else "taken")
             self._end_run()

@@ -106,6 +106,8 @@ class Localisation:
         covariance: (6, 6) of `node_from_live`, left perturbation, [translation, rotation].
         inliers: landmarks that agree with the pose, 0 unless `LOCALISED`.
         attempts: match attempts made for this frame.
+        proposed: how many of them where nothing was expected, at nodes proposed to a lost robot;
+            they cost a quarter of the others (`LocaliserConfig.lost_max_samples`).
         candidates: nodes that could have been tried.
         open_loop_m: distance driven on odometry alone since the last match.
         moved_m: distance since the usable frame before; guessed where odometry failed.
@@ -127,6 +129,7 @@ class Localisation:
     open_loop_m: float
     moved_m: float = 0.0
     usable: bool = True
+    proposed: int = 0
     node: NodeId | None = None
     node_stamp_ns: int | None = None
     node_from_live: SE3 | None = None

@@ -534,6 +534,7 @@ class Localiser:
             stamp_ns=live.stamp_ns,
             status=self._status_without_match(odometry),
             attempts=len(self._outcomes),
+            proposed=sum(one.candidate.prediction is None for one in self._outcomes),
             candidates=0 if neighbourhood is None else len(neighbourhood),
             moved_m=0.0 if self._motion is None else self._motion.prev_from_curr.distance_m,
             usable=odometry.status is not OdometryStatus.UNUSABLE_FRAME,

@@ -20,6 +20,7 @@ from engram.evaluation.fleet.results import (
     slowest,
     total,
 )
+from engram.evaluation.fleet.stages import Counts
 from engram.evaluation.fleet.trials import (
     AS_TOD,
     AS_TOD_PATHS,
@@ -70,7 +71,8 @@ def _protocol(arm: ArmResult) -> list[str]:
     if arm.stages is not None:
         lines.append(
             f"Medians on one core: {arm.stages.frame_ms:.2f} ms a frame, "
-            f"{arm.stages.attempt_ms:.2f} ms an attempt, {arm.stages.lookup_ms:.2f} ms a look-up. "
+            f"{arm.stages.attempt_ms:.2f} ms an attempt, {arm.stages.proposed_ms:.2f} ms one of a "
+            f"lost robot at a proposed node, {arm.stages.lookup_ms:.2f} ms a look-up. "
             "Saving, front-end and odometry are not counted: every drive passes through them once "
             "whichever way a map is built."
         )
@@ -322,7 +324,9 @@ def _order_times(fold: FoldResult, found: dict[str, Any]) -> tuple[str, str, str
     """By (8), against a prefix tree, and one order really built; dashes for what is not timed."""
     groups = fold.order_groups()
     groups_s = total(fold.time_of(one) for one in groups).counted_s
-    merges_s = fold.counted(found["replayed"], found["attempts"], found["lookups"])
+    merges_s = fold.counted(
+        Counts(found["replayed"], found["attempts"], found["proposed"], found["lookups"])
+    )
     if groups_s is None or merges_s is None:
         return "–", "–", "–"
     group_s, merge_s = groups_s / len(groups), merges_s / max(found["merges"], 1)

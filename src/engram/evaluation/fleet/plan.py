@@ -24,6 +24,8 @@ from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS
 
 EXPERIMENTS = (7, 8, 9, 10)
+# Raise it whenever more is recorded of maps and merges: studies that lack it are not gone on with.
+_RECORDS_VERSION = 2
 # Source: SPEC §8, [G16] §VI: docking after log 7; 4 groups of 9 logs for the orders.
 _FORAY_LOGS = 7
 _ORDER_GROUP_LOGS = 9
@@ -233,6 +235,7 @@ def make_fleet_plan(
         options.relocaliser,
         matcher_hash(settings.localiser.matcher),
         METHOD_VERSION,
+        _RECORDS_VERSION,
         __version__,
     )
     plan = FleetPlan(

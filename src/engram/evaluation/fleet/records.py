@@ -24,7 +24,8 @@ class MergeRecord:
         components: connected components of the centre afterwards.
         taken, omitted: nodes.
         frames: nodes that were replayed.
-        attempts, lookups: match attempts, and nodes for which the relocaliser was asked.
+        attempts, proposed, lookups: match attempts, those of them at proposed nodes, and nodes for
+            which the relocaliser was asked.
         seconds: wall time.
     """
 
@@ -35,6 +36,7 @@ class MergeRecord:
     omitted: int
     frames: int
     attempts: int
+    proposed: int
     lookups: int
     seconds: float
 

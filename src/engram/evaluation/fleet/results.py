@@ -22,7 +22,7 @@ from engram.evaluation.fleet.records import (
     read_drive,
     read_merge,
 )
-from engram.evaluation.fleet.stages import StageTimes, read_stages
+from engram.evaluation.fleet.stages import Counts, StageTimes, read_stages
 from engram.evaluation.fleet.steps import field_path, map_path, runs_path
 from engram.evaluation.fleet.trials import TriedDownload, read_trials
 from engram.evaluation.folds import Fold
@@ -172,16 +172,18 @@ class FoldResult:
 
     def time_of(self, sessions: Sequence[BuiltSession]) -> Time:
         """What mapping some drives took."""
-        counted = self.counted(
+        counts = Counts(
             sum(one.frames for one in sessions),
             sum(one.attempts for one in sessions),
+            sum(one.proposed for one in sessions),
             sum(one.lookups for one in sessions),
         )
-        return Time(counted, sum(one.seconds for one in sessions))
+        return Time(self.counted(counts), sum(one.seconds for one in sessions))
 
     def time_of_merge(self, made: MergeRecord) -> Time:
         """What a merge took."""
-        return Time(self.counted(made.frames, made.attempts, made.lookups), made.seconds)
+        counts = Counts(made.frames, made.attempts, made.proposed, made.lookups)
+        return Time(self.counted(counts), made.seconds)
 
     def single(self) -> list[BuiltSession] | None:
         """The single agent's map; None unless it is whole."""
@@ -256,9 +258,9 @@ class FoldResult:
         wanted = sum(len(one) for one in self.plan.order_groups(self.fold))
         return sessions if len(sessions) == wanted else None
 
-    def counted(self, frames: int, attempts: int, lookups: int) -> float | None:
+    def counted(self, counts: Counts) -> float | None:
         """Seconds of so many; None if no medians were measured."""
-        return None if self._stages is None else self._stages.seconds(frames, attempts, lookups)
+        return None if self._stages is None else self._stages.seconds(counts)
 
     def _beside(self, name: str, kind: str) -> Any:
         return map_path(self.plan, self.arm, self.fold, name).with_suffix(f".{kind}.json")

@@ -121,6 +121,7 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
         omitted=report.omitted,
         frames=sum(one.taken + one.omitted for one in report.segments),
         attempts=report.match_attempts,
+        proposed=report.proposed_attempts,
         lookups=report.lookups,
         seconds=report.seconds,
     )

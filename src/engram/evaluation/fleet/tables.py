@@ -217,6 +217,7 @@ def _mapped(sessions: Sequence[BuiltSession]) -> Row:
         "nodes": sessions[-1].nodes,
         "frames": sum(one.frames for one in sessions),
         "match_attempts": sum(one.attempts for one in sessions),
+        "proposed_attempts": sum(one.proposed for one in sessions),
         "lookups": sum(one.lookups for one in sessions),
     }
 
