@@ -13,7 +13,7 @@ from engram.experience.model import EdgeKind, PathEntryKind, path_id
 from engram.fleet import DownloadOptions, Reason, Seed, download, silent
 from engram.store import MapStore
 
-from .robots import frame_log, merged, robot_map, truth_of
+from .robots import OPTIONS, frame_log, merged, robot_map, truth_of
 
 
 def assert_sound(path) -> None:
@@ -108,6 +108,10 @@ def test_what_finds_no_place_becomes_a_component_of_its_own(tmp_path, fleet):
     (segment,) = report.segments
     assert segment.seed is Seed.NONE
     assert [run.reason for run in segment.runs] == [Reason.NO_PLACE]
+    # Every node was looked for elsewhere, and within the budget of those that know their place.
+    assert report.lookups == report.taken
+    assert report.match_attempts == report.proposed_attempts
+    assert 0 < report.match_attempts <= report.taken * OPTIONS.lanes * OPTIONS.rounds
     assert_sound(centre)
 
 

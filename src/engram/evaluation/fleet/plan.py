@@ -24,8 +24,9 @@ from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS
 
 EXPERIMENTS = (7, 8, 9, 10)
-# Raise it whenever more is recorded of maps and merges: studies that lack it are not gone on with.
-_RECORDS_VERSION = 2
+# Raise it whenever maps are merged otherwise, or more is recorded of maps and merges: studies of
+# before are not gone on with.
+_MERGING_VERSION = 2
 # Source: SPEC §8, [G16] §VI: docking after log 7; 4 groups of 9 logs for the orders.
 _FORAY_LOGS = 7
 _ORDER_GROUP_LOGS = 9
@@ -235,7 +236,7 @@ def make_fleet_plan(
         options.relocaliser,
         matcher_hash(settings.localiser.matcher),
         METHOD_VERSION,
-        _RECORDS_VERSION,
+        _MERGING_VERSION,
         __version__,
     )
     plan = FleetPlan(
