@@ -161,8 +161,8 @@ class Replay:
             self._robot.contents.cameras[segment.nodes[0].camera],
             self._settings,
             policy=options.policy,
-            # The lost get no more: the next node asks again, from a metre on. Four times as many
-            # attempts brought neither more nodes home nor fewer parts.
+            # The lost get no more, for the next node asks again, from a step on: four times as
+            # many attempts find one to three nodes more in a hundred.
             budget=Budget(options.lanes, options.rounds, lost_rounds=options.rounds),
             relocaliser=self._relocaliser,
             live=session.id,
