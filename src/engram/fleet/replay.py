@@ -19,6 +19,7 @@ from engram.experience.model import (
     SessionId,
 )
 from engram.experience.proximity import lay_proximity_edges, tighten_chain
+from engram.fleet.behind_gaps import FoundNode, look_along, position_behind_gap
 from engram.fleet.centre import Centre
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.positions import beyond, recomposed, seen_from, uncertainty_m2
@@ -34,6 +35,7 @@ from engram.localiser import (
     Position,
     Relocaliser,
 )
+from engram.localiser.attempts import Outcome
 from engram.mapper import match_edges
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import check_for_robot, policy_named
@@ -123,6 +125,9 @@ class Replay:
         self._taken: set[NodeId] = set()
         self._run: list[int] = []  # nodes taken one after another, by their dense indices
         self._iterations: dict[SessionId, int] = {}
+        self._last: Segment | None = None  # the one that was replayed last
+        # Found behind gaps, before their turn came.
+        self._looked_up: dict[NodeId, FoundNode] = {}
 
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
         """Replays one segment: what localises is omitted, the rest is taken (SPEC §7 MERGE 3)."""
@@ -130,16 +135,19 @@ class Replay:
         seed = self._seed(segment)
         if seed is not None:
             report.seed = Seed.NEIGHBOUR
+        elif self._look_behind_gap(session, segment):
+            report.seed = Seed.GAP
+        self._last = segment
         if self._relocaliser is not None:
             self._relocaliser.forget()
-        with self._localiser(session, segment) as localiser:
+        with self._localiser(session, segment, self._relocaliser) as localiser:
             if seed is not None:
                 localiser.start_at(seed)
             for stored, odometry in self._stream(segment):
                 frame = self._robot.store.frames.decode(stored)
-                found = self._localise(localiser, stored.node.id, frame, odometry)
+                found, outcomes = self._localise(localiser, stored.node.id, frame, odometry)
                 if found.status is LocalisationStatus.LOCALISED:
-                    self._omit(stored, found, localiser)
+                    self._omit(stored, found, outcomes)
                     _count_omitted(report)
                 else:
                     reason, begins = _reason(frame, found), not self._run
@@ -155,7 +163,9 @@ class Replay:
 
     # -- the stream
 
-    def _localiser(self, session: Session, segment: Segment) -> Localiser:
+    def _localiser(
+        self, session: Session, segment: Segment, relocaliser: Relocaliser | None
+    ) -> Localiser:
         centre, options = self._centre.opened, self._options
         localiser = centre.localiser(
             self._robot.contents.cameras[segment.nodes[0].camera],
@@ -164,7 +174,7 @@ class Replay:
             # The lost get no more, for the next node asks again, from a step on: four times as
             # many attempts find one to three nodes more in a hundred.
             budget=Budget(options.lanes, options.rounds, lost_rounds=options.rounds),
-            relocaliser=self._relocaliser,
+            relocaliser=relocaliser,
             live=session.id,
             saves=True,
             clock=session,
@@ -186,14 +196,42 @@ class Replay:
 
     def _localise(
         self, localiser: Localiser, node: NodeId, frame: Frame, odometry: OdometryStep
-    ) -> Localisation:
+    ) -> tuple[Localisation, list[Outcome]]:
         """One frame; where the robot itself measured how it lies to a known node, from there."""
+        looked_up = self._looked_up.pop(node, None)
+        if looked_up is not None:
+            localiser.carry_on(odometry, frame.stamp_ns)
+            position = looked_up.localisation.position
+            assert position is not None
+            localiser.start_at(position)
+            return looked_up.localisation, looked_up.outcomes
         known = self._known_neighbour(node, _MEASURED, self._run[0]) if self._run else None
-        if known is None:
-            return localiser.localise(frame, odometry)
-        localiser.carry_on(odometry, frame.stamp_ns)
-        localiser.start_at(known)
-        return localiser.localise(frame, OdometryStep(OdometryStatus.FIRST))
+        if known is not None:
+            localiser.carry_on(odometry, frame.stamp_ns)
+            localiser.start_at(known)
+            odometry = OdometryStep(OdometryStatus.FIRST)
+        found = localiser.localise(frame, odometry)
+        return found, localiser.outcomes
+
+    def _look_behind_gap(self, session: Session, segment: Segment) -> bool:
+        """Whether a segment is found from where the one before it ended; see `behind_gaps`."""
+        before = self._last
+        if before is None or before.nodes[0].session != session.id:
+            return False
+        end = self._centre.equivalent(before.nodes[-1].id)
+        start = None if end is None else position_behind_gap(end, before, segment)
+        if start is None:
+            return False
+        frames = (
+            (stored.node.id, self._robot.store.frames.decode(stored), odometry)
+            for stored, odometry in self._stream(segment)
+        )
+        with self._localiser(session, segment, relocaliser=None) as localiser:
+            found, attempts = look_along(localiser, start, frames)
+        self.match_attempts += attempts
+        if found is not None:
+            self._looked_up[found.node] = found
+        return found is not None
 
     def _seed(self, segment: Segment) -> Position | None:
         """Where the first frame is, by the nearest node of the segment with a known neighbour."""
@@ -237,7 +275,7 @@ class Replay:
 
     # -- what becomes of a frame
 
-    def _omit(self, stored: StoredNode, found: Localisation, localiser: Localiser) -> None:
+    def _omit(self, stored: StoredNode, found: Localisation, outcomes: list[Outcome]) -> None:
         """The centre shows this place alike already."""
         assert found.node is not None
         assert found.node_from_live is not None
@@ -247,8 +285,8 @@ class Replay:
         self._writer.add_omission(self._centre.omit(node, position))
         self._link(node)
         self._end_run()
-        acceptance = localiser.config.acceptance
-        for edge in match_edges(self._centre.graph, localiser.outcomes, acceptance):
+        acceptance = self._settings.localiser.acceptance
+        for edge in match_edges(self._centre.graph, outcomes, acceptance):
             self._add_edge(edge)
 
     def _take(self, stored: StoredNode, frame: Frame, localiser: Localiser) -> None:

@@ -18,6 +18,7 @@ class Seed(StrEnum):
     """How the replay of a segment knew where it was."""
 
     NEIGHBOUR = "neighbour"
+    GAP = "gap"
     PLACE = "place"
     NONE = "none"
 
@@ -104,6 +105,13 @@ class SegmentReport:
         }
 
 
+_SEED_WORDS = {
+    Seed.GAP: "found behind a gap",
+    Seed.PLACE: "found by looks",
+    Seed.NONE: "not found",
+}
+
+
 def _drive_text(segments: Sequence[SegmentReport]) -> str:
     """One line for all segments of a drive: lost odometry leaves hundreds of a node each."""
     first = segments[0]
@@ -112,7 +120,7 @@ def _drive_text(segments: Sequence[SegmentReport]) -> str:
     if len(segments) > 1:
         line += f", in {len(segments)} segments"
     seeds = Counter(one.seed for one in segments)
-    for seed, words in ((Seed.PLACE, "found by looks"), (Seed.NONE, "not found")):
+    for seed, words in _SEED_WORDS.items():
         if seeds[seed]:
             line += f", {words}" if len(segments) == 1 else f", {seeds[seed]} {words}"
     reasons = Counter[Reason]()
