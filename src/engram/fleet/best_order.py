@@ -23,6 +23,7 @@ from engram.fleet.merging import Progress
 from engram.fleet.replay import MergeOptions
 from engram.measures import Drive, failure_curve, failure_route, route_not_localised
 from engram.store import MapStore
+from engram.store.drafts import remove_left_drafts
 
 # [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
 _AREA_TO_M = 50.0
@@ -346,7 +347,8 @@ class _Search:
         self._sequences = [open_drive(path) for path in judge.drives]
         self._reported = [open_drive(path) for path in judge.reported]
         with keeping(folder):
-            for left in (*folder.glob("order-*.engram*"), *folder.glob(".order-*.new")):
+            remove_left_drafts(folder, "order-*")
+            for left in folder.glob("order-*.engram*"):
                 left.unlink()  # by a run that was killed
 
     def below(

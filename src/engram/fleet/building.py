@@ -24,7 +24,6 @@ from engram.fleet.best_order import (
 )
 from engram.fleet.cluster import check_scheduler, map_groups_on_cluster
 from engram.fleet.docking import merge_maps
-from engram.fleet.drafts import check_parent
 from engram.fleet.group_mapping import GroupResult, GroupTask, fetched
 from engram.fleet.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.merging import Progress, silent
@@ -33,6 +32,7 @@ from engram.fleet.report import MergeReport
 from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sole_builder
 from engram.fleet.workers import map_groups
 from engram.store import MapStore
+from engram.store.drafts import check_parent
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,6 @@ from engram.drive.interruption import deferred_interrupt
 from engram.errors import InputError
 from engram.fleet.centre import Centre
 from engram.fleet.checks import check_fits, check_readable
-from engram.fleet.drafts import draft_folder
 from engram.fleet.gate import Gate
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.merging import Progress, merge_map, silent
@@ -23,6 +22,7 @@ from engram.fleet.pictures import picture_before_and_after
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
 from engram.store import FORMAT_VERSION, MapStore
+from engram.store.drafts import draft_folder
 from engram.viewing import check_picture
 
 

@@ -20,12 +20,12 @@ from engram.errors import InputError
 from engram.experience.model import Edge, PathId, path_id
 from engram.fleet.bridges import close_gaps, components
 from engram.fleet.coverage import Coverage, expected_missed
-from engram.fleet.drafts import check_parent, draft_folder
 from engram.fleet.merging import Progress
 from engram.fleet.mission import DownloadOptions
 from engram.fleet.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.stock import Mask, Stock
 from engram.store import BulkWriter, MapStore, WritableMapStore
+from engram.store.drafts import check_parent, draft_folder
 
 # What a node takes beside its blobs: rows and indices of it, its edges and path entries; measured
 # on maps of `hamlet`. Only where the search for the budget begins: the file itself is measured.

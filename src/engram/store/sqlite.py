@@ -13,7 +13,7 @@ import os
 import sqlite3
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -49,6 +49,7 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.store.database import damage_named
+from engram.store.drafts import draft_folder
 from engram.store.lock import Holder, WriterLock, current_holder
 from engram.store.raising import raise_tables
 from engram.store.rows import sealed
@@ -499,15 +500,11 @@ def _check_tables(connection: Connection, path: Path, version: int) -> None:
 @contextmanager
 def _new_file(path: Path) -> Iterator[Path]:
     """A draft to be filled, which then appears under its name whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
-        with _naming(path):
-            _remove(draft)
-            yield draft
-            _publish(draft, path)
-            _sync_folder(path.parent)
-    finally:
-        _remove(draft)
+    with _naming(path), draft_folder(path) as folder:
+        draft = folder / path.name
+        yield draft
+        _publish(draft, path)
+        _sync_folder(path.parent)
 
 
 @contextmanager
@@ -571,12 +568,6 @@ def _sync_folder(folder: Path) -> None:
 
 
 _BESIDE = ("-wal", "-shm", "-journal")
-
-
-def _remove(path: Path) -> None:
-    for suffix in ("", *_BESIDE):
-        with suppress(FileNotFoundError):
-            path.with_name(path.name + suffix).unlink()
 
 
 def _remove_orphans(path: Path) -> None:
