@@ -216,6 +216,19 @@ def test_only_what_is_asked_for_is_reported(plan: FleetPlan, tmp_path: Path, exp
     page = (tmp_path / "claims.md").read_text()
     said = {7: "29.36 %", 8: "the shared map", 9: "`tod`", 10: "22.44 %"}
     assert [one for one, words in said.items() if words in page] == [experiment]
+    assert [f"(Fig. {one})\n" in page for one in said] == [one == experiment for one in said]
+
+
+def test_arms_stand_side_by_side(plan: FleetPlan, tmp_path: Path) -> None:
+    """Also those that were not run in whole."""
+    both = replace(plan, options=replace(OPTIONS, arms=("A", "B")))
+    write_fleet_report(tmp_path, [both])
+    heads = [row for row in claims(tmp_path) if row[0] == "what"]
+    assert [row[4:] for row in heads] == [["A: distance, 8 attempts", "B: recall, 8 attempts"]] * 4
+    measured = [row for row in claims(tmp_path) if row[0].startswith("nodes of 2 groups")]
+    assert len(measured) == 1
+    assert measured[0][-2].endswith(")")
+    assert measured[0][-1] == "–"
 
 
 def test_forays_in_copies_alone_are_not_reported(plan: FleetPlan, tmp_path: Path) -> None:

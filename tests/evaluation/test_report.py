@@ -233,7 +233,8 @@ def test_several_campaigns_are_pooled(plan: Plan, out: Path, tmp_path: Path) -> 
     text = (tmp_path / "claims.md").read_text()
     pooled = text[text.index("## All sessions pooled") :]
     # One block of 20 against 3, in every session of both.
-    told = "5.00 % against 15.00 %, difference -10.00 (-10.00 … -10.00) points"
+    ten = "\N{MINUS SIGN}10.00"
+    told = f"5.00 % against 15.00 %, difference {ten} ({ten} … {ten}) points"
     assert f"| `recall` against `distance` | {told} |" in pooled
 
 

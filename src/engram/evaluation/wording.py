@@ -23,6 +23,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     ]
 
 
+def share(value: float) -> str:
+    """A share."""
+    return f"{100 * value:.2f} %"
+
+
 def percent(interval: Interval) -> str:
     """A share and its interval."""
     if np.isnan(interval.estimate):
@@ -41,10 +46,13 @@ def times(interval: Interval) -> str:
 def against(resamples: Resamples, a: SessionSums, b: SessionSums) -> str:
     """Two shares and their paired difference with its interval."""
     gap = resamples.interval(difference(a, b))
-    ours, theirs = (f"{100 * one.value:.2f} %" for one in (a, b))
-    low, high = f"{100 * gap.low:+.2f}", f"{100 * gap.high:+.2f}"
-    points = f"{100 * gap.estimate:+.2f} ({low} … {high}) points"
-    return f"{ours} against {theirs}, difference {points}"
+    low, high = _signed(100 * gap.low), _signed(100 * gap.high)
+    points = f"{_signed(100 * gap.estimate)} ({low} … {high}) points"
+    return f"{share(a.value)} against {share(b.value)}, difference {points}"
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def _number(value: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,7 +32,7 @@ from engram.evaluation.fleet.trials import (
     TOD_PATHS,
     TriedDownload,
 )
-from engram.evaluation.wording import CLAIM_COLUMNS, Row, against, table
+from engram.evaluation.wording import CLAIM_COLUMNS, Row, against, share, table
 from engram.fleet import order_costs
 from engram.measures import Resamples, not_localised_sums
 
@@ -48,35 +49,56 @@ _AIM_POINTS = {QUARTER: "within 1 point", TENTH: "within 3 points"}
 
 
 def fleet_claims_page(arms: Sequence[ArmResult]) -> str:
-    """The tables of all arms. Intervals are 90 %, paired, by bootstrap over sessions."""
+    """A table per campaign and experiment, with a column per arm.
+
+    Intervals are 90 %, paired, by bootstrap over sessions.
+    """
     lines: list[str] = []
-    for arm in arms:
-        rows = [row for number, of in _ROWS.items() if arm.asked(number) for row in of(arm)]
-        title = f"## {arm.plan.drives.name}, arm {arm.arm.letter}: {arm.arm.words}"
-        lines += [title, "", *_protocol(arm), "", *table(CLAIM_COLUMNS, rows), ""]
+    for _, of_campaign in groupby(arms, key=lambda arm: arm.plan.work):
+        lines += _campaign(list(of_campaign))
     return "\n".join(lines)
 
 
-def _protocol(arm: ArmResult) -> list[str]:
+def _campaign(arms: Sequence[ArmResult]) -> Iterator[str]:
+    yield from (f"## {arms[0].plan.drives.name}", "", _protocol(arms[0]), "")
+    yield from (_medians(arm) for arm in arms if arm.stages is not None)
+    for number, (title, of) in _TABLES.items():
+        rows = _side_by_side([list(of(arm)) if arm.asked(number) else [] for arm in arms])
+        if rows:
+            columns = (f"{arm.arm.letter}: {arm.arm.words}" for arm in arms)
+            yield from ("", f"### {title} (Fig. {number})", "")
+            yield from table((*_COLUMNS, *columns), rows)
+
+
+def _side_by_side(of_arms: Sequence[list[Row]]) -> list[tuple[str, ...]]:
+    """What is claimed, and what was measured in each arm; a dash where it was not."""
+    claims = dict.fromkeys(row[:-1] for rows in of_arms for row in rows)
+    measured = [{row[:-1]: row[-1] for row in rows} for rows in of_arms]
+    return [(*claim, *(of.get(claim, "–") for of in measured)) for claim in claims]
+
+
+def _protocol(arm: ArmResult) -> str:
     """How many logs there were: [G16]'s protocols are scaled to them."""
     fold = arm.plan.folds[0]
     protocol, groups = arm.plan.protocol(fold), arm.plan.groups(fold, arm.plan.options.groups)
-    lines = [
+    return (
         f"{len(arm.plan.drives.drives)} drives, {arm.plan.options.folds} folds, "
         f"{len(fold.training)} training drives in the first; {len(groups)} groups of "
         f"{len(groups[-1])} to {len(groups[0])} (Fig. 7); forays of {protocol.foray} (7 in the "
         f"paper; Figs. 8 and 9); groups of {protocol.group} (9 in the paper) for the orders, "
-        f"chosen on {protocol.validation} validation drives (Fig. 10)."
-    ]
-    if arm.stages is not None:
-        lines.append(
-            f"Medians on one core: {arm.stages.frame_ms:.2f} ms a frame, "
-            f"{arm.stages.attempt_ms:.2f} ms an attempt, {arm.stages.proposed_ms:.2f} ms one of a "
-            f"lost robot at a proposed node, {arm.stages.lookup_ms:.2f} ms a look-up. "
-            "Saving, front-end and odometry are not counted: every drive passes through them once "
-            "whichever way a map is built."
-        )
-    return lines
+        f"chosen on {protocol.validation} validation drives (Fig. 10). Saving, front-end and "
+        "odometry are not counted: every drive passes through them once whichever way a map is "
+        "built."
+    )
+
+
+def _medians(arm: ArmResult) -> str:
+    assert arm.stages is not None
+    return (
+        f"- Medians of arm {arm.arm.letter} on one core: {arm.stages.frame_ms:.2f} ms a frame, "
+        f"{arm.stages.attempt_ms:.2f} ms an attempt, {arm.stages.proposed_ms:.2f} ms one of a "
+        f"lost robot at a proposed node, {arm.stages.lookup_ms:.2f} ms a look-up."
+    )
 
 
 def _building(arm: ArmResult) -> Iterator[Row]:
@@ -90,13 +112,13 @@ def _building(arm: ArmResult) -> Iterator[Row]:
         single = [fold.time_of(fold.single() or []) for fold, _ in whole]
         parallel = [built.time for _, built in whole]
         yield (
-            f"time of {groups} groups side by side, then merges one after another, ÷ one agent's; "
-            f"{len(whole)} folds",
+            f"time of {groups} groups side by side, then merges one after another, ÷ one agent's",
             "29.36 %" if is_main else "–",
             "≤ 45 % (arm A)" if is_main else "–",
             "≤ 30 %" if is_main else "",
             f"{_ratio(parallel, single)}; slowest group alone "
-            f"{_ratio([slowest(built.group_times) for _, built in whole], single)}",
+            f"{_ratio([slowest(built.group_times) for _, built in whole], single)}; "
+            f"{_folds(len(whole))}",
         )
         pairwise = [built.pairwise_time for _, built in whole]
         if is_main and all(pairwise):
@@ -111,7 +133,7 @@ def _building(arm: ArmResult) -> Iterator[Row]:
             "67.57 %" if is_main else "–",
             "≤ 85 % (A), ≤ 110 % (C)" if is_main else "–",
             "≤ 65 %" if is_main else "",
-            f"{merged / agents:.2%} ({merged} of {agents})",
+            f"{share(merged / agents)} ({merged} of {agents})",
         )
         yield from _compared(
             arm, f"route not localised, {groups} groups merged against one agent",
@@ -132,6 +154,10 @@ def _whole(arm: ArmResult, groups: int) -> list[tuple[FoldResult, Parallel]]:
     return [(fold, built) for fold, built in found if built is not None]
 
 
+def _folds(count: int) -> str:
+    return "1 fold" if count == 1 else f"{count} folds"
+
+
 def _ratio(above: Sequence[Time], below: Sequence[Time]) -> str:
     """By counts, wall time beside it."""
     a, b = total(above), total(below)
@@ -140,9 +166,9 @@ def _ratio(above: Sequence[Time], below: Sequence[Time]) -> str:
     )
 
 
-def _share(part: float | None, whole: float | None, form: str = ".2%") -> str:
+def _share(part: float | None, whole: float | None) -> str:
     """One by the other; a dash where either was not measured, or nothing was counted."""
-    return "–" if part is None or not whole else f"{part / whole:{form}}"
+    return "–" if part is None or not whole else share(part / whole)
 
 
 def _sharing(arm: ArmResult) -> Iterator[Row]:
@@ -163,7 +189,7 @@ def _compared(
     ours, theirs = found
     resamples = Resamples.of(len(ours.sessions), seed=arm.plan.options.seed)
     tail = "; ".join(
-        f"P(> {at:g} m) {ours.failure(at).value:.2%} against {theirs.failure(at).value:.2%}"
+        f"P(> {at:g} m) {share(ours.failure(at).value)} against {share(theirs.failure(at).value)}"
         for at in (5.0, 10.0)
     )
     measured = against(resamples, ours.not_localised, theirs.not_localised)
@@ -215,7 +241,7 @@ def _against_copy(arm: ArmResult, name: str, pairs: Pairs) -> Iterator[Row]:
             _PAPER_NODES[name],
             _MUST_NODES[name],
             "",
-            f"{nodes:.1%}; united with the robot's own {united:.1%}; bytes {size:.1%}",
+            f"{share(nodes)}; united with the robot's own {share(united)}; bytes {share(size)}",
         )
     promised = _weighted([one for one, _ in pairs])
     yield (
@@ -223,7 +249,7 @@ def _against_copy(arm: ArmResult, name: str, pairs: Pairs) -> Iterator[Row]:
         "–",
         _MUST_POINTS[name],
         _AIM_POINTS.get(name, ""),
-        f"{_difference(arm, pairs)}; promised {promised:.2%}; bytes {size:.1%}",
+        f"{_difference(arm, pairs)}; promised {share(promised)}; bytes {share(size)}",
     )
     if name in _MUST_NODES:
         ms, asked, query, dense = (
@@ -268,7 +294,7 @@ def _forays(arm: ArmResult) -> Iterator[Row]:
             _PAPER_NODES[policy],
             "–",
             "",
-            f"{sent / whole:.1%}; united with the robot's own {united / whole:.1%}"
+            f"{share(sent / whole)}; united with the robot's own {share(united / whole)}"
             + _asked_for_more(taken, policy),
         )
         yield (
@@ -312,7 +338,7 @@ def _orders(arm: ArmResult) -> Iterator[Row]:
     if fold.sequential() is not None:
         yield (
             "one order really built sequentially: time of its later groups ÷ (k − 1)·T_G of (8)",
-            "1 (assumed)",
+            "100 % (assumed)",
             "checked",
             "",
             checked,
@@ -339,7 +365,7 @@ def _order_times(fold: FoldResult, found: dict[str, Any]) -> tuple[str, str, str
         f"{_share(costs.tree_s, costs.sequential_s)} (T_G {group_s:.1f} s, T_M {merge_s:.2f} s by "
         f"counts, T_C {copy_s:.2f} s)",
         _share(costs.tree_s, costs.sequential_tree_s),
-        _share(rest_s, (len(groups) - 1) * group_s, ".2f"),
+        _share(rest_s, (len(groups) - 1) * group_s),
     )
 
 
@@ -347,18 +373,20 @@ def _spread(found: dict[str, Any]) -> Iterator[Row]:
     curves = np.array([one["reported"] for one in found["orders"]])
     for at in (5, 10, 20):
         values = curves[:, 2 * at]
+        least, median, most = (share(float(of(values))) for of in (np.min, np.median, np.max))
         yield (
             f"P(> {at} m) over the orders, held-out drives: least, median, most; chosen order",
             "orders differ",
             "printed",
             "",
-            f"{values.min():.2%}, {np.median(values):.2%}, {values.max():.2%}; {values[0]:.2%}",
+            f"{least}, {median}, {most}; {share(values[0])}",
         )
 
 
-_ROWS: dict[int, Callable[[ArmResult], Iterator[Row]]] = {
-    7: _building,
-    8: _sharing,
-    9: _downloads,
-    10: _orders,
+_COLUMNS = CLAIM_COLUMNS[:-1]
+_TABLES: dict[int, tuple[str, Callable[[ArmResult], Iterator[Row]]]] = {
+    7: ("Building side by side", _building),
+    8: ("Sharing", _sharing),
+    9: ("Taking a part", _downloads),
+    10: ("Orders of merging", _orders),
 }
