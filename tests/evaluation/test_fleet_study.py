@@ -199,6 +199,9 @@ def test_what_is_not_timed_is_left_empty(plan: FleetPlan, tmp_path: Path) -> Non
     by_counts = [row[-1] for row in page if row[0].startswith("time of 2 groups")]
     assert len(by_counts) == 1
     assert by_counts[0].startswith("– by counts, ")
+    (chosen,) = [row[-1] for row in page if row[0].startswith("chosen order against")]
+    assert " against " in chosen.split("; ")[0]
+    assert " against " in chosen.split("; ")[1]
     timed = ("by (8)", "sequential prefix tree", "really built")
     assert [[row[-1] for row in page if one in row[0]] for one in timed] == [["–"]] * 3
     assert not (tmp_path / "out" / "fig07_nodes.png").exists()

@@ -34,7 +34,7 @@ from engram.evaluation.fleet.trials import (
 )
 from engram.evaluation.wording import CLAIM_COLUMNS, Row, against, share, table
 from engram.fleet import order_costs
-from engram.measures import Resamples, not_localised_sums
+from engram.measures import Resamples, not_localised_sums, route_not_localised
 
 # Source: [G16] Figs. 7 and 9, §VI-E.
 _PAPER_NODES = {TOD: "81.77 and 79.57 % (united)", TOD_PATHS: "74.56 and 66.57 % (united)"}
@@ -344,6 +344,7 @@ def _orders(arm: ArmResult) -> Iterator[Row]:
             checked,
         )
     yield from _spread(found)
+    yield from _chosen_against_sequential(fold, found)
 
 
 def _order_times(fold: FoldResult, found: dict[str, Any]) -> tuple[str, str, str]:
@@ -380,6 +381,22 @@ def _spread(found: dict[str, Any]) -> Iterator[Row]:
             "printed",
             "",
             f"{least}, {median}, {most}; {share(values[0])}",
+        )
+
+
+def _chosen_against_sequential(fold: FoldResult, found: dict[str, Any]) -> Iterator[Row]:
+    """What choosing gains over one agent that mapped the groups' drives one after another."""
+    built, chosen = fold.sequential(), found["orders"][0]
+    driven = fold.held_out("orders-sequential")
+    if built and driven:
+        missed = route_not_localised([one.drive for one in driven])
+        yield (
+            "chosen order against one agent with the same drives: route not localised; nodes",
+            "–",
+            "printed",
+            "",
+            f"{share(chosen['reported_missed'])} against {share(missed)}; "
+            f"{chosen['nodes']} against {built[-1].nodes}",
         )
 
 
