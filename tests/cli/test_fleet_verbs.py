@@ -91,6 +91,8 @@ def test_build_maps_and_merges(engram, street, tmp_path):
         (("--seed", 0), "--seed is of random grouping"),
         (("--seed", 7, "--grouping", "by-condition"), "--seed is of random grouping"),
         (("--best-order",), "name at least one"),
+        (("--best-first",), "name at least one"),
+        (("--best-order", "--best-first", "--validate", "held-out.framelog"), "give one of them"),
     ],
 )
 def test_build_refuses_options_that_mean_nothing(engram, street, tmp_path, asked, says):

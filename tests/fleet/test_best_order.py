@@ -11,7 +11,7 @@ import pytest
 
 from engram.drive import MapOptions, Settings, map_drive, open_drive
 from engram.errors import ConfigError, MapError
-from engram.fleet import GateOptions, best_order, building, find_best_order, silent
+from engram.fleet import GateOptions, Orders, best_order, building, find_best_order, silent
 from engram.store import MapStore
 
 from .builds import build, judge, map_in_this_process
@@ -119,6 +119,41 @@ def test_a_step_that_cannot_be_read_is_made_again(tmp_path, maps, logs, searched
     again = search(tmp_path, maps[:2], judge(logs["held-out"]))
     assert again.results == searched[1].results
     assert json.loads(path.read_text())["result"] == values["result"]
+
+
+def test_each_group_comes_first_once_and_the_others_follow_in_their_order(
+    tmp_path, maps, logs, monkeypatch
+):
+    monkeypatch.setattr(best_order, "_MOST_GROUPS", 2)  # which is of all orders
+    by = judge(logs["held-out"], orders=Orders.FIRST)
+    found = search(tmp_path, maps, by)
+    assert {one.order for one in found.results} == {(0, 1, 2), (1, 0, 2), (2, 0, 1)}
+    assert found.order == min(found.results, key=lambda one: one.rank).order
+    assert (found.merges, found.copies) == (3 * 2, 3 * 3)
+    assert best_order.BestOrder.from_dict(found.to_dict()) == found
+
+
+def test_what_a_search_of_firsts_judged_all_orders_need_not_judge_again(
+    tmp_path, maps, logs, searched
+):
+    shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
+    by = judge(logs["held-out"], localise=never, orders=Orders.FIRST)
+    assert search(tmp_path, maps[:2], by).results == searched[1].results
+
+
+def test_a_build_that_began_with_the_best_first_goes_on_as_such(tmp_path, logs, monkeypatch):
+    centre, by = tmp_path / "centre.engram", judge(logs["held-out"], orders=Orders.FIRST)
+    merge_maps = building.merge_maps
+    monkeypatch.setattr(building, "merge_maps", killed)
+    with pytest.raises(KilledError):
+        build(centre, logs, "ab", judge=by)
+    monkeypatch.setattr(building, "merge_maps", merge_maps)
+    with pytest.raises(ConfigError, match="which was found otherwise"):
+        build(centre, logs, "ab", judge=judge(logs["held-out"]))
+    report = build(centre, logs, "ab", judge=by)
+    assert report.best.tried is Orders.FIRST
+    assert report.content_hash == report.best.results[0].content_hash
+    assert "model (8)" not in report.text()
 
 
 def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,7 @@ from engram.cli import options
 from engram.errors import ConfigError
 
 if TYPE_CHECKING:
-    from engram.fleet import JudgeOptions
+    from engram.fleet import JudgeOptions, Orders
 
 
 def build(
@@ -47,6 +48,10 @@ def build(
     ] = None,
     best_order: Annotated[
         bool, typer.Option("--best-order", help="Merge in all orders and keep the best.")
+    ] = False,
+    best_first: Annotated[
+        bool,
+        typer.Option("--best-first", help="Try each group first, the others in their order."),
     ] = False,
     validate: Annotated[
         list[Path] | None,
@@ -90,6 +95,7 @@ def build(
       engram build town.engram logs/*.framelog --workers 4 --groups 4
       engram build town.engram logs/*.framelog --groups 4 --grouping random --seed 7
       engram build town.engram logs/*.framelog --groups 3 --best-order --validate held-out.framelog
+      engram build town.engram logs/*.framelog --groups 8 --best-first --validate held-out.framelog
     """
     from engram.cli.progress import progress
     from engram.drive import MapOptions, load_settings
@@ -108,7 +114,7 @@ def build(
         ),
         merging=MergeOptions(policy, lanes, rounds, found, author),
         scheduler=scheduler,
-        judge=_judge(validate or [], judge_at, asked=best_order),
+        judge=_judge(validate or [], judge_at, _orders(best_order, best_first)),
     )
     report = build_map(centre, drives, load_settings(config), asked, keep=keep, progress=progress)
     if as_json:
@@ -119,7 +125,24 @@ def build(
         raise typer.Exit(130)
 
 
-def _judge(drives: list[Path], judge_at_m: float | None, *, asked: bool) -> JudgeOptions | None:
+def _orders(best_order: bool, best_first: bool) -> Orders | None:
+    """Which orders are tried; None where the groups are merged as they come.
+
+    Raises:
+        ConfigError: two things are asked for.
+    """
+    from engram.fleet import Orders
+
+    if best_order and best_first:
+        raise ConfigError("--best-order tries what --best-first does and more: give one of them")
+    if best_order:
+        return Orders.ALL
+    return Orders.FIRST if best_first else None
+
+
+def _judge(
+    drives: list[Path], judge_at_m: float | None, orders: Orders | None
+) -> JudgeOptions | None:
     """By what the best order is told; None where it is not searched for.
 
     Raises:
@@ -127,9 +150,13 @@ def _judge(drives: list[Path], judge_at_m: float | None, *, asked: bool) -> Judg
     """
     from engram.fleet import JudgeOptions
 
-    if asked:
-        return JudgeOptions(drives) if judge_at_m is None else JudgeOptions(drives, judge_at_m)
+    if orders is not None:
+        judge = JudgeOptions(drives, orders=orders)
+        return judge if judge_at_m is None else replace(judge, judge_at_m=judge_at_m)
     for flag, given in (("--validate", bool(drives)), ("--judge-at", judge_at_m is not None)):
         if given:
-            raise ConfigError(f"{flag} judges orders of merging: leave it out, or add --best-order")
+            raise ConfigError(
+                f"{flag} judges orders of merging: leave it out, or add --best-order or "
+                "--best-first"
+            )
     return None

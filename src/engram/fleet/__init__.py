@@ -4,6 +4,7 @@ from engram.fleet.best_order import (
     BestOrder,
     JudgeOptions,
     OrderResult,
+    Orders,
     find_best_order,
     order_costs,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "MergeOptions",
     "MergeReport",
     "OrderResult",
+    "Orders",
     "Progress",
     "Reason",
     "RunReport",

@@ -1,4 +1,7 @@
-"""The best order of merging k groups: all k! of them, over a prefix tree ([G16] §VI-E, SPEC §7)."""
+"""The best order of merging k groups: all k! of them, over a prefix tree ([G16] §VI-E, SPEC §7).
+
+Or only which of them comes first, on which most depends (docs/results-fleet.md).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -34,6 +38,22 @@ _REPORTED_AT_M = np.arange(0.0, _AREA_TO_M + _AREA_STEP_M / 2, _AREA_STEP_M)
 _MOST_GROUPS = 6
 
 
+class Orders(StrEnum):
+    """Which orders of k groups are tried."""
+
+    ALL = "all"  # k! of them
+    FIRST = "first"  # k: each group comes first once, the others follow in their order
+
+    def following(self, prefix: tuple[int, ...], groups: int) -> list[int]:
+        """The groups that may come after a prefix."""
+        left = [number for number in range(groups) if number not in prefix]
+        return left if self is Orders.ALL or not prefix else left[:1]
+
+    def of(self, groups: int) -> int:
+        """How many orders there are."""
+        return math.factorial(groups) if self is Orders.ALL else groups
+
+
 Localise: TypeAlias = Callable[[OpenMap, DriveSequence, Settings, GateOptions], Drive]
 
 
@@ -50,6 +70,7 @@ class JudgeOptions:
             order is.
         localise: how a drive is localised in a map; None for `localise_drive`. Results that a
             search finds from earlier are taken to be by the same.
+        orders: which are tried.
     """
 
     drives: Sequence[Path]
@@ -57,6 +78,7 @@ class JudgeOptions:
     localising: GateOptions = field(default_factory=GateOptions)
     reported: Sequence[Path] = ()
     localise: Localise | None = None
+    orders: Orders = Orders.ALL
 
     def __post_init__(self) -> None:
         if not self.drives:
@@ -66,6 +88,8 @@ class JudgeOptions:
 
     def hash(self) -> str:
         """Changes when any order could be judged otherwise: by drives, distance or localising.
+
+        Not by which orders are tried: those that were judged need not be again.
 
         Raises:
             SequenceError: a drive cannot be read.
@@ -156,11 +180,12 @@ class Spent:
 
 @dataclass(slots=True)
 class BestOrder:
-    """All orders of some groups.
+    """Orders of some groups, and how they fare.
 
     Attributes:
         results: one per order, best first.
         judge_at_m: what they were judged by.
+        tried: which orders of the groups.
         rooted: whether every order began with a centre that was there, not with its first group.
         merges, copies: made in this search, in all its runs; what an interruption undid is
             counted once.
@@ -171,6 +196,7 @@ class BestOrder:
 
     results: list[OrderResult] = field(default_factory=list)
     judge_at_m: float = 10.0
+    tried: Orders = Orders.ALL
     rooted: bool = False
     merges: int = 0
     copies: int = 0
@@ -191,6 +217,7 @@ class BestOrder:
     def from_dict(values: Mapping[str, Any]) -> BestOrder:
         """From what `to_dict` gave."""
         kept = {one.name: values[one.name] for one in fields(BestOrder) if one.name in values}
+        kept["tried"] = Orders(kept.get("tried", Orders.ALL))  # builds of before tried all
         return BestOrder([_order_result(one) for one in values["orders"]], **kept)
 
     @property
@@ -216,6 +243,7 @@ class BestOrder:
         return {
             "order": list(self.order),
             "judge_at_m": self.judge_at_m,
+            "tried": self.tried.value,
             "rooted": self.rooted,
             "orders": [asdict(one) for one in self.results],
             "spread": self.spread(),
@@ -247,16 +275,18 @@ class BestOrder:
         return "\n".join(lines)
 
 
-def check_countable(groups: int) -> None:
+def check_countable(groups: int, orders: Orders) -> None:
     """Refuses more groups than all orders of them could be tried.
 
     Raises:
         ConfigError: there are too many, or none.
     """
-    if not 1 <= groups <= _MOST_GROUPS:
+    if groups < 1:
+        raise ConfigError("there are no groups to be merged in any order")
+    if orders is Orders.ALL and groups > _MOST_GROUPS:
         raise ConfigError(
             f"{groups} groups have {math.factorial(groups):,} orders; at most {_MOST_GROUPS} "
-            "groups can be tried in all orders"
+            f"groups can be tried in all orders; --best-first tries {groups}"
         )
 
 
@@ -270,7 +300,7 @@ def find_best_order(
     *,
     root: Path | None = None,
 ) -> BestOrder:
-    """Merges groups in every order and judges the results.
+    """Merges groups in every order, or with each of them first, and judges the results.
 
     Merges of a common prefix are made once and copied: k! orders of k groups take
     Σ k!/(k−d)! over d = 2 … k merges, 60 for k = 4; with a root over d = 1 … k, 64. The search
@@ -293,11 +323,11 @@ def find_best_order(
         StorageFullError: no space is left.
         KeyboardInterrupt: a merge was interrupted.
     """
-    check_countable(len(maps))
+    check_countable(len(maps), judge.orders)
     with keeping(folder):
         folder.mkdir(parents=True, exist_ok=True)
     search = _Search(maps, folder, settings, merging, judge, root)
-    with progress("try orders", math.factorial(len(maps))) as advance:
+    with progress("try orders", judge.orders.of(len(maps))) as advance:
         search.below((), root, advance)
     search.check_root()
     search.found.results.sort(key=lambda one: one.rank)
@@ -325,7 +355,7 @@ class _Search:
         judge: JudgeOptions,
         root: Path | None,
     ) -> None:
-        self.found = BestOrder(judge_at_m=judge.judge_at_m, rooted=root is not None)
+        self.found = BestOrder([], judge.judge_at_m, judge.orders, root is not None)
         self._maps = maps
         self._folder = folder
         self._settings = settings
@@ -355,10 +385,8 @@ class _Search:
         self, prefix: tuple[int, ...], merged: Path | None, advance: Callable[[str], None]
     ) -> None:
         """All orders that begin so; `merged` is the map of the prefix."""
-        for number in range(len(self._maps)):
+        for number in self._judge.orders.following(prefix, len(self._maps)):
             order = (*prefix, number)
-            if number in prefix:
-                continue
             if (known := self._known_from(order)) is not None:
                 for step in known:
                     self._count(step, advance)
@@ -448,7 +476,7 @@ class _Search:
     def _known_from(self, prefix: tuple[int, ...]) -> list[_Step] | None:
         """All steps from a prefix on, if earlier runs made them by the same; else None."""
         known = []
-        for order in _tree(prefix, len(self._maps)):
+        for order in _tree(prefix, len(self._maps), self._judge.orders):
             step = self._known(order)
             if step is None:
                 return None
@@ -505,12 +533,11 @@ class _Intermediate:
                 beside.unlink()
 
 
-def _tree(prefix: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:
+def _tree(prefix: tuple[int, ...], count: int, orders: Orders) -> Iterator[tuple[int, ...]]:
     """The nodes of the prefix tree of `count` groups from a prefix on, itself first."""
     yield prefix
-    for number in range(count):
-        if number not in prefix:
-            yield from _tree((*prefix, number), count)
+    for number in orders.following(prefix, count):
+        yield from _tree((*prefix, number), count, orders)
 
 
 @dataclass(frozen=True, slots=True)

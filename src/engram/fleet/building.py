@@ -17,6 +17,7 @@ from engram.experience.model import SessionId, path_id
 from engram.fleet.best_order import (
     BestOrder,
     JudgeOptions,
+    Orders,
     check_countable,
     check_held_out,
     find_best_order,
@@ -152,7 +153,7 @@ class BuildReport:
         return "\n".join(lines)
 
     def _costs(self) -> str:
-        """What trying all orders cost, beside the models of it."""
+        """What trying orders cost, beside the models of all of them."""
         assert self.best is not None
         mapped_s = sum(one.seconds for one in self.mapped)
         group_s = mapped_s / len(self.mapped)
@@ -160,9 +161,11 @@ class BuildReport:
         copy_s = self.best.copy_s / max(self.best.copies, 1)
         spent_s = mapped_s + self.best.merge_s + self.best.copy_s
         took = (
-            f"  all orders took {spent_s:.1f} s (T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C "
-            f"{copy_s:.2f} s)"
+            f"  mapping, and merging in {len(self.best.results)} orders, took {spent_s:.1f} s "
+            f"(T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C {copy_s:.2f} s)"
         )
+        if self.best.tried is not Orders.ALL:
+            return took
         if self.best.rooted:
             return f"{took}; the models of it are of centres that are new"
         costs = order_costs(len(self.mapped), group_s, merge_s, copy_s)
@@ -231,7 +234,7 @@ def _build(
     if options.judge is not None:
         _check_judges(options.judge, looked_at, centre)
         if grouped:
-            check_countable(len(grouped))
+            check_countable(len(grouped), options.judge.orders)
     report = BuildReport(
         str(centre), left_out=[drive.name for drive in looked_at if drive.session.id in known]
     )
@@ -359,14 +362,14 @@ def _settled_order(
         ConfigError: merging has begun in an order that was found otherwise.
     """
     judge = options.judge
-    judged_by = None if judge is None else judge.hash()
+    judged_by = None if judge is None else _judged_by(judge)
     begun = scratch.merging_begun()
     if begun is not None:
         if begun.judge != judged_by:
             raise ConfigError(
                 f"the groups of {scratch.folder} are being merged already, in the order "
                 f"{' '.join(map(str, begun.order))}, which was found otherwise; finish it with the "
-                "same --best-order, --validate and --judge-at, or delete the folder"
+                "same --best-order or --best-first, --validate and --judge-at, or delete the folder"
             )
         return begun
     if judge is None:
@@ -384,6 +387,11 @@ def _settled_order(
         begun = MergingBegun(list(best.order), judged_by, best.to_dict())
     scratch.remember_merging(begun)
     return begun
+
+
+def _judged_by(judge: JudgeOptions) -> str:
+    """How an order was found: by which judges, and among which orders."""
+    return judge.hash() + ("" if judge.orders is Orders.ALL else f"-{judge.orders}")
 
 
 def _merge(
