@@ -67,8 +67,8 @@ def report(plan, tmp_path_factory) -> Path:
     return out
 
 
-def rows(report: Path) -> list[dict[str, str]]:
-    with (report / "summary.csv").open() as file:
+def rows(report: Path, name: str = "summary.csv") -> list[dict[str, str]]:
+    with (report / name).open() as file:
         return list(csv.DictReader(file))
 
 
@@ -76,6 +76,24 @@ def test_every_experiment_arm_and_fold_has_its_rows(report: Path) -> None:
     found = {(row["experiment"], row["fold"]) for row in rows(report)}
     every_fold = {(one, fold) for one in ("7", "9") for fold in ("0", "1", "all")}
     assert found == every_fold | {("8", "0"), ("10", "0")}
+
+
+def test_every_mean_over_drives_can_be_made_again(report: Path) -> None:
+    """Of the rows of single drives, weighted by their lengths."""
+    drives = rows(report, "sessions.csv")
+    means = [row for row in rows(report) if row["fold"] != "all" and row["sessions"]]
+    held_out = [row for row in means if "foray" not in row["map"]]
+    assert {row["experiment"] for row in held_out} == {"7", "8", "9", "10"}
+    columns = ("experiment", "fold", "map")
+    for mean in held_out:
+        some = [row for row in drives if all(row[one] == mean[one] for one in columns)]
+        assert len({row["drive"] for row in some}) == len(some) == int(mean["sessions"])
+        driven_m = np.array([float(row["driven_m"]) for row in some])
+        assert driven_m.sum() == pytest.approx(float(mean["driven_m"]), rel=1e-5)
+        for column in ("share_not_localised", "p_gt_5m"):
+            shares = np.array([float(row[column]) for row in some])
+            expected = shares @ driven_m / driven_m.sum()
+            assert expected == pytest.approx(float(mean[column]), rel=1e-4, abs=1e-6)
 
 
 def test_folds_may_be_run_one_after_another(plan: FleetPlan) -> None:

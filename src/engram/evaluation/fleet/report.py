@@ -12,7 +12,7 @@ from engram.evaluation.fleet.plan import FleetPlan
 from engram.evaluation.fleet.records import read_json
 from engram.evaluation.fleet.results import ArmResult
 from engram.evaluation.fleet.stages import stages_path
-from engram.evaluation.fleet.tables import fleet_rows, order_rows
+from engram.evaluation.fleet.tables import fleet_rows, order_rows, session_rows
 from engram.evaluation.tables import write_csv
 from engram.evaluation.writing import writing
 
@@ -32,10 +32,11 @@ def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
         MissingExtraError: Matplotlib is not installed; the tables are written by then.
     """
     arms = [ArmResult(plan, arm) for plan in plans for arm in plan.arms]
-    names = ("summary.csv", "orders.csv", "configuration.json", "claims.md")
+    names = ("summary.csv", "sessions.csv", "orders.csv", "configuration.json", "claims.md")
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_csv(out / "summary.csv", [row for arm in arms for row in fleet_rows(arm)])
+        write_csv(out / "sessions.csv", [row for arm in arms for row in session_rows(arm)])
         write_csv(out / "orders.csv", [row for arm in arms for row in order_rows(arm)])
         write_json(out / "configuration.json", [_configuration(plan) for plan in plans])
         (out / "claims.md").write_text(fleet_claims_page(arms), encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -36,14 +37,44 @@ def fleet_rows(arm: ArmResult) -> list[Row]:
         rows += _trial_rows(str(fold.fold.number), _flat(fold.trials()))
         rows += _order_rows(fold)
     rows += _pooled_rows(arm)
-    asked = [row for row in rows if arm.asked(row["experiment"])]
+    return _asked(arm, rows)
+
+
+def session_rows(arm: ArmResult) -> list[Row]:
+    """One row per held-out drive in each map and download: what intervals are drawn from."""
+    rows: list[Row] = []
+    drives = arm.plan.drives.drives
+    for fold in arm.folds:
+        number = str(fold.fold.number)
+        for experiment, what, name in _shown(fold):
+            for one in fold.held_out(name):
+                about = _row(experiment, number, what) | {"drive": drives[one.session].name}
+                rows.append(about | _held_out([one]))
+        for drive, trial in chain.from_iterable(fold.trials().values()):
+            rows += [{**row, "drive": drive.name} for row in _trial_rows(number, [trial])]
+    return _asked(arm, rows)
+
+
+def _asked(arm: ArmResult, rows: Sequence[Row]) -> list[Row]:
+    """Those of the experiments that are asked for, with what they are about."""
     about = {
         "campaign": arm.plan.drives.name,
         "arm": arm.arm.letter,
         "policy": arm.arm.policy,
         "attempts": arm.configuration.budget.attempts if arm.arm.letter != "C" else "all",
     }
-    return [{**about, **row} for row in asked]
+    return [{**about, **row} for row in rows if arm.asked(row["experiment"])]
+
+
+def _shown(fold: FoldResult) -> Iterator[tuple[int, str, str]]:
+    """Experiment, words and name of the maps that held-out drives are localised in."""
+    yield 7, SINGLE, SINGLE
+    for groups in fold.plan.group_counts(fold.fold):
+        yield 7, f"{groups} groups", merged_name(groups, groups - 1)
+        yield 7, f"{groups} groups, pairwise", pair_merges(groups)[-1].name
+    for name in (*ROBOTS, SHARED):
+        yield 8, name, name
+    yield 10, "one order built sequentially", "orders-sequential"
 
 
 def order_rows(arm: ArmResult) -> list[Row]:
@@ -137,7 +168,7 @@ def _foray_rows(number: str, forays: Sequence[InField]) -> Iterator[Row]:
 
 
 def _flat(trials: Trials) -> list[TriedDownload]:
-    return [one for some in trials.values() for _, one in some]
+    return [one for _, one in chain.from_iterable(trials.values())]
 
 
 def _trial_rows(number: str, trials: Sequence[TriedDownload]) -> Iterator[Row]:
