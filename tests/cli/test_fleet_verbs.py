@@ -90,8 +90,8 @@ def test_build_maps_and_merges(engram, street, tmp_path):
         (("--judge-at", 10), "--judge-at judges orders of merging"),
         (("--seed", 0), "--seed is of random grouping"),
         (("--seed", 7, "--grouping", "by-condition"), "--seed is of random grouping"),
-        (("--best-order",), "name at least one"),
-        (("--best-first",), "name at least one"),
+        (("--best-order",), "name some"),
+        (("--best-first",), "name some"),
         (("--best-order", "--best-first", "--validate", "held-out.framelog"), "give one of them"),
     ],
 )

@@ -82,7 +82,9 @@ class JudgeOptions:
 
     def __post_init__(self) -> None:
         if not self.drives:
-            raise ConfigError("the best order is judged by validation drives: name at least one")
+            raise ConfigError(
+                "the best order is judged by validation drives: name some (--validate)"
+            )
         if not 0 <= self.judge_at_m < math.inf:
             raise ConfigError(f"judge_at_m is {self.judge_at_m}, must be finite and >= 0")
 
