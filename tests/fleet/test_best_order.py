@@ -11,7 +11,16 @@ import pytest
 
 from engram.drive import MapOptions, Settings, map_drive, open_drive
 from engram.errors import ConfigError, MapError
-from engram.fleet import GateOptions, Orders, best_order, building, find_best_order, silent
+from engram.fleet import (
+    BestOrder,
+    GateOptions,
+    Orders,
+    best_order,
+    building,
+    find_best_order,
+    judging,
+    silent,
+)
 from engram.store import MapStore
 
 from .builds import build, judge, map_in_this_process
@@ -124,13 +133,13 @@ def test_a_step_that_cannot_be_read_is_made_again(tmp_path, maps, logs, searched
 def test_each_group_comes_first_once_and_the_others_follow_in_their_order(
     tmp_path, maps, logs, monkeypatch
 ):
-    monkeypatch.setattr(best_order, "_MOST_GROUPS", 2)  # which is of all orders
+    monkeypatch.setattr(judging, "_MOST_GROUPS", 2)  # which is of all orders
     by = judge(logs["held-out"], orders=Orders.FIRST)
     found = search(tmp_path, maps, by)
     assert {one.order for one in found.results} == {(0, 1, 2), (1, 0, 2), (2, 0, 1)}
     assert found.order == min(found.results, key=lambda one: one.rank).order
     assert (found.merges, found.copies) == (3 * 2, 3 * 3)
-    assert best_order.BestOrder.from_dict(found.to_dict()) == found
+    assert BestOrder.from_dict(found.to_dict()) == found
 
 
 def test_what_a_search_of_firsts_judged_all_orders_need_not_judge_again(
@@ -180,7 +189,7 @@ def test_the_name_of_the_robot_does_not_let_a_drive_judge(tmp_path, maps, logs):
 def test_more_groups_than_can_be_tried_are_refused_before_they_are_mapped(
     tmp_path, logs, monkeypatch
 ):
-    monkeypatch.setattr(best_order, "_MOST_GROUPS", 2)
+    monkeypatch.setattr(judging, "_MOST_GROUPS", 2)
     centre = tmp_path / "centre.engram"
     with pytest.raises(ConfigError, match="3 groups have 6 orders; at most 2"):
         build(centre, logs, "abc", groups=3, judge=judge(logs["held-out"]))

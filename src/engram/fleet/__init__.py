@@ -1,13 +1,6 @@
 """The fleet: many robots, one centre (SPEC §7): merging, downloading, building."""
 
-from engram.fleet.best_order import (
-    BestOrder,
-    JudgeOptions,
-    OrderResult,
-    Orders,
-    find_best_order,
-    order_costs,
-)
+from engram.fleet.best_order import find_best_order
 from engram.fleet.building import BuildOptions, BuildReport, build_map
 from engram.fleet.docking import merge_maps
 from engram.fleet.downloading import DownloadReport, download
@@ -15,8 +8,11 @@ from engram.fleet.gate import Gate, GateOptions, what_is_worse
 from engram.fleet.group_mapping import GroupResult, GroupTask, map_group
 from engram.fleet.grouping import GROUPINGS, group_drives
 from engram.fleet.handed_in import HandedIn
+from engram.fleet.judging import JudgeOptions, Orders
 from engram.fleet.merging import Progress, merge_map, silent
 from engram.fleet.mission import DownloadOptions, bytes_from_text, hour_from_text
+from engram.fleet.order_costs import order_costs
+from engram.fleet.order_results import BestOrder, OrderResult
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment, string_segments

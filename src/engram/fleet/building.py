@@ -14,20 +14,15 @@ from engram.drive import MapOptions, Settings
 from engram.drive.interruption import deferred_interrupt
 from engram.errors import ConfigError
 from engram.experience.model import SessionId, path_id
-from engram.fleet.best_order import (
-    BestOrder,
-    JudgeOptions,
-    Orders,
-    check_countable,
-    check_held_out,
-    find_best_order,
-    order_costs,
-)
+from engram.fleet.best_order import find_best_order
 from engram.fleet.cluster import check_scheduler, map_groups_on_cluster
 from engram.fleet.docking import merge_maps
 from engram.fleet.group_mapping import GroupResult, GroupTask, fetched
 from engram.fleet.grouping import Drive, group_drives, look_at_drive
+from engram.fleet.judging import JudgeOptions, Orders, check_countable, check_held_out
 from engram.fleet.merging import Progress, silent
+from engram.fleet.order_costs import order_costs
+from engram.fleet.order_results import BestOrder
 from engram.fleet.replay import MergeOptions
 from engram.fleet.report import MergeReport
 from engram.fleet.scratch import BuildPlan, MergingBegun, Scratch, sole_builder

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from engram.errors import ConfigError, MapError, MapLockedError
-from engram.fleet.best_order import BestOrder
 from engram.fleet.group_mapping import GroupResult
 from engram.fleet.keeping import keeping
+from engram.fleet.order_results import BestOrder
 from engram.store import MapStore
 from engram.store.lock import WriterLock, current_holder
 
