@@ -29,11 +29,12 @@ from engram.errors import (
     RefusedError,
     SequenceError,
 )
-from engram.experience.model import Clock, SessionId
+from engram.experience.model import Clock, NodeId, Omission, SessionId
 from engram.fleet import MergeOptions, docking, gate, merge_maps, merging
 from engram.fleet.gate import check_held_out, what_is_worse
 from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.frontend import DescriptorKind
+from engram.geometry import SE3
 from engram.measures import Drive
 from engram.store import MapStore
 
@@ -88,6 +89,29 @@ def rewritten(source: Path, target: Path, *, session=None, node=None, descriptor
     return target
 
 
+def swapped(source: Path, target: Path, node: NodeId | None = None) -> tuple[Path, NodeId]:
+    """A copy of a map in which a node has the landmarks of another; and its UUID."""
+    with MapStore.open(source) as store:
+        nodes = store.load().nodes
+        node = node or nodes[3].id
+        others = [one for one in nodes if one.id != node]
+        other = next(iter(store.frames.stored(others[-1:])))
+
+    def changed(stored):
+        if stored.node.id != node:
+            return stored
+        return replace(stored, landmarks=other.landmarks, landmark_hash=other.landmark_hash)
+
+    return rewritten(source, target, node=changed), node
+
+
+def omitted_from(centre: Path, robot: Path) -> NodeId:
+    """Merges a map, and names a node that was not taken."""
+    merged(centre, robot)
+    with MapStore.open(centre) as store:
+        return next(iter(store.omissions()))
+
+
 def damaged(source: Path, target: Path) -> Path:
     """A copy of a map in which a bit of the last node's landmarks was lost."""
     shutil.copy(source, target)
@@ -134,17 +158,50 @@ class TestRefused:
         self.refuses(centre, robot, IncompatibleError, "teblid", "brief")
 
     def test_a_node_with_the_uuid_of_another(self, tmp_path, centre, fleet):
-        with MapStore.open(fleet["first"][0]) as store:
-            nodes = store.load().nodes
-            other = next(iter(store.frames.stored(nodes[5:6])))
+        robot, node = swapped(fleet["first"][0], tmp_path / "r.engram")
+        self.refuses(centre, robot, IncompatibleError, str(node), "another in the centre")
 
-        def swapped(stored):
-            if stored.node.id != nodes[3].id:
-                return stored
-            return replace(stored, landmarks=other.landmarks, landmark_hash=other.landmark_hash)
+    def test_a_node_that_was_omitted_and_comes_with_other_landmarks(self, tmp_path, centre, fleet):
+        node = omitted_from(centre, fleet["same"][0])
+        robot, _ = swapped(fleet["same"][0], tmp_path / "r.engram", node)
+        self.refuses(centre, robot, IncompatibleError, str(node), "another in the centre")
 
-        robot = rewritten(fleet["first"][0], tmp_path / "r.engram", node=swapped)
-        self.refuses(centre, robot, IncompatibleError, str(nodes[3].id), "another in the centre")
+    def test_an_omission_of_what_the_centre_has_with_other_landmarks(self, tmp_path, centre, fleet):
+        """Another centre omitted a node under the UUID of one that this one took."""
+        other, node = swapped(fleet["same"][0], tmp_path / "other.engram")
+        theirs = tmp_path / "theirs.engram"
+        merged(theirs, fleet["first"][0])
+        with MapStore.open_for_writing(theirs) as store, MapStore.open(other) as given:
+            known = store.load().nodes[0].id
+            omission = Omission(node, known, SE3.identity(), given.landmark_hashes()[node])
+            with store.begin_revision(author="tests", message="", configuration={}) as writer:
+                writer.add_omission(omission)
+                writer.commit()
+        shutil.copy(fleet["same"][0], centre)
+        self.refuses(centre, theirs, IncompatibleError, str(node), "another in the centre")
+
+    def test_maps_of_format_2_did_not_keep_what_they_omitted(self, tmp_path, centre, fleet):
+        """Nothing can be said of such nodes, so nothing is refused."""
+        node = omitted_from(centre, fleet["same"][0])
+        with MapStore.open(centre) as store:
+            assert store.omissions()[node].landmark_hash is not None
+        connection = sqlite3.connect(centre)
+        with connection:
+            connection.execute("DELETE FROM omitted_landmarks")
+        connection.close()
+        robot, _ = swapped(fleet["same"][0], tmp_path / "r.engram", node)
+        (report,) = merged(centre, robot)
+        assert not report.changed
+
+    def test_what_a_revert_took_back_binds_nobody(self, tmp_path, centre, fleet):
+        node = omitted_from(centre, fleet["same"][0])
+        with MapStore.open_for_writing(centre) as store:
+            store.revert("head", author="tests", message="")
+            assert node not in store.landmark_hashes()
+        robot, _ = swapped(fleet["same"][0], tmp_path / "r.engram", node)
+        merged(centre, robot)
+        with MapStore.open(centre) as store, MapStore.open(robot) as given:
+            assert store.landmark_hashes()[node] == given.landmark_hashes()[node]
 
     def test_a_drive_with_the_uuid_of_another(self, tmp_path, centre, fleet):
         robot = rewritten(

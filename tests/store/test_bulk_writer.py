@@ -175,18 +175,21 @@ def test_killed_before_the_commit_the_map_is_as_it_was(tmp_path, source):
         assert store.seal(session("robot-9").id).number == 2
 
 
-def test_omissions_and_partial_paths_are_read_back(target, source):
+@pytest.mark.parametrize("landmark_hash", [None, bytes(range(16))])
+def test_omissions_and_partial_paths_are_read_back(target, source, landmark_hash):
     omitted = node_id(session("robot-7").id, 5)
     with begin_bulk(target) as writer:
         copy_into(writer, source, partial={path_id(session("robot-2").id)})
         equivalent = source.load().nodes[2].id
         transform = edge(omitted, equivalent, seed=3).a_from_b
-        writer.add_omission(Omission(omitted, equivalent, transform))
+        writer.add_omission(Omission(omitted, equivalent, transform, landmark_hash))
         with pytest.raises(InputError, match="twice"):
             writer.add_omission(Omission(omitted, equivalent, transform))
         writer.commit()
     (found,) = target.omissions().values()
     assert (found.omitted, found.node) == (omitted, equivalent)
+    assert found.landmark_hash == landmark_hash
+    assert target.landmark_hashes().get(omitted) == landmark_hash
     np.testing.assert_array_equal(found.node_from_omitted.matrix(), transform.matrix())
     assert target.partial_paths() == {path_id(session("robot-2").id)}
 

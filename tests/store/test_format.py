@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import pytest
 from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError
-from engram.experience.model import EdgeKind
+from engram.experience.model import EdgeKind, NodeId, Omission
 from engram.frontend import DescriptorKind
+from engram.geometry import SE3
 from engram.store import MapStore, SessionState
 from engram.store.schema import FORMAT_VERSION, metadata
 
 from .maps import begin, node, session
 
 DATA = Path(__file__).parent / "data"
+HASH = bytes(range(16))
 PAGE = Path(__file__).parents[2] / "docs" / "format.md"
 
 
@@ -90,6 +93,26 @@ def test_the_page_on_the_format_names_every_table_and_column():
                 assert f"`{column.name}`" in rows[table.name], f"{table.name}.{column.name}"
 
 
+@pytest.mark.parametrize("version", range(1, FORMAT_VERSION))
+def test_older_maps_become_of_the_newest_format_when_they_are_written_on(tmp_path, version):
+    path = shutil.copy(DATA / f"format-{version}.engram", tmp_path / "old.engram")
+    with MapStore.open(path) as store:
+        assert store.format_version == version
+        before, contents = store.content_hash(), store.load()
+    with MapStore.open_for_writing(path) as store:
+        assert store.format_version == FORMAT_VERSION
+        assert store.content_hash() == before
+        omitted = Omission(
+            node(session("robot-9"), 0).id, contents.nodes[0].id, SE3.identity(), HASH
+        )
+        with store.begin_revision(author="tests", message="", configuration={}) as writer:
+            writer.add_omission(omitted)
+            writer.commit()
+        assert store.landmark_hashes()[omitted.omitted] == HASH
+        assert store.content_hash() != before
+    assert MapStore.check(path).problems == ()
+
+
 @pytest.fixture
 def second(tmp_path):
     """Format 2: two drives, one taken back and mapped again; a tag; the words of one node."""
@@ -120,4 +143,33 @@ def test_format_2_reads_as_it_was_written(second):
 )
 def test_format_2_keeps_its_content_hash(second, at, expected):
     with MapStore.open(second, at=at) as store:
+        assert store.content_hash() == expected
+
+
+@pytest.fixture
+def third(tmp_path):
+    """Format 3: a drive of three nodes, and a fourth that was omitted."""
+    return shutil.copy(DATA / "format-3.engram", tmp_path / "third.engram")
+
+
+def test_format_3_reads_as_it_was_written(third):
+    with MapStore.open(third) as store:
+        (omission,) = store.omissions().values()
+        assert omission.omitted == NodeId(UUID(int=3))
+        assert omission.node == node(session("robot-1"), 1).id
+        assert omission.landmark_hash == HASH
+        assert set(store.landmark_hashes()) == {one.id for one in store.load().nodes} | {
+            omission.omitted
+        }
+    with MapStore.open(third, at=1) as store:
+        assert len(store.landmark_hashes()) == 3
+    assert MapStore.check(third).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [(1, "34f49b799af7925db24ff73b39a16a21"), (2, "5faf38a7d236dd3b61d25bc49e553f96")],
+)
+def test_format_3_keeps_its_content_hash(third, at, expected):
+    with MapStore.open(third, at=at) as store:
         assert store.content_hash() == expected

@@ -108,11 +108,14 @@ class Omission:
         omitted: the node that was handed in.
         node: its equivalent in the map.
         node_from_omitted: the omitted node's camera in the equivalent's camera frame.
+        landmark_hash: the 16 bytes that stand for its landmarks; None where they were not kept,
+            as by maps of format 2.
     """
 
     omitted: NodeId
     node: NodeId
     node_from_omitted: SE3
+    landmark_hash: bytes | None = None
 
 
 class PathEntryKind(StrEnum):

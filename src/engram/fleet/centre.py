@@ -43,7 +43,7 @@ class Centre:
 
     @cached_property
     def landmark_hashes(self) -> dict[NodeId, bytes]:
-        """The 16 bytes that stand for each node's landmarks, as of the start of the merge."""
+        """What `MapStore.landmark_hashes` gave when it was first asked for in the merge."""
         return self.store.landmark_hashes()
 
     def has_omitted(self, node: NodeId) -> bool:
@@ -60,10 +60,10 @@ class Centre:
             return Position.at(node)
         return self._omitted.get(node)
 
-    def omit(self, node: NodeId, position: Position) -> Omission:
+    def omit(self, node: NodeId, position: Position, landmark_hash: bytes | None) -> Omission:
         """Remember a node as one that is not taken."""
         self._omitted[node] = position
-        return Omission(node, position.node, position.node_from_live)
+        return Omission(node, position.node, position.node_from_live, landmark_hash)
 
     def new_entry(self, entry: PathEntry) -> PathEntry | None:
         """A path entry handed in, as it joins the centre's path of the same drive.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from engram.errors import IncompatibleError
-from engram.experience.model import Clock, Node, Session, SessionId
+from engram.experience.model import Clock, Node, NodeId, Session, SessionId
 from engram.fleet.centre import Centre
 from engram.fleet.handed_in import HandedIn
 
@@ -38,19 +38,18 @@ def check_fits(centre: Centre, robot: HandedIn) -> None:
                 f"session {session.id} is a drive of {session.robot} in {robot.name} and another "
                 f"one, of {ours.robot}, in the centre: one of the two maps is not what it says"
             )
-    hashes = centre.landmark_hashes
-    for node in robot.contents.nodes:
-        if node.id in centre.graph and _content(centre, node) != (
-            node.session,
-            node.stamp_ns,
-            node.camera,
-            robot.landmark_hashes[node.id],
-        ):
+    _check_nodes(centre, robot)
+
+
+def _check_nodes(centre: Centre, robot: HandedIn) -> None:
+    """Refuse nodes that the centre has, or once omitted, with another content."""
+    for node, theirs in robot.landmark_hashes.items():
+        ours = centre.landmark_hashes.get(node, theirs)
+        if ours != theirs or not _same_record(centre, robot, node):
             raise IncompatibleError(
-                f"node {node.id} (session {node.session}, stamp {node.stamp_ns}) has one content "
-                f"in {robot.name} and another in the centre, landmarks "
-                f"{robot.landmark_hashes[node.id].hex()} and {hashes[node.id].hex()}: a node never "
-                "changes, so one of the two maps is not what it says"
+                f"node {node}{_told(robot, node)} has one content in {robot.name} and another in "
+                f"the centre, landmarks {theirs.hex()} and {ours.hex()}: a node never changes, so "
+                "one of the two maps is not what it says"
             )
 
 
@@ -96,9 +95,23 @@ def _drive(session: Session) -> tuple[str, str, int]:
     return session.robot, session.camera, session.start_ns
 
 
-def _content(centre: Centre, node: Node) -> tuple[SessionId, int, str, bytes]:
-    ours = centre.graph.node(centre.graph.index(node.id))
-    return ours.session, ours.stamp_ns, ours.camera, centre.landmark_hashes[node.id]
+def _same_record(centre: Centre, robot: HandedIn, node: NodeId) -> bool:
+    """Whether a node that both have is of the same drive, moment and camera."""
+    if node not in centre.graph or node not in robot.nodes:
+        return True
+    ours, theirs = centre.graph.node(centre.graph.index(node)), robot.nodes[node]
+    return (ours.session, ours.stamp_ns, ours.camera) == (
+        theirs.session,
+        theirs.stamp_ns,
+        theirs.camera,
+    )
+
+
+def _told(robot: HandedIn, node: NodeId) -> str:
+    """Where a node comes from; nothing of one that the robot's map has omitted itself."""
+    if node not in robot.nodes:
+        return ""
+    return f" (session {robot.nodes[node].session}, stamp {robot.nodes[node].stamp_ns})"
 
 
 def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:

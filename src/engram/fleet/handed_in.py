@@ -24,7 +24,7 @@ class HandedIn:
         nodes: by id.
         omissions: nodes that the map itself had omitted, by id.
         frontends: of each session.
-        landmark_hashes: of each node.
+        landmark_hashes: of each node, and of those omitted as far as they are known.
         partial_paths: paths of which the map holds some entries only.
     """
 

@@ -287,7 +287,8 @@ class _Merging:
         for omitted in sorted(self._robot.omissions):
             position = _carries(self._centre, self._robot, omitted)
             if position is not None:
-                self._writer.add_omission(self._centre.omit(omitted, position))
+                landmark_hash = self._robot.omissions[omitted].landmark_hash
+                self._writer.add_omission(self._centre.omit(omitted, position, landmark_hash))
                 self._report.omitted += 1
 
     def _carry_attempts(self, replay: Replay) -> None:

@@ -282,7 +282,7 @@ class Replay:
         assert found.covariance is not None
         node = stored.node.id
         position = Position(found.node, found.node_from_live, found.covariance)
-        self._writer.add_omission(self._centre.omit(node, position))
+        self._writer.add_omission(self._centre.omit(node, position, stored.landmark_hash))
         self._link(node)
         self._end_run()
         acceptance = self._settings.localiser.acceptance

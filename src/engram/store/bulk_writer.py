@@ -50,6 +50,7 @@ from engram.store.schema import (
     hidden,
     nodes,
     omissions,
+    omitted_landmarks,
     path_entries,
     paths,
     sessions,
@@ -296,6 +297,14 @@ class BulkWriter:
             "node_from_omitted": transform_bytes(omission.node_from_omitted),
         }
         self._put(omissions, row)
+        if omission.landmark_hash is not None:
+            row = {
+                "key": self._keys.next(omitted_landmarks),
+                "uuid": omission.omitted.bytes,
+                "revision": self._revision_key,
+                "landmark_hash": omission.landmark_hash,
+            }
+            self._put(omitted_landmarks, row)
 
     def put_statistics(self, name: str, values: Mapping[str, Any]) -> None:
         """Keep a statistic of the map under a name; the newest counts. Once for each name.
@@ -405,6 +414,7 @@ class BulkWriter:
                 paths,
                 path_entries,
                 omissions,
+                omitted_landmarks,
                 statistics,
                 vocabularies,
                 hidden,

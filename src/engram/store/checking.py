@@ -16,7 +16,13 @@ from engram.experience.model import NodeId, PathEntryKind, SessionId
 from engram.frontend import DescriptorKind, FrameStatus
 from engram.geometry import StereoCamera
 from engram.store.attempts import unpack
-from engram.store.blob import blob_hash, content_digest, decode_landmarks, decode_thumbnail
+from engram.store.blob import (
+    HASH_BYTES,
+    blob_hash,
+    content_digest,
+    decode_landmarks,
+    decode_thumbnail,
+)
 from engram.store.database import Database
 from engram.store.records import CheckReport, Problem
 from engram.store.rows import (
@@ -31,6 +37,7 @@ from engram.store.rows import (
     verified,
 )
 from engram.store.schema import (
+    NEWER,
     VERSIONED,
     attempts,
     cameras,
@@ -42,6 +49,7 @@ from engram.store.schema import (
     metadata,
     nodes,
     omissions,
+    omitted_landmarks,
     path_entries,
     paths,
     revisions,
@@ -53,6 +61,7 @@ from engram.store.schema import (
 )
 from engram.store.words import decode_words
 
+_LATER = {table for news in NEWER.values() for table in news}
 # What a column refers to, by its name.
 _REFERENCES = {
     "session": sessions,
@@ -210,12 +219,11 @@ class _Checking:
                 continue
             for table in VERSIONED:
                 found = self.brought[row["key"], table.name]
-                if contents.get(table.name) != found:
+                # Formats before knew nothing of the table, and brought none.
+                brought = contents.get(table.name, 0 if table in _LATER else None)
+                if brought != found:
                     self.report(
-                        table,
-                        "",
-                        f"revision {name} brought {contents.get(table.name)} rows, "
-                        f"{found} are there",
+                        table, "", f"revision {name} brought {brought} rows, {found} are there"
                     )
 
     def _brought_by(self, session_key: int) -> Row | None:
@@ -319,6 +327,12 @@ def _check_omission(_: _Checking, row: Row) -> None:
     _check_rotation(transform_from_bytes(row["node_from_omitted"], "the transform").rotation)
 
 
+def _check_omitted_landmarks(_: _Checking, row: Row) -> None:
+    uuid_from_bytes(row["uuid"], "the row")
+    if len(row["landmark_hash"]) != HASH_BYTES:
+        raise MapCorruptError(f"the hash has {len(row['landmark_hash'])} bytes, not {HASH_BYTES}")
+
+
 def _check_attempts(checking: _Checking, row: Row) -> None:
     checking.blobs += 1
     table = unpack(row["body"], row["count"])
@@ -382,6 +396,7 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     paths: _check_path,
     path_entries: _check_path_entry,
     omissions: _check_omission,
+    omitted_landmarks: _check_omitted_landmarks,
     attempts: _check_attempts,
     statistics: _check_statistic,
     vocabularies: _check_vocabulary,

@@ -14,6 +14,7 @@ from engram.store.attempts import COLUMNS, AttemptTable, concatenate, unpack
 from engram.store.reading import load_cameras, load_frontends
 from engram.store.rows import Row, verified
 from engram.store.schema import (
+    NEWER,
     VERSIONED,
     attempts,
     frames,
@@ -41,6 +42,8 @@ _REFERENCES = {
 # Landmarks stand in their nodes' hashes; thumbnails are for people and differ between decoders.
 _HASHED = tuple(table for table in VERSIONED if table is not frames)
 _LEFT_OUT = {"key", "checksum"}
+# A map that could do without them is the same in every format.
+_IF_ANY = {str(table.name) for news in NEWER.values() for table in news}
 
 Identities = dict[str, dict[int, Any]]
 
@@ -64,6 +67,8 @@ def content_hash(connection: Connection, at: int) -> str:
     }
     canonical[str(hidden.name)] = _hidden_rows(connection, view, identities, canonical)
     for name, rows in canonical.items():
+        if not rows and name in _IF_ANY:
+            continue
         canonical_rows = sorted(set(rows.values()))  # attempts: one for all bodies of a session
         digest.update(_encode([name, len(canonical_rows)]))
         for row in canonical_rows:

@@ -257,7 +257,10 @@ class MapStore:
             return reading.frontends_of_sessions(connection, self._view)
 
     def landmark_hashes(self) -> dict[NodeId, bytes]:
-        """The 16 bytes that stand for each node's landmarks."""
+        """The 16 bytes that stand for each node's landmarks.
+
+        Also of nodes that were not taken, as far as it was kept.
+        """
         with self._database.reading() as connection:
             return reading.landmark_hashes(connection, self._view)
 

@@ -46,6 +46,7 @@ from engram.store.schema import (
     frontends,
     nodes,
     omissions,
+    omitted_landmarks,
     path_entries,
     paths,
     revisions,
@@ -209,12 +210,16 @@ def load_omissions(connection: Connection, view: View) -> dict[NodeId, Omission]
     """Nodes that were not taken, each with its newest equivalent that is seen."""
     query = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
     node_ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
+    landmarks = {
+        row["uuid"]: row["landmark_hash"] for row in view.rows(connection, omitted_landmarks)
+    }
     found = {}
     for row in view.rows(connection, omissions):
         omitted = NodeId(uuid_from_bytes(row["uuid"], f"omission {row['key']}"))
         if row["node"] in node_ids:
             transform = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")
-            found[omitted] = Omission(omitted, node_ids[row["node"]], transform)
+            landmark_hash = landmarks.get(row["uuid"])
+            found[omitted] = Omission(omitted, node_ids[row["node"]], transform, landmark_hash)
     return found
 
 
@@ -233,9 +238,12 @@ def frontends_of_sessions(
 
 
 def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
-    """The hash of each node's landmarks."""
-    query = view.select(nodes).with_only_columns(nodes.c.uuid, nodes.c.landmark_hash)
-    return {NodeId(UUID(bytes=row[0])): row[1] for row in connection.execute(query)}
+    """The hash of each node's landmarks; of omitted ones, too, as far as it was kept."""
+    found: dict[NodeId, bytes] = {}
+    for table in (omitted_landmarks, nodes):
+        query = view.select(table).with_only_columns(table.c.uuid, table.c.landmark_hash)
+        found |= {NodeId(UUID(bytes=row[0])): row[1] for row in connection.execute(query)}
+    return found
 
 
 def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:

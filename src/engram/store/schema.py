@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import SchemaItem
 from sqlalchemy.types import TypeEngine
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 # SQLite's INTEGER and REAL are 64 bits wide.
 _INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
@@ -185,6 +185,17 @@ omissions = _table(
     UniqueConstraint("uuid", "revision"),  # format 1: uuid
 )
 
+# What stands for the landmarks of nodes that were not taken: one that comes again under the same
+# UUID must be the same.
+omitted_landmarks = _table(
+    "omitted_landmarks",
+    _key(),
+    _bytes("uuid"),
+    _int("revision"),
+    _bytes("landmark_hash"),
+    UniqueConstraint("uuid", "revision"),
+)
+
 attempts = _table(
     "attempts",
     _key(),
@@ -251,6 +262,7 @@ VERSIONED: tuple[Table, ...] = (
     paths,
     path_entries,
     omissions,
+    omitted_landmarks,
     attempts,
     statistics,
     vocabularies,
@@ -260,7 +272,7 @@ KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "k
 
 # Tables by the format that brought them; all others are of format 1. A map of an older format reads
 # as one in which they are empty.
-NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words)}
+NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words), 3: (omitted_landmarks,)}
 # Tables whose columns stand since format 1, but whose constraints a later format loosened.
 LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
 
