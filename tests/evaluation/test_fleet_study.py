@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from tests.evaluation.campaigns import write_campaign
 
-from engram.drive import Settings, open_map
+from engram.drive import LocaliseOptions, Settings, open_map
 from engram.errors import ConfigError, InputError
 from engram.evaluation import DriveSet
 from engram.evaluation.fleet import (
@@ -20,6 +20,7 @@ from engram.evaluation.fleet import (
     Protocol,
     fleet_tasks,
     make_fleet_plan,
+    stages,
     steps,
     trials,
     write_fleet_report,
@@ -144,6 +145,18 @@ def test_merging_omits_what_the_other_group_saw_alike(plan: FleetPlan) -> None:
         assert built.nodes < sum(group[-1].nodes for group in built.groups)
 
 
+def test_the_lost_are_timed_by_what_they_attempt_in_vain(plan: FleetPlan, monkeypatch) -> None:
+    """Where every drive is found at once, too."""
+    (fold, *_), options = plan.folds, LocaliseOptions("distance", 1, 8, relocaliser="exhaustive")
+    drives = [one.path for one in plan.held_out(fold)]
+    about = drives, steps.map_path(plan, plan.arms[0], fold, "single"), plan.settings, options
+    assert stages.medians(*about)["proposed_ms"] > 0
+    without = replace(options, relocaliser=None)
+    assert stages.medians(*about[:-1], without)["proposed_ms"] == 0
+    monkeypatch.setattr(stages, "accept_lost", lambda *_: True)
+    assert stages.medians(*about)["proposed_ms"] == 0
+
+
 def test_times_are_counts_times_medians(plan: FleetPlan) -> None:
     arm = ArmResult(plan, plan.arms[0])
     assert arm.stages is not None
@@ -188,11 +201,11 @@ def without(plan: FleetPlan, work: Path, *patterns: str, **options) -> FleetPlan
 
 
 def test_orders_alone_are_timed(plan: FleetPlan, tmp_path: Path) -> None:
-    other = without(plan, tmp_path / "work", "stages.json", experiments=(10,))
+    other = without(plan, tmp_path / "work", "medians.json", experiments=(10,))
     run(other)
-    stages = ArmResult(other, other.arms[0]).stages
-    assert stages is not None
-    assert stages.frame_ms > 0
+    medians = ArmResult(other, other.arms[0]).stages
+    assert medians is not None
+    assert medians.frame_ms > 0
     write_fleet_report(tmp_path / "out", [other])
     (built,) = [row for row in rows(tmp_path / "out") if row["counted_s"]]
     assert built["map"] == "one order built sequentially"
@@ -208,7 +221,7 @@ def claims(report: Path) -> list[list[str]]:
 
 def test_what_is_not_timed_is_left_empty(plan: FleetPlan, tmp_path: Path) -> None:
     """As in the studies of earlier versions, which had no medians without Fig. 7."""
-    write_fleet_report(tmp_path / "out", [without(plan, tmp_path / "work", "stages.json")])
+    write_fleet_report(tmp_path / "out", [without(plan, tmp_path / "work", "medians.json")])
     table = rows(tmp_path / "out")
     for column in ("counted_s", "merges_counted_s", "counted_ms_per_frame"):
         assert {row[column] for row in table} == {""}

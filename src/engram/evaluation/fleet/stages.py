@@ -4,27 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from itertools import islice
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 
-from engram.drive import LocaliseOptions, LocaliseRun, Settings
+from engram.drive import LocaliseOptions, LocaliseRun, OpenMap, Settings, session_of_drive
 from engram.evaluation.fleet.arms import Arm
 from engram.evaluation.fleet.plan import FleetPlan
 from engram.evaluation.fleet.records import read_json, write_record
 from engram.evaluation.fleet.steps import map_path
 from engram.evaluation.folds import Fold
-from engram.localiser import Localisation
+from engram.experience.model import node_id
+from engram.localiser import FrameMatcher, Localisation, Relocaliser, accept_lost
 from engram.sequences import FrameLog
 
-# Enough for medians. Each drive begins lost, and in bad weather it stays so: most of what the lost
-# attempt is in vain, and cheaper than what finds them.
+# Enough for medians.
 _DRIVES = 5
 _FRAMES = 80
-_LOST_FRAMES = 5
+_LOST_FRAMES = 5  # each drive begins lost, so that all ask for places
 _ROUNDS = 8
 _PASSES = 5
+_LOST_PLACES = 10  # of each drive, at which the lost attempt what is proposed
+_PROPOSED = 16
 _FRAME_STAGES = ("neighbourhood", "rank", "remember")
 
 
@@ -52,7 +56,8 @@ class StageTimes:
     Attributes:
         frame_ms: of a frame: carrying on, neighbourhood, ranking, remembering.
         attempt_ms: of one match attempt where something was expected.
-        proposed_ms: of one at a node that was proposed to a lost robot.
+        proposed_ms: of one in vain at a node that was proposed to a lost robot. Of the many that
+            it makes one at most finds it; that one costs more.
         lookup_ms: of asking the relocaliser.
     """
 
@@ -73,8 +78,11 @@ class StageTimes:
 
 
 def stages_path(plan: FleetPlan, arm: Arm) -> Path:
-    """Where an arm's medians are kept."""
-    return plan.work / f"arm-{arm.letter}" / "stages.json"
+    """Where an arm's medians are kept.
+
+    Not as ``stages.json``: those of before left the lost's attempts to what held-out drives met.
+    """
+    return plan.work / f"arm-{arm.letter}" / "medians.json"
 
 
 def read_stages(plan: FleetPlan, arm: Arm) -> StageTimes | None:
@@ -97,14 +105,24 @@ def measure_stages(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> None:
     )
     drives, centre = plan.held_out(fold), map_path(plan, arm, fold, name)
     chosen = [one.path for one in drives[:: max(len(drives) // _DRIVES, 1)][:_DRIVES]]
-    passes = [_medians(chosen, centre, plan.settings, options) for _ in range(_PASSES)]
+    passes = [medians(chosen, centre, plan.settings, options) for _ in range(_PASSES)]
     write_record(path, StageTimes(**{one: min(made[one] for made in passes) for one in passes[0]}))
 
 
-def _medians(
+def medians(
     drives: Sequence[Path], centre: Path, settings: Settings, options: LocaliseOptions
 ) -> dict[str, float]:
-    """By the names of `StageTimes`, ms; 0 for what did not happen."""
+    """What each stage takes, in one pass.
+
+    Args:
+        drives: frame logs of drives that the map does not hold.
+        centre: the map.
+        settings: the resolved configuration.
+        options: policy and budget; one lane, so that attempts are made one after another.
+
+    Returns:
+        Medians by the names of `StageTimes`, ms; 0 for what did not happen.
+    """
     taken_ms: dict[str, list[float]] = {one.name: [] for one in fields(StageTimes)}
     for drive in drives:
         log = FrameLog(drive)
@@ -114,15 +132,42 @@ def _medians(
                     run.localiser.position = None  # lost again
                 for stage, ms in _stages_of(result.localisation):
                     taken_ms[stage].append(ms)
+            if options.relocaliser is not None:
+                relocaliser = run.opened.relocaliser(options.relocaliser, log.header.descriptor)
+                taken_ms["proposed_ms"] += _in_vain_ms(run.opened, log, settings, relocaliser)
         log.close()
     return {name: float(np.median(some)) if some else 0.0 for name, some in taken_ms.items()}
 
 
 def _stages_of(one: Localisation) -> Iterator[tuple[str, float]]:
-    """What a frame tells about stages; frames with both kinds of attempts say nothing of either."""
+    """What a frame tells about stages; one at which the robot was lost says nothing of attempts."""
     yield "frame_ms", sum(one.stage_ms.get(stage, 0.0) for stage in _FRAME_STAGES)
-    if one.attempts and one.proposed in (0, one.attempts):
-        kind = "proposed_ms" if one.proposed else "attempt_ms"
-        yield kind, one.stage_ms["attempts"] / one.attempts
+    if one.attempts and not one.proposed:
+        yield "attempt_ms", one.stage_ms["attempts"] / one.attempts
     if "places" in one.stage_ms:
         yield "lookup_ms", one.stage_ms["places"]
+
+
+def _in_vain_ms(
+    opened: OpenMap, log: FrameLog, settings: Settings, relocaliser: Relocaliser
+) -> Iterator[float]:
+    """Each attempt that does not find a robot which is lost here and there along its drive.
+
+    Not left to chance: where all held-out drives are found at once there would be none. The
+    landmarks are in memory, as they are for those who are lost for a while.
+    """
+    landmarks, acceptance = opened.store.frames, settings.localiser.acceptance
+    matcher = FrameMatcher(landmarks, settings.localiser.lost_matcher, threads=False)
+    session = session_of_drive(log).id
+    for logged in islice(log, 0, None, max(len(log) // _LOST_PLACES, 1)):
+        live = logged.frame
+        live_id = node_id(session, live.stamp_ns)
+        relocaliser.forget()
+        for index in relocaliser.propose(live, _PROPOSED, lambda _: True):
+            node = opened.graph.node(index).id
+            landmarks.frame(node)
+            started = perf_counter()
+            match = matcher.match(live, live_id, node, None)
+            spread = partial(matcher.spread, live, live_id, node, match)
+            if not accept_lost(match, spread, acceptance):
+                yield 1e3 * (perf_counter() - started)
