@@ -245,3 +245,24 @@ def test_nodes_that_a_revert_had_hidden_bring_back_what_joins_them_to_others(tmp
     assert not any("found in the centre" in note for note in report.notes)
     assert not any("hang together with nothing" in note for note in report.notes)
     assert_sound(centre)
+
+
+def test_short_runs_that_only_the_robot_knows_how_to_place_are_looked_for_everywhere(
+    tmp_path, fleet
+):
+    """By day it hung on what it had seen at night, which the centre knows nothing of."""
+    near, look = np.arange(0, 24, 0.8), np.ones(30, np.int64)
+    for start in (6, 16, 25):
+        look[start : start + 5] = 0
+    path = tmp_path / "robot.engram"
+    robot_map(path, near, 1, name="r5", day=5)
+    by_day = robot_map(path, near, look, name="r5", day=6, aside_m=0.2)
+    centre = tmp_path / "centre.engram"
+    merged(centre, fleet["first"][0])
+    (report,) = merged(centre, path)
+    night, *short = report.segments
+    assert night.omitted == 0
+    assert sum(one.taken + one.omitted for one in short) == len(by_day.saved)
+    assert all(one.taken + one.omitted <= 5 for one in short)  # 4 m
+    assert sum(one.omitted for one in short) == len(by_day.saved)
+    assert report.components == 1

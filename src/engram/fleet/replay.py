@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,6 +13,7 @@ from engram.experience.model import (
     Attempt,
     Edge,
     EdgeKind,
+    Node,
     NodeId,
     PathEntry,
     PathEntryKind,
@@ -22,6 +24,7 @@ from engram.experience.proximity import lay_proximity_edges, tighten_chain
 from engram.fleet.behind_gaps import FoundNode, look_along, position_behind_gap
 from engram.fleet.centre import Centre
 from engram.fleet.handed_in import HandedIn
+from engram.fleet.parts import Parts
 from engram.fleet.positions import beyond, recomposed, seen_from, uncertainty_m2
 from engram.fleet.report import Reason, RunReport, Seed, SegmentReport
 from engram.fleet.segments import Segment
@@ -123,8 +126,11 @@ class Replay:
         self._relocaliser = relocaliser
         self._advance = advance
         self._taken: set[NodeId] = set()
+        self._parts = Parts()
         self._run: list[int] = []  # nodes taken one after another, by their dense indices
         self._iterations: dict[SessionId, int] = {}
+        # How far each drive had come when the centre last knew it.
+        self._matched_at_m: dict[SessionId, float] = {}
         self._last: Segment | None = None  # the one that was replayed last
         # Found behind gaps, before their turn came.
         self._looked_up: dict[NodeId, FoundNode] = {}
@@ -142,11 +148,12 @@ class Replay:
             self._relocaliser.forget()
         with self._localiser(session, segment, self._relocaliser) as localiser:
             if seed is not None:
-                localiser.start_at(seed)
+                self._start_at(localiser, seed, segment.nodes[0])
             for stored, odometry in self._stream(segment):
                 frame = self._robot.store.frames.decode(stored)
-                found, outcomes = self._localise(localiser, stored.node.id, frame, odometry)
+                found, outcomes = self._localise(localiser, stored.node, frame, odometry)
                 if found.status is LocalisationStatus.LOCALISED:
+                    self._matched_at_m[session.id] = stored.node.driven_m
                     self._omit(stored, found, outcomes)
                     _count_omitted(report)
                 else:
@@ -195,23 +202,30 @@ class Replay:
         yield from zip(self._robot.store.frames.stored(segment.nodes), steps, strict=True)
 
     def _localise(
-        self, localiser: Localiser, node: NodeId, frame: Frame, odometry: OdometryStep
+        self, localiser: Localiser, node: Node, frame: Frame, odometry: OdometryStep
     ) -> tuple[Localisation, list[Outcome]]:
         """One frame; where the robot itself measured how it lies to a known node, from there."""
-        looked_up = self._looked_up.pop(node, None)
+        looked_up = self._looked_up.pop(node.id, None)
         if looked_up is not None:
             localiser.carry_on(odometry, frame.stamp_ns)
             position = looked_up.localisation.position
             assert position is not None
             localiser.start_at(position)
             return looked_up.localisation, looked_up.outcomes
-        known = self._known_neighbour(node, _MEASURED, self._run[0]) if self._run else None
+        known = self._known_neighbour(node.id, _MEASURED, self._run[0]) if self._run else None
         if known is not None:
             localiser.carry_on(odometry, frame.stamp_ns)
-            localiser.start_at(known)
+            self._start_at(localiser, known, node)
             odometry = OdometryStep(OdometryStatus.FIRST)
         found = localiser.localise(frame, odometry)
         return found, localiser.outcomes
+
+    def _start_at(self, localiser: Localiser, position: Position, node: Node) -> None:
+        """A robot that only its own nodes vouch for is as lost as it was when it saved them."""
+        open_loop_m = 0.0
+        if self._parts.is_apart(position.node):
+            open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
+        localiser.start_at(position, open_loop_m)
 
     def _look_behind_gap(self, session: Session, segment: Segment) -> bool:
         """Whether a segment is found from where the one before it ended; see `behind_gaps`."""
@@ -295,6 +309,7 @@ class Replay:
         index = self._centre.graph.add_node(node)
         self._writer.add_node(stored, frame)
         self._taken.add(node.id)
+        self._parts.take(node.id)
         self._run.append(index)
         self._link(node.id)
         self._write(lay_proximity_edges(self._centre.graph, index))
@@ -327,6 +342,7 @@ class Replay:
         """Edges that are in the graph already."""
         for edge in edges:
             self._writer.add_edge(edge)
+            self._parts.join(edge)
         self.edges += len(edges)
 
     def _remember(self, session: Session, localiser: Localiser) -> None:

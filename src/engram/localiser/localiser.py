@@ -181,10 +181,15 @@ class Localiser:
         taken, self._attempts = self._attempts, []
         return taken
 
-    def start_at(self, position: Position) -> None:
-        """Tells a robot where it is, as an operator or another localiser would."""
+    def start_at(self, position: Position, open_loop_m: float = 0.0) -> None:
+        """Tells a robot where it is, as an operator or another localiser would.
+
+        Args:
+            position: where it is.
+            open_loop_m: how far it has come since it last matched what the map knew before.
+        """
         self.position = position
-        self._open_loop_m = 0.0
+        self._open_loop_m = open_loop_m
         self._guessed_m2 = 0.0
 
     def resume_walk(self, node: NodeId, next_sequence: int, next_iteration: int) -> None:
