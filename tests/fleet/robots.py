@@ -37,8 +37,10 @@ def robot_map(
     return map_simulated(path, steps, name)
 
 
-def merged(centre: Path, *robots: Path, **options: object) -> list[MergeReport]:
-    return merge_maps(centre, robots, Settings(), OPTIONS, **options)
+def merged(
+    centre: Path, *robots: Path, asked: MergeOptions = OPTIONS, **options: object
+) -> list[MergeReport]:
+    return merge_maps(centre, robots, Settings(), asked, **options)
 
 
 def truth_of(*maps: Mapped) -> dict[NodeId, SE3]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from tests.worlds import attempts_of
 from engram.drive import MapOptions, Settings, map_drive, open_drive, open_map
 from engram.experience.model import EdgeKind, PathEntryKind, path_id
 from engram.fleet import DownloadOptions, Reason, Seed, download, silent
+from engram.fleet.handed_in import HandedIn
 from engram.store import MapStore
 
 from .robots import OPTIONS, frame_log, merged, robot_map, truth_of
@@ -175,6 +177,42 @@ def test_later_robots_localise_in_what_earlier_ones_of_the_merge_brought(tmp_pat
         # The omissions of the map handed in go along.
         assert set(ours.omissions()) >= set(store.omissions())
         assert report.omitted >= len(store.omissions())
+
+
+def test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match(tmp_path, fleet):
+    """Half of the robot's first drive is driven again, by what that had saved."""
+    path = tmp_path / "robot.engram"
+    robot_map(path, np.arange(0, 24, 0.8), name="r5", day=5, aside_m=0.1)
+    again = robot_map(path, np.arange(0, 12, 0.8), name="r5", day=6)
+    assert not again.saved
+    with MapStore.open(path) as store, HandedIn(store, "r5") as handed_in:
+        relied_on, all_nodes = handed_in.relied_on, set(handed_in.nodes)
+    assert 5 <= len(relied_on) <= len(all_nodes) / 2 + 1
+
+    def taken_by(centre, sure_inliers):
+        _, report = merged(
+            centre, fleet["first"][0], path, asked=replace(OPTIONS, sure_inliers=sure_inliers)
+        )
+        with MapStore.open(centre) as store:
+            contents, omitted = store.load(), set(store.omissions())
+        taken = all_nodes - omitted
+        assert taken <= {node.id for node in contents.nodes}
+        assert report.taken == len(taken)
+        assert report.components == 1
+        assert_sound(centre)
+        return taken, contents, report
+
+    every, contents, _ = taken_by(tmp_path / "every.engram", 0)
+    assert every == set()
+    inliers = contents.attempts.inliers[contents.attempts.accepted]
+    some, _, _ = taken_by(tmp_path / "some.engram", int(np.median(inliers)))
+    most, contents, report = taken_by(tmp_path / "most.engram", 10_000)
+    assert set() < some < most == relied_on
+    assert {run.reason for one in report.segments for run in one.runs} == {Reason.WEAK_MATCH}
+    matched = {edge.b for edge in contents.edges if edge.kind is EdgeKind.MATCH}
+    assert most <= matched
+    (again,) = merged(tmp_path / "most.engram", path)
+    assert not again.changed
 
 
 def test_two_parts_of_the_centre_are_joined_by_a_drive_through_both(tmp_path):

@@ -78,6 +78,7 @@ def build(
     relocaliser: Annotated[
         str, typer.Option("--relocaliser", help="fabmap, bag-of-words, exhaustive or none.")
     ] = "fabmap",
+    sure_inliers: options.SureInliers = 40,
     author: Annotated[
         str | None, typer.Option("--author", help="Who builds [default: the robots].")
     ] = None,
@@ -112,7 +113,7 @@ def build(
         mapping=MapOptions(
             policy=policy, lanes=lanes, rounds=rounds, relocaliser=found, author=author
         ),
-        merging=MergeOptions(policy, lanes, rounds, found, author),
+        merging=MergeOptions(policy, lanes, rounds, found, author, sure_inliers),
         scheduler=scheduler,
         judge=_judge(validate or [], judge_at, _orders(best_order, best_first)),
     )

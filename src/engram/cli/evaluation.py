@@ -169,7 +169,8 @@ def fleet(
         typer.Option(
             "--arms",
             metavar="X,X…",
-            help="A: distance, 8 attempts a frame; B: recall, 8 attempts; C: all candidates.",
+            help="A: distance, 8 attempts a frame; B: recall, 8 attempts; C: all candidates; "
+            "P: A, but every match omits, as in the paper.",
         ),
     ] = "A,B,C",
     experiments: Annotated[

@@ -58,6 +58,7 @@ def merge(
             "exhaustive or none.",
         ),
     ] = "fabmap",
+    sure_inliers: options.SureInliers = 40,
     author: Annotated[
         str | None, typer.Option("--author", help="Who merges [default: the robots].")
     ] = None,
@@ -68,8 +69,8 @@ def merge(
 
     Every map handed in is one revision, whole or not at all. Nodes that the centre has are not
     taken again; the others are replayed as if they were a live drive, and only those that do not
-    localise are taken. The same map handed in twice changes nothing. Where a later map fails, the
-    merges before it stand, and are told of.
+    localise are taken, or barely do and other drives rely on them. The same map handed in twice
+    changes nothing. Where a later map fails, the merges before it stand, and are told of.
 
     \b
     Examples:
@@ -82,7 +83,12 @@ def merge(
     from engram.fleet import MergeOptions, merge_maps
 
     asked = MergeOptions(
-        policy, lanes, rounds, None if relocaliser == "none" else relocaliser, author
+        policy,
+        lanes,
+        rounds,
+        None if relocaliser == "none" else relocaliser,
+        author,
+        sure_inliers,
     )
     reports: list[MergeReport] = []
 

@@ -74,6 +74,15 @@ Lanes: TypeAlias = Annotated[
 Rounds: TypeAlias = Annotated[
     int, typer.Option("--rounds", min=1, help="Rounds of attempts for one frame (Nr).")
 ]
+SureInliers: TypeAlias = Annotated[
+    int,
+    typer.Option(
+        "--sure-inliers",
+        min=0,
+        help="Leave out a node that other drives rely on only for a match of so many inliers; "
+        "0 for every match, as in the paper.",
+    ),
+]
 Deadline: TypeAlias = Annotated[
     float | None,
     typer.Option("--deadline", metavar="MS", help="No attempt starts later after its frame."),

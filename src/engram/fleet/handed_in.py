@@ -8,7 +8,17 @@ from typing import Self
 
 import numpy as np
 
-from engram.experience.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
+from engram.experience.model import (
+    Edge,
+    Node,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    PathId,
+    Session,
+    SessionId,
+    path_id,
+)
 from engram.store import MapStore
 
 
@@ -84,6 +94,17 @@ class HandedIn:
         for entry in self.contents.path_entries:
             found[entry.path].append(entry)
         return found
+
+    @cached_property
+    def relied_on(self) -> frozenset[NodeId]:
+        """Nodes that a drive other than their own localised by."""
+        paths = {node.id: path_id(node.session) for node in self.contents.nodes}
+        return frozenset(
+            entry.node
+            for entry in self.contents.path_entries
+            if entry.kind is not PathEntryKind.SAVED
+            and paths.get(entry.node, entry.path) != entry.path
+        )
 
     @cached_property
     def nodes_of(self) -> dict[Session, list[Node]]:

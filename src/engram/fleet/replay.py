@@ -63,6 +63,10 @@ class MergeOptions:
             so that the same input gives the same map.
         relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
         author: who merges; None for the robots whose drives are handed in.
+        sure_inliers: a node that other drives of the robot's map matched is omitted only for a
+            match of so many inliers: what localised by the node need not localise by another that
+            the node itself barely matches. 0 omits for every match, as [G16] does. What it
+            costs and brings is in docs/results-fleet.md.
     """
 
     policy: str = "recall"
@@ -70,6 +74,7 @@ class MergeOptions:
     rounds: int = 4
     relocaliser: str | None = "fabmap"
     author: str | None = None
+    sure_inliers: int = 40
 
     def __post_init__(self) -> None:
         policy_named(self.policy)  # refuses what is none
@@ -79,6 +84,8 @@ class MergeOptions:
             raise ConfigError(
                 f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
             )
+        if self.sure_inliers < 0:
+            raise ConfigError(f"sure_inliers is {self.sure_inliers}, must be 0 or more")
 
 
 class Replay:
@@ -136,7 +143,10 @@ class Replay:
         self._looked_up: dict[NodeId, FoundNode] = {}
 
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
-        """Replays one segment: what localises is omitted, the rest is taken (SPEC §7 MERGE 3)."""
+        """Replays one segment: what localises is omitted, the rest is taken (SPEC §7 MERGE 3).
+
+        Taken is, too, what others rely on and the centre barely shows; see `MergeOptions`.
+        """
         report = SegmentReport(str(session.id), session.robot, segment.nodes[0].stamp_ns)
         seed = self._seed(segment)
         if seed is not None:
@@ -146,24 +156,32 @@ class Replay:
         self._last = segment
         if self._relocaliser is not None:
             self._relocaliser.forget()
+        begins = True  # a run of nodes taken
         with self._localiser(session, segment, self._relocaliser) as localiser:
             if seed is not None:
                 self._start_at(localiser, seed, segment.nodes[0])
             for stored, odometry in self._stream(segment):
                 frame = self._robot.store.frames.decode(stored)
                 found, outcomes = self._localise(localiser, stored.node, frame, odometry)
-                if found.status is LocalisationStatus.LOCALISED:
+                localised = found.status is LocalisationStatus.LOCALISED
+                omits = localised and self._may_replace(found, stored.node)
+                if localised:
                     self._matched_at_m[session.id] = stored.node.driven_m
-                    self._omit(stored, found, outcomes)
-                    _count_omitted(report)
+                    _count_found(report)
+                if omits:
+                    self._omit(stored, found)
+                    report.omitted += 1
                 else:
-                    reason, begins = _reason(frame, found), not self._run
-                    self._take(stored, frame, localiser)
-                    _count_taken(report, stored, odometry, reason, begins=begins)
+                    self._take(stored, frame, localiser, found)
+                    _count_taken(report, stored, odometry, _reason(frame, found), begins=begins)
+                if localised:
+                    self._end_run()
+                    self._join_matched(outcomes)
+                begins = omits
                 self.match_attempts += found.attempts
                 self.proposed_attempts += found.proposed
                 self.lookups += "places" in found.stage_ms
-                self._advance("omitted" if found.node else "taken")
+                self._advance("omitted" if omits else "taken")
             self._end_run()
             self._remember(session, localiser)
         return report
@@ -289,22 +307,21 @@ class Replay:
 
     # -- what becomes of a frame
 
-    def _omit(self, stored: StoredNode, found: Localisation, outcomes: list[Outcome]) -> None:
+    def _may_replace(self, found: Localisation, node: Node) -> bool:
+        """Whether what a node matched will do for all that localised by the node."""
+        return found.inliers >= self._options.sure_inliers or node.id not in self._robot.relied_on
+
+    def _omit(self, stored: StoredNode, found: Localisation) -> None:
         """The centre shows this place alike already."""
-        assert found.node is not None
-        assert found.node_from_live is not None
-        assert found.covariance is not None
         node = stored.node.id
-        position = Position(found.node, found.node_from_live, found.covariance)
+        position = _measured(found)
         self._writer.add_omission(self._centre.omit(node, position, stored.landmark_hash))
         self._link(node)
-        self._end_run()
-        acceptance = self._settings.localiser.acceptance
-        for edge in match_edges(self._centre.graph, outcomes, acceptance):
-            self._add_edge(edge)
 
-    def _take(self, stored: StoredNode, frame: Frame, localiser: Localiser) -> None:
-        """A node that the centre is lacking, with its own edges."""
+    def _take(
+        self, stored: StoredNode, frame: Frame, localiser: Localiser, found: Localisation
+    ) -> None:
+        """A node that the centre is lacking, with its own edges and that to what it matched."""
         node = stored.node
         index = self._centre.graph.add_node(node)
         self._writer.add_node(stored, frame)
@@ -312,8 +329,18 @@ class Replay:
         self._parts.take(node.id)
         self._run.append(index)
         self._link(node.id)
+        if found.node is not None:
+            at = _measured(found)
+            match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
+            self._add_edge(match)
         self._write(lay_proximity_edges(self._centre.graph, index))
         localiser.settle_in(node.id, node.stamp_ns)
+
+    def _join_matched(self, outcomes: list[Outcome]) -> None:
+        """What one frame matched lies together."""
+        acceptance = self._settings.localiser.acceptance
+        for edge in match_edges(self._centre.graph, outcomes, acceptance):
+            self._add_edge(edge)
 
     def _link(self, node: NodeId) -> None:
         """The robot's edges from a node to what is resolved already, to the equivalents of both."""
@@ -356,8 +383,18 @@ class Replay:
         )
 
 
+def _measured(found: Localisation) -> Position:
+    """Where a frame that localised is."""
+    assert found.node is not None
+    assert found.node_from_live is not None
+    assert found.covariance is not None
+    return Position(found.node, found.node_from_live, found.covariance)
+
+
 def _reason(frame: Frame, found: Localisation) -> Reason:
-    """Why a frame was not matched."""
+    """Why a frame was taken."""
+    if found.node is not None:
+        return Reason.WEAK_MATCH
     if frame.status is not FrameStatus.OK:
         return Reason.UNUSABLE_FRAME
     if found.candidates:
@@ -365,10 +402,10 @@ def _reason(frame: Frame, found: Localisation) -> Reason:
     return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
 
-def _count_omitted(report: SegmentReport) -> None:
+def _count_found(report: SegmentReport) -> None:
+    """A segment that nothing was known of was found by its looks."""
     if report.seed is Seed.NONE:
         report.seed = Seed.PLACE
-    report.omitted += 1
 
 
 def _count_taken(

@@ -24,12 +24,13 @@ class Seed(StrEnum):
 
 
 class Reason(StrEnum):
-    """Why a frame of the replay did not localise."""
+    """Why a frame of the replay was taken."""
 
     UNUSABLE_FRAME = "unusable_frame"
     NOTHING_NEAR = "nothing_near"
     NO_PLACE = "no_place"
     NO_MATCH = "no_match"
+    WEAK_MATCH = "weak_match"
 
 
 _WORDS = {
@@ -37,18 +38,19 @@ _WORDS = {
     Reason.NOTHING_NEAR: "nothing known is near",
     Reason.NO_PLACE: "no place of the map looks like it",
     Reason.NO_MATCH: "what is near does not match",
+    Reason.WEAK_MATCH: "what other drives rely on barely matches",
 }
 
 
 @dataclass(slots=True)
 class RunReport:
-    """Nodes of a segment, one after another, that did not localise and were taken.
+    """Nodes of a segment, one after another, that were taken.
 
     Attributes:
         first_stamp_ns: of the first of them.
         nodes: how many.
         length_m: odometry distance from first to last.
-        reasons: why each did not localise.
+        reasons: why each was.
     """
 
     first_stamp_ns: int

@@ -18,6 +18,7 @@ class Arm:
         policy: key of `POLICIES`.
         lanes, rounds: Np and Nr; counts only, so that the same input gives the same maps.
         words: for tables and legends.
+        sure_inliers: of `MergeOptions`.
     """
 
     letter: str
@@ -25,6 +26,7 @@ class Arm:
     lanes: int
     rounds: int
     words: str
+    sure_inliers: int = MergeOptions().sure_inliers
 
     def mapping(self, relocaliser: str | None) -> MapOptions:
         """How drives are mapped."""
@@ -32,7 +34,13 @@ class Arm:
 
     def merging(self, relocaliser: str | None) -> MergeOptions:
         """How maps are merged."""
-        return MergeOptions(self.policy, self.lanes, self.rounds, relocaliser)
+        return MergeOptions(
+            self.policy,
+            self.lanes,
+            self.rounds,
+            relocaliser,
+            sure_inliers=self.sure_inliers,
+        )
 
     def localising(self, relocaliser: str | None) -> LocaliseOptions:
         """How drives are localised as on a robot."""
@@ -54,4 +62,6 @@ ARMS = {
     "B": Arm("B", "recall", 2, 4, "recall, 8 attempts"),
     # All candidates, one after another, until one is believed.
     "C": Arm("C", "distance", 1, UNLIMITED, "exhaustive"),
+    # A as it was in the paper: whatever matches is omitted, also what other drives rely on.
+    "P": Arm("P", "distance", 2, 4, "as A, every match omits", sure_inliers=0),
 }
