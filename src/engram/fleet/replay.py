@@ -26,7 +26,7 @@ from engram.fleet.centre import Centre
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.parts import Parts
 from engram.fleet.positions import beyond, recomposed, seen_from, uncertainty_m2
-from engram.fleet.report import Reason, RunReport, Seed, SegmentReport
+from engram.fleet.report import Reason, Seed, SegmentReport
 from engram.fleet.segments import Segment
 from engram.frontend import Frame, FrameStatus
 from engram.localiser import (
@@ -156,32 +156,26 @@ class Replay:
         self._last = segment
         if self._relocaliser is not None:
             self._relocaliser.forget()
-        begins = True  # a run of nodes taken
         with self._localiser(session, segment, self._relocaliser) as localiser:
             if seed is not None:
                 self._start_at(localiser, seed, segment.nodes[0])
             for stored, odometry in self._stream(segment):
                 frame = self._robot.store.frames.decode(stored)
                 found, outcomes = self._localise(localiser, stored.node, frame, odometry)
-                localised = found.status is LocalisationStatus.LOCALISED
-                omits = localised and self._may_replace(found, stored.node)
-                if localised:
-                    self._matched_at_m[session.id] = stored.node.driven_m
-                    _count_found(report)
-                if omits:
+                reason = self._reason(stored.node, frame, found)
+                if reason is None:
                     self._omit(stored, found)
-                    report.omitted += 1
+                    report.omit()
                 else:
                     self._take(stored, frame, localiser, found)
-                    _count_taken(report, stored, odometry, _reason(frame, found), begins=begins)
-                if localised:
-                    self._end_run()
-                    self._join_matched(outcomes)
-                begins = omits
+                    report.take(stored.node.stamp_ns, _moved_m(odometry), reason)
+                if found.status is LocalisationStatus.LOCALISED:
+                    self._matched(stored.node, outcomes)
+                    report.seed = Seed.PLACE if report.seed is Seed.NONE else report.seed
                 self.match_attempts += found.attempts
                 self.proposed_attempts += found.proposed
                 self.lookups += "places" in found.stage_ms
-                self._advance("omitted" if omits else "taken")
+                self._advance("taken" if reason else "omitted")
             self._end_run()
             self._remember(session, localiser)
         return report
@@ -307,9 +301,16 @@ class Replay:
 
     # -- what becomes of a frame
 
-    def _may_replace(self, found: Localisation, node: Node) -> bool:
-        """Whether what a node matched will do for all that localised by the node."""
-        return found.inliers >= self._options.sure_inliers or node.id not in self._robot.relied_on
+    def _reason(self, node: Node, frame: Frame, found: Localisation) -> Reason | None:
+        """Why a node is taken; None where what it matched will do for all that localised by it."""
+        if found.status is LocalisationStatus.LOCALISED:
+            is_sure = found.inliers >= self._options.sure_inliers
+            return None if is_sure or node.id not in self._robot.relied_on else Reason.WEAK_MATCH
+        if frame.status is not FrameStatus.OK:
+            return Reason.UNUSABLE_FRAME
+        if found.candidates:
+            return Reason.NO_MATCH
+        return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
     def _omit(self, stored: StoredNode, found: Localisation) -> None:
         """The centre shows this place alike already."""
@@ -336,8 +337,10 @@ class Replay:
         self._write(lay_proximity_edges(self._centre.graph, index))
         localiser.settle_in(node.id, node.stamp_ns)
 
-    def _join_matched(self, outcomes: list[Outcome]) -> None:
-        """What one frame matched lies together."""
+    def _matched(self, node: Node, outcomes: list[Outcome]) -> None:
+        """The robot knows where it is: a run ends, and what one frame matched lies together."""
+        self._matched_at_m[node.session] = node.driven_m
+        self._end_run()
         acceptance = self._settings.localiser.acceptance
         for edge in match_edges(self._centre.graph, outcomes, acceptance):
             self._add_edge(edge)
@@ -391,37 +394,6 @@ def _measured(found: Localisation) -> Position:
     return Position(found.node, found.node_from_live, found.covariance)
 
 
-def _reason(frame: Frame, found: Localisation) -> Reason:
-    """Why a frame was taken."""
-    if found.node is not None:
-        return Reason.WEAK_MATCH
-    if frame.status is not FrameStatus.OK:
-        return Reason.UNUSABLE_FRAME
-    if found.candidates:
-        return Reason.NO_MATCH
-    return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
-
-
-def _count_found(report: SegmentReport) -> None:
-    """A segment that nothing was known of was found by its looks."""
-    if report.seed is Seed.NONE:
-        report.seed = Seed.PLACE
-
-
-def _count_taken(
-    report: SegmentReport,
-    stored: StoredNode,
-    odometry: OdometryStep,
-    reason: Reason,
-    *,
-    begins: bool,
-) -> None:
-    """Counts a node taken, in a run of its own if what came before it was omitted."""
-    if begins:
-        report.runs.append(RunReport(stored.node.stamp_ns))
-    run = report.runs[-1]
-    if not begins and odometry.prev_from_curr is not None:
-        run.length_m += odometry.prev_from_curr.distance_m
-    run.nodes += 1
-    run.reasons[reason] += 1
-    report.taken += 1
+def _moved_m(odometry: OdometryStep) -> float:
+    """How far a node is from the one before; 0 for a segment's first."""
+    return 0.0 if odometry.prev_from_curr is None else odometry.prev_from_curr.distance_m

@@ -93,6 +93,29 @@ class SegmentReport:
     taken: int = 0
     omitted: int = 0
     runs: list[RunReport] = field(default_factory=list)
+    _in_run: bool = field(default=False, repr=False)
+
+    def omit(self) -> None:
+        """Counts a node omitted, which ends a run."""
+        self.omitted += 1
+        self._in_run = False
+
+    def take(self, stamp_ns: int, moved_m: float, reason: Reason) -> None:
+        """Counts a node taken, in a run of its own if what came before it was omitted.
+
+        Args:
+            stamp_ns: of the node.
+            moved_m: odometry distance since the node before.
+            reason: why it was taken.
+        """
+        if self._in_run:
+            self.runs[-1].length_m += moved_m
+        else:
+            self.runs.append(RunReport(stamp_ns))
+        self._in_run = True
+        self.runs[-1].nodes += 1
+        self.runs[-1].reasons[reason] += 1
+        self.taken += 1
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
