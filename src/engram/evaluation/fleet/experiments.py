@@ -116,20 +116,20 @@ class _Tasks:
 
     def all(self) -> list[Task]:
         """Each behind those that it needs; with what several experiments need only once."""
-        wanted, first_fold = self._plan.options.experiments, self._fold.number == 0
+        wanted = self._plan.options.experiments
         tasks: list[Task] = []
         if 7 in wanted:
             tasks += self._parallel_building()
-        if 9 in wanted or (8 in wanted and first_fold):
+        if 8 in wanted or 9 in wanted:
             tasks += self._first_forays()
             tasks += self._forays(("copy",))
             tasks += self._sharing()
-        if 8 in wanted and first_fold:
+        if 8 in wanted:
             tasks += self._alone()
         if 9 in wanted:
             tasks += self._forays(FORAY_POLICIES)
             tasks += self._downloads()
-        if 10 in wanted and first_fold:
+        if 10 in wanted and self._fold.number == 0:
             tasks += self._orders()
         return list({task.name: task for task in reversed(tasks)}.values())[::-1]
 

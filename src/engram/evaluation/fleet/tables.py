@@ -234,6 +234,9 @@ def _pooled_rows(arm: ArmResult) -> Iterator[Row]:
         found = arm.held_out(name)
         if found is not None:
             yield {**_row(experiment, "all", what), **_result(found[0])}
+    maps = (*ROBOTS, SHARED)
+    for name, result in zip(maps, arm.held_out(*maps) or (), strict=False):
+        yield {**_row(8, "all", name), **_result(result)}
     yield from _foray_rows("all", [one for policy in FORAY_POLICIES for one in arm.forays(policy)])
     yield from _trial_rows("all", _flat(arm.trials()))
 
