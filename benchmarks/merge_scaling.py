@@ -111,6 +111,7 @@ def main() -> None:
         return
     with tempfile.TemporaryDirectory() as made:
         folder = asked.folder or Path(made)
+        folder.mkdir(parents=True, exist_ok=True)
         centre = folder / f"centre-{asked.centre}.engram"
         if not centre.exists():
             starts = range(0, asked.centre, SESSION_NODES)
