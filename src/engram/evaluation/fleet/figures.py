@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -166,12 +167,19 @@ def _in_field(arm: ArmResult) -> Panel:
 
 
 def _downloads(arm: ArmResult) -> Panel:
-    """Held-out drives in downloads for their own hours."""
-    lines = [
-        _curve(name, [one.drive for _, one in tried], arm.plan.options.seed)
-        for name, tried in arm.trials().items()
-    ]
-    return Panel(_title(arm), "x, m", _P, lines, least_y=_LEAST_PERCENT)
+    """Held-out drives in downloads for their own hours; not every policy has one for every drive.
+
+    Without bands: of seven curves they would hide each other. Paired intervals are in `claims.md`.
+    """
+    trials = arm.trials()
+    most = max((len(tried) for tried in trials.values()), default=0)
+    lines, drives = [], f"{most} drives"
+    for name, tried in trials.items():
+        curve = _curve(name, [one.drive for _, one in tried], arm.plan.options.seed)
+        lines.append(replace(curve, low=None, high=None))
+        if len(tried) < most and name in FORAY_POLICIES:
+            drives += f", {name} {len(tried)}"
+    return Panel(f"{_title(arm)}\n{drives}", "x, m", _P, lines, least_y=1)
 
 
 def _orders(arm: ArmResult) -> Panel:
