@@ -29,7 +29,7 @@ from engram.store.records import AttemptArrays, MapContents, MapInfo, Revision
 from engram.store.rows import (
     Row,
     camera_from_row,
-    edge_from_row,
+    edges_from_rows,
     from_json,
     node_from_row,
     path_entry_from_row,
@@ -304,11 +304,12 @@ def _newest_edges(connection: Connection, view: View) -> list[Row]:
 
 def _edges(connection: Connection, view: View, node_ids: dict[int, NodeId]) -> tuple[Edge, ...]:
     """Edges between nodes that are seen: those of hidden nodes are hidden with them."""
-    return tuple(
-        edge_from_row(row, node_ids[row["a"]], node_ids[row["b"]])
+    seen = [
+        row
         for row in _newest_edges(connection, view)
         if row["a"] in node_ids and row["b"] in node_ids
-    )
+    ]
+    return edges_from_rows(seen, [(node_ids[row["a"]], node_ids[row["b"]]) for row in seen])
 
 
 def _path_entries(
