@@ -53,6 +53,14 @@ def test_it_writes_a_map_and_says_what_it_promises(engram, centre: Path, tmp_pat
     assert "expected share of the way without a match" in text
 
 
+def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: Path) -> None:
+    asked = ("--policy", "budget", "--budget", "80%", "--json")
+    told = engram("download", centre, tmp_path / "r1.engram", *asked).json
+    assert 0 < told["nodes"] < told["of_nodes"]
+    assert (tmp_path / "r1.engram").stat().st_size == told["size_bytes"]
+    assert told["size_bytes"] <= 0.8 * told["why"]["everything_bytes"]
+
+
 def test_a_promise_is_held_against_a_drive(
     engram, centre: Path, street: Path, tmp_path: Path
 ) -> None:
@@ -136,6 +144,8 @@ def test_a_check_that_fails_leaves_the_download_and_its_report(
         (("--policy", "tod", "--start", "21:00"), "widen the --window"),
         (("--policy", "paths", "--start", "3:00", "--end", "4:00"), "there is some from 9:00"),
         (("--policy", "budget", "--budget", "much"), "budget is 'much'"),
+        (("--policy", "budget", "--budget", "0%"), "budget is 0 per cent"),
+        (("--policy", "budget", "--budget", "1e2%"), "budget is '1e2%'"),
         (("--policy", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
         (("--policy", "region", "--near", "xyz"), "no UUID"),
         (("--policy", "route", "--route", "00"), "0 sessions begin with '00'"),

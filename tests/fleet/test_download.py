@@ -227,6 +227,24 @@ def test_a_budget_is_kept_and_more_of_it_promises_more(centre, tmp_path):
     assert small.get("r1", 0) + small.get("r3", 0) > 2 * (small.get("r2", 0) + small.get("r4", 0))
 
 
+def test_a_budget_can_be_a_share_of_everything_sent_alike(centre, tmp_path):
+    everything = sent(centre, tmp_path / "all.engram", "budget", budget_percent=100, start_h=9.2)
+    assert everything.nodes == everything.of_nodes
+    assert everything.why["everything_bytes"] == everything.size_bytes
+    half = sent(centre, tmp_path / "half.engram", "budget", budget_percent=50, start_h=9.2)
+    assert 0.9 < half.size_bytes / (everything.size_bytes // 2) <= 1
+    as_bytes = sent(
+        centre,
+        tmp_path / "bytes.engram",
+        "budget",
+        budget_bytes=everything.size_bytes // 2,
+        start_h=9.2,
+    )
+    assert as_bytes.nodes == half.nodes
+    assert "of the" in half.text()
+    assert "that all nodes take" in half.text()
+
+
 def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(centre, tmp_path):
     mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
     robot = tmp_path / "robot.engram"
@@ -333,6 +351,10 @@ class TestMistakes:
             ({"epoch_min": 0.0}, "epoch is 0.0 minutes"),
             ({"best_percent": 101.0}, "best is 101.0 per cent"),
             ({"budget_bytes": 0}, "budget is 0 bytes"),
+            ({"budget_percent": 0.0}, "budget is 0 per cent"),
+            ({"budget_percent": 101.0}, "budget is 101 per cent"),
+            ({"budget_percent": float("nan")}, "budget is nan per cent"),
+            ({"budget_percent": 10.0, "budget_bytes": 9}, "give one"),
             ({"radius_m": float("inf")}, "radius is inf"),
         ],
     )
@@ -368,6 +390,7 @@ class TestMistakes:
             ({"policy": "tod", "start_h": 9.0, "epoch_min": 30.0}, "does not go by --epoch"),
             ({"policy": "paths", "window_min": 60.0}, r"choose --policy tod or tod\+paths"),
             ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "go by --budget"),
+            ({"policy": "region", "near": ("0",), "budget_percent": 50.0}, "go by --budget"),
             ({"policy": "route", "route": "0", "best_percent": 20.0}, "go by --best"),
             ({"policy": "copy", "radius_m": 5.0}, "does not go by --radius"),
             ({"policy": "budget", "budget_bytes": 9, "radius_m": 5.0}, "with it"),

@@ -61,7 +61,12 @@ def download(
         float, typer.Option("--buffer", metavar="MIN", help="paths: widens the mission.")
     ] = 0.0,
     budget: Annotated[
-        str | None, typer.Option("--budget", metavar="SIZE", help="budget: 200MB, 1.5GiB, 4096.")
+        str | None,
+        typer.Option(
+            "--budget",
+            metavar="SIZE",
+            help="budget: 200MB, 1.5GiB, 4096, or 25% of what everything takes.",
+        ),
     ] = None,
     near: Annotated[
         list[str] | None,
@@ -108,13 +113,15 @@ def download(
       engram download centre.engram r1.engram --policy tod --start 9:30
       engram download centre.engram r1.engram --policy tod+paths --start 9:30 --end 11:00
       engram download centre.engram r1.engram --policy budget --budget 200MB --start 17:00
+      engram download centre.engram r1.engram --policy budget --budget 25% --start 17:00
       engram download centre.engram r1.engram --policy tod --start 9:30 --check monday.framelog
     """
     from engram.cli.progress import progress
     from engram.drive import load_settings
-    from engram.fleet import DownloadOptions, bytes_from_text, hour_from_text
+    from engram.fleet import DownloadOptions, budget_from_text, hour_from_text
     from engram.fleet import download as send
 
+    budget_bytes, budget_percent = budget_from_text(budget)
     asked = DownloadOptions(
         policy=policy,
         start_h=hour_from_text(start, "start"),
@@ -125,7 +132,8 @@ def download(
         epoch_min=epoch,
         best_percent=best,
         buffer_min=buffer,
-        budget_bytes=bytes_from_text(budget),
+        budget_bytes=budget_bytes,
+        budget_percent=budget_percent,
         near=tuple(near or ()),
         route=route,
         radius_m=radius,

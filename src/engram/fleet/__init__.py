@@ -10,7 +10,7 @@ from engram.fleet.grouping import GROUPINGS, group_drives
 from engram.fleet.handed_in import HandedIn
 from engram.fleet.judging import JudgeOptions, Orders
 from engram.fleet.merging import Progress, merge_map, silent
-from engram.fleet.mission import DownloadOptions, bytes_from_text, hour_from_text
+from engram.fleet.mission import DownloadOptions, budget_from_text, hour_from_text
 from engram.fleet.order_costs import order_costs
 from engram.fleet.order_results import BestOrder, OrderResult
 from engram.fleet.replay import MergeOptions
@@ -46,8 +46,8 @@ __all__ = [
     "SegmentReport",
     "Trial",
     "TrialSummary",
+    "budget_from_text",
     "build_map",
-    "bytes_from_text",
     "download",
     "find_best_order",
     "group_drives",

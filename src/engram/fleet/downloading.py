@@ -101,6 +101,11 @@ class DownloadReport:
                 f"epochs {self.why['epochs'][0]} to {self.why['epochs'][-1]}, "
                 f"{len(self.why['paths'])} paths chosen"
             )
+        if everything_bytes := self.why.get("everything_bytes"):
+            lines.append(
+                f"{self.size_bytes / everything_bytes:.1%} of the {everything_bytes / 1e6:.1f} MB "
+                "that all nodes take, sent alike"
+            )
         if self.why.get("nodes_without_hour"):
             lines.append(
                 f"{self.why['nodes_without_hour']} nodes have no known hour of day and stayed"
@@ -166,7 +171,6 @@ def _fitting(
     """Write the draft; for a budget as many nodes as fit, found by writing and measuring."""
     if selection.order is None:
         return _write_draft(stock, selection, options, folder, progress)
-    assert options.budget_bytes is not None
     landmarks, thumbnails = stock.sizes
     blobs = landmarks + thumbnails * options.with_thumbnails
     pages = np.ceil(blobs / _PAGE_BYTES) * _PAGE_BYTES + _ROWS_BYTES
@@ -178,10 +182,15 @@ def _fitting(
         newest[count] = _write_draft(stock, part, options, folder, progress)
         return _compacted_bytes(folder)
 
-    count = most_that_fit(measure, np.cumsum(pages[selection.order]), options.budget_bytes)
+    budget_bytes, why = options.budget_bytes, dict(selection.why)
+    if options.budget_percent is not None:
+        why["everything_bytes"] = everything_bytes = measure(len(selection.order))
+        budget_bytes = int(everything_bytes * options.budget_percent / 100)
+    assert budget_bytes is not None
+    count = most_that_fit(measure, np.cumsum(pages[selection.order]), budget_bytes)
     if count not in newest:
         measure(count)
-    return newest[count]
+    return _Sent(replace(newest[count].selection, why=why), newest[count].bridges)
 
 
 def most_that_fit(

@@ -13,6 +13,7 @@ from engram.errors import ConfigError
 _HOURS = 24.0
 _CLOCK = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d{2}))?", re.ASCII)
 _SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kMGT]?i?B?)", re.ASCII)
+_PERCENT = re.compile(r"(?P<number>\d+(\.\d+)?)\s*%", re.ASCII)
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 _UNITS |= {f"{name}i": 2 ** (10 * power) for power, name in enumerate("kMGT", start=1)}
 
@@ -34,6 +35,7 @@ class DownloadOptions:
         best_percent: `paths`: share of the paths of each epoch that is sent. 50: [G16] §VI-D.
         buffer_min: widens the mission at both ends, minutes.
         budget_bytes: `budget`: what the file may take.
+        budget_percent: `budget`: the same as a share of what all nodes would take, sent alike.
         near: `region`: beginnings of UUIDs of nodes.
         route: `route`, and `budget` if it is to serve one: beginning of the UUID of a session
             that drove it.
@@ -51,6 +53,7 @@ class DownloadOptions:
     best_percent: float = 50.0
     buffer_min: float = 0.0
     budget_bytes: int | None = None
+    budget_percent: float | None = None
     near: tuple[str, ...] = ()
     route: str | None = None
     radius_m: float = 20.0
@@ -71,6 +74,8 @@ class DownloadOptions:
             _check(self.latitude_deg, "latitude", "degrees", -90.0, 90.0)
         if self.budget_bytes is not None and self.budget_bytes <= 0:
             raise ConfigError(f"budget is {self.budget_bytes} bytes, must be > 0")
+        if self.budget_percent is not None:
+            _check_share(self.budget_percent, self.budget_bytes)
 
     @property
     def with_thumbnails(self) -> bool:
@@ -92,19 +97,33 @@ def hour_from_text(text: str | None, name: str) -> float | None:
     return int(found["hour"]) + int(found["minute"] or 0) / 60
 
 
-def bytes_from_text(text: str | None) -> int | None:
-    """Bytes of "200MB", "1.5 GiB" or "4096"; None of None.
+def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
+    """Bytes of "200MB", "1.5 GiB" or "4096", or per cent of "25%"; the other is None, both of None.
 
     Raises:
-        ConfigError: it is no size.
+        ConfigError: it is neither a size nor a share.
     """
     if text is None:
-        return None
+        return None, None
+    if share := _PERCENT.fullmatch(text.strip()):
+        return None, float(share["number"])
     found = _SIZE.fullmatch(text.strip())
     unit = found["unit"].removesuffix("B") if found else ""
     if found is None or unit not in _UNITS:
-        raise ConfigError(f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096")
-    return int(float(found["number"]) * _UNITS[unit])
+        raise ConfigError(
+            f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096, or a share of "
+            "everything such as 25%"
+        )
+    return int(float(found["number"]) * _UNITS[unit]), None
+
+
+def _check_share(percent: float, budget_bytes: int | None) -> None:
+    if budget_bytes is not None:
+        raise ConfigError(
+            f"budget is {budget_bytes} bytes and {percent:g} per cent of everything; give one"
+        )
+    if not 0 < percent <= 100:
+        raise ConfigError(f"budget is {percent:g} per cent, must be > 0 and at most 100")
 
 
 def _check_day(text: str) -> None:

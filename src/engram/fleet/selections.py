@@ -92,8 +92,8 @@ def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
 
     How many of them fit into the budget is found when the map is written.
     """
-    if options.budget_bytes is None:
-        raise ConfigError("policy budget needs --budget SIZE, such as 200MB")
+    if options.budget_bytes is None and options.budget_percent is None:
+        raise ConfigError("policy budget needs --budget SIZE, such as 200MB or 25%")
     if options.start_h is not None:
         stock.known_hours()
     coverage = coverage_for(stock, options)
@@ -122,7 +122,7 @@ UNDERSTOOD: dict[str, frozenset[str]] = {
     "tod+paths": frozenset({"window_min", "epoch_min", "best_percent", "buffer_min"}),
     "region": frozenset({"near", "radius_m"}),
     "route": frozenset({"route", "radius_m"}),
-    "budget": frozenset({"budget_bytes", "near", "route", "radius_m"}),
+    "budget": frozenset({"budget_bytes", "budget_percent", "near", "route", "radius_m"}),
 }
 _FLAGS = {
     "window_min": "--window",
@@ -130,6 +130,7 @@ _FLAGS = {
     "best_percent": "--best",
     "buffer_min": "--buffer",
     "budget_bytes": "--budget",
+    "budget_percent": "--budget",
     "near": "--near",
     "route": "--route",
     "radius_m": "--radius",
