@@ -263,6 +263,9 @@ def test_arms_stand_side_by_side(plan: FleetPlan, tmp_path: Path) -> None:
     assert len(measured) == 1
     assert measured[0][-2].endswith(")")
     assert measured[0][-1] == "–"
+    # Of two groups a tree is the same one merge.
+    tree = [row for row in claims(tmp_path) if row[0].endswith("a pairwise tree: nodes")]
+    assert [row[-2:] for row in tree] == [measured[0][-2:]]
 
 
 def test_forays_in_copies_alone_are_not_reported(plan: FleetPlan, tmp_path: Path) -> None:

@@ -135,6 +135,12 @@ def _building(arm: ArmResult) -> Iterator[Row]:
             "≤ 65 %" if is_main else "",
             f"{share(merged / agents)} ({merged} of {agents})",
         )
+        if is_main and all(pairwise):
+            tree = sum(built.pairs[-1][1].nodes for _, built in whole)
+            yield (
+                "the same, merged as a pairwise tree: nodes", "–", "printed", "",
+                f"{share(tree / agents)} ({tree} of {agents})",
+            )  # fmt: skip
         yield from _compared(
             arm, f"route not localised, {groups} groups merged against one agent",
             "21.97 against 32.03 %" if is_main else "–", "not worse" if is_main else "–",
