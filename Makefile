@@ -3,8 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-CORE_SOURCES := $(shell find src/core CMakeLists.txt -type f)
-PACKAGES := $(shell find src/engram -name __init__.py)
+CORE_SOURCES := $(shell find src/core lab/core cmake CMakeLists.txt lab/CMakeLists.txt -type f)
+PACKAGES := $(shell find src/engram lab/src/engram_lab -name __init__.py)
 
 # Real images for tests and benchmarks; tests that need them skip where there are none.
 ifndef ENGRAM_DATA
@@ -17,13 +17,13 @@ endif
 
 setup: $(STAMP)
 
-$(STAMP): pyproject.toml constraints.txt $(CORE_SOURCES) $(PACKAGES)
+$(STAMP): pyproject.toml lab/pyproject.toml constraints.txt $(CORE_SOURCES) $(PACKAGES)
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Engram needs Python 3.11 or newer; set PYTHON=...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(BIN)/python -m pip install --quiet -c constraints.txt scikit-build-core nanobind cmake ninja
 	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev
-	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e '.[plots]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --no-build-isolation -e . -e lab
 	touch $(STAMP)
 
 demo: setup
@@ -36,14 +36,14 @@ test-long: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
 check: setup
-	$(BIN)/ruff format --check src tests benchmarks
-	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff format --check src lab tests
+	$(BIN)/ruff check src lab tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: setup
-	$(BIN)/ruff format src tests benchmarks
-	$(BIN)/ruff check --fix src tests benchmarks
+	$(BIN)/ruff format src lab tests
+	$(BIN)/ruff check --fix src lab tests
 
 clean:
-	rm -rf $(VENV) build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build lab/build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

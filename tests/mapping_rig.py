@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tests.synthetic_world import Seen
 
-from engram.drive import OpenMap, Settings
-from engram.drive.mapping import loop_search
-from engram.experience.model import Clock, NodeId, Session, session_id
 from engram.geometry import SE3
+from engram.graph.model import Clock, NodeId, Session, session_id
 from engram.localiser import Budget, Localisation
 from engram.mapper import Mapper, MappingStep, Saver
-from engram.store import MapStore
-from synthetic_world import Seen
+from engram.maps import MapStore
+from engram.robot import OpenMap, Settings
+from engram.robot.mapping import loop_search
 
 
 @dataclass

@@ -13,7 +13,7 @@ import typer
 
 import engram
 from engram.cli.app import app
-from engram.drive import MapOptions, map_drive, open_drive
+from engram.robot import MapOptions, map_drive, open_drive
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

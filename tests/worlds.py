@@ -4,9 +4,10 @@ from uuid import UUID
 
 import numpy as np
 
-from engram.experience.basin import MatchBasin
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import (
+from engram.geometry import SE3, CameraId
+from engram.graph.basin import MatchBasin
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import (
     Attempt,
     Clock,
     Edge,
@@ -21,9 +22,9 @@ from engram.experience.model import (
     node_id,
     path_id,
 )
-from engram.experience.neighbourhood import Neighbourhood
-from engram.experience.path_memory import ALL_KINDS, PathMemory
-from engram.geometry import SE3, CameraId
+from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.paths import ALL_KINDS, PathMemory
+from engram.maps import MapContents
 from engram.ranking import (
     Background,
     Lessons,
@@ -33,7 +34,6 @@ from engram.ranking import (
     RunAttempts,
     SessionTimes,
 )
-from engram.store import MapContents
 
 CAMERA = CameraId("0" * 32)
 

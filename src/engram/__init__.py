@@ -10,11 +10,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from engram.drive import LiveRobot, OpenMap, Settings, map_drive, open_drive, open_map
     from engram.errors import EngramError
     from engram.frontend import StereoPair
     from engram.geometry import SE3, StereoCamera
     from engram.localiser import Budget, Localisation, LocalisationStatus, Position
+    from engram.robot import LiveRobot, OpenMap, Settings, map_drive, open_drive, open_map
 
 __version__ = "0.1.0"
 
@@ -40,17 +40,17 @@ _HOMES = {
     "SE3": "engram.geometry",
     "Budget": "engram.localiser",
     "EngramError": "engram.errors",
-    "LiveRobot": "engram.drive",
+    "LiveRobot": "engram.robot",
     "Localisation": "engram.localiser",
     "LocalisationStatus": "engram.localiser",
-    "OpenMap": "engram.drive",
+    "OpenMap": "engram.robot",
     "Position": "engram.localiser",
-    "Settings": "engram.drive",
+    "Settings": "engram.robot",
     "StereoCamera": "engram.geometry",
     "StereoPair": "engram.frontend",
-    "map_drive": "engram.drive",
-    "open_drive": "engram.drive",
-    "open_map": "engram.drive",
+    "map_drive": "engram.robot",
+    "open_drive": "engram.robot",
+    "open_map": "engram.robot",
 }
 
 

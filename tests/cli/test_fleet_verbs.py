@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import MapCorruptError
-from engram.fleet import MergeReport
+from engram.fleet.merge import MergeReport
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def failing(monkeypatch):
             told(MergeReport(str(robots[0]), "", ["r1"], revision=2, taken=3))
             raise error
 
-        monkeypatch.setattr("engram.fleet.merge_maps", merge_maps)
+        monkeypatch.setattr("engram.fleet.merge.merge_maps", merge_maps)
 
     return fail
 

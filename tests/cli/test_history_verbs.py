@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from engram.drive import MapOptions, Settings, map_drive, open_drive
-from engram.store import MapStore
+from engram.maps import MapStore
+from engram.robot import MapOptions, Settings, map_drive, open_drive
 
 
 @pytest.fixture

@@ -122,14 +122,6 @@ def test_replay_in_real_time_counts_late_frames(engram, street: Path, town: Path
     assert engram("localise", town, street, "--json").json["summary"]["late_frames"] == 0
 
 
-def test_there_and_back_is_a_drive_of_its_own(engram, street: Path, tmp_path: Path) -> None:
-    path = tmp_path / "loop.engram"
-    report = engram("map", path, street, "--there-and-back", 40, "--json").json
-    assert report["frames"] == 40
-    assert engram("check", path).status == 0
-    assert not engram("map", path, street, "--json").json["known"]
-
-
 def test_log_and_check_speak_of_a_sound_map(engram, town: Path) -> None:
     assert engram("log", town, "--json").json[0]["number"] == 1
     ran = engram("check", town, "--json")
@@ -263,7 +255,7 @@ def test_a_second_writer_is_told_who_writes(engram, street: Path, town: Path) ->
         [
             sys.executable,
             "-c",
-            "import sys; from engram.store import MapStore\n"
+            "import sys; from engram.maps import MapStore\n"
             f"with MapStore.open_for_writing({str(town)!r}):\n"
             "    print('open', flush=True); sys.stdin.read()",
         ],
@@ -321,7 +313,7 @@ def test_ctrl_c_before_there_is_a_result_is_said_in_json_too(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("engram.drive.open_drive", interrupted)
+    monkeypatch.setattr("engram.robot.open_drive", interrupted)
     ran = engram("localise", town, street, "--json")
     assert ran.status == 130
     assert "interrupted" in ran.json["error"]["message"]

@@ -8,9 +8,9 @@ import threading
 from contextlib import contextmanager
 from pathlib import Path
 
-from engram.drive import Settings
-from engram.fleet import build_map
+from engram.fleet.build import build_map
 from engram.processes import end_with_parent
+from engram.robot import Settings
 
 from .builds import options
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import signal
 from contextlib import contextmanager
 
-from engram.drive import MapOptions, Settings
-from engram.fleet import BuildOptions, JudgeOptions, build_map
-from engram.fleet.gate import GateOptions
-from engram.fleet.group_mapping import map_group
+from engram.fleet.build import BuildOptions, JudgeOptions, build_map
+from engram.fleet.build.group_mapping import map_group
+from engram.fleet.merge.gate import GateOptions
+from engram.robot import MapOptions, Settings
 
 from .robots import OPTIONS
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from engram.drive import Settings
-from engram.fleet import merge_maps
-from engram.store import bulk_writer
+from engram.fleet.merge import merge_maps
+from engram.maps import bulk_writer
+from engram.robot import Settings
 
 from .robots import OPTIONS
 

@@ -6,14 +6,14 @@ import hashlib
 from pathlib import Path
 
 import numpy as np
+from tests.mapping_rig import Mapped, map_simulated
+from tests.synthetic_world import World, drive
 
-from engram.drive import Settings
-from engram.experience.model import Clock, NodeId
-from engram.fleet import MergeOptions, MergeReport, merge_maps
+from engram.fleet.merge import MergeOptions, MergeReport, merge_maps
 from engram.geometry import SE3
+from engram.graph.model import Clock, NodeId
+from engram.robot import Settings
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
-from mapping_rig import Mapped, map_simulated
-from synthetic_world import World, drive
 
 DAY_NS = 86_400_000_000_000
 HOUR_NS = 3_600_000_000_000

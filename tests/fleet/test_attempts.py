@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.worlds import attempts_of
 
-from engram.experience.model import SessionId
-from engram.fleet import DownloadOptions, download, silent
-from engram.fleet.attempts import lacking
-from engram.store import AttemptArrays, MapStore
+from engram.fleet.download import DownloadOptions, download
+from engram.fleet.merge import silent
+from engram.fleet.merge.attempts import lacking
+from engram.graph.model import SessionId
+from engram.maps import AttemptArrays, MapStore
 
 from .robots import merged, robot_map
 

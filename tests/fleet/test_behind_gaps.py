@@ -8,17 +8,17 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import PERIOD_NS, drive
 
-from engram.drive import open_map
-from engram.experience.model import Edge, EdgeKind, Node, SessionId, node_id
-from engram.fleet import Seed
-from engram.fleet.behind_gaps import position_behind_gap
-from engram.fleet.segments import Segment
+from engram.fleet.merge import Seed
+from engram.fleet.merge.behind_gaps import position_behind_gap
+from engram.fleet.merge.segments import Segment
 from engram.geometry import SE3
+from engram.graph.model import Edge, EdgeKind, Node, SessionId, node_id
 from engram.localiser import Position
 from engram.odometry import OdometryStatus, OdometryStep
-from mapping_rig import map_simulated
-from synthetic_world import PERIOD_NS, drive
+from engram.robot import open_map
 
 from .robots import DAY_NS, WORLD, merged, robot_map, truth_of
 

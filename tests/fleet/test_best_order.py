@@ -9,19 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from engram.drive import MapOptions, Settings, map_drive, open_drive
 from engram.errors import ConfigError, MapError
-from engram.fleet import (
-    BestOrder,
-    GateOptions,
-    Orders,
-    best_order,
-    building,
-    find_best_order,
-    judging,
-    silent,
-)
-from engram.store import MapStore
+from engram.fleet.build import BestOrder, Orders, best_order, building, find_best_order, judging
+from engram.fleet.merge import GateOptions, silent
+from engram.maps import MapStore
+from engram.robot import MapOptions, Settings, map_drive, open_drive
 
 from .builds import build, judge, map_in_this_process
 from .robots import OPTIONS

@@ -10,9 +10,9 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from engram.experience.model import Edge, EdgeKind, NodeId
-from engram.fleet.bridges import close_gaps
+from engram.fleet.download.bridges import close_gaps
 from engram.geometry import SE3, propagate_covariance
+from engram.graph.model import Edge, EdgeKind, NodeId
 
 
 def node_id(number: int) -> NodeId:

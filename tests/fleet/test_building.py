@@ -14,11 +14,11 @@ from pathlib import Path
 
 import pytest
 
-from engram.drive import MapOptions, Settings
 from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
-from engram.fleet import JudgeOptions, build_map, order_costs
-from engram.fleet.gate import GateOptions
-from engram.store import MapStore
+from engram.fleet.build import JudgeOptions, build_map, order_costs
+from engram.fleet.merge.gate import GateOptions
+from engram.maps import MapStore
+from engram.robot import MapOptions, Settings
 
 from .builds import build, interrupting, options
 
@@ -69,8 +69,8 @@ def test_a_worker_that_dies_is_replaced_and_the_map_is_the_same(tmp_path, logs, 
 @contextmanager
 def process_of_a_build(*arguments):
     """A process that builds, after the first word from a worker of it."""
-    command = [sys.executable, "-m", "fleet.building_process", *map(str, arguments)]
-    tests = Path(__file__).parents[1]
+    command = [sys.executable, "-m", "tests.fleet.building_process", *map(str, arguments)]
+    tests = Path(__file__).parents[2]
     with subprocess.Popen(command, cwd=tests, stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()
         yield process

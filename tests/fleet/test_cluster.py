@@ -8,13 +8,13 @@ from types import SimpleNamespace
 
 import pytest
 
-from engram.drive import Settings
 from engram.errors import SequenceError, WorkerError
-from engram.fleet import cluster
-from engram.fleet.cluster import map_groups_on_cluster
-from engram.fleet.group_mapping import GroupTask
-from engram.fleet.workers import WORDS_AT_ONCE
-from engram.store import MapStore
+from engram.fleet.build import cluster
+from engram.fleet.build.cluster import map_groups_on_cluster
+from engram.fleet.build.group_mapping import GroupTask
+from engram.fleet.build.workers import WORDS_AT_ONCE
+from engram.maps import MapStore
+from engram.robot import Settings
 
 from .builds import build, options
 

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import drive
 
-from engram.experience.basin import MatchBasin
-from engram.fleet import DownloadOptions
-from engram.fleet.affinity import affinities
-from engram.fleet.coverage import Coverage, Demand, expected_missed, greedy_order
-from engram.fleet.selections import coverage_for
-from engram.fleet.stock import Stock
-from engram.store import MapStore
-from mapping_rig import map_simulated
-from synthetic_world import drive
+from engram.fleet.download import DownloadOptions
+from engram.fleet.download.affinity import affinities
+from engram.fleet.download.coverage import Coverage, Demand, expected_missed, greedy_order
+from engram.fleet.download.selections import coverage_for
+from engram.fleet.download.stock import Stock
+from engram.graph.basin import MatchBasin
+from engram.maps import MapStore
 
 from .robots import DAY_NS, WORLD
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from engram.errors import ConfigError
-from engram.experience.clock import hour_of_day
-from engram.experience.model import Clock, Session, SessionId
-from engram.experience.sun import day_of_year, sun_height_deg
-from engram.fleet import DownloadOptions, daylight
-from engram.fleet.daylight import importance, learnt_latitude
+from engram.fleet.download import DownloadOptions, daylight
+from engram.fleet.download.daylight import importance, learnt_latitude
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Clock, Session, SessionId
+from engram.graph.sun import day_of_year, sun_height_deg
 
 CAMERAS = {"camera": SimpleNamespace(fx=400.0)}
 

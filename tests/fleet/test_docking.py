@@ -18,7 +18,6 @@ from uuid import uuid4
 import numpy as np
 import pytest
 
-from engram.drive import MapOptions, Settings, map_drive, open_drive, session_of_drive
 from engram.errors import (
     ConfigError,
     IncompatibleError,
@@ -29,19 +28,20 @@ from engram.errors import (
     RefusedError,
     SequenceError,
 )
-from engram.experience.model import Clock, NodeId, Omission, SessionId
-from engram.fleet import MergeOptions, docking, gate, merge_maps, merging
-from engram.fleet.gate import check_held_out, what_is_worse
-from engram.fleet.report import MergeReport, Reason, RunReport, Seed, SegmentReport
+from engram.fleet.merge import MergeOptions, docking, gate, merge_maps, merging
+from engram.fleet.merge.gate import check_held_out, what_is_worse
+from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.frontend import DescriptorKind
 from engram.geometry import SE3
+from engram.graph.model import Clock, NodeId, Omission, SessionId
+from engram.maps import MapStore
 from engram.measures import Drive
-from engram.store import MapStore
+from engram.robot import MapOptions, Settings, map_drive, open_drive, session_of_drive
 
 from .robots import OPTIONS, frame_log, merged, robot_map
 
 HOUR_NS = 3_600_000_000_000
-OLDER_FORMAT = Path(__file__).parents[1] / "store" / "data" / "format-2.engram"
+OLDER_FORMAT = Path(__file__).parents[1] / "maps" / "data" / "format-2.engram"
 WELL = Drive(np.ones(40), np.ones(40, np.bool_))
 BADLY = Drive(np.ones(40), np.zeros(40, np.bool_))
 
@@ -133,10 +133,10 @@ def judged(monkeypatch):
         answers = iter([[one] for one in found])
         named = SimpleNamespace(id=SessionId(uuid4()), camera="another", start_ns=0)
         monkeypatch.setattr(
-            "engram.fleet.gate.Gate._localise", lambda self, store, _: next(answers)
+            "engram.fleet.merge.gate.Gate._localise", lambda self, store, _: next(answers)
         )
-        monkeypatch.setattr("engram.fleet.gate.open_drive", lambda path: path)
-        monkeypatch.setattr("engram.fleet.gate.session_of_drive", lambda sequence: named)
+        monkeypatch.setattr("engram.fleet.merge.gate.open_drive", lambda path: path)
+        monkeypatch.setattr("engram.fleet.merge.gate.session_of_drive", lambda sequence: named)
 
     return say
 
@@ -625,9 +625,9 @@ def kill_and_look(tmp_path: Path, fleet: dict, kills: int, seed: int) -> None:
     seconds = 2.0
     for _ in range(kills):
         merging = subprocess.Popen(
-            [sys.executable, "-m", "fleet.merging_process", centre, fleet["longer"][0]],
+            [sys.executable, "-m", "tests.fleet.merging_process", centre, fleet["longer"][0]],
             stdout=subprocess.PIPE,
-            cwd=Path(__file__).parents[1],
+            cwd=Path(__file__).parents[2],
             text=True,
         )
         assert merging.stdout is not None

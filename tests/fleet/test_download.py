@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.mapping_rig import localise_simulated, map_simulated
+from tests.synthetic_world import drive
 from tests.worlds import attempts_of
 
-from engram.drive.place_words import keep_missing_words, stored_words
 from engram.errors import ConfigError, InputError, MapError, NotAMapError, RevisionError
-from engram.experience.model import EdgeKind, path_id
-from engram.fleet import DownloadOptions, DownloadReport, download, silent
-from engram.fleet.downloading import most_that_fit
-from engram.fleet.selections import SELECTIONS, UNDERSTOOD
+from engram.fleet.download import DownloadOptions, DownloadReport, download
+from engram.fleet.download.downloading import most_that_fit
+from engram.fleet.download.selections import SELECTIONS, UNDERSTOOD
+from engram.fleet.merge import silent
 from engram.frontend import DescriptorKind
+from engram.graph.model import EdgeKind, path_id
+from engram.maps import MapStore
 from engram.places import default_vocabulary
-from engram.store import MapStore
-from mapping_rig import localise_simulated, map_simulated
-from synthetic_world import drive
+from engram.places.stored_words import keep_missing_words, stored_words
 
 from .robots import DAY_NS, WORLD, merged
 
@@ -418,7 +419,7 @@ class TestMistakes:
         def fails(*_):
             raise MapError("no report")
 
-        monkeypatch.setattr("engram.fleet.downloading._report", fails)
+        monkeypatch.setattr("engram.fleet.download.downloading._report", fails)
         with pytest.raises(MapError, match="no report"):
             sent(centre, tmp_path / "out.engram", "tod", start_h=9.0)
         assert list(tmp_path.iterdir()) == []

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from tests.worlds import attempts_of
 
-from engram.drive import MapOptions, Settings, map_drive, open_drive, open_map
-from engram.experience.model import EdgeKind, PathEntryKind, path_id
-from engram.fleet import DownloadOptions, Reason, Seed, download, silent
-from engram.fleet.handed_in import HandedIn
-from engram.store import MapStore
+from engram.fleet.download import DownloadOptions, download
+from engram.fleet.merge import Reason, Seed, silent
+from engram.fleet.merge.handed_in import HandedIn
+from engram.graph.model import EdgeKind, PathEntryKind, path_id
+from engram.maps import MapStore
+from engram.robot import MapOptions, Settings, map_drive, open_drive, open_map
 
 from .robots import OPTIONS, frame_log, merged, robot_map, truth_of
 

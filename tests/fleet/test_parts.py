@@ -6,10 +6,10 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.fleet.parts import Parts
+from engram.fleet.merge.parts import Parts
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -7,7 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.drive import (
+from engram.fleet.download import DownloadOptions, download
+from engram.fleet.merge import MergeOptions, MergeReport, merge_maps, silent
+from engram.graph.model import NodeId, Omission
+from engram.maps import MapStore
+from engram.robot import (
     LocaliseOptions,
     LocaliseRun,
     MapOptions,
@@ -16,10 +20,7 @@ from engram.drive import (
     open_drive,
     summarise,
 )
-from engram.experience.model import NodeId, Omission
-from engram.fleet import DownloadOptions, MergeOptions, MergeReport, download, merge_maps, silent
 from engram.sequences.trajectories import Trajectory, read_kitti_poses, read_matrix_truth
-from engram.store import MapStore
 
 pytestmark = pytest.mark.data
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from engram.drive import Settings, map_drive, open_drive, session_of_drive
 from engram.errors import ConfigError, InputError, MapError, MapLockedError, StorageFullError
-from engram.fleet import building, find_best_order
-from engram.fleet.scratch import BuildPlan, Scratch, build_folder, sessions_of
-from engram.store import MapStore
+from engram.fleet.build import building, find_best_order
+from engram.fleet.build.scratch import BuildPlan, Scratch, build_folder, sessions_of
+from engram.maps import MapStore
+from engram.robot import Settings, map_drive, open_drive, session_of_drive
 
 from .builds import build, judge, map_in_this_process, options
 from .robots import OPTIONS

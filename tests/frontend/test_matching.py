@@ -9,6 +9,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
+from tests.scenes import CAMERA, Scene, normalised_error
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError, InputError
@@ -22,7 +23,6 @@ from engram.frontend.matching import (
     pair_seed,
 )
 from engram.geometry import SE3, StereoCamera
-from scenes import CAMERA, Scene, normalised_error
 
 CONFIG = MatcherConfig()
 # What the scenes' noise is: independent, without a common offset.
@@ -258,7 +258,7 @@ def test_same_input_same_bits_on_every_instruction_set() -> None:
 import hashlib, sys
 import numpy as np
 sys.path.insert(0, sys.argv[1])
-from scenes import Scene
+from tests.scenes import Scene
 from engram import _core
 from engram.frontend.matching import MatcherConfig, match_frames
 from engram.geometry import SE3

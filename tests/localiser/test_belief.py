@@ -6,9 +6,9 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.geometry import SE3, CameraId
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.localiser import BeliefConfig, PlaceBelief
 
 AHEAD = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))

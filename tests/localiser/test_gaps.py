@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from engram.geometry import SE3
-from engram.localiser import driven_steps_m, shared_out
-from engram.localiser.gaps import GapFiller
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry.motion import GapFiller, driven_steps_m, shared_out
 
 FIRST = OdometryStep(OdometryStatus.FIRST)
 BLIND = OdometryStep(OdometryStatus.NO_CONSENSUS)

@@ -7,11 +7,11 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.experience.neighbourhood import Neighbourhood
 from engram.frontend.matching import Match
 from engram.geometry import SE3, CameraId
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
+from engram.graph.neighbourhood import Neighbourhood
 from engram.localiser import AcceptanceConfig, Position
 from engram.localiser.attempts import Candidate, Outcome
 from engram.localiser.hypotheses import Hypotheses

@@ -4,15 +4,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive
 
-from engram.drive import OpenMap, Settings
 from engram.errors import MapCorruptError
 from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
+from engram.maps import MapStore
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
-from engram.store import MapStore
-from mapping_rig import map_simulated
-from synthetic_world import World, drive
+from engram.robot import OpenMap, Settings
 
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.synthetic_world import World, see
 
 from engram.errors import IncompatibleError
 from engram.frontend import DescriptorKind, Frame, Landmarks
@@ -19,7 +20,6 @@ from engram.localiser.relocalisation import (
     van_der_corput_order,
 )
 from engram.places import Vocabulary, default_vocabulary
-from synthetic_world import World, see
 
 
 @given(st.integers(0, 500))

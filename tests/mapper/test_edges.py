@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from tests.worlds import flat_graph, forward, make_edge
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import EdgeKind
 from engram.frontend import Match
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import EdgeKind
 from engram.localiser import AcceptanceConfig
 from engram.localiser.attempts import Candidate, Outcome
 from engram.mapper import match_edges

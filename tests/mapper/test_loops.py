@@ -6,15 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.mapping_rig import Mapped, map_simulated
+from tests.synthetic_world import World, drive, see
 
-from engram.drive import OpenMap
 from engram.errors import MapCorruptError
-from engram.experience.model import Edge, EdgeKind
 from engram.geometry import SE3
+from engram.graph.model import Edge, EdgeKind
 from engram.localiser import FrameMatcher
-from engram.store import MapStore
-from mapping_rig import Mapped, map_simulated
-from synthetic_world import World, drive, see
+from engram.maps import MapStore
+from engram.robot import OpenMap
 
 # A lap of 151 m with a step every 0.7 m: 0.17° a step too much is 37° and 17 m at its end.
 LAP_M = 2 * np.pi * 24.0

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.mapping_rig import errors_m, localise_simulated, map_simulated
+from tests.synthetic_world import World, drive
 
-from engram.drive import OpenMap
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import EdgeKind, PathEntryKind
 from engram.frontend import FrameStatus
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import EdgeKind, PathEntryKind
+from engram.maps import MapStore
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.store import MapStore
-from mapping_rig import errors_m, localise_simulated, map_simulated
-from synthetic_world import World, drive
+from engram.robot import OpenMap
 
 WORLD = World(60.0)
 ROAD = np.arange(0.0, 55.0, 0.7)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.mapping_rig import errors_m, localise_simulated, map_simulated
+from tests.synthetic_world import World, drive
 
 from engram.localiser import LocalisationStatus
-from mapping_rig import errors_m, localise_simulated, map_simulated
-from synthetic_world import World, drive
 
 ROAD = World(length_m=120.0, seed=11)
 ELSEWHERE = World(length_m=60.0, seed=12)

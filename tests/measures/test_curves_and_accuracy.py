@@ -13,8 +13,8 @@ from engram.measures import (
     failure_gap,
     failure_lost,
     failure_route,
-    pose_errors,
 )
+from engram_lab.accuracy import pose_errors
 
 
 def drive(marks: str, step_m: float = 1.0) -> Drive:

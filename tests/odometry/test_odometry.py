@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.scenes import CAMERA, Scene, normalised_error
 
 from engram.errors import ConfigError, IncompatibleError
 from engram.frontend import DescriptorKind, Frame, FrameStatus, MatcherConfig
 from engram.geometry import SE3, StereoCamera
 from engram.odometry import Odometry, OdometryConfig, OdometryStatus, WindowConfig
-from scenes import CAMERA, Scene, normalised_error
 
 MOTION = SE3.exp([0.03, 0.0, 0.4, 0.0, 0.015, 0.002])
 INTERVAL_NS = 100_000_000

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference.bundle_adjustment import adjust, project
+from tests.scenes import CAMERA
 
 from engram import _core
 from engram.geometry import SE3
-from reference.bundle_adjustment import adjust, project
-from scenes import CAMERA
 
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.baseline_m)
 SCALE = 11.34

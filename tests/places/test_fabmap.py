@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.fabmap import log_likelihood
 
 from engram.frontend import DescriptorKind
 from engram.places import DetectorModel, FabMap, FabMapConfig
 from places.worlds import look, places, small_vocabulary
-from reference.fabmap import log_likelihood
 
 VOCABULARY = small_vocabulary()
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from tests.worlds import flat_graph, make_context, memory_of, path_uuid, run_of, session_uuid
 
-from engram.drive.localising import LocaliseOptions
 from engram.errors import ConfigError
-from engram.experience.model import PathEntry, PathEntryKind, path_id
+from engram.graph.model import PathEntry, PathEntryKind, path_id
 from engram.ranking import POLICIES, Foreseen, RunLog, policy_named
 from engram.ranking.bandit import session_tallies
 from engram.ranking.time_of_day import TimeOfDayPolicy
+from engram.robot.localising import LocaliseOptions
 
 
 def order_of(name: str, context) -> list[int]:

@@ -10,7 +10,7 @@ import numpy as np
 from engram import _core
 from engram.geometry import SE3
 from engram.ranking.recall import RecallPolicy
-from engram.ranking.synthetic import SyntheticPlace
+from engram_lab.bench.synthetic import SyntheticPlace
 
 PRINT_DIGEST = """
 from engram import _core
@@ -21,7 +21,7 @@ print(_core.isa, digest())
 
 def digest() -> str:
     """Of scores over long and short bitsets, and of a search over a random graph."""
-    from tests.experience.test_graph import random_graph
+    from tests.graph.test_graph import random_graph
 
     parts = []
     for path_count in (0, 1, 150, 700):

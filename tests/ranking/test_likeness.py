@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests.worlds import MadeUpWords, flat_graph, make_context
 
 from engram.errors import MapCorruptError
-from engram.experience.model import NodeId
 from engram.frontend import DescriptorKind, Frame
+from engram.graph.model import NodeId
 from engram.places import default_vocabulary
 from engram.ranking import QuantisedWords
 from engram.ranking.likeness import Likeness, standard_likenesses

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram import _core
-from engram.experience.basin import BIN_COUNT, BIN_M, MatchBasin
+from engram.graph.basin import BIN_COUNT, BIN_M, MatchBasin
 
 UUID_WORDS = np.array([[3, 1], [3, 0], [2, 9], [0, 5], [2**63, 0], [1, 1]], dtype=np.uint64)
 

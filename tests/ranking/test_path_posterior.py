@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests.reference.path_posterior import posterior, prior_of, theta_row
 from tests.worlds import flat_graph, make_context, memory_of, neighbourhood_of, path_uuid
 
-from engram.experience.model import PathEntry, PathEntryKind
-from engram.experience.path_memory import PathMemory
+from engram.graph.model import PathEntry, PathEntryKind
+from engram.graph.paths import PathMemory
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_literal import PathLiteralPolicy
 

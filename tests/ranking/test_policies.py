@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.worlds import make_context, neighbourhood_of, path_uuid
 
 from engram.errors import ConfigError
-from engram.experience.basin import BASIN_LEVEL
+from engram.graph.basin import BASIN_LEVEL
 from engram.ranking import POLICIES, Foreseen, RankingContext, policy_named
 from engram.ranking.context import order_by
 

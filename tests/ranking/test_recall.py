@@ -19,14 +19,14 @@ from tests.worlds import (
 )
 
 from engram import _core
-from engram.experience.basin import prior_basin_m
-from engram.experience.model import PathEntry, PathEntryKind, path_id
-from engram.experience.path_memory import PathMemory
+from engram.graph.basin import prior_basin_m
+from engram.graph.model import PathEntry, PathEntryKind, path_id
+from engram.graph.paths import PathMemory
 from engram.ranking import Lessons, PastAttempts
 from engram.ranking.lessons import UNKNOWN_BASE
 from engram.ranking.recall import RECALL, RecallPolicy
 from engram.ranking.run import RunLog
-from engram.ranking.synthetic import SyntheticPlace
+from engram_lab.bench.synthetic import SyntheticPlace
 
 SESSIONS = 4
 

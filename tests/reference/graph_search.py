@@ -4,9 +4,9 @@ import heapq
 
 import numpy as np
 
-from engram.experience.chain_error import PivotedError
-from engram.experience.graph import ExperienceGraph
 from engram.geometry import SE3
+from engram.graph.chain_error import PivotedError
+from engram.graph.graph import ExperienceGraph
 
 LEVER_M = 10.0
 

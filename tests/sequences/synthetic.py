@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 
 from engram.errors import EngramError
-from engram.experience.model import Clock
 from engram.frontend import DescriptorKind, Frame, FrameStatus, Landmarks, StereoPair
 from engram.frontend.quantisation import LandmarkCodes, landmarks_from_codes
 from engram.geometry import SE3, StereoCamera
+from engram.graph.model import Clock
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.sequences import (
     FrameLogHeader,

@@ -23,8 +23,8 @@ from engram.errors import (
     SequenceError,
     StorageFullError,
 )
-from engram.experience.model import Clock
 from engram.geometry import SE3, propagate_covariance
+from engram.graph.model import Clock
 from engram.odometry import OdometryStatus
 from engram.sequences import FrameLog, FrameLogWriter, FrameRange, LoggedFrame, open_sequence
 

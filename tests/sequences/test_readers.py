@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from engram.errors import CalibrationError, ConfigError, InputError, SequenceError
-from engram.experience.model import Clock
+from engram.graph.model import Clock
 from engram.sequences import SEQUENCES, ImageSequence, first_pair_hash, open_sequence, session_of
 from engram.sequences.images import read_image
 

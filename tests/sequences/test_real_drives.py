@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from engram.experience.model import Clock
 from engram.frontend import Frontend
+from engram.graph.model import Clock
 from engram.odometry import Odometry
 from engram.sequences import (
     FrameLogHeader,

@@ -14,7 +14,6 @@ void bind_ordering(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
 void bind_places(nb::module_ &module);
 void bind_recall(nb::module_ &module);
-void bind_render(nb::module_ &module);
 void bind_window_ba(nb::module_ &module);
 
 NB_MODULE(_core, module) {
@@ -30,6 +29,5 @@ NB_MODULE(_core, module) {
   bind_path_scores(module);
   bind_places(module);
   bind_recall(module);
-  bind_render(module);
   bind_window_ba(module);
 }

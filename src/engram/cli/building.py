@@ -13,7 +13,7 @@ from engram.cli import options
 from engram.errors import ConfigError
 
 if TYPE_CHECKING:
-    from engram.fleet import JudgeOptions, Orders
+    from engram.fleet.build import JudgeOptions, Orders
 
 
 def build(
@@ -99,8 +99,9 @@ def build(
       engram build town.engram logs/*.framelog --groups 8 --best-first --validate held-out.framelog
     """
     from engram.cli.progress import progress
-    from engram.drive import MapOptions, load_settings
-    from engram.fleet import BuildOptions, MergeOptions, build_map
+    from engram.fleet.build import BuildOptions, build_map
+    from engram.fleet.merge import MergeOptions
+    from engram.robot import MapOptions, load_settings
 
     if seed is not None and grouping != "random":
         raise ConfigError("--seed is of random grouping: leave it out, or give --grouping random")
@@ -132,7 +133,7 @@ def _orders(best_order: bool, best_first: bool) -> Orders | None:
     Raises:
         ConfigError: two things are asked for.
     """
-    from engram.fleet import Orders
+    from engram.fleet.build import Orders
 
     if best_order and best_first:
         raise ConfigError("--best-order tries what --best-first does and more: give one of them")
@@ -149,7 +150,7 @@ def _judge(
     Raises:
         ConfigError: it is searched for without drives; or it is not, and an option means nothing.
     """
-    from engram.fleet import JudgeOptions
+    from engram.fleet.build import JudgeOptions
 
     if orders is not None:
         judge = JudgeOptions(drives, orders=orders)

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from engram.cli import options
-from engram.cli.endings import PartlyDoneError, VerbInterruptedError
-from engram.errors import EngramError
-
-if TYPE_CHECKING:
-    from engram.drive import Settings
-    from engram.fleet import DownloadOptions, LeftOut, TrialSummary
 
 
 def download(
@@ -86,26 +79,13 @@ def download(
             help="Send pictures for people too [default: not with budget].",
         ),
     ] = None,
-    check: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--check",
-            metavar="DRIVE",
-            help="Localise this held-out drive in such a download and in everything, and say what "
-            "was promised and what came of it; repeat.",
-        ),
-    ] = None,
-    lanes: options.Lanes = 2,
-    rounds: options.Rounds = 2,
     at: options.At = None,
-    config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
     """Write the part of a centre that a robot needs for its next mission, as a map of its own.
 
     Times are hours of day at the place: mean solar time where longitudes are known, else civil
-    time. The robot drives with the download alone, adds to it, and hands it back to `merge`. Where
-    a --check fails after OUT was written, OUT stays and is told of.
+    time. The robot drives with the download alone, adds to it, and hands it back to `merge`.
 
     \b
     Examples:
@@ -114,12 +94,10 @@ def download(
       engram download centre.engram r1.engram --policy tod+paths --start 9:30 --end 11:00
       engram download centre.engram r1.engram --policy budget --budget 200MB --start 17:00
       engram download centre.engram r1.engram --policy budget --budget 25% --start 17:00
-      engram download centre.engram r1.engram --policy tod --start 9:30 --check monday.framelog
     """
     from engram.cli.progress import progress
-    from engram.drive import load_settings
-    from engram.fleet import DownloadOptions, budget_from_text, hour_from_text
-    from engram.fleet import download as send
+    from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
+    from engram.fleet.download import download as send
 
     budget_bytes, budget_percent = budget_from_text(budget)
     asked = DownloadOptions(
@@ -139,65 +117,8 @@ def download(
         radius_m=radius,
         thumbnails=thumbnails,
     )
-    drives = _looked_at(centre, check or [], at)
-    settings = load_settings(config)
     report = send(centre, out, asked, at=at, progress=progress)
-    if not as_json:
-        typer.echo(report.text())
-    try:
-        tried, left_out = _check(centre, asked, drives, settings, lanes, rounds, at)
-    except EngramError as error:
-        raise PartlyDoneError(error, {**report.to_dict(), "check": []}) from error
-    except KeyboardInterrupt:
-        stopped = VerbInterruptedError(f"interrupted; {out} is whole")
-        raise PartlyDoneError(stopped, {**report.to_dict(), "check": []}) from None
     if as_json:
-        rows = [*map(asdict, tried), *(one.to_dict() for one in left_out)]
-        print(json.dumps({**report.to_dict(), "check": rows}))
-        return
-    for line in (*(one.text() for one in tried), *(one.text() for one in left_out)):
-        typer.echo(line)
-
-
-def _looked_at(centre: Path, drives: list[Path], at: str | None) -> dict[str, Path]:
-    """By session; what cannot judge shall not fail behind a download that is written."""
-    from engram.drive import open_drive, session_of_drive
-    from engram.fleet.trial import check_not_sent
-
-    opened = [(drive, open_drive(drive)) for drive in drives]
-    check_not_sent(centre, opened, at)
-    return {str(session_of_drive(sequence).id): drive for drive, sequence in opened}
-
-
-def _check(
-    centre: Path,
-    asked: DownloadOptions,
-    drives: dict[str, Path],
-    settings: Settings,
-    lanes: int,
-    rounds: int,
-    at: str | None,
-) -> tuple[list[TrialSummary], list[LeftOut]]:
-    """What such downloads promised held-out drives and what came of it, and drives left out."""
-    from functools import partial
-
-    from engram.cli.progress import progress
-    from engram.drive import LocaliseOptions, open_drive
-    from engram.fleet import DownloadOptions, summarise_trials, try_downloads
-
-    left_out: list[LeftOut] = []
-
-    def note(one: LeftOut) -> None:
-        left_out.append(replace(one, drive=str(drives[one.drive])))
-
-    trials = try_downloads(
-        centre,
-        {asked.policy: asked, "copy": DownloadOptions()},
-        [partial(open_drive, drive) for drive in drives.values()],
-        settings,
-        LocaliseOptions(lanes=lanes, rounds=rounds),
-        progress,
-        at=at,
-        left_out=note,
-    )
-    return summarise_trials(trials), left_out
+        print(json.dumps(report.to_dict()))
+    else:
+        typer.echo(report.text())

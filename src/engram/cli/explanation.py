@@ -10,7 +10,7 @@ import typer
 from engram.cli import options
 
 if TYPE_CHECKING:
-    from engram.drive.explaining import ExplainedCandidate, Explanation
+    from engram.robot.explaining import ExplainedCandidate, Explanation
 
 
 def explain(
@@ -43,8 +43,8 @@ def explain(
       engram explain town.engram drives/tuesday --frame 120 --policy recall
       engram explain town.engram drives/tuesday --frame 120 --policy path --json
     """
-    from engram.drive import load_settings, open_drive
-    from engram.drive.explaining import ExplainOptions, explain_frame
+    from engram.robot import load_settings, open_drive
+    from engram.robot.explaining import ExplainOptions, explain_frame
 
     sequence = open_drive(
         path,

@@ -39,7 +39,7 @@ def extract(
       engram extract 2011_09_26_drive_0001_sync colour.framelog --rig colour --channel blue
     """
     from engram.cli.progress import progress
-    from engram.drive import extract_log, load_settings, open_drive
+    from engram.robot import extract_log, load_settings, open_drive
 
     sequence = open_drive(
         path,

@@ -37,7 +37,7 @@ def log(
       engram log town.engram --oneline --limit 10
       engram log town.engram --json
     """
-    from engram.drive.history import log_text, map_log
+    from engram.maps.history import log_text, map_log
 
     revisions = map_log(map_path, at)[:limit]
     if as_json:
@@ -57,7 +57,7 @@ def show(
       engram show town.engram
       engram show town.engram 3 --json
     """
-    from engram.drive.history import log_text, show_revision
+    from engram.maps.history import log_text, show_revision
 
     shown, changed = show_revision(map_path, revision)
     if as_json:
@@ -91,11 +91,12 @@ def diff(
       engram diff town.engram 3 7
       engram diff town.engram winter head --picture changes.png
     """
-    from engram.drive.difference import diff_revisions
+    from engram.maps.difference import diff_revisions
+    from engram.viewing.difference import draw_difference
 
     found = diff_revisions(map_path, before, after, stretch_m=stretch)
     if picture is not None:
-        found.draw(picture)
+        draw_difference(found, picture)
     typer.echo(json.dumps(found.to_dict()) if as_json else found.text())
 
 
@@ -120,7 +121,7 @@ def tag(
       engram tag town.engram
       engram tag town.engram winter --delete
     """
-    from engram.drive.history import delete_tag, map_tags, tag_dict, tag_revision
+    from engram.maps.history import delete_tag, map_tags, tag_dict, tag_revision
 
     if name is None:
         _check_only_listing({"--delete": delete, "--move": move, "--message": bool(message)})
@@ -174,7 +175,7 @@ def revert(
       engram revert town.engram 7 --dry-run
       engram revert town.engram 7 --message "the camera was loose"
     """
-    from engram.drive.history import revert_revision
+    from engram.maps.history import revert_revision
 
     report = revert_revision(
         map_path, revision, author=author or _user(), message=message, dry_run=dry_run
@@ -198,7 +199,7 @@ def blame(
       engram blame town.engram 5f3a
       engram blame town.engram 5f3a91c2 --json
     """
-    from engram.drive.history import blame_node, blame_text
+    from engram.maps.history import blame_node, blame_text
 
     found = [blame_node(map_path, node, at) for node in nodes]
     if as_json:

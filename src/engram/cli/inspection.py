@@ -20,7 +20,7 @@ def info(
       engram info town.engram
       engram info town.engram --at 3 --json
     """
-    from engram.drive import describe_map
+    from engram.robot import describe_map
 
     found = describe_map(map_path, at)
     if as_json:
@@ -47,7 +47,7 @@ def check(
       engram check town.engram
       engram check town.engram --clean
     """
-    from engram.drive import check_map
+    from engram.robot import check_map
 
     report = check_map(map_path, clean=clean)
     if as_json:
@@ -80,7 +80,7 @@ def seal(
     Examples:
       engram seal town.engram
     """
-    from engram.drive import seal_map
+    from engram.robot import seal_map
 
     sealed = seal_map(map_path)
     if as_json:

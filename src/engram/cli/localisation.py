@@ -45,7 +45,6 @@ def localise(
     preload: Annotated[
         bool, typer.Option("--preload", help="Decode all images before the first frame.")
     ] = False,
-    there_and_back: options.ThereAndBack = None,
     format_: options.Format = None,
     rig: options.Rig = "grey",
     channel: options.Channel = "grey",
@@ -68,20 +67,19 @@ def localise(
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures pictures
     """
     from engram.cli.progress import progress
-    from engram.drive import (
+    from engram.robot import (
         FrameResult,
         LocaliseOptions,
         LocaliseRun,
-        PictureWriter,
         load_settings,
         open_drive,
         summarise,
-        write_trajectory,
     )
+    from engram.viewing.pictures import PictureWriter
+    from engram.viewing.trajectory import write_trajectory
 
     sequence = open_drive(
         path,
-        there_and_back=there_and_back,
         format=format_,
         rig=rig,
         channel=channel,
@@ -136,7 +134,7 @@ def localise(
 
 
 def _print(summary: dict[str, Any]) -> None:
-    from engram.drive.results import damage_warning
+    from engram.robot.results import damage_warning
 
     if summary["damaged_nodes"]:
         typer.echo(damage_warning(summary["damaged_nodes"]), err=True)

@@ -17,7 +17,6 @@ def map_(
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 2,
     deadline: options.Deadline = None,
-    there_and_back: options.ThereAndBack = None,
     format_: options.Format = None,
     rig: options.Rig = "grey",
     channel: options.Channel = "grey",
@@ -43,11 +42,10 @@ def map_(
       engram map town.engram kitti/sequences/06 --frames 0:50:2
     """
     from engram.cli.progress import progress
-    from engram.drive import MapOptions, load_settings, map_drive, open_drive
+    from engram.robot import MapOptions, load_settings, map_drive, open_drive
 
     sequence = open_drive(
         path,
-        there_and_back=there_and_back,
         format=format_,
         rig=rig,
         channel=channel,

@@ -13,7 +13,7 @@ from engram.cli.endings import PartlyDoneError, VerbInterruptedError
 from engram.errors import EngramError
 
 if TYPE_CHECKING:
-    from engram.fleet import MergeReport
+    from engram.fleet.merge import MergeReport
 
 
 def merge(
@@ -79,8 +79,8 @@ def merge(
       engram merge centre.engram r1.engram --require-better held-out.framelog
     """
     from engram.cli.progress import progress
-    from engram.drive import load_settings
-    from engram.fleet import MergeOptions, merge_maps
+    from engram.fleet.merge import MergeOptions, merge_maps
+    from engram.robot import load_settings
 
     asked = MergeOptions(
         policy,

@@ -14,7 +14,7 @@ def map_file(text: str) -> Path:
     Raises:
         BadParameter: it is an address. It may hold a password, so it is not repeated.
     """
-    from engram.store.map_store import is_address
+    from engram.maps.map_store import is_address
 
     if is_address(text):
         raise typer.BadParameter(
@@ -93,14 +93,6 @@ Policy: TypeAlias = Annotated[
         "--policy",
         help="Ranking: recall, path, distance, bandit, bag-of-words, time-of-day, "
         "collaborative, nearest-of-each, path-literal or random.",
-    ),
-]
-ThereAndBack: TypeAlias = Annotated[
-    int | None,
-    typer.Option(
-        "--there-and-back",
-        metavar="FRAMES",
-        help="Drive the sequence there and back until so many frames have passed.",
     ),
 ]
 Descriptor: TypeAlias = Annotated[

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from typing import Any
 
 import typer
 
-from engram.cli.benchmark import bench
 from engram.cli.building import build
-from engram.cli.demonstration import demo
 from engram.cli.downloading import download
 from engram.cli.endings import VerbInterruptedError
-from engram.cli.evaluation import evaluate
 from engram.cli.explanation import explain
 from engram.cli.extraction import extract
 from engram.cli.history import blame, diff, log, revert, show, tag
@@ -21,11 +19,9 @@ from engram.cli.inspection import check, info, seal
 from engram.cli.localisation import localise
 from engram.cli.mapping import map_
 from engram.cli.merging import merge
-from engram.cli.places import places, relocalise, vocabulary
-from engram.cli.simulation import simulate
+from engram.cli.vocabulary import vocabulary
 
 VERBS: dict[str, Callable[..., None]] = {
-    "demo": demo,
     "extract": extract,
     "map": map_,
     "localise": localise,
@@ -42,28 +38,28 @@ VERBS: dict[str, Callable[..., None]] = {
     "build": build,
     "download": download,
     "seal": seal,
-    "simulate": simulate,
     "vocabulary": vocabulary,
-    "relocalise": relocalise,
-    "places": places,
-    "bench": bench,
 }
 
-# Verbs that have verbs below them.
-GROUPS: tuple[typer.Typer, ...] = (evaluate,)
+# Where installed packages name verbs of their own: functions, or Typer groups of them.
+ENTRY_POINTS = "engram.verbs"
 # What is done is kept as it is done there.
 _GOES_ON = "interrupted; what was done is kept, and the same command goes on"
 
 
 def register(app: typer.Typer) -> None:
-    """Gives the program its verbs."""
+    """Gives the program its verbs, and those that other installed packages bring."""
     for name, verb in VERBS.items():
         app.command(name)(_tells_of_interruption(verb))
-    for group in GROUPS:
-        for command in group.registered_commands:
+    for entry in sorted(entry_points(group=ENTRY_POINTS)):
+        brought = entry.load()
+        if not isinstance(brought, typer.Typer):
+            app.command(entry.name)(_tells_of_interruption(brought))
+            continue
+        for command in brought.registered_commands:
             assert command.callback is not None
             command.callback = _tells_of_interruption(command.callback, _GOES_ON)
-        app.add_typer(group)
+        app.add_typer(brought, name=entry.name)
 
 
 def _tells_of_interruption(

@@ -11,7 +11,6 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
-from engram.localiser.gaps import GapFiller, Motion, driven_steps_m, shared_out
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
 from engram.localiser.place_book import PlaceBook, Searched
@@ -36,13 +35,11 @@ __all__ = [
     "ByAppearance",
     "Exhaustive",
     "FrameMatcher",
-    "GapFiller",
     "Localisation",
     "LocalisationStatus",
     "Localiser",
     "LocaliserConfig",
     "Matcher",
-    "Motion",
     "PlaceBelief",
     "PlaceBook",
     "Position",
@@ -55,8 +52,6 @@ __all__ = [
     "accept_lost",
     "agrees",
     "best_places",
-    "driven_steps_m",
     "plausible",
-    "shared_out",
     "spread",
 ]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError
-from engram.experience.neighbourhood import Neighbourhood
 from engram.frontend import Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
+from engram.graph.neighbourhood import Neighbourhood
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,9 +12,9 @@ from typing import Protocol, Self
 import numpy as np
 
 from engram.errors import MapCorruptError
-from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
 from engram.frontend.matching import NO_MATCH, Match, MatcherConfig, match_frames, pair_seed
+from engram.graph.model import LandmarkSource, NodeId
 from engram.localiser.acceptance import (
     AcceptanceConfig,
     Prediction,

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.graph import ExperienceGraph, HalfEdges
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph, HalfEdges
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.neighbourhood import Neighbourhood
+from engram.graph.graph import ExperienceGraph
+from engram.graph.neighbourhood import Neighbourhood
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import Position

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError
-from engram.experience.model import NodeId
 from engram.geometry import SE3, propagate_covariance
+from engram.graph.model import NodeId
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,12 @@ from uuid import uuid5
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.basin import MatchBasin
-from engram.experience.clock import Clocked, day_of, hour_of_day
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import (
+from engram.frontend import Frame, FrameStatus
+from engram.geometry import SE3
+from engram.graph.basin import MatchBasin
+from engram.graph.clock import Clocked, day_of, hour_of_day
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import (
     ENGRAM_NAMESPACE,
     Attempt,
     LandmarkSource,
@@ -25,10 +27,8 @@ from engram.experience.model import (
     node_id,
     path_id,
 )
-from engram.experience.neighbourhood import Neighbourhood
-from engram.experience.path_memory import PathMemory
-from engram.frontend import Frame, FrameStatus
-from engram.geometry import SE3
+from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.paths import PathMemory
 from engram.localiser.acceptance import Prediction
 from engram.localiser.attempts import (
     Attempter,
@@ -38,13 +38,13 @@ from engram.localiser.attempts import (
     Outcome,
     best_success,
 )
-from engram.localiser.gaps import GapFiller, Motion
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig
 from engram.localiser.walk import Walk
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry.motion import GapFiller, Motion
 from engram.ranking import (
     Background,
     Foreseen,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from engram.experience.model import NodeId, PathEntry, PathEntryKind, PathId
+from engram.graph.model import NodeId, PathEntry, PathEntryKind, PathId
 
 
 class Walk:

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Edge, EdgeKind
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind
 from engram.localiser import AcceptanceConfig, Position, Prediction, agrees
 from engram.localiser.attempts import Outcome
 

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError, MapCorruptError
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Edge, EdgeKind, Node, NodeId
 from engram.frontend import Frame
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, Node, NodeId
 from engram.localiser import (
     AcceptanceConfig,
     Matcher,

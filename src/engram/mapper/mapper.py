@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from engram.errors import ConfigError
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Edge, EdgeKind, Node, NodeId, Session, node_id
-from engram.experience.proximity import lay_proximity_edges, tighten_chain
 from engram.frontend import Frame, FrameStatus
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, Node, NodeId, Session, node_id
+from engram.graph.proximity import lay_proximity_edges, tighten_chain
 from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch

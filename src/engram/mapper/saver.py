@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.model import Attempt, Edge, Node, NodeId, PathEntry
 from engram.frontend import Frame
+from engram.graph.model import Attempt, Edge, Node, NodeId, PathEntry
 
 # Frames that may wait to be written, about 40 MB of them: past that a slow disk slows the drive.
 _QUEUE_LENGTH = 1000
@@ -40,7 +40,7 @@ class NodeWords:
 
 
 class RecordWriter(Protocol):
-    """Where a session's records go; `engram.store.SessionWriter` is one."""
+    """Where a session's records go; `engram.maps.SessionWriter` is one."""
 
     def add_node(self, node: Node, frame: Frame) -> None:
         """Adds a node with the frame that it was."""

@@ -1,6 +1,5 @@
 """How good is a map: pure functions of results (SPEC §8)."""
 
-from engram.measures.accuracy import PoseErrors, pose_errors
 from engram.measures.bootstrap import (
     Interval,
     Resamples,
@@ -35,7 +34,6 @@ __all__ = [
     "Estimator",
     "Gaps",
     "Interval",
-    "PoseErrors",
     "Resamples",
     "SessionSums",
     "Statistic",
@@ -50,7 +48,6 @@ __all__ = [
     "gaps",
     "longest_gap_m",
     "not_localised_sums",
-    "pose_errors",
     "product",
     "ratio",
     "route_m",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.model import path_id
+from engram.graph.model import path_id
 from engram.ranking.context import RankingContext, round_robin
 from engram.ranking.reasons import IN_TURNS, Reasons
 

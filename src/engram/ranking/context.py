@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.experience.basin import MatchBasin
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import PathId
-from engram.experience.neighbourhood import Neighbourhood
-from engram.experience.path_memory import PathMemory
+from engram.graph.basin import MatchBasin
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import PathId
+from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.paths import PathMemory
 from engram.ranking.background import Background
 from engram.ranking.recent import Observations
 from engram.ranking.run import RunAttempts

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import PathId, path_id
-from engram.experience.path_memory import PathMemory
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import PathId, path_id
+from engram.graph.paths import PathMemory
 
 # A node of the same experience tells as much less as it is farther along the drive: e-fold per
 # 3 m, nothing beyond 4 m. The chains are sampled every metre, and a drive attempts some of them.

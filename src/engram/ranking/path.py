@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.basin import BASIN_LEVEL
+from engram.graph.basin import BASIN_LEVEL
 from engram.ranking.context import RankingContext
 from engram.ranking.path_literal import PathLiteralPolicy
 from engram.ranking.reasons import Reasons

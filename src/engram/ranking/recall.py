@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.experience.basin import prior_basin_m
+from engram.graph.basin import prior_basin_m
 from engram.ranking.bandit import PRIOR_ATTEMPTS, PRIOR_RATE
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.likeness import standard_likenesses

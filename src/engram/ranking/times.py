@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.experience.clock import day_of, hour_of_day
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import Session, SessionId
+from engram.graph.clock import day_of, hour_of_day
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Session, SessionId
 
 
 class SessionTimes:

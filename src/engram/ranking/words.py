@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import MapCorruptError
-from engram.experience.graph import ExperienceGraph
-from engram.experience.model import LandmarkSource, NodeId
 from engram.frontend import Frame
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import LandmarkSource, NodeId
 from engram.places import Vocabulary
 from engram.places.bag_of_words import inverse_frequencies
 

@@ -6,7 +6,6 @@ from engram.sequences.identity import first_pair_hash, session_of
 from engram.sequences.image_sequence import ImageSequence
 from engram.sequences.opening import SEQUENCES, open_sequence
 from engram.sequences.sequence import FrameSequence, LoggedFrame, SequenceInfo, StereoSequence
-from engram.sequences.simulated import SimulatedSequence
 
 __all__ = [
     "SEQUENCES",
@@ -18,7 +17,6 @@ __all__ = [
     "ImageSequence",
     "LoggedFrame",
     "SequenceInfo",
-    "SimulatedSequence",
     "StereoSequence",
     "first_pair_hash",
     "open_sequence",

@@ -14,7 +14,6 @@ import numpy as np
 import yaml
 
 from engram.errors import CalibrationError, InputError, SequenceError
-from engram.experience.model import Clock
 from engram.geometry import SE3
 from engram.geometry.rectification import (
     DistortionModel,
@@ -23,6 +22,7 @@ from engram.geometry.rectification import (
     Rectification,
     rectify,
 )
+from engram.graph.model import Clock
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.listing import BadPlace, StampedFile, image_files, pair_by_stamp
 from engram.sequences.options import OpenOptions

@@ -12,8 +12,6 @@ import numpy as np
 
 from engram.config import load_toml
 from engram.errors import CalibrationError, ConfigError, InputError, SequenceError
-from engram.experience.clock import check_longitude, check_zone
-from engram.experience.model import Clock
 from engram.geometry import SE3, StereoCamera
 from engram.geometry.rectification import (
     DistortionModel,
@@ -22,6 +20,8 @@ from engram.geometry.rectification import (
     Rectification,
     rectify,
 )
+from engram.graph.clock import check_longitude, check_zone
+from engram.graph.model import Clock
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.listing import (
     Listing,

@@ -6,9 +6,9 @@ import hashlib
 
 import numpy as np
 
-from engram.experience.model import Session, session_id
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
+from engram.graph.model import Session, session_id
 from engram.sequences.sequence import SequenceInfo
 
 # The robot of a drive whose source and caller name none.

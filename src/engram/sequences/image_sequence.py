@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError, SequenceError
-from engram.experience.model import Clock
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
 from engram.geometry.rectification import Rectification, RemapTable
+from engram.graph.model import Clock
 from engram.sequences.frame_range import FrameRange
 from engram.sequences.images import Channel, read_image
 from engram.sequences.listing import BadPlace, Listing, PairFiles, usable_pairs

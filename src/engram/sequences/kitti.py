@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import CalibrationError, SequenceError
-from engram.experience.model import Clock
 from engram.geometry import SE3, StereoCamera
+from engram.graph.model import Clock
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.images import image_size
 from engram.sequences.listing import Listing, PairFiles, numbered_files, pair_by_number

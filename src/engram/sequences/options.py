@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 
 from engram.errors import ConfigError
-from engram.experience.clock import check_longitude, check_zone
+from engram.graph.clock import check_longitude, check_zone
 from engram.sequences.frame_range import FrameRange
 from engram.sequences.images import Channel
 

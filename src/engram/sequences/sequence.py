@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
-from engram.experience.model import Clock
 from engram.frontend import Frame, StereoPair
 from engram.geometry import StereoCamera
+from engram.graph.model import Clock
 from engram.odometry import OdometryStep
 
 

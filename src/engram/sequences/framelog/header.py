@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from engram.errors import EngramError, MapCorruptError
-from engram.experience.clock import check_longitude, check_zone
-from engram.experience.model import Clock
 from engram.frontend import DescriptorKind
 from engram.geometry import SE3, StereoCamera
+from engram.graph.clock import check_longitude, check_zone
+from engram.graph.model import Clock
 from engram.sequences.sequence import SequenceInfo
 
 _CAMERA_NUMBERS = ("fx", "fy", "cx", "cy", "baseline_m")

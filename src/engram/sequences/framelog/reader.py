@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from engram.errors import ConfigError, MapCorruptError, SequenceError
+from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera, propagate_covariance
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.sequences.framelog import file
@@ -22,7 +23,6 @@ from engram.sequences.image_sequence import with_options
 from engram.sequences.images import Channel
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
-from engram.store.blob import content_digest
 
 SUFFIX = ".framelog"
 

@@ -14,12 +14,7 @@ from sqlalchemy import func
 
 from engram.errors import InputError, MapCorruptError
 from engram.frontend import Frame, FrameStatus
-from engram.geometry import SE3
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.sequences.framelog.file import frames_table
-from engram.sequences.framelog.header import FrameLogHeader
-from engram.sequences.sequence import LoggedFrame
-from engram.store.blob import (
+from engram.frontend.blobs import (
     HASH_BYTES,
     content_digest,
     decode_landmarks,
@@ -27,6 +22,11 @@ from engram.store.blob import (
     encode_landmarks,
     encode_thumbnail,
 )
+from engram.geometry import SE3
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.sequences.framelog.file import frames_table
+from engram.sequences.framelog.header import FrameLogHeader
+from engram.sequences.sequence import LoggedFrame
 
 # All but the blobs, of which the hashes at their beginning stand in: what a skipped frame needs.
 STEP_COLUMNS = (

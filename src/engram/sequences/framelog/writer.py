@@ -12,13 +12,13 @@ from sqlalchemy import Connection, func, insert, select, update
 
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapError
+from engram.frontend.blobs import content_digest
 from engram.sequences.framelog import file
 from engram.sequences.framelog.file import frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.reader import read_header
 from engram.sequences.framelog.rows import encode_row
 from engram.sequences.sequence import LoggedFrame
-from engram.store.blob import content_digest
 
 
 class FrameLogWriter:

@@ -1,0 +1,59 @@
+"""Fixtures for all tests."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import hypothesis
+import pytest
+
+from engram_lab.bench.data import synthetic_drive
+
+# A busy machine is no failure: no test has a time limit.
+hypothesis.settings.register_profile("engram", deadline=None, print_blob=True)
+hypothesis.settings.load_profile("engram")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def ctrl_c_raises() -> Iterator[None]:
+    """Ctrl-C means the same wherever the tests run: a shell's background jobs ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the real images that ENGRAM_DATA names; the test is skipped where there are none.
+
+    Tests that use it carry the marker `data`.
+    """
+    named = os.environ.get("ENGRAM_DATA")
+    if not named:
+        pytest.skip("ENGRAM_DATA names no folder of real images")
+    folder = Path(named)
+    if not folder.is_dir():
+        pytest.skip(f"ENGRAM_DATA names {folder}, which is no folder")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve pairs of a rendered street in the plain layout."""
+    folder = tmp_path_factory.mktemp("drives") / "street"
+    pairs = synthetic_drive(frames=12, step_m=0.8)
+    camera = pairs[0].camera
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        for number, pair in enumerate(pairs):
+            cv2.imwrite(str(folder / side / f"{number:06d}.png"), getattr(pair, side))
+    stamps = "".join(f"{number / 10:.6f}\n" for number in range(len(pairs)))
+    (folder / "times.txt").write_text(stamps)
+    values = [
+        f"{name} = {getattr(camera, name)}"
+        for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
+    ]
+    (folder / "calibration.toml").write_text("\n".join(["[rectified]", *values]) + "\n")
+    return folder

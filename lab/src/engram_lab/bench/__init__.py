@@ -1,0 +1,7 @@
+"""The stages of `engram bench`, each timed beside the plain pipeline in the same run."""
+
+from engram_lab.bench.report import BenchReport, Machine, Side, StageResult
+from engram_lab.bench.runner import run_bench
+from engram_lab.bench.stages import STAGES
+
+__all__ = ["STAGES", "BenchReport", "Machine", "Side", "StageResult", "run_bench"]

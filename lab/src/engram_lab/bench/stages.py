@@ -1,0 +1,149 @@
+"""The stages of `engram bench`: the hot paths of a robot, each beside the plain pipeline."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from engram.frontend import Frontend, MatcherConfig, StereoPair, match_frames
+from engram.geometry import StereoCamera
+from engram.odometry import Odometry, OdometryConfig, WindowConfig
+from engram_lab.bench.data import BenchData
+from engram_lab.bench.places import prepare_places_query, prepare_vocabulary_train
+from engram_lab.bench.plain import PlainPipeline
+from engram_lab.bench.ranking import prepare_ranking
+from engram_lab.bench.rendering import NIGHT, RAIN, prepare_rendering
+from engram_lab.bench.stage import Prepared, Run, Stage
+from engram_lab.bench.window import prepare_window
+
+# Frames between the two of a localisation attempt: 3 to 4 m on the KITTI clip.
+_ATTEMPT_GAP = 3
+_FRAME_INTERVAL_NS = 100_000_000
+
+
+def prepare_frontend_odometry(
+    data: BenchData, plain: PlainPipeline | None, *, size: str, windowed: bool = False
+) -> Prepared:
+    """One stereo pair in, one motion out.
+
+    The window is a stage of its own; `windowed` adds it to our side as the product runs it, while
+    the reference has none. The drive is played to and fro without end, so every step is a real
+    motion.
+    """
+    pairs = data.at(size)
+    frontend = Frontend()
+    window = WindowConfig() if windowed else WindowConfig(iterations=0)
+    odometry = Odometry(OdometryConfig(window=window))
+
+    def ours(i: int) -> dict[str, int]:
+        pair = pairs[_to_and_fro(i, len(pairs))]
+        frame = frontend.extract(dataclasses.replace(pair, stamp_ns=i * _FRAME_INTERVAL_NS))
+        step = odometry.step(frame)
+        return {"landmarks": len(frame.landmarks), "inliers": step.inliers}
+
+    if plain is None:
+        return Prepared(ours)
+    plain_odometry = plain.Odometry(_plain_camera(plain, pairs[0].camera))
+    extract = _plain_extract(plain, frontend, pairs)
+
+    def reference(i: int) -> dict[str, int]:
+        features = extract(pairs[_to_and_fro(i, len(pairs))])
+        pose = plain_odometry.step(features)
+        counts = {"features": features.detected, "landmarks": len(features.points)}
+        return counts | {"inliers": 0 if pose is None else len(pose.inliers)}
+
+    return Prepared(ours, reference)
+
+
+def prepare_attempt(data: BenchData, plain: PlainPipeline | None, *, size: str) -> Prepared:
+    """One localisation attempt without a prediction, 3 frames apart, features made beforehand."""
+    pairs = data.at(size)
+    frontend, matcher = Frontend(), MatcherConfig()
+    frames = [frontend.extract(pair) for pair in pairs]
+    starts = len(frames) - _ATTEMPT_GAP
+
+    def ours(i: int) -> dict[str, int]:
+        at = i % starts
+        match = match_frames(frames[at], frames[at + _ATTEMPT_GAP], matcher, seed=i)
+        return {"landmarks": len(frames[at].landmarks), "inliers": match.inliers}
+
+    if plain is None:
+        return Prepared(ours)
+    camera = _plain_camera(plain, pairs[0].camera)
+    extract = _plain_extract(plain, frontend, pairs)
+    features = [extract(pair) for pair in pairs]
+
+    def reference(i: int) -> dict[str, int]:
+        at = i % starts
+        pose = plain.attempt(features[at], features[at + _ATTEMPT_GAP], camera)
+        return {
+            "landmarks": len(features[at].points),
+            "inliers": 0 if pose is None else len(pose.inliers),
+        }
+
+    return Prepared(ours, reference)
+
+
+STAGES: Mapping[str, Stage] = MappingProxyType(
+    {
+        "frontend_odometry_512": partial(prepare_frontend_odometry, size="512"),
+        "frontend_odometry_full": partial(prepare_frontend_odometry, size="full"),
+        "frontend_odometry_windowed_512": partial(
+            prepare_frontend_odometry, size="512", windowed=True
+        ),
+        "frontend_odometry_windowed_full": partial(
+            prepare_frontend_odometry, size="full", windowed=True
+        ),
+        "attempt_512": partial(prepare_attempt, size="512"),
+        "attempt_full": partial(prepare_attempt, size="full"),
+        "render_pair_512": prepare_rendering,
+        "render_pair_512_rain": partial(prepare_rendering, session=RAIN),
+        "render_pair_512_night": partial(prepare_rendering, session=NIGHT),
+        "window_ba_512": prepare_window,
+        "places_query_20000": partial(prepare_places_query, places=20_000, dense=True),
+        "places_query_1000000": partial(prepare_places_query, places=1_000_000, dense=False),
+        "vocabulary_train": prepare_vocabulary_train,
+        "rank_path_150": partial(prepare_ranking, policy="path", paths=150),
+        "rank_path_10000": partial(prepare_ranking, policy="path", paths=10_000),
+        "rank_recall_150": partial(prepare_ranking, policy="recall", paths=150),
+        "rank_recall_10000": partial(prepare_ranking, policy="recall", paths=10_000),
+    }
+)
+
+
+def _to_and_fro(i: int, count: int) -> int:
+    """0, 1, …, count - 1, count - 2, …, 1, 0, 1, …."""
+    at = i % (2 * count - 2)
+    return min(at, 2 * count - 2 - at)
+
+
+def _plain_camera(plain: PlainPipeline, camera: StereoCamera) -> Any:
+    names = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
+    return plain.Camera(*(getattr(camera, name) for name in names))
+
+
+def _plain_extract(
+    plain: PlainPipeline, frontend: Frontend, pairs: tuple[StereoPair, ...]
+) -> Callable[[StereoPair], Any]:
+    """The plain front-end, describing as many corners as ours has landmarks (median, ± 10 %)."""
+    camera = _plain_camera(plain, pairs[0].camera)
+    few = pairs[:: max(1, len(pairs) // 5)]
+    wanted = round(float(np.median([len(frontend.extract(pair).landmarks) for pair in few])))
+    asked = wanted
+    for _ in range(5):  # its grid holds some back: ask for more until it gives as many
+        plain_frontend = plain.FrontEnd(camera, asked)
+        got = float(
+            np.median([plain_frontend.extract(pair.left, pair.right).detected for pair in few])
+        )
+        if got > 0.95 * wanted:
+            break
+        asked = round(asked * wanted / max(got, 1.0))
+    return lambda pair: plain_frontend.extract(pair.left, pair.right)
+
+
+__all__ = ["STAGES", "Run", "prepare_attempt", "prepare_frontend_odometry"]

@@ -1,0 +1,203 @@
+"""Two robots drive a hamlet through a few days; another drive is localised on a tight budget."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import InputError
+from engram.maps import MapStore
+from engram.monitor import ignore
+from engram.robot import (
+    FrameResult,
+    LocaliseOptions,
+    LocaliseRun,
+    MapOptions,
+    MapReport,
+    OpenMap,
+    Settings,
+    map_drive,
+    open_drive,
+    summarise,
+)
+from engram.viewing import Track, draw_attempts, draw_from_above
+from engram.viewing.pictures import PictureWriter
+from engram_lab.town import SimulatedDrive, campaign_named
+from engram_lab.town.simulating import simulate
+
+_CAMPAIGN = "hamlet"
+_POLICIES = ("distance", "path")
+# One attempt, or one after another up to four: what counts is which experience is tried first.
+_ATTEMPTS = (1, 4)
+# The place that is shown in every condition, as a share of the drive.
+_SHOWN_AT = 0.35
+
+Progress = Callable[[str, int], Any]
+
+
+@dataclass(slots=True)
+class DemoReport:
+    """What the demo did.
+
+    Attributes:
+        out: folder with logs, map and pictures.
+        mapped: one report per drive that made the map, with the conditions it was driven in.
+        conditions: of each drive, the localised one last.
+        localised: policy → most attempts a frame → summary of the last drive.
+    """
+
+    out: Path
+    conditions: list[str] = field(default_factory=list)
+    mapped: list[MapReport] = field(default_factory=list)
+    localised: dict[str, dict[int, dict[str, Any]]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``demo --json`` prints."""
+        return {
+            "out": str(self.out),
+            "conditions": self.conditions,
+            "mapped": [report.to_dict() for report in self.mapped],
+            "localised": self.localised,
+        }
+
+
+@contextmanager
+def silent(what: str, total: int) -> Iterator[Callable[[str], None]]:
+    """Progress that is not shown."""
+    del what, total
+    yield ignore
+
+
+def run_demo(out: Path, progress: Progress = silent, workers: int = 2) -> DemoReport:
+    """Renders the drives, maps all but the last, localises the last, and draws pictures.
+
+    What an earlier run has rendered is not rendered again.
+
+    Args:
+        out: folder to write to, made where there is none.
+        progress: makes a progress bar: a context manager of title and length.
+        workers: processes that render.
+
+    Raises:
+        InputError: the folder cannot be made.
+        MissingExtraError: Matplotlib is not installed.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be made: {error.strerror}") from error
+    campaign = campaign_named(_CAMPAIGN)
+    drives = [SimulatedDrive(campaign, i) for i in range(len(campaign.sessions))]
+    report = DemoReport(out)
+    report.conditions = [_condition(drive) for drive in drives]
+    with progress("drive", sum(len(drive) for drive in drives)) as advance:
+        rendered = simulate(campaign, out, workers=workers, advance=advance)
+    logs = [Path(file) for file in rendered.files]
+    map_path = out / f"{_CAMPAIGN}.engram"
+    map_path.unlink(missing_ok=True)
+    for log, condition in zip(logs[:-1], report.conditions, strict=False):
+        sequence = open_drive(log)
+        with progress(f"map: {condition}", len(sequence)) as advance:
+            report.mapped.append(map_drive(map_path, sequence, Settings(), MapOptions(), advance))
+    thorough = {}
+    for policy in _POLICIES:
+        runs = {
+            most: _localise(map_path, logs[-1], policy, most, out, progress) for most in _ATTEMPTS
+        }
+        report.localised[policy] = {most: summarise(found) for most, found in runs.items()}
+        thorough[policy] = runs[max(_ATTEMPTS)]
+    _draw(report, map_path, thorough, drives)
+    return report
+
+
+def _condition(drive: SimulatedDrive) -> str:
+    plan = drive.plan
+    return f"{plan.start:%a %H:%M}, {plan.weather}, {plan.robot}"
+
+
+def _localise(
+    map_path: Path, log: Path, policy: str, most: int, out: Path, progress: Progress
+) -> list[FrameResult]:
+    sequence = open_drive(log)
+    options = LocaliseOptions(policy=policy, lanes=1, rounds=most)
+    with (
+        LocaliseRun(map_path, sequence, Settings(), options) as run,
+        progress(f"localise: {policy}, {most} a frame", len(sequence)) as advance,
+    ):
+        writer = PictureWriter(
+            out / f"matches_{policy}_{most}", 40, run.localiser, run.opened.store.frames
+        )
+        results = []
+        for live, result in run:
+            results.append(result)
+            writer.offer(live, result)
+            advance(result.localisation.status.value)
+        return results
+
+
+def _draw(
+    report: DemoReport,
+    map_path: Path,
+    results: dict[str, list[FrameResult]],
+    drives: list[SimulatedDrive],
+) -> None:
+    attempts = {
+        policy: np.array([one.localisation.attempts for one in found])
+        for policy, found in results.items()
+    }
+    draw_attempts(attempts, report.out / "attempts.png", "Attempts per frame, last drive")
+    draw_from_above(
+        _experience_tracks(map_path, drives, report.conditions),
+        report.out / "map_from_above.png",
+        "Experiences by the drive that saved them",
+    )
+    shown = _one_place(drives, report.conditions)
+    cv2.imwrite(str(report.out / "one_place.png"), shown)
+
+
+def _experience_tracks(
+    map_path: Path, drives: list[SimulatedDrive], conditions: list[str]
+) -> list[Track]:
+    """Nodes of each session, placed along the least uncertain chains from the first node."""
+    with MapStore.open(map_path) as store:
+        opened = OpenMap(store)
+        graph = opened.graph
+        tree = graph.chains_from(0)
+        tracks = []
+        for session in opened.sessions.values():
+            number = graph.session_number(session.id)
+            if number is None:  # it localised everywhere, and saved nothing
+                continue
+            nodes = [i for i in np.flatnonzero(graph.sessions == number) if int(i) in tree.row_of]
+            points = [tree.pose(int(i)).translation[[0, 2]] for i in nodes]
+            label = next(
+                text
+                for drive, text in zip(drives, conditions, strict=True)
+                if drive.stamp_ns(0) == session.start_ns
+            )
+            apart = int((graph.sessions == number).sum()) - len(points)
+            label += f": {len(points)} nodes" + (f", {apart} more unconnected" if apart else "")
+            tracks.append(Track(label, np.array(points).reshape(-1, 2)))
+    return tracks
+
+
+def _one_place(drives: list[SimulatedDrive], conditions: list[str]) -> NDArray[np.uint8]:
+    """The same place in each drive, with its condition below."""
+    tiles = []
+    for drive, condition in zip(drives, conditions, strict=True):
+        at = int(_SHOWN_AT * len(drive))
+        pair = next(iter(drive.frames(at, at + 1)))
+        tile = cv2.resize(pair.left, (512, 384))
+        tile = cv2.copyMakeBorder(tile, 0, 28, 0, 0, cv2.BORDER_CONSTANT, value=(0,))
+        place = (8, 384 + 19)
+        cv2.putText(tile, condition, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255,), 1, cv2.LINE_AA)
+        tiles.append(tile)
+    rows = [np.hstack(tiles[i : i + 3]) for i in range(0, len(tiles), 3)]
+    return np.vstack(rows)

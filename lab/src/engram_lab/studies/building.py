@@ -1,0 +1,209 @@
+"""One map per fold, from its training sessions in the order of time (SPEC §8)."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from engram.config import to_dict
+from engram.errors import InputError
+from engram.localiser import Position
+from engram.maps import MapStore
+from engram.monitor import ignore
+from engram.robot import MapOptions, MapReport, OpenMap, Settings, map_drive
+from engram.sequences import FrameLog
+from engram_lab.studies.drives import EvaluatedDrive
+from engram_lab.studies.starting import TrueNodes
+
+# Enough for every candidate that matters; counts only, so that the same drives give the same map.
+# Folds are built beside each other, one thread each.
+GENEROUS = MapOptions(policy="path", lanes=4, rounds=8, relocaliser="fabmap", threads=False)
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltSession:
+    """What adding one training session came to.
+
+    Attributes:
+        name: of the drive.
+        revision: of the map with it.
+        nodes: of the map with it.
+        share_localised: of its frames.
+        seconds: it took.
+        frames, attempts, proposed, lookups: how many frames, match attempts, those of them at nodes
+            proposed to a lost robot, and frames for which the relocaliser was asked: what it took,
+            on whatever machine.
+    """
+
+    name: str
+    revision: int
+    nodes: int
+    share_localised: float
+    seconds: float
+    frames: int = 0
+    attempts: int = 0
+    proposed: int = 0
+    lookups: int = 0
+
+
+@dataclass(slots=True)
+class BuiltMap:
+    """A fold's map.
+
+    Attributes:
+        path: the file.
+        sessions: as they were added, in the order of time.
+    """
+
+    path: Path
+    sessions: list[BuiltSession] = field(default_factory=list)
+
+    def revision_after(self, sessions: int) -> int:
+        """The revision that holds the first so many training sessions."""
+        return self.sessions[sessions - 1].revision
+
+
+def build_map(
+    path: Path,
+    drives: Sequence[EvaluatedDrive],
+    settings: Settings,
+    options: MapOptions,
+    *,
+    base: Path | None = None,
+    known: Sequence[EvaluatedDrive] = (),
+    look_at: Callable[[EvaluatedDrive, MapReport], None] | None = None,
+) -> BuiltMap:
+    """Maps the drives one after another; goes on where an earlier run stopped.
+
+    A session is mapped in a copy that takes the map's place when it is whole, so that a map that
+    was built with interruptions is the same as one that was not.
+
+    Args:
+        path: NAME.engram; NAME.json beside it tells how far it is.
+        drives: the training sessions, in the order of time.
+        settings: the resolved configuration.
+        options: the budget of the build.
+        base: the map to which the drives are added; None for an empty one.
+        known: the drives that the base was built from.
+        look_at: is shown how each drive went, before it counts as done.
+
+    Raises:
+        MapError: the map cannot be written.
+        SequenceError: a drive cannot be read.
+    """
+    built = read_built_map(path)
+    for drive in drives[len(built.sessions) :]:
+        started = time.perf_counter()
+        draft = path.with_name(f"{path.stem}.draft{path.suffix}")
+        _remove(draft)
+        before = path if built.sessions else base
+        if before is not None:
+            shutil.copyfile(before, draft)
+        start = partial(_start, drive=drive, drives=(*drives, *known))
+        log = FrameLog(drive.path)
+        try:
+            report = map_drive(draft, log, settings, options, ignore, start)
+        finally:
+            log.close()
+        if report.interrupted or report.revision is None:
+            raise KeyboardInterrupt
+        seconds = time.perf_counter() - started
+        if look_at is not None:
+            look_at(drive, report)
+        built.sessions.append(_built_session(draft, drive, report, seconds))
+        # The record first: where a run is killed between the two it is ahead of the map, and what
+        # it is ahead by is done again.
+        write_json(path.with_suffix(".json"), {"sessions": to_dict(built.sessions)})
+        draft.replace(path)
+        _remove(draft)
+    return built
+
+
+def _built_session(
+    draft: Path, drive: EvaluatedDrive, report: MapReport, seconds: float
+) -> BuiltSession:
+    assert report.revision is not None
+    localisations = [one.localisation for one in report.results]
+    with MapStore.open(draft) as store:
+        nodes = store.node_count()
+    return BuiltSession(
+        drive.name,
+        report.revision,
+        nodes,
+        sum(one.localised for one in report.results) / max(len(report.results), 1),
+        round(seconds, 3),
+        frames=len(localisations),
+        attempts=sum(one.attempts for one in localisations),
+        proposed=sum(one.proposed for one in localisations),
+        lookups=sum("places" in one.stage_ms for one in localisations),
+    )
+
+
+def read_built_map(path: Path) -> BuiltMap:
+    """How far a fold's map is; nothing where it was not begun."""
+    recorded = read_record(path)
+    if not (recorded.sessions and path.exists()):
+        return BuiltMap(path)
+    with MapStore.open(path) as store:
+        newest = store.revision
+    return BuiltMap(path, [one for one in recorded.sessions if one.revision <= newest])
+
+
+def read_record(path: Path) -> BuiltMap:
+    """What the record beside a map says, without a look at the map.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    record = path.with_suffix(".json")
+    if not record.exists():
+        return BuiltMap(path)
+    try:
+        known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
+        return BuiltMap(path, [BuiltSession(**one) for one in known])
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{record} does not tell how far {path.name} is ({error}); remove both, and the same "
+            "command builds the map again"
+        ) from error
+
+
+def _start(
+    opened: OpenMap, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]
+) -> Position | None:
+    """Where the drive begins, by truth; None in an empty map, or where truth is not known."""
+    truth = drive.truth()
+    if truth is None:
+        return None
+    log = FrameLog(drive.path)
+    try:
+        first = truth.at(int(log.stamps_ns[0]))
+    finally:
+        log.close()
+    return None if first is None else true_nodes(opened, drives).start(first)
+
+
+def true_nodes(opened: OpenMap, drives: Sequence[EvaluatedDrive]) -> TrueNodes:
+    """True poses of a map's nodes; `drives` are at least those that it was built from."""
+    sessions = {node.session for node in opened.graph.nodes}
+    truths = {one.session.id: one.truth() for one in drives if one.session.id in sessions}
+    return TrueNodes(opened, truths)
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Writes a file in one step."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    draft.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def _remove(path: Path) -> None:
+    for one in path.parent.glob(f"{path.name}*"):
+        one.unlink()

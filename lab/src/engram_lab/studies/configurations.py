@@ -1,0 +1,155 @@
+"""What is run: policies under budgets and settings, and the sweeps of [L15]'s figures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
+from enum import StrEnum
+from typing import Any
+
+from engram.graph.model import PathEntryKind
+from engram.graph.paths import ALL_KINDS, MATCHES_ONLY
+from engram.localiser import Budget
+from engram.ranking import RecentConfig
+
+# Lanes of a budget that never runs out.
+UNLIMITED = 1_000_000
+DEFAULT_LANES = (1, 2, 3, 4, 6, 8, 12, 16, UNLIMITED)
+# Source: [L15] Fig. 13.
+T_SWEEP = (0, 1, 2, 5, 10, 20, 50, 100, 200)
+DEFAULT_T = RecentConfig().T
+# The budget of [L15]'s Figs. 9, 12 and 13.
+FEW_LANES = 2
+# Policies whose second round is measured too.
+TWO_ROUNDS = ("distance", "path", "recall")
+PATH_POLICIES = ("path", "path-literal")
+
+
+class Radius(StrEnum):
+    """How far candidates are searched for."""
+
+    SEARCH = "search"  # max(8 m, basin + 2σ), SPEC §3.1
+    BASIN = "basin"  # basin + 2σ: our other reading of "local metric neighbourhood"
+
+
+class PathKinds(StrEnum):
+    """Which entries put a node on a path."""
+
+    ALL = "matched+saved"
+    MATCHED = "matched"  # [L15 §IV]'s text
+
+    @property
+    def kinds(self) -> frozenset[PathEntryKind]:
+        """As path memory wants them."""
+        return ALL_KINDS if self is PathKinds.ALL else MATCHES_ONLY
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """One way to localise the held-out sessions.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: Np and Nr.
+        T: iterations remembered.
+        radius: of the search for candidates.
+        paths: which entries count in path memory.
+        sessions: in the map after so many training sessions; None for all of them.
+    """
+
+    policy: str
+    lanes: int = FEW_LANES
+    rounds: int = 1
+    T: int = DEFAULT_T
+    radius: Radius = Radius.SEARCH
+    paths: PathKinds = PathKinds.ALL
+    sessions: int | None = None
+
+    @property
+    def budget(self) -> Budget:
+        """Np × Nr."""
+        return Budget(self.lanes, self.rounds)
+
+    @property
+    def lanes_text(self) -> str:
+        """Np for tables."""
+        return lanes_text(self.lanes)
+
+    @property
+    def label(self) -> str:
+        """The policy and what is unusual about it, for tables and legends."""
+        parts = [self.policy]
+        if self.radius is Radius.BASIN:
+            parts.append("radius = basin")
+        if self.paths is PathKinds.MATCHED:
+            parts.append("matched only")
+        return ", ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(values: dict[str, Any]) -> Configuration:
+        """The reverse of `to_dict`."""
+        known = {one.name for one in fields(Configuration)}
+        plain = {name: value for name, value in values.items() if name in known}
+        return Configuration(
+            **{**plain, "radius": Radius(values["radius"]), "paths": PathKinds(values["paths"])}
+        )
+
+
+# Attempts every candidate: shows what could have succeeded ([L15] Fig. 10) and whom the
+# neighbourhood overlooks.
+EVERYTHING = Configuration("distance", UNLIMITED)
+
+
+def sweep(
+    policies: Sequence[str],
+    lanes: Sequence[int] = DEFAULT_LANES,
+    rounds: Sequence[int] = (1, 2),
+) -> tuple[Configuration, ...]:
+    """All that is run in the whole map: policy × Np, T, Nr = 2, and the variants of `path`.
+
+    Args:
+        policies: keys of `POLICIES`.
+        lanes: Np; `UNLIMITED` for as many attempts as there are candidates.
+        rounds: Nr; rounds beyond the first are run for `TWO_ROUNDS` only.
+    """
+    found: dict[Configuration, None] = {}
+
+    def add(some: Iterable[Configuration]) -> None:
+        found.update(dict.fromkeys(some))
+
+    few = FEW_LANES if FEW_LANES in lanes else lanes[0]
+    for policy in policies:
+        add(Configuration(policy, np, rounds[0]) for np in lanes)
+    if UNLIMITED in lanes or "oracle" in policies:
+        add([EVERYTHING])  # every match is made anyway, which is most of the time all this takes
+    for nr in rounds[1:]:
+        limited = [np for np in lanes if np != UNLIMITED]
+        add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)
+    if "path" in policies:
+        add(Configuration("path", few, rounds[0], T) for T in T_SWEEP)
+        add(Configuration("path", np, rounds[0], paths=PathKinds.MATCHED) for np in lanes)
+    for policy in PATH_POLICIES:
+        if policy in policies:
+            add([Configuration(policy, few, rounds[0], radius=Radius.BASIN)])
+            add([Configuration(policy, few, rounds[0], paths=PathKinds.MATCHED)])
+    return tuple(found)
+
+
+def map_sizes(
+    policies: Sequence[str], lanes: int, sessions: int, rounds: int = 1
+) -> tuple[Configuration, ...]:
+    """[L15] Fig. 9: each policy in the map as it was after each training session but the last."""
+    return tuple(
+        Configuration(policy, lanes, rounds, sessions=count)
+        for count in range(1, sessions)
+        for policy in policies
+    )
+
+
+def lanes_text(lanes: int) -> str:
+    """Np for people."""
+    return "unlimited" if lanes == UNLIMITED else str(lanes)

@@ -1,0 +1,256 @@
+"""What the fleet study runs on which drives: [G16]'s protocols, scaled to the drives there are."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engram import __version__
+from engram.config import config_hash, to_dict
+from engram.errors import ConfigError
+from engram.frontend.matching import matcher_hash
+from engram.localiser import METHOD_VERSION, RELOCALISERS
+from engram.robot import Settings
+from engram_lab.studies.building import write_json
+from engram_lab.studies.drives import DriveSet, EvaluatedDrive
+from engram_lab.studies.fleet.arms import ARMS, Arm
+from engram_lab.studies.folds import Fold, check_only, chosen, split
+from engram_lab.studies.running import file_name
+from engram_lab.studies.writing import writing
+
+EXPERIMENTS = (7, 8, 9, 10)
+# Raise it whenever maps are merged otherwise, or more is recorded of maps and merges: studies of
+# before are not gone on with.
+_MERGING_VERSION = 4
+# Source: SPEC §8, [G16] §VI: docking after log 7; 4 groups of 9 logs for the orders.
+_FORAY_LOGS = 7
+_ORDER_GROUP_LOGS = 9
+ROBOTS = ("r1", "r2")
+# What the robots download between their forays ([G16] Fig. 9).
+FORAY_POLICIES = ("copy", "tod", "tod+paths")
+
+
+@dataclass(frozen=True, slots=True)
+class FleetOptions:
+    """What a fleet study runs.
+
+    Attributes:
+        arms: keys of `ARMS`.
+        experiments: numbers of [G16]'s figures.
+        folds: of the cross-validation.
+        seed: of the shuffle of sessions and of the bootstrap.
+        groups: k of the parallel build.
+        more_groups: further k, on the first fold, to see how far more of them go.
+        order_groups: how many groups are merged in all orders. 4: [G16] §VI-E.
+        tried: held-out drives of each fold that downloads are tried out on; None for all.
+        relocaliser: key of `RELOCALISERS`; None for none.
+        only_folds: numbers of the folds that are run; empty for all. What is run of the others
+            later joins it.
+    """
+
+    arms: tuple[str, ...] = ("A", "B", "C")
+    experiments: tuple[int, ...] = EXPERIMENTS
+    folds: int = 5
+    seed: int = 0
+    groups: int = 4
+    more_groups: tuple[int, ...] = (2, 8)
+    order_groups: int = 4
+    tried: int | None = None
+    relocaliser: str | None = "fabmap"
+    only_folds: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, given, known in (
+            ("arms", self.arms, tuple(ARMS)),
+            ("experiments", self.experiments, EXPERIMENTS),
+        ):
+            strange = [one for one in given if one not in known]
+            if strange or not given:
+                raise ConfigError(
+                    f"{name} are {given}, must be some of {', '.join(map(str, known))}"
+                )
+        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+            )
+        check_only(self.only_folds, self.folds)
+        if min(self.groups, *self.more_groups, self.order_groups) < 2:
+            raise ConfigError(
+                f"groups are {self.groups}, {self.more_groups} and {self.order_groups} for the "
+                "orders; must be 2 or more"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """[G16]'s numbers of logs, as far as a fold's training sessions go.
+
+    Attributes:
+        foray: logs of each robot's forays, the first and the second; 7 where there are enough.
+        group: logs of each of the groups of the orders; 9 where there are enough.
+        validation: training sessions by which the best order is chosen.
+    """
+
+    foray: int
+    group: int
+    validation: int
+
+    @staticmethod
+    def of(training: int, order_groups: int = 4) -> Protocol:
+        """For so many training sessions.
+
+        Raises:
+            ConfigError: too few for two robots with two forays each, or for the orders.
+        """
+        least = max(2 * 2, order_groups + 1)
+        if training < least:
+            raise ConfigError(
+                f"{training} training sessions are too few for two robots with two forays each and "
+                f"for {order_groups} groups beside a validation session; {least} are needed"
+            )
+        validation = max(training // 8, 1)
+        return Protocol(
+            foray=min(_FORAY_LOGS, training // 4),
+            group=min(_ORDER_GROUP_LOGS, (training - validation) // order_groups),
+            validation=validation,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FleetPlan:
+    """All that a worker needs to know.
+
+    Attributes:
+        drives: what is evaluated.
+        settings: the resolved configuration.
+        options: what is run.
+        work: folder of maps and results.
+    """
+
+    drives: DriveSet
+    settings: Settings
+    options: FleetOptions
+    work: Path
+
+    @property
+    def folds(self) -> tuple[Fold, ...]:
+        """The divisions of the drives."""
+        return split(len(self.drives.drives), self.options.folds, self.options.seed)
+
+    @property
+    def run_folds(self) -> tuple[Fold, ...]:
+        """Those that are run now."""
+        return chosen(self.folds, self.options.only_folds)
+
+    @property
+    def arms(self) -> tuple[Arm, ...]:
+        """Those asked for."""
+        return tuple(ARMS[one] for one in self.options.arms)
+
+    def folder(self, arm: Arm, fold: Fold) -> Path:
+        """Where one arm's maps and results of one fold lie."""
+        return self.work / f"arm-{arm.letter}" / f"fold{fold.number}"
+
+    def training(self, fold: Fold) -> list[EvaluatedDrive]:
+        """In the order of time."""
+        return [self.drives.drives[number] for number in fold.training]
+
+    def held_out(self, fold: Fold) -> list[EvaluatedDrive]:
+        """In the order of time."""
+        return [self.drives.drives[number] for number in fold.held_out]
+
+    def protocol(self, fold: Fold) -> Protocol:
+        """Numbers of logs."""
+        return Protocol.of(len(fold.training), self.options.order_groups)
+
+    def forays(self, fold: Fold) -> dict[str, list[list[EvaluatedDrive]]]:
+        """Each robot's two forays: drives spread over the training sessions, turn about."""
+        logs = self.protocol(fold).foray
+        chosen = _spread(self.training(fold), 2 * 2 * logs)
+        return {
+            robot: [chosen[number::2][:logs], chosen[number::2][logs:]]
+            for number, robot in enumerate(ROBOTS)
+        }
+
+    def groups(self, fold: Fold, count: int) -> list[list[EvaluatedDrive]]:
+        """All training sessions in chronological groups, sizes within one."""
+        drives = self.training(fold)
+        return [[drives[k] for k in part] for part in np.array_split(np.arange(len(drives)), count)]
+
+    def group_counts(self, fold: Fold) -> tuple[int, ...]:
+        """How many groups the parallel build is tried with, the usual number first."""
+        more = self.options.more_groups if fold.number == 0 else ()
+        wanted = dict.fromkeys((self.options.groups, *more))
+        return tuple(one for one in wanted if one <= len(fold.training))
+
+    def order_groups(self, fold: Fold) -> list[list[EvaluatedDrive]]:
+        """The chronological groups whose orders are tried."""
+        validation = {one.path for one in self.validation(fold)}
+        rest = [one for one in self.training(fold) if one.path not in validation]
+        size = self.protocol(fold).group
+        chosen = _spread(rest, self.options.order_groups * size)
+        return [chosen[k : k + size] for k in range(0, len(chosen), size)]
+
+    def validation(self, fold: Fold) -> list[EvaluatedDrive]:
+        """The drives by which the best order is chosen: neither mapped nor reported on."""
+        return _spread(self.training(fold), self.protocol(fold).validation)
+
+    def configuration(self) -> dict[str, Any]:
+        """The resolved configuration, kept with the results."""
+        return {
+            "campaign": self.drives.name,
+            "drives": [one.name for one in self.drives.drives],
+            "drives_hash": self.drives.hash,
+            "folds": [to_dict(one) for one in self.folds],
+            "protocol": [to_dict(self.protocol(one)) for one in self.folds],
+            "settings": to_dict(self.settings),
+            "options": to_dict(self.options),
+            "arms": [to_dict(one) for one in self.arms],
+            "matcher": matcher_hash(self.settings.localiser.matcher),
+            "machine": platform.machine(),
+            "engram": __version__,
+        }
+
+
+def make_fleet_plan(
+    drives: DriveSet, settings: Settings, options: FleetOptions, work: Path
+) -> FleetPlan:
+    """A plan; its folder below `work` depends on all that its maps and results depend on.
+
+    More arms or experiments may be run later, and find there what was done.
+
+    Raises:
+        ConfigError: too few drives for the protocols.
+    """
+    settings = settings.for_descriptor(drives.drives[0].descriptor)
+    depends = (
+        drives.hash,
+        to_dict(settings),
+        options.folds,
+        options.seed,
+        options.relocaliser,
+        matcher_hash(settings.localiser.matcher),
+        METHOD_VERSION,
+        _MERGING_VERSION,
+        __version__,
+    )
+    plan = FleetPlan(
+        drives, settings, options, work / f"fleet-{file_name(drives.name)}-{config_hash(depends)}"
+    )
+    for fold in plan.folds:
+        plan.protocol(fold)  # raises where there are too few
+    with writing(plan.work):
+        plan.work.mkdir(parents=True, exist_ok=True)
+        write_json(plan.work / "configuration.json", plan.configuration())
+    return plan
+
+
+def _spread(drives: Sequence[EvaluatedDrive], count: int) -> list[EvaluatedDrive]:
+    """So many of the drives, evenly over them."""
+    rows = np.floor((np.arange(count) + 0.5) * len(drives) / count).astype(int)
+    return [drives[row] for row in rows]

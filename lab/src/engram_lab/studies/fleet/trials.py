@@ -1,0 +1,253 @@
+"""Downloads for the hour of each held-out drive, tried out on it ([G16] Fig. 9, SPEC §7).
+
+All are without thumbnails, so that equal bytes are equal: `budget` sends none unless it is told to,
+the others do, and thumbnails are a tenth of a map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import InputError
+from engram.fleet.download import DownloadOptions
+from engram.fleet.merge import silent
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Node, SessionId
+from engram.localiser import Position
+from engram.maps import MapStore
+from engram.measures import Drive
+from engram.places import (
+    DenseTable,
+    FabMap,
+    FabMapConfig,
+    decode_vocabulary,
+    default_vocabulary,
+)
+from engram.places.stored_words import stored_words
+from engram.robot import OpenMap
+from engram.sequences import FrameLog
+from engram_lab.studies.building import true_nodes, write_json
+from engram_lab.studies.drives import EvaluatedDrive
+from engram_lab.studies.fleet.arms import Arm
+from engram_lab.studies.fleet.plan import FleetPlan
+from engram_lab.studies.fleet.records import read_json
+from engram_lab.studies.fleet.steps import map_path
+from engram_lab.studies.folds import Fold
+from engram_lab.trial import Trial, try_downloads
+
+COPY = "copy"
+TOD = "tod"
+TOD_PATHS = "tod+paths"
+QUARTER = "budget 1/4"
+TENTH = "budget 1/10"
+AS_TOD = "budget as tod"
+AS_TOD_PATHS = "budget as tod+paths"
+_BY_HOUR = (TOD, TOD_PATHS)
+_QUERIES = 50  # frames of the drive
+_BEST = 10  # places that are asked for
+_NO_WORDS = np.zeros(0, np.int32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriedDownload:
+    """One held-out drive in one download.
+
+    Attributes:
+        name: of the kind of download.
+        nodes, of_nodes: sent, and of the centre.
+        united: sent, together with the robot's own; mean over the robots.
+        size_bytes: of the file.
+        expected_missed: share of the way without a match, as promised.
+        drive: steps and matches.
+        ms: mean time of localising a frame.
+        lookup_ms: of that, asking the relocaliser.
+        lookups: frames for which it was asked.
+        query_ms, dense_ms: median of asking FAB-MAP, by the inverted index that the product has,
+            and by a row for every place.
+    """
+
+    name: str
+    nodes: int
+    of_nodes: int
+    united: float
+    size_bytes: int
+    expected_missed: float
+    drive: Drive
+    ms: float
+    lookup_ms: float
+    lookups: int
+    query_ms: float
+    dense_ms: float
+
+
+def trials_path(plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive) -> Path:
+    """Where the trials of one held-out drive are kept."""
+    return plan.folder(arm, fold) / f"downloads-{drive.key}.json"
+
+
+def try_downloads_for(
+    plan: FleetPlan, arm: Arm, fold: Fold, name: str, drive: EvaluatedDrive
+) -> None:
+    """All kinds of download of one map for one held-out drive."""
+    path = trials_path(plan, arm, fold, drive)
+    if _kept(path) is not None:
+        return
+    centre = map_path(plan, arm, fold, name)
+    trials = partial(
+        try_downloads,
+        centre,
+        drives=[lambda: FrameLog(drive.path)],
+        settings=plan.settings,
+        localise=arm.localising(plan.options.relocaliser),
+        progress=silent,
+        start=partial(_start, plan, fold, drive),
+    )
+    found, refused = trials({COPY: _wanted(COPY)}), {}
+    if hour_of_day(drive.session, drive.session.start_ns) is not None:
+        for one in _BY_HOUR:
+            try:
+                found += trials({one: _wanted(one)})
+            except InputError as error:  # nothing was driven at such an hour
+                refused[one] = str(error)
+    sizes = {one.name: one.report.size_bytes for one in found}
+    budgets = {QUARTER: sizes[COPY] // 4, TENTH: sizes[COPY] // 10}
+    budgets |= {
+        asked: sizes[like]
+        for asked, like in ((AS_TOD, TOD), (AS_TOD_PATHS, TOD_PATHS))
+        if like in sizes
+    }
+    for one, room in budgets.items():
+        try:
+            found += trials({one: _wanted("budget", room)})
+        except InputError as error:  # a map so small that a part of it has no room for a node
+            refused[one] = str(error)
+    own = [
+        {one.session.id for foray in forays for one in foray}
+        for forays in plan.forays(fold).values()
+    ]
+    queries = _Queries(centre, drive)
+    tried = [
+        {
+            **_plain(one),
+            "united": float(np.mean([_united(one, found[0].nodes, mine) for mine in own])),
+            "query_ms": queries.ms(one.nodes),
+            "dense_ms": queries.dense_ms(one.nodes),
+        }
+        for one in found
+    ]
+    write_json(path, {"thumbnails": False, "refused": refused, "tried": tried})
+
+
+def read_trials(
+    plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive
+) -> list[TriedDownload]:
+    """The trials of one held-out drive; empty if they are still to be made."""
+    kept = _kept(trials_path(plan, arm, fold, drive))
+    if kept is None:
+        return []
+    return [
+        TriedDownload(
+            **{
+                **one,
+                "drive": Drive(np.array(one["drive"][0]), np.array(one["drive"][1], np.bool_)),
+            }
+        )
+        for one in kept
+    ]
+
+
+def _wanted(policy: str, budget_bytes: int | None = None) -> DownloadOptions:
+    """As all downloads here are."""
+    return DownloadOptions(policy, budget_bytes=budget_bytes, thumbnails=False)
+
+
+def _kept(path: Path) -> list[dict[str, Any]] | None:
+    """Trials that were made; None if they are still to be made.
+
+    Earlier versions said nothing of thumbnails, and had them in all but `budget`: their trials do
+    not count, so that they are never pooled with those of today.
+    """
+    if not path.exists():
+        return None
+    values = read_json(path)
+    tried: list[dict[str, Any]] = values["tried"]
+    return tried if values.get("thumbnails") is False else None
+
+
+def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: OpenMap) -> Position | None:
+    """Where the drive begins, by truth; None where that is not known: it is lost."""
+    truth = drive.truth()
+    log = FrameLog(drive.path)
+    first = None if truth is None else truth.at(int(log.stamps_ns[0]))
+    log.close()
+    return None if first is None else true_nodes(opened, plan.training(fold)).start(first)
+
+
+class _Queries:
+    """What asking FAB-MAP where a drive is costs in parts of a map."""
+
+    def __init__(self, centre: Path, drive: EvaluatedDrive) -> None:
+        with MapStore.open(centre) as store:
+            body = store.vocabulary()
+            self._vocabulary = (
+                default_vocabulary(drive.descriptor) if body is None else decode_vocabulary(body)
+            )
+            self._words = stored_words(store, self._vocabulary)
+        log = FrameLog(drive.path)
+        every = max(len(log) // _QUERIES, 1)
+        frames = [one.frame for one in islice(log, 0, None, every)]
+        log.close()
+        self._asked = [
+            self._vocabulary.words_of(one.landmarks.descriptors, one.descriptor) for one in frames
+        ]
+
+    def ms(self, nodes: Sequence[Node]) -> float:
+        """Median of a query by the inverted index."""
+        places = FabMap(self._vocabulary)
+        for node in nodes:
+            places.add(self._words.get(node.id, _NO_WORDS))
+        return self._median(lambda words: places.recognise(words, _BEST))
+
+    def dense_ms(self, nodes: Sequence[Node]) -> float:
+        """Median of a query by a row for every place."""
+        places = DenseTable(self._vocabulary, FabMapConfig(), len(nodes))
+        for node in nodes:
+            places.add(self._words.get(node.id, _NO_WORDS))
+        return self._median(lambda words: places.best(words, min(_BEST, len(nodes))))
+
+    def _median(self, ask: Callable[[NDArray[np.int32]], object]) -> float:
+        times = []
+        for words in self._asked:
+            started = perf_counter()
+            ask(words)
+            times.append(perf_counter() - started)
+        return 1e3 * float(np.median(times))
+
+
+def _united(trial: Trial, whole: Sequence[Node], own: Collection[SessionId]) -> int:
+    """Nodes on a robot that keeps all it saved itself beside what was sent."""
+    mine = sum(node.session in own for node in whole)
+    return mine + sum(node.session not in own for node in trial.nodes)
+
+
+def _plain(trial: Trial) -> dict[str, Any]:
+    return {
+        "name": trial.name,
+        "nodes": trial.report.nodes,
+        "of_nodes": trial.report.of_nodes,
+        "size_bytes": trial.report.size_bytes,
+        "expected_missed": trial.report.expected_missed,
+        "drive": [trial.steps.step_m.tolist(), trial.steps.matched.tolist()],
+        "ms": trial.ms_per_frame,
+        "lookup_ms": trial.lookup_ms_per_frame,
+        "lookups": trial.lookups,
+    }

@@ -1,0 +1,288 @@
+"""Many localisers over one drive in step: what does not depend on the policy is done once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from time import perf_counter, thread_time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import Frame
+from engram.geometry import SE3
+from engram.graph.basin import DEFAULT_RADIUS_M
+from engram.graph.model import NodeId
+from engram.graph.neighbourhood import Neighbourhood
+from engram.localiser import Localiser, Matcher, Position
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry.motion import GapFiller, Motion, driven_steps_m
+from engram.robot import OpenMap, Settings
+from engram.sequences import LoggedFrame
+from engram_lab.studies.configurations import EVERYTHING, Configuration, PathKinds, Radius
+from engram_lab.studies.drives import EvaluatedDrive, Truth
+from engram_lab.studies.starting import TrueNodes
+
+
+class SharedSearch:
+    """A graph's neighbourhood search that remembers this frame's answers.
+
+    Localisers that matched the same node stand at the same position to the bit, whatever their
+    policies: they ask the same.
+    """
+
+    def __init__(self, search: Callable[..., Neighbourhood]) -> None:
+        self._search = search
+        self._known: dict[tuple[object, ...], Neighbourhood] = {}
+
+    def next_frame(self) -> None:
+        """Forgets: another frame, other positions."""
+        self._known.clear()
+
+    def __call__(
+        self,
+        reference: int,
+        reference_from_live: SE3,
+        covariance: NDArray[np.float64],
+        **options: Any,
+    ) -> Neighbourhood:
+        """See `ExperienceGraph.neighbourhood`."""
+        key = (
+            reference,
+            reference_from_live.translation.tobytes(),
+            reference_from_live.rotation.tobytes(),
+            covariance.tobytes(),
+            *options.values(),
+        )
+        found = self._known.get(key)
+        if found is None:
+            found = self._search(reference, reference_from_live, covariance, **options)
+            self._known[key] = found
+        return found
+
+
+class SharedMotion:
+    """Fills the gaps of odometry for all: it depends on the drive alone."""
+
+    def __init__(self) -> None:
+        self._gaps = GapFiller()
+        self._asked: tuple[OdometryStep, int] | None = None
+        self._motion: Motion | None = None
+
+    def __call__(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
+        """See `GapFiller.motion`; asked again for the very same step it says the same."""
+        if self._asked is None or odometry is not self._asked[0] or stamp_ns != self._asked[1]:
+            self._motion = self._gaps.motion(odometry, stamp_ns)
+            self._asked = odometry, stamp_ns
+        return self._motion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runs:
+    """How one drive was localised by C configurations, F frames each.
+
+    Attributes:
+        configurations: the C configurations.
+        step_m: (F,) float64, distance of the step that ends in the frame: by odometry, guessed
+            where that failed.
+        matched: (C, F) bool, whether the frame was localised.
+        attempts: (C, F) int32, match attempts.
+        candidates: (C, F) int32, |Y|.
+        succeeded: (C, F) int32, attempts that were accepted.
+        near, near_seen: (C, F) int32, nodes truly within 8 m and 60° of a localised robot, and
+            those of them that were candidates; counted for `EVERYTHING` only, else 0.
+        offset_m, turn_rad: (C, F) float32, error of the pose of a success; NaN without one, or
+            without truth.
+        step_ms: (C,) float64, mean time of a frame; with a memo without the making of new matches.
+    """
+
+    configurations: tuple[Configuration, ...]
+    step_m: NDArray[np.float64]
+    matched: NDArray[np.bool_]
+    attempts: NDArray[np.int32]
+    candidates: NDArray[np.int32]
+    succeeded: NDArray[np.int32]
+    near: NDArray[np.int32]
+    near_seen: NDArray[np.int32]
+    offset_m: NDArray[np.float32]
+    turn_rad: NDArray[np.float32]
+    step_ms: NDArray[np.float64]
+
+    @staticmethod
+    def empty(configurations: Sequence[Configuration], step_m: NDArray[np.float64]) -> Runs:
+        """Nothing run yet."""
+        shape = (len(configurations), len(step_m))
+        return Runs(
+            configurations=tuple(configurations),
+            step_m=step_m,
+            matched=np.zeros(shape, np.bool_),
+            attempts=np.zeros(shape, np.int32),
+            candidates=np.zeros(shape, np.int32),
+            succeeded=np.zeros(shape, np.int32),
+            near=np.zeros(shape, np.int32),
+            near_seen=np.zeros(shape, np.int32),
+            offset_m=np.full(shape, np.nan, np.float32),
+            turn_rad=np.full(shape, np.nan, np.float32),
+            step_ms=np.zeros(shape[0]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Situation:
+    """One held-out drive and the map that it is localised in.
+
+    Attributes:
+        opened: the map, which stays as it is.
+        drive: the drive.
+        frames: its frames.
+        start: number of the first frame that is localised, and the position there; None where
+            no start is known.
+        nodes: true poses of the map's nodes.
+        truth: true poses of the drive; None where they are not known.
+    """
+
+    opened: OpenMap
+    drive: EvaluatedDrive
+    frames: Sequence[LoggedFrame]
+    start: tuple[int, Position] | None
+    nodes: TrueNodes
+    truth: Truth | None
+
+
+def run_in_step(
+    situation: Situation,
+    configurations: Sequence[Configuration],
+    settings: Settings,
+    matcher: Matcher | None,
+    relocaliser: str | None = None,
+    cost_so_far: Callable[[], float] = lambda: 0.0,
+) -> Runs:
+    """Localises the drive with every configuration, frame by frame.
+
+    Args:
+        situation: drive and map.
+        configurations: what to run.
+        settings: the resolved configuration.
+        matcher: makes the matches, unguided; None for the localiser's own, guided ones.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
+        cost_so_far: seconds spent in making matches; left out of `step_ms`.
+    """
+    frames = situation.frames
+    # With a memo everything runs on this thread, beside other workers on a busy machine; as on a
+    # robot, on several threads, the time until the answer counts.
+    clock = perf_counter if matcher is None else thread_time
+    step_m = driven_steps_m(
+        (one.odometry for one in frames), (one.frame.stamp_ns for one in frames)
+    )
+    runs = Runs.empty(configurations, step_m)
+    search = SharedSearch(situation.opened.graph.neighbourhood)
+    with _localisers(
+        situation, configurations, settings, matcher, search, relocaliser
+    ) as localisers:
+        for number, logged in enumerate(frames):
+            odometry = logged.odometry
+            if situation.start is None or number < situation.start[0]:
+                for localiser in localisers:
+                    localiser.carry_on(odometry, logged.frame.stamp_ns)
+                continue
+            if number == situation.start[0]:
+                for localiser in localisers:
+                    localiser.carry_on(odometry, logged.frame.stamp_ns)
+                    localiser.start_at(situation.start[1])
+                odometry = OdometryStep(OdometryStatus.FIRST)
+            search.next_frame()
+            judge = _Judge(situation, logged.frame)
+            for row, localiser in enumerate(localisers):
+                started, made = clock(), cost_so_far()
+                found = localiser.localise(logged.frame, odometry)
+                seconds = clock() - started - (cost_so_far() - made)
+                runs.step_ms[row] += 1e3 * seconds
+                runs.matched[row, number] = found.node is not None
+                runs.attempts[row, number] = found.attempts
+                runs.candidates[row, number] = found.candidates
+                runs.succeeded[row, number] = sum(one.accepted for one in localiser.outcomes)
+                if found.node is not None and found.node_from_live is not None:
+                    error = judge.error(found.node, found.node_from_live)
+                    runs.offset_m[row, number], runs.turn_rad[row, number] = error
+                    if configurations[row] == EVERYTHING:
+                        near = judge.near()
+                        seen = {one.candidate.node for one in localiser.outcomes}
+                        runs.near[row, number] = len(near)
+                        runs.near_seen[row, number] = len(near & seen)
+    runs.step_ms[:] /= max(len(frames), 1)
+    return runs
+
+
+class _Judge:
+    """Errors of one frame's poses; several configurations often have the same."""
+
+    def __init__(self, situation: Situation, live: Frame) -> None:
+        self._nodes = situation.nodes
+        truth = situation.truth
+        self._world_from_live = None if truth is None else truth.at(live.stamp_ns)
+        self._known: dict[tuple[NodeId, bytes], tuple[float, float]] = {}
+
+    def near(self) -> set[NodeId]:
+        """The nodes that should be candidates; none where truth is not known."""
+        if self._world_from_live is None:
+            return set()
+        return self._nodes.near(self._world_from_live, DEFAULT_RADIUS_M)
+
+    def error(self, node: NodeId, node_from_live: SE3) -> tuple[float, float]:
+        """Metres and radians; NaN where truth is not known."""
+        world_from_node = self._nodes.pose(node)
+        if self._world_from_live is None or world_from_node is None:
+            return np.nan, np.nan
+        key = (node, node_from_live.translation.tobytes())
+        if key not in self._known:
+            true = world_from_node.inverse() @ self._world_from_live
+            offset_m = float(np.linalg.norm(node_from_live.translation - true.translation))
+            self._known[key] = offset_m, (true.inverse() @ node_from_live).angle_rad
+        return self._known[key]
+
+
+@contextmanager
+def _localisers(
+    situation: Situation,
+    configurations: Iterable[Configuration],
+    settings: Settings,
+    matcher: Matcher | None,
+    search: SharedSearch,
+    relocaliser: str | None,
+) -> Iterator[list[Localiser]]:
+    """One per configuration; in one map they share what is known of it."""
+    views: dict[PathKinds, OpenMap] = {}
+    motion = SharedMotion()
+    with ExitStack() as stack:
+        localisers = []
+        for one in configurations:
+            view = views.get(one.paths)
+            if view is None:
+                view = views[one.paths] = situation.opened.counting(one.paths.kinds)
+            localiser = view.localiser(
+                situation.drive.camera,
+                _settings_for(settings, one, guided=matcher is None),
+                policy=one.policy,
+                budget=one.budget,
+                relocaliser=relocaliser,
+                live=situation.drive.session.id,
+                matcher=matcher,
+                search=search,
+                motion=motion,
+                clock=situation.drive.session,
+            )
+            localiser.keeps_attempts = False  # nothing is written
+            localisers.append(stack.enter_context(localiser))
+        yield localisers
+
+
+def _settings_for(settings: Settings, configuration: Configuration, *, guided: bool) -> Settings:
+    localiser = settings.localiser
+    changed = replace(localiser, recent=replace(localiser.recent, T=configuration.T))
+    if configuration.radius is Radius.BASIN:
+        changed = replace(changed, search_radius_m=0.0)
+    if not guided:
+        changed = replace(changed, guide_below_m=0.0)
+    return replace(settings, localiser=changed)

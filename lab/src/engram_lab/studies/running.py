@@ -1,0 +1,336 @@
+"""Builds the maps of all folds and runs every configuration on every held-out session."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from engram import __version__
+from engram.config import config_hash, to_dict
+from engram.errors import ConfigError
+from engram.frontend.matching import matcher_hash
+from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
+from engram.monitor import ignore
+from engram.ranking import POLICIES
+from engram.robot import MapOptions, OpenMap, Settings, open_map
+from engram.sequences import LoggedFrame
+from engram_lab.studies.building import (
+    GENEROUS,
+    BuiltMap,
+    build_map,
+    read_built_map,
+    read_record,
+    write_json,
+)
+from engram_lab.studies.configurations import (
+    DEFAULT_LANES,
+    FEW_LANES,
+    Configuration,
+    map_sizes,
+    sweep,
+)
+from engram_lab.studies.drives import DriveSet
+from engram_lab.studies.folds import Fold, check_only, chosen, split
+from engram_lab.studies.held_out import localise_held_out
+from engram_lab.studies.kept_maps import KeptMaps
+from engram_lab.studies.lockstep import Runs
+from engram_lab.studies.memo import MatchMemo
+from engram_lab.studies.store import joined, missing, only, read_runs, write_runs
+from engram_lab.studies.tasks import Task, run_tasks
+from engram_lab.studies.writing import alone_in, writing
+
+# Policies that cannot run without knowing the outcomes.
+_BOUNDS = ("oracle",)
+_SMALL_CACHE_BYTES = 4 * 2**20
+
+
+@dataclass(frozen=True, slots=True)
+class RankingOptions:
+    """What an evaluation of ranking policies runs.
+
+    Attributes:
+        policies: keys of `POLICIES`.
+        lanes, rounds: Np and Nr.
+        folds: of the cross-validation.
+        seed: of the shuffle of sessions and of the bootstrap.
+        map_sizes: whether earlier revisions are run too ([L15] Fig. 9).
+        live_folds: folds whose sessions are also run guided and without memo, at Np = 2: that
+            confirms the order of policies and gives milliseconds per frame.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near (SPEC §8).
+        build: how the maps are built.
+        only_folds: numbers of the folds that are run; empty for all. What is run of the others
+            later joins it.
+    """
+
+    policies: tuple[str, ...] = tuple(POLICIES)
+    lanes: tuple[int, ...] = DEFAULT_LANES
+    rounds: tuple[int, ...] = (1, 2)
+    folds: int = 5
+    seed: int = 0
+    map_sizes: bool = True
+    live_folds: int = 1
+    relocaliser: str | None = None
+    build: MapOptions = field(default_factory=lambda: GENEROUS)
+    only_folds: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("policies", "lanes", "rounds", "only_folds"):
+            once = tuple(dict.fromkeys(getattr(self, name)))
+            object.__setattr__(self, name, once)  # what is named twice is run once
+        for policy in self.policies:
+            if policy not in POLICIES:
+                raise ConfigError(
+                    f"no ranking policy '{policy}'; there are: {', '.join(sorted(POLICIES))}"
+                )
+        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+            )
+        for name, values in (("lanes", self.lanes), ("rounds", self.rounds)):
+            if not values or min(values) < 1:
+                raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")
+        check_only(self.only_folds, self.folds)
+
+    @property
+    def few_lanes(self) -> int:
+        """Np of the figures that show one budget: 2 where that is run."""
+        return FEW_LANES if FEW_LANES in self.lanes else self.lanes[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All that a worker needs to know.
+
+    Attributes:
+        drives: what is evaluated.
+        settings: the resolved configuration.
+        options: what is run.
+        work: folder of maps, memos and results.
+    """
+
+    drives: DriveSet
+    settings: Settings
+    options: RankingOptions
+    work: Path
+
+    @property
+    def folds(self) -> tuple[Fold, ...]:
+        """The divisions of the drives."""
+        return split(len(self.drives.drives), self.options.folds, self.options.seed)
+
+    @property
+    def run_folds(self) -> tuple[Fold, ...]:
+        """Those that are run now."""
+        return chosen(self.folds, self.options.only_folds)
+
+    def map_path(self, fold: Fold) -> Path:
+        """The map built from a fold's training sessions."""
+        return self.work / f"fold{fold.number}.engram"
+
+    def runs_path(self, session: int, mode: str) -> Path:
+        """Results of one held-out session; `mode` is "memo" or "live".
+
+        Maps and matches serve every relocaliser, results are its own.
+        """
+        with_it = "" if self.options.relocaliser is None else f"-{self.options.relocaliser}"
+        return self.work / f"{mode}{with_it}-{self.drives.drives[session].key}.npz"
+
+    def configuration(self) -> dict[str, Any]:
+        """The resolved configuration, kept with the results."""
+        return {
+            "campaign": self.drives.name,
+            "drives": [one.name for one in self.drives.drives],
+            "drives_hash": self.drives.hash,
+            "with_truth": self.drives.has_truth,
+            "folds": [to_dict(one) for one in self.folds],
+            "settings": to_dict(self.settings),
+            "options": to_dict(self.options),
+            "matcher": matcher_hash(self.settings.localiser.matcher),
+            "machine": platform.machine(),
+            "engram": __version__,
+        }
+
+
+def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, work: Path) -> Plan:
+    """A plan; its folder below `work` depends on all that its maps and results depend on.
+
+    More policies, lanes or relocalisers may be run later, and find there what was done.
+    """
+    settings = settings.for_descriptor(drives.drives[0].descriptor)
+    depends = (
+        drives.hash,
+        to_dict(settings),
+        to_dict(options.build),
+        options.folds,
+        options.seed,
+        matcher_hash(settings.localiser.matcher),
+        METHOD_VERSION,
+        __version__,
+    )
+    folder = work / f"{file_name(drives.name)}-{config_hash(depends)}"
+    plan = Plan(drives, settings, options, folder)
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / "configuration.json", plan.configuration())
+    return plan
+
+
+def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -> None:
+    """Builds, runs, and leaves the results in the plan's folder; what is there is kept.
+
+    Fold by fold: sessions are run as soon as their map is built. Results do not depend on the
+    number of workers. Killed or interrupted, the same call goes on.
+
+    Args:
+        plan: what to run.
+        workers: processes.
+        advance: called once per task with a word; see `task_count`.
+
+    Raises:
+        MapError: a map cannot be written, or no space is left.
+        MapLockedError: another run works in the same folder.
+        InputError: a drive cannot be read, or results cannot be written.
+    """
+    try:
+        with writing(plan.work), alone_in(plan.work):
+            run_tasks(_tasks(plan), workers, advance)
+    finally:
+        _earlier_maps.close()
+
+
+def _tasks(plan: Plan) -> list[Task]:
+    """Fold by fold: sessions before the next map, so that what is done can be looked at."""
+    tasks = []
+    for fold in plan.run_folds:
+        built = f"build {fold.number}"
+        tasks.append(Task(built, partial(_build, plan, fold), word="built"))
+        tasks += [
+            Task(f"run {session}", partial(_run_session, plan, fold, session), (built,), "run")
+            for session in fold.held_out
+        ]
+    for fold in plan.run_folds[: plan.options.live_folds]:
+        for session in fold.held_out:
+            work = partial(_run_live, plan, fold, session)
+            tasks.append(Task(f"time {session}", work, (), "timed", alone=True))
+    return tasks
+
+
+def forget(plan: Plan, policies: Sequence[str]) -> None:
+    """Drops the results of some policies, whose code has changed; maps and matches stay.
+
+    Only those of the folds that are run: others would be missed by a report that takes in all.
+    """
+    for session in (session for fold in plan.run_folds for session in fold.held_out):
+        for mode in ("memo", "live"):
+            path = plan.runs_path(session, mode)
+            runs = read_runs(path)
+            if runs is not None:
+                kept = {one for one in runs.configurations if one.policy not in policies}
+                write_runs(path, only(runs, kept))
+
+
+def task_count(plan: Plan) -> int:
+    """How often `run` will call `advance`."""
+    return len(_tasks(plan))
+
+
+def _build(plan: Plan, fold: Fold) -> None:
+    drives = [plan.drives.drives[number] for number in fold.training]
+    build_map(plan.map_path(fold), drives, plan.settings, plan.options.build)
+
+
+def _run_session(plan: Plan, fold: Fold, session: int) -> None:
+    """All that is missing of one held-out session."""
+    drive = plan.drives.drives[session]
+    path = plan.runs_path(session, "memo")
+    done = read_runs(path)
+    options = plan.options
+    whole = missing(done, sweep(options.policies, options.lanes, options.rounds))
+    earlier: list[Configuration] = []
+    if options.map_sizes:
+        wanted = map_sizes(
+            options.policies, options.few_lanes, len(fold.training), options.rounds[0]
+        )
+        earlier = missing(done, wanted)
+    if not (whole or earlier):
+        return
+    built = read_built_map(plan.map_path(fold))
+    # The newest map's landmarks: earlier revisions have no others.
+    with open_map(built.path) as newest:
+        config = plan.settings.localiser.matcher
+        memo = MatchMemo(
+            FrameMatcher(newest.store.frames, config),
+            plan.work / f"memo-{drive.key}.matches.npz",
+            matcher_hash(config),
+        )
+        frames = drive.frames()
+        run_one = partial(_run_in, plan, fold, session, frames, memo)
+        if whole:
+            done = joined(done, run_one(newest, whole))
+            memo.save()
+            write_runs(path, done)
+        for count in sorted({one.sessions for one in earlier if one.sessions is not None}):
+            some = [one for one in earlier if one.sessions == count]
+            opened = _earlier_maps.open(built.path, built.revision_after(count))
+            done = joined(done, run_one(opened, some))
+        if earlier and done is not None:
+            memo.save()
+            write_runs(path, done)
+
+
+# Their landmarks are hardly ever read: the memo asks the newest map.
+_earlier_maps = KeptMaps(files=1, cache_bytes=_SMALL_CACHE_BYTES)  # one per worker
+
+
+def _run_live(plan: Plan, fold: Fold, session: int) -> None:
+    """Guided, with every match made as on a robot."""
+    path = plan.runs_path(session, "live")
+    done = read_runs(path)
+    policies = [one for one in plan.options.policies if one not in _BOUNDS]
+    few, rounds = plan.options.few_lanes, plan.options.rounds[0]
+    wanted = missing(done, [Configuration(one, few, rounds) for one in policies])
+    if not wanted:
+        return
+    frames = plan.drives.drives[session].frames()
+    for configuration in wanted:  # one after another: each has the machine for itself
+        with open_map(read_built_map(plan.map_path(fold)).path) as opened:
+            runs = _run_in(plan, fold, session, frames, None, opened, [configuration])
+            done = joined(done, runs)
+    assert done is not None
+    write_runs(path, done)
+
+
+def _run_in(
+    plan: Plan,
+    fold: Fold,
+    session: int,
+    frames: Sequence[LoggedFrame],
+    matcher: Matcher | None,
+    opened: OpenMap,
+    configurations: Sequence[Configuration],
+) -> Runs:
+    """One session in one map."""
+    return localise_held_out(
+        opened,
+        plan.drives.drives[session],
+        frames,
+        [plan.drives.drives[number] for number in fold.training],
+        configurations,
+        plan.settings,
+        matcher,
+        plan.options.relocaliser,
+    )
+
+
+def file_name(name: str) -> str:
+    """A name without what file systems do not like."""
+    return "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
+
+
+def built_map(plan: Plan, fold: Fold) -> BuiltMap:
+    """A fold's map, as far as its record says that it is built."""
+    return read_record(plan.map_path(fold))

@@ -1,0 +1,194 @@
+"""What a camera makes of light: exposure, noise, blur, glare, and what sticks to its lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram_lab import _town
+from engram_lab.town.drive import Pose
+from engram_lab.town.robots import Robot
+
+Luminance = NDArray[np.float32]
+Grey = NDArray[np.uint8]
+
+_TARGET = 0.4  # exposed luminance that the metered highlights are brought to
+_MOST_GAIN = 26.0
+_SHUTTER_BY_DAY_S = 0.0007
+_LONGEST_SHUTTER_S = 0.012
+_CLOTH = 0.002  # share of the light that comes through what covers a lens
+# Drops that sit on the glass in the hardest rain, on 512×384 pixels: three quarters of the picture
+# lie behind one. Odometry mostly bears that; of the nodes about, few match (calibration, row f).
+_DROPS = 220
+# What the hash of the world is made from, besides the robots.
+CONSTANTS = {
+    "target": _TARGET,
+    "most_gain": _MOST_GAIN,
+    "shutter_by_day_s": _SHUTTER_BY_DAY_S,
+    "longest_shutter_s": _LONGEST_SHUTTER_S,
+    "drops": _DROPS,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What is wrong with the front lens in a session.
+
+    Attributes:
+        dirt: 0…1, specks and smears that stay.
+        covered_from_m, covered_to_m: stretch on which something lies over both lenses.
+    """
+
+    dirt: float = 0.0
+    covered_from_m: float = np.inf
+    covered_to_m: float = np.inf
+
+
+CLEAN = Lens()
+
+
+class CameraModel:
+    """Turns luminance into grey levels; keeps the exposure from frame to frame.
+
+    Args:
+        robot: whose camera.
+        seed: of noise, drops and dirt.
+        lens: what is wrong with it.
+    """
+
+    def __init__(self, robot: Robot, seed: int, lens: Lens) -> None:
+        self._robot = robot
+        self._seed = seed
+        self._lens = lens
+        self._gain: float | None = None
+        self._sitting = [((-1, -1), np.zeros((0, 0), dtype=np.float32))] * 2
+        self._dirt = [self._specks(eye) for eye in range(2)] if lens.dirt > 0 else []
+
+    def expose(
+        self, luminance: Luminance, inverse_depths: Luminance, pose: Pose, rain: float, frame: int
+    ) -> tuple[Grey, Grey]:
+        """The pair's grey images.
+
+        Args:
+            luminance: (2, height, width), linear.
+            inverse_depths: (2, height, width), 1/m.
+            pose: motion while the shutter is open.
+            rain: 0…1, drops on the lens and streaks in the air.
+            frame: number of the frame, seeds its noise.
+        """
+        if self._lens.covered_from_m <= pose.driven_m < self._lens.covered_to_m:
+            luminance = _covered(luminance)
+        gain = self._meter(luminance)
+        shutter_s = float(np.clip(_SHUTTER_BY_DAY_S * gain, 0.0002, _LONGEST_SHUTTER_S))
+        pair = []
+        for eye in range(2):
+            light = self._blur(luminance[eye], inverse_depths[eye], pose.twist * shutter_s)
+            light = _veil(light, gain)
+            if self._dirt:
+                light = _smudge(light, self._dirt[eye])
+            if rain > 0.05:
+                light = self._wet(light, rain, frame, eye)
+            noise_seed = (self._seed * 1_000_003 + 2 * frame + eye) & 0xFFFFFFFFFFFF
+            robot = self._robot
+            pair.append(
+                _town.develop(
+                    np.ascontiguousarray(light, dtype=np.float32), gain,
+                    robot.shot_noise * max(1.0, gain),
+                    robot.read_noise * max(1.0, gain) ** 0.75, robot.vignette, noise_seed,
+                )
+            )  # fmt: skip
+        return pair[0], pair[1]
+
+    def _meter(self, luminance: Luminance) -> float:
+        """The gain, which follows the scene with a lag of about three frames."""
+        rows = luminance.shape[1]
+        metered = luminance[0, rows // 6 :: 4, ::4]
+        bright = float(np.quantile(metered, 0.85))
+        wanted = min(_TARGET / max(bright, 1e-6), _MOST_GAIN)
+        self._gain = wanted if self._gain is None else self._gain * (wanted / self._gain) ** 0.3
+        return self._gain
+
+    def _blur(
+        self, light: Luminance, inverse_depths: Luminance, twist: NDArray[np.float64]
+    ) -> Luminance:
+        camera = self._robot.camera
+        # The nearest things, about 3 m away, move by this much at most.
+        moved_px = camera.fx * (np.abs(twist[:3]).max() / 3 + np.abs(twist[3:]).max())
+        if moved_px < 0.5:
+            return light
+        blurred: Luminance = _town.smear(
+            np.ascontiguousarray(light), np.ascontiguousarray(inverse_depths),
+            camera.fx, camera.fy, camera.cx, camera.cy, twist.astype(np.float32),
+        )  # fmt: skip
+        return blurred
+
+    def _specks(self, eye: int) -> Luminance:
+        """How much of each pixel (height, width) the dirt on one lens takes, 0…1."""
+        camera = self._robot.camera
+        rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD127, eye])
+        mask = np.zeros((camera.height, camera.width), dtype=np.float32)
+        for _ in range(int(40 * self._lens.dirt) + 1):
+            centre = (int(rng.uniform(0, camera.width)), int(rng.uniform(0, camera.height)))
+            axes = (int(rng.uniform(4, 22)), int(rng.uniform(4, 14)))
+            turned_deg, takes = float(rng.uniform(0, 180)), float(rng.uniform(0.3, 0.9))
+            cv2.ellipse(mask, centre, axes, turned_deg, 0, 360, takes, -1)
+        return np.asarray(cv2.GaussianBlur(mask, (0, 0), 4.0), dtype=np.float32)
+
+    def _wet(self, light: Luminance, rain: float, frame: int, eye: int) -> Luminance:
+        height, width = light.shape
+        rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0x3A14, frame, eye])
+        air = float(np.quantile(light[::8, ::8], 0.8))
+        streaks = np.zeros((height, width), dtype=np.float32)
+        low, high = np.array([[0, -20, 8, 0.05], [width, height, 28, 0.22]])
+        for x, y, long, bright in low + (high - low) * rng.random((int(150 * rain), 4)):
+            end = (int(x + 0.08 * long), int(y + long))
+            cv2.line(streaks, (int(x), int(y)), end, float(air * bright), 1)
+        light = light + cv2.GaussianBlur(streaks, (0, 0), 0.6)
+        soft = self._drops(int(_DROPS * rain**1.6 * height * width / (384 * 512)), frame, eye)
+        through = cv2.blur(np.minimum(light, 2 * air), (27, 27))
+        return np.asarray(light * (1 - soft) + through * soft, dtype=np.float32)
+
+    def _drops(self, count: int, frame: int, eye: int) -> Luminance:
+        """How much of each pixel drops take, 0…1; they sit for nine frames before they run off."""
+        key = (count, frame // 9)
+        if self._sitting[eye][0] != key:
+            camera = self._robot.camera
+            rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD209, eye, frame // 9])
+            drops = np.zeros((camera.height, camera.width), dtype=np.float32)
+            low, high = np.array([[0, 0, 8], [camera.width, camera.height, 30]])
+            for x, y, radius in low + (high - low) * rng.random((count, 3)):
+                cv2.circle(drops, (int(x), int(y)), int(radius), 1.0, -1)
+            soft = np.asarray(cv2.GaussianBlur(drops, (0, 0), 3.0), dtype=np.float32)
+            self._sitting[eye] = (key, soft)
+        return self._sitting[eye][1]
+
+
+def _covered(luminance: Luminance) -> Luminance:
+    """What comes through a cloth over both lenses: next to nothing, and without any edges."""
+    height, width = luminance.shape[1:]
+    coarse = [cv2.resize(eye, (4, 3), interpolation=cv2.INTER_AREA) for eye in luminance]
+    dim = [cv2.resize(eye, (width, height), interpolation=cv2.INTER_LINEAR) for eye in coarse]
+    return np.asarray(dim, dtype=np.float32) * np.float32(_CLOTH)
+
+
+def _veil(light: Luminance, gain: float) -> Luminance:
+    """Light that strays in the lens: a halo round what is far brighter than white."""
+    if float(light.max()) * gain < 1.6:
+        return light
+    small = cv2.resize(light, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    excess = np.clip(small - 1.0 / gain, 0, 30.0 / gain)
+    halo = 0.10 * cv2.GaussianBlur(excess, (0, 0), 2.5) + 0.06 * cv2.GaussianBlur(
+        excess, (0, 0), 14
+    )
+    grown = cv2.resize(halo, (light.shape[1], light.shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(light + grown, dtype=np.float32)
+
+
+def _smudge(light: Luminance, mask: Luminance) -> Luminance:
+    blurred = cv2.GaussianBlur(light, (0, 0), 5.0)
+    mean = float(light[::8, ::8].mean())
+    smeared = 0.55 * blurred + 0.12 * mean  # dirt swallows a third and scatters
+    return np.asarray(light * (1 - mask) + mask * smeared, dtype=np.float32)

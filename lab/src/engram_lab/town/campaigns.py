@@ -1,0 +1,271 @@
+"""Campaigns: reproducible lists of drives, named after the papers' data sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+
+import numpy as np
+
+from engram.errors import ConfigError
+from engram_lab.town.camera_model import CLEAN, Lens
+from engram_lab.town.conditions import OXFORD, Place
+from engram_lab.town.streets import Route, StreetPlan, crossing_loops, loop_of_length
+
+# Raised whenever a frame of any campaign changes: rendered data is kept by it.
+WORLD_VERSION = 5
+
+
+_SUMMER_TIME = timedelta(hours=1)
+
+
+class Size(StrEnum):
+    """How much of a campaign: what fits working machines, or the papers' own sizes."""
+
+    STANDARD = "standard"
+    FULL = "full"
+
+
+@dataclass(frozen=True, slots=True)
+class SessionPlan:
+    """One drive.
+
+    Attributes:
+        number: within its home campaign, in the order of time.
+        start: UTC.
+        weather: key in `WEATHERS`.
+        robot: key in `ROBOTS`.
+        reverse: driven the other way round.
+        seed: of the driving line, the noise, the traffic and the clouds.
+        lens: what is wrong with the front lens.
+    """
+
+    number: int
+    start: datetime
+    weather: str
+    robot: str
+    reverse: bool
+    seed: int
+    lens: Lens = CLEAN
+
+    @property
+    def name(self) -> str:
+        """Such as ``007-0812T0930-overcast-wildcat``."""
+        way = "-reverse" if self.reverse else ""
+        return f"{self.number:03d}-{self.start:%m%dT%H%M}-{self.weather}-{self.robot}{way}"
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """A town, a route in it, and the drives.
+
+    Attributes:
+        name: key in `CAMPAIGNS`.
+        seed: of the town and all drives.
+        length_m: of the route.
+        crossing: a route of several loops that meet, instead of one loop.
+        sessions: in the order of time.
+        traffic: how many cars and people move, 0…1.
+        size: how much of it this is.
+        home: campaign whose town and drives these are: `begbroke` at standard size is the part
+            of `begbroke24h` by day, and is not rendered again.
+        parked_share: of the parking places that are taken.
+        spacing_m: way between frames.
+        place: where on earth.
+        first_day: from which structural change counts.
+    """
+
+    name: str
+    seed: int
+    length_m: float
+    crossing: bool
+    sessions: tuple[SessionPlan, ...]
+    traffic: float
+    size: Size
+    home: str
+    parked_share: float = 0.45
+    spacing_m: float = 0.7
+    place: Place = OXFORD
+
+    @property
+    def first_day(self) -> int:
+        """Proleptic ordinal of the first drive's date; a part of a campaign begins with it."""
+        if self.name == self.home:
+            return self.sessions[0].start.toordinal()
+        return CAMPAIGNS[self.home](self.seed, self.size).first_day
+
+    def plan(self) -> tuple[StreetPlan, Route]:
+        """Where its streets run and the way that is driven."""
+        return (crossing_loops if self.crossing else loop_of_length)(self.length_m, self.seed)
+
+    def session(self, number: int) -> SessionPlan:
+        """One of its drives.
+
+        Raises:
+            ConfigError: no such number.
+        """
+        if not 0 <= number < len(self.sessions):
+            raise ConfigError(
+                f"campaign '{self.name}' has sessions 0 to {len(self.sessions) - 1}, not {number}"
+            )
+        return self.sessions[number]
+
+
+def campaign_named(name: str, seed: int = 1, size: Size = Size.STANDARD) -> Campaign:
+    """A campaign by name.
+
+    Raises:
+        ConfigError: no such campaign, or the seed is outside 0 to 2³¹ − 1.
+    """
+    if name not in CAMPAIGNS:
+        raise ConfigError(f"unknown campaign '{name}'; known are: {', '.join(CAMPAIGNS)}")
+    if not 0 <= seed < 2**31:
+        raise ConfigError(f"seed is {seed}, must be 0 to {2**31 - 1}")
+    return CAMPAIGNS[name](seed, size)
+
+
+def _planned(
+    name: str, seed: int, starts: list[datetime], weathers: list[str], robots: list[str],
+    reverse: list[bool],
+) -> tuple[SessionPlan, ...]:  # fmt: skip
+    order = sorted(range(len(starts)), key=lambda k: (starts[k], k))
+    base = int(np.random.default_rng([seed, *name.encode()]).integers(2**30))
+    return tuple(
+        SessionPlan(
+            number, starts[k], weathers[k], robots[k], reverse[k], base + 7919 * number,
+            Lens(dirt=0.4) if (base + number) % 13 == 5 else CLEAN,
+        )
+        for number, k in enumerate(order)
+    )  # fmt: skip
+
+
+# How often each weather comes, as in a very wet English summer: drops on the lens are what our own
+# matcher fails at, and held-out laps shall fail as calibration (f) asks.
+_SUMMER = (("clear", 0.21), ("fair", 0.17), ("broken", 0.17), ("overcast", 0.17), ("showers", 0.12),
+           ("rain", 0.10), ("damp", 0.06))  # fmt: skip
+
+
+def _dealt(rng: np.random.Generator, count: int) -> list[str]:
+    """Weathers of some drives in the shares of the summer, to within one drive, in random order.
+
+    Ten that are drawn one by one can miss both sun and rain, and nothing would ever fail there.
+    """
+    names, shares = zip(*_SUMMER, strict=True)
+    at = (rng.random() + np.arange(count)) / count
+    dealt = np.searchsorted(np.cumsum(shares)[:-1], at, side="right")
+    return [str(names[k]) for k in rng.permutation(dealt)]
+
+
+def by_day(start: datetime) -> bool:
+    """Whether a drive sets out between 7 and 19 h, summer time."""
+    return 7 <= (start + _SUMMER_TIME).hour < 19
+
+
+def _spread(
+    rng: np.random.Generator, first: datetime, days: int, count: int, hours: tuple[float, float]
+) -> list[datetime]:
+    """`count` starts over some days, each within the hours (UTC)."""
+    day = np.sort(rng.integers(0, days, count))
+    hour = rng.uniform(*hours, count)
+    return [
+        first + timedelta(days=int(d), minutes=round(60 * float(h)))
+        for d, h in zip(day, hour, strict=True)
+    ]
+
+
+def _hamlet(seed: int, size: Size) -> Campaign:
+    first = datetime(2025, 7, 14, tzinfo=UTC)
+    drives = [
+        (0, 8.5, "clear", "wildcat"), (0, 17.0, "clear", "courier"),
+        (1, 11.0, "overcast", "wildcat"), (1, 22.5, "fair", "wildcat"),
+        (2, 10.0, "rain", "courier"), (3, 9.0, "fair", "wildcat"),
+    ]  # fmt: skip
+    starts = [first + timedelta(days=d, hours=h) for d, h, _, _ in drives]
+    sessions = _planned(
+        "hamlet", seed, starts, [d[2] for d in drives], [d[3] for d in drives], [False] * 6
+    )
+    return Campaign("hamlet", seed, 150, False, sessions, 0.4, size, "hamlet")
+
+
+def _village(seed: int, size: Size) -> Campaign:
+    """24 drives that meet every condition there is, by two robots."""
+    first = datetime(2025, 6, 20, tzinfo=UTC)
+    drives = [
+        (0, 6.5, "clear"), (0, 9.5, "clear"), (0, 13.0, "clear"), (0, 17.5, "clear"),
+        (1, 9.5, "overcast"), (1, 14.0, "broken"), (2, 10.0, "rain"), (2, 22.8, "overcast"),
+        (3, 9.7, "fair"), (4, 12.0, "showers"), (5, 5.5, "fog"), (6, 17.0, "fair"),
+        (8, 21.3, "clear"), (10, 1.5, "clear"), (12, 11.0, "overcast"), (20, 16.0, "broken"),
+        (40, 9.0, "clear"), (61, 19.3, "fair"), (110, 10.0, "overcast"), (125, 15.0, "clear"),
+        (150, 17.2, "damp"), (190, 11.0, "snow"), (192, 13.0, "thaw"), (200, 12.0, "clear"),
+    ]  # fmt: skip
+    starts = [first + timedelta(days=d, hours=h) for d, h, _ in drives]
+    robots = ["courier" if k % 4 == 2 else "wildcat" for k in range(len(drives))]
+    sessions = _planned(
+        "village", seed, starts, [d[2] for d in drives], robots, [k % 8 == 5 for k in range(24)]
+    )
+    # On one drive something lies over the lenses for some metres.
+    hidden = replace(sessions[15], lens=Lens(covered_from_m=200.0, covered_to_m=208.0))
+    sessions = (*sessions[:15], hidden, *sessions[16:])
+    return Campaign("village", seed, 700, False, sessions, 0.4, size, "village")
+
+
+def _begbroke(seed: int, size: Size) -> Campaign:
+    """107 laps in two months, 7 h to 19 h local; at standard size begbroke24h's by day."""
+    if size is Size.STANDARD:
+        whole = _begbroke24h(seed, size)
+        laps = tuple(lap for lap in whole.sessions if by_day(lap.start))
+        return replace(whole, name="begbroke", sessions=laps)
+    rng = np.random.default_rng([seed, 0xBE6])
+    starts = _spread(rng, datetime(2025, 6, 1, tzinfo=UTC), 61, 107, (6.0, 18.0))
+    sessions = _planned(
+        "begbroke", seed, starts, _dealt(rng, 107), ["wildcat"] * 107, [False] * 107
+    )
+    return Campaign("begbroke", seed, 700, False, sessions, 0.25, size, "begbroke")
+
+
+def _begbroke24h(seed: int, size: Size) -> Campaign:
+    """Regular starts day and night, 6 August to 5 September; as much rain by night as by day."""
+    count = 140 if size is Size.FULL else 80
+    rng = np.random.default_rng([seed, 0x24])
+    first = datetime(2025, 8, 6, tzinfo=UTC)
+    minutes = np.arange(count) * 30 * 24 * 60 / count + rng.uniform(-12, 12, count) + 15
+    starts = [first + timedelta(minutes=round(float(m))) for m in minutes]
+    day = [by_day(start) for start in starts]
+    of_day, of_night = iter(_dealt(rng, sum(day))), iter(_dealt(rng, count - sum(day)))
+    weathers = [next(of_day if light else of_night) for light in day]
+    sessions = _planned("begbroke24h", seed, starts, weathers, ["wildcat"] * count, [False] * count)
+    return Campaign("begbroke24h", seed, 700, False, sessions, 0.25, size, "begbroke24h")
+
+
+def _keble(seed: int, size: Size) -> Campaign:
+    """On a bicycle through crowds, many junctions and own loops, over three months."""
+    count = 25 if size is Size.FULL else 10
+    rng = np.random.default_rng([seed, 0x4EB])
+    starts = _spread(rng, datetime(2025, 5, 1, tzinfo=UTC), 90, count, (8.0, 16.0))
+    sessions = _planned(
+        "keble", seed, starts, _dealt(rng, count), ["bicycle"] * count, [False] * count
+    )
+    return Campaign("keble", seed, 2200, True, sessions, 1.0, size, "keble")
+
+
+def _oxford(seed: int, size: Size) -> Campaign:
+    """Through the town in summer, both directions, behind other vehicles."""
+    rng = np.random.default_rng([seed, 0x0F0])
+    starts = _spread(rng, datetime(2025, 6, 10, tzinfo=UTC), 60, 10, (8.0, 18.0))
+    sessions = _planned(
+        "oxford", seed, starts, _dealt(rng, 10), ["wildcat"] * 10, [k % 2 == 1 for k in range(10)]
+    )
+    length = 7600 if size is Size.FULL else 3000
+    return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.65)
+
+
+CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {
+    "hamlet": _hamlet,
+    "village": _village,
+    "begbroke": _begbroke,
+    "keble": _keble,
+    "oxford": _oxford,
+    "begbroke24h": _begbroke24h,
+}

@@ -1,0 +1,181 @@
+"""Light and weather of a drive, and how they change while it lasts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError
+from engram_lab.town.sky import clear_sky_power, clear_sun_power, sun_direction
+
+
+@dataclass(frozen=True, slots=True)
+class Weather:
+    """What the sky does, apart from the hour.
+
+    Attributes:
+        cloud: share of the sky that is covered, on average over the drive, 0…1.
+        changes: how far that share swings along the way, 0…1.
+        fog_per_m: extinction of the air.
+        rain: how hard it rains, 0…1; `changes` makes it come and go.
+        wet: film of water on the ground, 0…1.
+        snow: how much lies, 0…1.
+    """
+
+    cloud: float = 0.0
+    changes: float = 0.0
+    fog_per_m: float = 0.0
+    rain: float = 0.0
+    wet: float = 0.0
+    snow: float = 0.0
+
+
+WEATHERS: dict[str, Weather] = {
+    "clear": Weather(cloud=0.04),
+    "fair": Weather(cloud=0.35, changes=0.12),
+    "broken": Weather(cloud=0.55, changes=0.45),
+    "overcast": Weather(cloud=1.0, fog_per_m=0.0008),
+    "fog": Weather(cloud=1.0, fog_per_m=0.035),
+    "rain": Weather(cloud=1.0, fog_per_m=0.006, rain=0.88, wet=1.0),
+    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.002, rain=0.58, wet=0.7),
+    "damp": Weather(cloud=0.9, changes=0.2, fog_per_m=0.001, wet=0.7),
+    "snow": Weather(cloud=1.0, fog_per_m=0.010, snow=0.95),
+    "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.45),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where on earth the town stands."""
+
+    latitude_deg: float
+    longitude_deg: float
+
+
+OXFORD = Place(51.75, -1.26)
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Light and weather at one point of a drive.
+
+    Attributes:
+        sun_direction: (3,) towards the sun, world axes.
+        sun_power: irradiance / π of the sun on a surface that faces it; 0 behind a cloud.
+        sky_power: mean luminance of the sky.
+        cloud: share of the sky covered.
+        cloud_shift: (2,) drift of the clouds, in the noise's texels.
+        fog_per_m, haze: extinction; luminance of the air as a factor of the sky's.
+        wet, snow, rain: 0…1.
+        lamps_on: street lamps and lit windows.
+        headlights_on: of the robot and of others.
+    """
+
+    sun_direction: NDArray[np.float64]
+    sun_power: float
+    sky_power: float
+    cloud: float
+    cloud_shift: tuple[float, float]
+    fog_per_m: float
+    haze: float
+    wet: float
+    snow: float
+    rain: float
+    lamps_on: bool
+    headlights_on: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """Light and weather of one drive.
+
+    Attributes:
+        start: UTC, with its zone.
+        weather: key in `WEATHERS`.
+        seed: of how the clouds pass.
+        place: where.
+    """
+
+    start: datetime
+    weather: str
+    seed: int
+    place: Place = OXFORD
+
+    def __post_init__(self) -> None:
+        if self.weather not in WEATHERS:
+            known = ", ".join(WEATHERS)
+            raise ConfigError(f"unknown weather '{self.weather}'; known are: {known}")
+
+    @property
+    def hour(self) -> float:
+        """Mean solar time, hours."""
+        utc = self.start.hour + self.start.minute / 60 + self.start.second / 3600
+        return (utc + self.place.longitude_deg / 15) % 24
+
+    @property
+    def season(self) -> int:
+        """0 with leaves, 1 autumn, 2 bare."""
+        day = self.start.timetuple().tm_yday
+        if 115 <= day < 285:
+            return 0
+        return 1 if 285 <= day < 325 else 2
+
+    def at(self, driven_m: float, elapsed_s: float) -> Moment:
+        """Light and weather after so far and so long.
+
+        The sun stands still during a drive (it moves 1° in four minutes); clouds pass over the
+        robot every 50 to 300 m, and lamps come on one minute into civil twilight.
+        """
+        weather = WEATHERS[self.weather]
+        sun = self._sun(0.0)
+        swing = _drift(self.seed, driven_m)
+        cloud = float(np.clip(weather.cloud + weather.changes * swing, 0, 1))
+        shade = _shade(cloud, _drift(self.seed + 1, driven_m))
+        rain = float(np.clip(weather.rain + 1.6 * weather.changes * swing, 0, 1))
+        rain = rain if weather.rain > 0 else 0.0
+        clear = clear_sky_power(float(sun[2]))
+        dusk_deg = float(np.degrees(np.arcsin(self._sun(elapsed_s)[2])))
+        lamps = dusk_deg < -1.0
+        return Moment(
+            sun_direction=sun if sun[2] > 0 else np.array([0.0, 0.0, 1.0]),
+            sun_power=clear_sun_power(float(sun[2])) * (1 - shade),
+            sky_power=clear * (1 + 0.9 * cloud - 0.45 * _darkening(rain)),
+            cloud=cloud,
+            cloud_shift=(0.31 * elapsed_s + 17.0 * (self.seed % 97), 0.07 * elapsed_s),
+            fog_per_m=weather.fog_per_m * (1 + 0.5 * swing * (weather.fog_per_m > 0.01)),
+            haze=0.9,
+            wet=weather.wet,
+            snow=weather.snow,
+            rain=rain,
+            lamps_on=lamps,
+            headlights_on=dusk_deg < 1.5 or weather.fog_per_m > 0.01 or rain > 0.1,
+        )
+
+    def _sun(self, elapsed_s: float) -> NDArray[np.float64]:
+        when = self.start + timedelta(seconds=elapsed_s)
+        return sun_direction(when, self.place.latitude_deg, self.place.longitude_deg)
+
+
+def _drift(seed: int, driven_m: float) -> float:
+    """A slow function of the way, −1…1: three waves of 90 to 400 m with phases of the seed."""
+    rng = np.random.default_rng([seed & 0x7FFFFFFF, 0xC10D])
+    lengths_m = rng.uniform([90, 150, 260], [150, 260, 400])
+    phases = rng.uniform(0, 2 * np.pi, 3)
+    waves = np.sin(2 * np.pi * driven_m / lengths_m + phases)
+    return float(np.tanh(0.9 * waves.sum()))
+
+
+def _darkening(rain: float) -> float:
+    """How much of a rain cloud stands overhead, 0…1: all of it before the rain is half as hard."""
+    return min(rain / 0.4, 1.0)
+
+
+def _shade(cloud: float, drift: float) -> float:
+    """Share of the sun that clouds take: none, part or all, with soft transitions."""
+    if cloud < 0.15:
+        return 0.0
+    edge = 1 - 2 * cloud  # the drift lies above it for about the covered share of the way
+    return float(np.clip((drift - edge) / 0.25 + 0.5, 0, 1))

@@ -1,0 +1,141 @@
+"""A drive through a town as stereo pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.geometry import SE3, StereoCamera
+from engram_lab import _town
+from engram_lab.town.conditions import Moment
+from engram_lab.town.mesh import Mesh
+from engram_lab.town.streets import Junction
+from engram_lab.town.town import Tile, Today, Town
+
+_AHEAD_M = 170.0  # how far tiles are kept around the camera
+_LAMP_POWER = 7.0
+_LAMP_RANGE_M = 22.0
+_WINDOW_LUMINANCE = 0.3
+
+
+class TownRenderer:
+    """Keeps the tiles around the camera in the scene and renders what it sees.
+
+    Args:
+        town: what there is.
+        today: what is there today.
+        threads: of the renderer.
+    """
+
+    def __init__(self, town: Town, today: Today, threads: int = 1) -> None:
+        self.town = town
+        self._today = today
+        self._threads = threads
+        self._tiles: dict[Junction, Tile] = {}
+        self._lamps_on: bool | None = None
+
+    def render(
+        self, world_from_cam: SE3, camera: StereoCamera, moment: Moment, moving: Mesh | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Luminance and inverse depth, each (2, height, width) float32: left, right."""
+        self._stand_ready(world_from_cam)
+        self._light_lamps(moment.lamps_on)
+        self._set_moving(moving)
+        luminance, inverse_depths = self.town.scene.render(
+            _town.RenderCamera(
+                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+                camera.baseline_m,
+            ),
+            np.ascontiguousarray(world_from_cam.rotation),
+            world_from_cam.translation,
+            _light(moment, world_from_cam),
+            self._threads,
+        )  # fmt: skip
+        return luminance, inverse_depths
+
+    def depth(
+        self, world_from_cam: SE3, camera: StereoCamera, moving: Mesh | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """What the left camera's pixel centres see.
+
+        Returns:
+            depth in metres (height, width) float32, infinite for the sky; `Kind` (height, width)
+            int32, −1 for the sky.
+        """
+        self._stand_ready(world_from_cam)
+        self._set_moving(moving)
+        depth_m, kinds = self.town.scene.depth(
+            _town.RenderCamera(
+                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
+                camera.baseline_m,
+            ),
+            np.ascontiguousarray(world_from_cam.rotation),
+            world_from_cam.translation,
+        )  # fmt: skip
+        return depth_m, kinds
+
+    def leave(self) -> None:
+        """Takes its tiles out of the town's scene; they come back when it renders again."""
+        for tile in self._tiles.values():
+            self.town.drop_tile(tile)
+        self._tiles.clear()
+        self._lamps_on = None
+
+    def _stand_ready(self, world_from_cam: SE3) -> None:
+        """Has the tiles around the camera, and no others, in the scene."""
+        if self.town.tenant is not self:
+            if self.town.tenant is not None:
+                self.town.tenant.leave()
+            self.town.tenant = self
+        position = world_from_cam.translation
+        keep = set(self.town.blocks_near(position, 1.4 * _AHEAD_M))
+        for block in [b for b in self._tiles if b not in keep]:
+            self.town.drop_tile(self._tiles.pop(block))
+            self._lamps_on = None
+        for block in self.town.blocks_near(position, _AHEAD_M):
+            if block not in self._tiles:
+                self._tiles[block] = self.town.build_tile(block, self._today)
+                self._lamps_on = None
+
+    def _light_lamps(self, lamps_on: bool) -> None:
+        if lamps_on is self._lamps_on:
+            return
+        self._lamps_on = lamps_on
+        places = [self._tiles[block].lamps for block in sorted(self._tiles)]
+        lamps = np.concatenate(places) if places and lamps_on else np.zeros((0, 3))
+        rows = np.empty((len(lamps), 5), dtype=np.float32)
+        rows[:, :3] = lamps
+        rows[:, 3:] = (_LAMP_POWER, _LAMP_RANGE_M)
+        self.town.scene.set_lamps(rows)
+
+    def _set_moving(self, moving: Mesh | None) -> None:
+        mesh = Mesh.joined([]) if moving is None else moving
+        self.town.scene.set_moving(
+            mesh.vertices, mesh.uv, mesh.textures, mesh.flags, mesh.tint, mesh.glow, mesh.kinds
+        )
+
+
+def _light(moment: Moment, world_from_cam: SE3) -> _town.Light:
+    """The core's record of the light, with the robot's own headlights below its camera."""
+    rotation, centre = world_from_cam.rotation, world_from_cam.translation
+    ahead = np.array([rotation[0, 2], rotation[1, 2], 0.0])
+    ahead /= np.linalg.norm(ahead)
+    aside = np.array([ahead[1], -ahead[0], 0.0])
+    bumper = np.array([centre[0], centre[1], 0.7]) + 1.2 * ahead
+    beam = ahead + np.array([0, 0, -0.06])
+    vehicle = np.stack([bumper - 0.6 * aside, bumper + 0.6 * aside, beam / np.linalg.norm(beam)])
+    return _town.Light.of(
+        sun=moment.sun_direction.astype(np.float32),
+        vehicle=vehicle.astype(np.float32),
+        sun_power=moment.sun_power,
+        sky_power=moment.sky_power,
+        cloud=moment.cloud,
+        cloud_x=moment.cloud_shift[0],
+        cloud_y=moment.cloud_shift[1],
+        fog_per_m=moment.fog_per_m,
+        haze=moment.haze,
+        wet=moment.wet,
+        snow=moment.snow,
+        headlights=1.0 if moment.headlights_on else 0.0,
+        windows=_WINDOW_LUMINANCE if moment.lamps_on else 0.0,
+    )

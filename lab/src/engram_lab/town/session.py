@@ -1,0 +1,133 @@
+"""One drive of a campaign: stereo pairs in the order of time, with truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import numpy as np
+
+from engram.errors import ConfigError
+from engram.frontend import StereoPair
+from engram.geometry import SE3, StereoCamera
+from engram_lab.town.camera_model import CameraModel
+from engram_lab.town.campaigns import Campaign, SessionPlan
+from engram_lab.town.changes import alterations_on
+from engram_lab.town.conditions import Conditions
+from engram_lab.town.drive import DrivingStyle, Line, Pose, drive, driving_line
+from engram_lab.town.life import Life
+from engram_lab.town.mesh import Mesh
+from engram_lab.town.rendering import TownRenderer
+from engram_lab.town.robots import Robot, robot_named
+from engram_lab.town.streets import Route, StreetPlan
+from engram_lab.town.textures import Style
+from engram_lab.town.town import Today, Town
+from engram_lab.town.truth import FrameTruth
+
+_MOST_THREADS = 256  # of the core
+
+
+class SimulatedDrive:
+    """A session of a campaign, rendered as it is iterated over.
+
+    Iterating twice gives the same images. Poses are cheap and need no rendering. The drives of a
+    town share one scene: not for use from several threads at once.
+
+    Args:
+        campaign: what to drive through.
+        session: number of the drive.
+        threads: of the renderer, 1 to 256.
+
+    Raises:
+        ConfigError: no such session, or another number of threads.
+    """
+
+    def __init__(self, campaign: Campaign, session: int, threads: int = 1) -> None:
+        if not 1 <= threads <= _MOST_THREADS:
+            raise ConfigError(f"threads is {threads}, must be 1 to {_MOST_THREADS}")
+        self.campaign = campaign
+        self.plan: SessionPlan = campaign.session(session)
+        self.robot: Robot = robot_named(self.plan.robot)
+        self.conditions = Conditions(
+            self.plan.start, self.plan.weather, self.plan.seed, campaign.place
+        )
+        self._threads = threads
+        self._stage: TownRenderer | None = None
+        self._life: Life | None = None
+        self._streets, self._route = campaign.plan()
+        self.line: Line = driving_line(self._streets, self._route, self.plan.reverse)
+        count = int(self.line.length_m // campaign.spacing_m)
+        style = DrivingStyle(self.plan.seed)
+        self.poses: list[Pose] = drive(self.line, self.robot, style, campaign.spacing_m, count)
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The robot's camera."""
+        return self.robot.camera
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return self.frames()
+
+    def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoPair]:
+        """Pairs `start` to `stop`; the exposure settles anew at the first."""
+        camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens)
+        for k, pose in enumerate(self.poses[start:stop], start):
+            moment = self.conditions.at(pose.driven_m, pose.elapsed_s)
+            luminance, inverse_depths = self._renderer().render(
+                pose.world_from_cam, self.camera, moment, self._moving(pose)
+            )
+            left, right = camera_model.expose(luminance, inverse_depths, pose, moment.rain, k)
+            yield StereoPair(self.stamp_ns(k), left, right, self.camera)
+
+    def truths(self, start: int = 0, stop: int | None = None) -> Iterator[FrameTruth]:
+        """Truth of frames `start` to `stop`."""
+        for pose in self.poses[start:stop]:
+            depth_m, kinds = self._renderer().depth(
+                pose.world_from_cam, self.camera, self._moving(pose)
+            )
+            yield FrameTruth(pose.world_from_cam, self.camera, depth_m, kinds)
+
+    def stamp_ns(self, frame: int) -> int:
+        """UTC of a frame, ns."""
+        start_ns = int(self.plan.start.timestamp()) * 1_000_000_000
+        return start_ns + round(self.poses[frame].elapsed_s * 1e9)
+
+    def world_from_cams(self) -> list[SE3]:
+        """The true pose of each frame."""
+        return [pose.world_from_cam for pose in self.poses]
+
+    def today(self) -> Today:
+        """What is there on the day of the drive."""
+        day = self.plan.start.toordinal()
+        rng = np.random.default_rng([self.campaign.seed, day, 0xDA7])
+        return Today(
+            day,
+            self.conditions.hour,
+            self.conditions.season,
+            float(np.clip(self.campaign.parked_share + rng.normal(0, 0.1), 0, 1)),
+            alterations_on(self.campaign.seed, day - self.campaign.first_day),
+        )
+
+    def _renderer(self) -> TownRenderer:
+        if self._stage is None:
+            town = _town(self._streets, self._route)
+            self._stage = TownRenderer(town, self.today(), self._threads)
+        return self._stage
+
+    def _moving(self, pose: Pose) -> Mesh:
+        if self._life is None:
+            self._life = Life(
+                _town(self._streets, self._route).cast, self._streets, self._route, self.line,
+                self.plan.reverse, self.campaign.traffic, self.plan.seed,
+            )  # fmt: skip
+        position = pose.world_from_cam.translation[:2]
+        return self._life.around(position, pose.driven_m, pose.elapsed_s)
+
+
+@lru_cache(maxsize=2)
+def _town(streets: StreetPlan, route: Route) -> Town:
+    """Towns are costly to begin; the sessions of a campaign share one."""
+    return Town(streets, route, Style())

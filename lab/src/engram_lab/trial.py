@@ -1,0 +1,307 @@
+"""Downloads tried out: what they promised beside what then happened on held-out drives.
+
+The mission of each trial is that of the drive itself: its date and its hour of day.
+Source: [G16] Fig. 9 (nodes, time per localisation, failure); SPEC §7 (the forecast).
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engram.errors import ConfigError, InputError
+from engram.fleet.download.downloading import DownloadReport, download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.gate import check_held_out
+from engram.fleet.merge.merging import Progress
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Node, Session
+from engram.localiser import Position
+from engram.maps import MapStore
+from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+from engram.robot import (
+    DriveSequence,
+    FrameResult,
+    LocaliseOptions,
+    LocaliseRun,
+    OpenMap,
+    Settings,
+    measured,
+    session_of_drive,
+)
+
+OpenDrive = Callable[[], DriveSequence]
+# Stages that are the robot's own business, whatever map it has.
+_BEFORE_THE_MAP = ("read", "frontend", "odometry")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """One drive in one download.
+
+    Attributes:
+        name: of the options.
+        drive: session of the drive, as text.
+        start_h: the drive's hour of day; None if it is not known.
+        report: of the download.
+        steps: of the drive: distances and matches.
+        ms_per_frame: mean time of localising a frame, relocalisation included, without front-end
+            and odometry.
+        lookup_ms_per_frame: of that, asking the relocaliser.
+        lookups: frames for which it was asked.
+        nodes: that were sent.
+    """
+
+    name: str
+    drive: str
+    start_h: float | None
+    report: DownloadReport
+    steps: Drive
+    ms_per_frame: float
+    lookup_ms_per_frame: float
+    lookups: int
+    nodes: Sequence[Node]
+
+    @property
+    def missed(self) -> float:
+        """Share of the drive without a match."""
+        return route_not_localised([self.steps])
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSummary:
+    """All drives in one kind of download.
+
+    Attributes:
+        name: of the options.
+        drives: how many.
+        route_m: how far they went together.
+        nodes, size_bytes: mean over the downloads.
+        expected_missed, missed: share of the way without a match, promised and met.
+        p_no_match_10m: failure curve at 10 m (estimator *route*).
+        longest_gap_m: of all drives.
+        ms_per_frame: mean over the drives.
+    """
+
+    name: str
+    drives: int
+    route_m: float
+    nodes: float
+    size_bytes: float
+    expected_missed: float
+    missed: float
+    p_no_match_10m: float
+    longest_gap_m: float
+    ms_per_frame: float
+
+    def text(self) -> str:
+        """One line for people."""
+        return (
+            f"{self.name:16s} {self.nodes:7.0f} nodes {self.size_bytes / 1e6:7.1f} MB  "
+            f"missed {self.missed:6.1%} (promised {self.expected_missed:6.1%})  "
+            f"P(> 10 m) {self.p_no_match_10m:6.2%}  longest {self.longest_gap_m:5.1f} m  "
+            f"{self.ms_per_frame:6.2f} ms a frame"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A drive for which some options found nothing to send.
+
+    Attributes:
+        name: of the options.
+        drive: session of the drive, as text.
+        start_h: the drive's hour of day; None if it is not known.
+        why: what was not found.
+    """
+
+    name: str
+    drive: str
+    start_h: float | None
+    why: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+    def text(self) -> str:
+        """One line for people."""
+        hour = "" if self.start_h is None else f", of {self.start_h:.1f} h"
+        return f"{self.name:16s} left out {self.drive}{hour}: {self.why}"
+
+
+def check_not_sent(
+    centre: Path, drives: Sequence[tuple[Path | str, DriveSequence]], at: int | str | None = None
+) -> None:
+    """Refuses drives that downloads of a centre may hold: they would do well in any.
+
+    Args:
+        centre: the map.
+        drives: that downloads are to be held against, each with what people call it.
+        at: revision of the centre; None for the newest.
+
+    Raises:
+        ConfigError: the centre holds one of them, under whatever name of the robot.
+        MapError: the centre cannot be read.
+        SequenceError: a drive cannot be read.
+    """
+    if drives:
+        with MapStore.open(centre, at=at) as store:
+            check_held_out(drives, store.sessions(), centre, "--check")
+
+
+def try_downloads(
+    centre: Path,
+    wanted: Mapping[str, DownloadOptions],
+    drives: Sequence[OpenDrive],
+    settings: Settings,
+    localise: LocaliseOptions,
+    progress: Progress,
+    *,
+    at: int | str | None = None,
+    start: Callable[[OpenMap], Position | None] = lambda _: None,
+    left_out: Callable[[LeftOut], None] | None = None,
+) -> list[Trial]:
+    """Download for each drive in each way, and localise it there without writing anything.
+
+    Args:
+        centre: the map.
+        wanted: options by name; the drive's hour of day, where it is known, stands for theirs.
+        drives: open a held-out drive each.
+        settings: of the localiser.
+        localise: policy and budget.
+        progress: shows how it goes.
+        at: revision of the centre; None for the newest.
+        start: where a drive begins in a download; None if nobody knows: it begins lost.
+        left_out: is told of a drive for which one of the options fits nothing; it is tried in
+            none of the others then, so that all are of the same drives. None for an error.
+
+    Raises:
+        ConfigError: the centre holds one of the drives itself; nothing was tried.
+        InputError: a drive's options fit nothing, and nobody is told.
+        MapError: the centre cannot be read, or a download not be written.
+    """
+    opened = [open_drive() for open_drive in drives]
+    check_not_sent(centre, [(sequence.info.name, sequence) for sequence in opened], at)
+    trials: list[Trial] = []
+    with tempfile.TemporaryDirectory(prefix="engram-trial-") as folder:
+        for open_drive in drives:
+            sequence = open_drive()
+            session = session_of_drive(sequence)
+            hour = hour_of_day(session, session.start_ns)
+            own: list[Trial] = []
+            for number, (name, asked) in enumerate(wanted.items()):
+                options = asked if hour is None else replace(asked, **_when(session, hour))
+                out = Path(folder) / f"{session.id}-{number}.engram"
+                try:
+                    report = download(centre, out, options, at=at, progress=progress)
+                except ConfigError:
+                    raise
+                except InputError as error:
+                    if left_out is None:
+                        raise
+                    left_out(LeftOut(name, str(session.id), hour, str(error)))
+                    own = []
+                    break
+                with LocaliseRun(out, open_drive(), settings, localise) as run:
+                    position = start(run.opened)
+                    if position is not None:
+                        run.localiser.start_at(position)
+                    results = _localised(run, len(sequence), progress)
+                    nodes = list(run.opened.graph.nodes)
+                own.append(_trial(name, session, hour, report, results, nodes))
+                out.unlink()
+            trials += own
+    return trials
+
+
+def _trial(
+    name: str,
+    session: Session,
+    hour: float | None,
+    report: DownloadReport,
+    results: Sequence[FrameResult],
+    nodes: Sequence[Node],
+) -> Trial:
+    """What came of a drive in a download."""
+    lookups = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
+    return Trial(
+        name=name,
+        drive=str(session.id),
+        start_h=hour,
+        report=report,
+        steps=measured([one.localisation for one in results]),
+        ms_per_frame=_ms(results),
+        lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
+        lookups=len(lookups),
+        nodes=nodes,
+    )
+
+
+def _when(session: Session, hour: float) -> dict[str, Any]:
+    """The mission is the drive itself."""
+    day = datetime.fromtimestamp(session.start_ns / 1e9, UTC).date().isoformat()
+    return {"start_h": hour, "end_h": hour, "day": day}
+
+
+def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
+    """One row for each name, in the order of first appearance."""
+    summaries = []
+    for name in dict.fromkeys(trial.name for trial in trials):
+        own = [trial for trial in trials if trial.name == name]
+        steps = [trial.steps for trial in own]
+        lengths = np.array([route_m([one]) for one in steps])
+        promised = np.array([trial.report.expected_missed for trial in own])
+        total_m = float(lengths.sum())
+        summaries.append(
+            TrialSummary(
+                name=name,
+                drives=len(own),
+                route_m=total_m,
+                nodes=float(np.mean([trial.report.nodes for trial in own])),
+                size_bytes=float(np.mean([trial.report.size_bytes for trial in own])),
+                expected_missed=float(promised @ lengths / total_m) if total_m else 0.0,
+                missed=route_not_localised(steps),
+                p_no_match_10m=failure_route(steps, 10.0),
+                longest_gap_m=longest_gap_m(steps),
+                ms_per_frame=float(np.mean([trial.ms_per_frame for trial in own])),
+            )
+        )
+    return summaries
+
+
+def trial_dict(trial: Trial) -> dict[str, Any]:
+    """A trial as plain values."""
+    return {
+        "name": trial.name,
+        "drive": trial.drive,
+        "start_h": trial.start_h,
+        "nodes": trial.report.nodes,
+        "size_bytes": trial.report.size_bytes,
+        "expected_missed": trial.report.expected_missed,
+        "missed": trial.missed,
+        "ms_per_frame": trial.ms_per_frame,
+    }
+
+
+def _localised(run: LocaliseRun, frames: int, progress: Progress) -> list[FrameResult]:
+    with progress("localise", frames) as advance:
+        results = []
+        for _, result in run:
+            results.append(result)
+            advance(result.localisation.status.value)
+        return results
+
+
+def _ms(results: Sequence[FrameResult]) -> float:
+    times = [
+        sum(ms for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP)
+        for one in results
+    ]
+    return float(np.mean(times)) if times else 0.0

@@ -1,7 +1,0 @@
-"""The stages of `engram bench`, each timed beside the plain pipeline in the same run."""
-
-from engram.bench.report import BenchReport, Machine, Side, StageResult
-from engram.bench.runner import run_bench
-from engram.bench.stages import STAGES
-
-__all__ = ["STAGES", "BenchReport", "Machine", "Side", "StageResult", "run_bench"]

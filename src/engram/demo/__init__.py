@@ -1,5 +1,0 @@
-"""The story that `engram demo` tells."""
-
-from engram.demo.story import DemoReport, run_demo
-
-__all__ = ["DemoReport", "run_demo"]

@@ -1,0 +1,281 @@
+"""The best order of merging k groups: all k! of them, over a prefix tree ([G16] §VI-E, SPEC §7).
+
+Or only which of them comes first, on which most depends (docs/results-fleet.md).
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engram.config import config_hash, to_dict
+from engram.robot import (OpenMap, Settings, open_drive)
+from engram.errors import MapError
+from engram.graph.model import Session
+from engram.fleet.merge.docking import merge_maps
+from engram.fleet.merge.gate import localise_drive
+from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
+from engram.fleet.build.keeping import keeping
+from engram.fleet.merge.merging import Progress
+from engram.fleet.build.order_results import BestOrder, OrderResult, Spent
+from engram.fleet.merge.replay import MergeOptions
+from engram.measures import (failure_curve, failure_route, route_not_localised)
+from engram.maps import MapStore
+from engram.maps.drafts import remove_left_drafts
+
+# [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
+_AREA_TO_M = 50.0
+_AREA_STEP_M = 0.5
+_SPREAD_AT_M = (5.0, 10.0, 20.0)
+_REPORTED_AT_M = np.arange(0.0, _AREA_TO_M + _AREA_STEP_M / 2, _AREA_STEP_M)
+
+
+def find_best_order(
+    maps: Sequence[Path],
+    folder: Path,
+    settings: Settings,
+    merging: MergeOptions,
+    judge: JudgeOptions,
+    progress: Progress,
+    *,
+    root: Path | None = None,
+) -> BestOrder:
+    """Merges groups in every order, or with each of them first, and judges the results.
+
+    Merges of a common prefix are made once and copied: k! orders of k groups take
+    Σ k!/(k−d)! over d = 2 … k merges, 60 for k = 4; with a root over d = 1 … k, 64. The search
+    walks the tree depth first, so that no more than k maps lie on the disk; results are kept with
+    all that they depend on, so that it can be interrupted.
+
+    Args:
+        maps: the groups' maps, by number.
+        folder: for intermediate maps and results.
+        settings: of the localiser.
+        merging: policy and budget of the merges.
+        judge: by what the best is told.
+        progress: shows how it goes.
+        root: the map that all orders begin with; None where each begins with its first group's.
+
+    Raises:
+        ConfigError: more groups than all orders of them could be tried, or a drive that judges is
+            in one of the maps.
+        MapError: the root was written to meanwhile, or the folder cannot be written.
+        StorageFullError: no space is left.
+        KeyboardInterrupt: a merge was interrupted.
+    """
+    check_countable(len(maps), judge.orders)
+    with keeping(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    search = _Search(maps, folder, settings, merging, judge, root)
+    with progress("try orders", judge.orders.of(len(maps))) as advance:
+        search.below((), root, advance)
+    search.check_root()
+    search.found.results.sort(key=lambda one: one.rank)
+    return search.found
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """One node of the prefix tree: its map was made, and judged if it has all groups."""
+
+    order: tuple[int, ...]
+    spent: Spent
+    result: OrderResult | None
+
+
+class _Search:
+    """The walk over the prefix tree."""
+
+    def __init__(
+        self,
+        maps: Sequence[Path],
+        folder: Path,
+        settings: Settings,
+        merging: MergeOptions,
+        judge: JudgeOptions,
+        root: Path | None,
+    ) -> None:
+        self.found = BestOrder([], judge.judge_at_m, judge.orders, root is not None)
+        self._maps = maps
+        self._folder = folder
+        self._settings = settings
+        self._merging = merging
+        self._judge = judge
+        self._root = root
+        self._localise = judge.localise or localise_drive
+        mapped: list[tuple[Session, str]] = []
+        hashes = []
+        for path in (*maps, *([] if root is None else [root])):
+            with MapStore.open(path) as store:
+                mapped += [(one, f"in {path}") for one in store.sessions()]
+                hashes.append(store.content_hash())
+        check_held_out(judge, mapped)
+        self._root_hash = None if root is None else hashes[-1]
+        self._depends = config_hash(
+            [hashes, self._root_hash, to_dict(settings), to_dict(merging), judge.hash()]
+        )
+        self._sequences = [open_drive(path) for path in judge.drives]
+        self._reported = [open_drive(path) for path in judge.reported]
+        with keeping(folder):
+            remove_left_drafts(folder, "order-*")
+            for left in folder.glob("order-*.engram*"):
+                left.unlink()  # by a run that was killed
+
+    def below(
+        self, prefix: tuple[int, ...], merged: Path | None, advance: Callable[[str], None]
+    ) -> None:
+        """All orders that begin so; `merged` is the map of the prefix."""
+        for number in self._judge.orders.following(prefix, len(self._maps)):
+            order = (*prefix, number)
+            if (known := self._known_from(order)) is not None:
+                for step in known:
+                    self._count(step, advance)
+                continue
+            with _Intermediate(self._folder, order) as place:
+                step = self._step(order, place, merged)
+                self._keep(step)
+                self._count(step, advance)
+                self.below(order, place, advance)
+
+    def check_root(self) -> None:
+        """The maps that were judged are those that merging would give now."""
+        if self._root is None:
+            return
+        with MapStore.open(self._root) as store:
+            if store.content_hash() != self._root_hash:
+                raise MapError(
+                    f"{self._root} was written to while the orders were tried, so that they were "
+                    "judged by what would not be built; give the same command again"
+                )
+
+    def _step(self, order: tuple[int, ...], place: Path, prefix: Path | None) -> _Step:
+        """The map of an order: a copy of its prefix's, and one more group."""
+        started = time.perf_counter()
+        added = self._maps[order[-1]]
+        MapStore.copy(added if prefix is None else prefix, place)
+        costs: dict[str, Any] = {"copies": 1, "copy_s": time.perf_counter() - started}
+        if prefix is not None:
+            costs |= self._merge(place, added)
+        result = None
+        if len(order) == len(self._maps):
+            started = time.perf_counter()
+            result = self._judged(order, place)
+            costs["judge_s"] = time.perf_counter() - started
+        return _Step(order, Spent(**costs), result)
+
+    def _merge(self, place: Path, added: Path) -> dict[str, Any]:
+        started = time.perf_counter()
+        (report,) = merge_maps(place, [added], self._settings, self._merging)
+        if report.interrupted:
+            raise KeyboardInterrupt
+        return {
+            "merges": 1,
+            "merge_s": time.perf_counter() - started,
+            "replayed": sum(one.taken + one.omitted for one in report.segments),
+            "attempts": report.match_attempts,
+            "proposed": report.proposed_attempts,
+            "lookups": report.lookups,
+        }
+
+    def _judged(self, order: tuple[int, ...], place: Path) -> OrderResult:
+        with OpenMap(MapStore.open(place)) as opened:
+            drives, reported = (
+                [
+                    self._localise(opened, one, self._settings, self._judge.localising)
+                    for one in sequences
+                ]
+                for sequences in (self._sequences, self._reported)
+            )
+            nodes, content_hash = len(opened.graph), opened.store.content_hash()
+        steps = np.arange(0.0, _AREA_TO_M, _AREA_STEP_M) + _AREA_STEP_M / 2
+        area_m = sum(failure_route(drives, float(at)) for at in steps) * _AREA_STEP_M
+        return OrderResult(
+            order,
+            failure_route(drives, self._judge.judge_at_m),
+            float(area_m),
+            {f"{at:g}": failure_route(drives, at) for at in _SPREAD_AT_M},
+            nodes,
+            content_hash,
+            failure_curve(reported, _REPORTED_AT_M).tolist() if reported else [],
+            route_not_localised(reported),
+        )
+
+    def _count(self, step: _Step, advance: Callable[[str], None]) -> None:
+        self.found.count(step.spent)
+        if step.result is not None:
+            self.found.results.append(step.result)
+            advance(" ".join(map(str, step.order)))
+
+    def _keep(self, step: _Step) -> None:
+        path = self._path(step.order)
+        draft = path.with_suffix(".part")
+        with keeping(self._folder):
+            draft.write_text(json.dumps({"depends": self._depends, **asdict(step)}))
+            draft.replace(path)
+
+    def _known_from(self, prefix: tuple[int, ...]) -> list[_Step] | None:
+        """All steps from a prefix on, if earlier runs made them by the same; else None."""
+        known = []
+        for order in _tree(prefix, len(self._maps), self._judge.orders):
+            step = self._known(order)
+            if step is None:
+                return None
+            known.append(step)
+        return known
+
+    def _known(self, order: tuple[int, ...]) -> _Step | None:
+        """A step of an earlier run; None without one, and where its file cannot be made sense of.
+
+        A computer that lost power may leave a file empty or in part: the step is made again.
+        """
+        path = self._path(order)
+        if not path.exists():
+            return None
+        with keeping(self._folder):
+            content = path.read_bytes()
+        try:
+            values = json.loads(content)
+            if values["depends"] != self._depends:
+                return None
+            result = values["result"]
+            spent = Spent(**values["spent"])
+            step = _Step(order, spent, None if result is None else OrderResult.from_dict(result))
+        except (ValueError, TypeError, KeyError):
+            return None
+        is_whole = (step.result is not None) == (len(order) == len(self._maps))
+        return step if is_whole else None
+
+    def _path(self, order: tuple[int, ...]) -> Path:
+        return self._folder / f"order-{'-'.join(map(str, order))}.json"
+
+
+class _Intermediate:
+    """A map that exists for as long as a part of the tree is walked."""
+
+    def __init__(self, folder: Path, order: tuple[int, ...]) -> None:
+        self._path = folder / f"order-{'-'.join(map(str, order))}.engram"
+
+    def __enter__(self) -> Path:
+        self._remove()
+        return self._path
+
+    def __exit__(self, *_: object) -> None:
+        self._remove()
+
+    def _remove(self) -> None:
+        with keeping(self._path.parent):
+            for beside in self._path.parent.glob(f"{self._path.name}*"):
+                beside.unlink()
+
+
+def _tree(prefix: tuple[int, ...], count: int, orders: Orders) -> Iterator[tuple[int, ...]]:
+    """The nodes of the prefix tree of `count` groups from a prefix on, itself first."""
+    yield prefix
+    for number in orders.following(prefix, count):
+        yield from _tree((*prefix, number), count, orders)

@@ -1,0 +1,430 @@
+"""Building a map fast: groups mapped side by side, then merged one after another (SPEC §7)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from uuid import UUID
+
+from engram.config import config_hash, to_dict
+from engram.robot import (MapOptions, Settings)
+from engram.monitor import deferred_interrupt
+from engram.errors import ConfigError
+from engram.graph.model import SessionId, path_id
+from engram.fleet.build.best_order import find_best_order
+from engram.fleet.build.cluster import check_scheduler, map_groups_on_cluster
+from engram.fleet.merge.docking import merge_maps
+from engram.fleet.build.group_mapping import GroupResult, GroupTask, fetched
+from engram.fleet.build.grouping import Drive, group_drives, look_at_drive
+from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
+from engram.fleet.merge.merging import Progress, silent
+from engram.fleet.build.order_costs import order_costs
+from engram.fleet.build.order_results import BestOrder
+from engram.fleet.merge.replay import MergeOptions
+from engram.fleet.merge.report import MergeReport
+from engram.fleet.build.scratch import BuildPlan, MergingBegun, Scratch, sole_builder
+from engram.fleet.build.workers import map_groups
+from engram.maps import MapStore
+from engram.maps.drafts import check_parent
+
+
+@dataclass(frozen=True, slots=True)
+class BuildOptions:
+    """How a map is built.
+
+    Attributes:
+        workers: processes of this machine at a time.
+        groups: how many the drives are split into.
+        grouping: key of `GROUPINGS`, or path of a file of groups.
+        seed: of the grouping.
+        mapping: how each drive is mapped.
+        merging: how the groups' maps are merged.
+        scheduler: address of a Dask scheduler in place of processes of this machine.
+        judge: how the best order of merging is found; None merges in the order of the groups.
+    """
+
+    workers: int = 2
+    groups: int = 2
+    grouping: str = "chronological"
+    seed: int = 0
+    mapping: MapOptions = field(default_factory=MapOptions)
+    merging: MergeOptions = field(default_factory=MergeOptions)
+    scheduler: str | None = None
+    judge: JudgeOptions | None = None
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise ConfigError(f"build: {self.workers} workers, must be 1 or more")
+        if self.mapping.deadline_ms is not None or self.mapping.rate_hz is not None:
+            raise ConfigError("a build has budgets by count: a deadline would give chance maps")
+
+
+@dataclass(slots=True)
+class BuildReport:
+    """What a build came to.
+
+    Attributes:
+        centre: the map.
+        left_out: names of the drives that the centre had before.
+        groups: names of the drives of each group, in the order of merging.
+        mapped: what mapping each group came to.
+        merges: one report per merge of this run; the first group's map becomes a centre that is
+            new.
+        merged_before_s: time of the merges of earlier runs of this build, seconds.
+        best: how the order was found, where that was asked.
+        notes: what somebody should look at.
+        interrupted: whether it was stopped; the same command goes on.
+        content_hash: of the map.
+        seconds: wall time of this run.
+    """
+
+    centre: str
+    left_out: list[str] = field(default_factory=list)
+    groups: list[list[str]] = field(default_factory=list)
+    mapped: list[GroupResult] = field(default_factory=list)
+    merges: list[MergeReport] = field(default_factory=list)
+    merged_before_s: float = 0.0
+    best: BestOrder | None = None
+    notes: list[str] = field(default_factory=list)
+    interrupted: bool = False
+    content_hash: str = ""
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``build --json`` prints."""
+        return {
+            "centre": self.centre,
+            "left_out": self.left_out,
+            "groups": self.groups,
+            "mapped": [one.to_dict() for one in self.mapped],
+            "merges": [one.to_dict() for one in self.merges],
+            "merged_before_s": self.merged_before_s,
+            "best_order": None if self.best is None else self.best.to_dict(),
+            "notes": self.notes,
+            "interrupted": self.interrupted,
+            "content_hash": self.content_hash,
+            "seconds": self.seconds,
+            "parallel_s": self.parallel_s,
+        }
+
+    @property
+    def parallel_s(self) -> float:
+        """Time with a worker per group: the slowest group, then the merges one after another."""
+        slowest = max((one.seconds for one in self.mapped), default=0.0)
+        return slowest + self.merged_s
+
+    @property
+    def merged_s(self) -> float:
+        """Time of all merges, those of earlier runs too."""
+        return self.merged_before_s + sum(one.seconds for one in self.merges)
+
+    def text(self) -> str:
+        """For people."""
+        if self.interrupted:
+            return "interrupted: what was done is kept; give the same command to go on"
+        lines = []
+        if self.left_out:
+            known = ", ".join(self.left_out)
+            lines.append(f"left out, since {self.centre} has them already: {known}")
+        if not self.groups:
+            return "\n".join([*lines, f"{self.centre}: nothing new; content {self.content_hash}"])
+        for names, one in zip(self.groups, self.mapped, strict=True):
+            died = f", {one.retries} workers died" if one.retries else ""
+            made = f"{one.nodes} nodes, {one.seconds:.1f} s"
+            lines.append(f"group {one.number}: {len(names)} drives, {made}{died}")
+        lines += [one.text() for one in self.merges]
+        if self.best is not None:
+            lines += [self.best.text(), self._costs()]
+        mapped_s = sum(one.seconds for one in self.mapped)
+        lines += [f"  note: {note}" for note in self.notes]
+        lines.append(
+            f"{self.centre}: content {self.content_hash}; mapping {mapped_s:.1f} s in "
+            f"{len(self.mapped)} groups, merging {self.merged_s:.1f} s; with a worker for each "
+            f"group {self.parallel_s:.1f} s"
+        )
+        return "\n".join(lines)
+
+    def _costs(self) -> str:
+        """What trying orders cost, beside the models of all of them."""
+        assert self.best is not None
+        mapped_s = sum(one.seconds for one in self.mapped)
+        group_s = mapped_s / len(self.mapped)
+        merge_s = self.best.merge_s / max(self.best.merges, 1)
+        copy_s = self.best.copy_s / max(self.best.copies, 1)
+        spent_s = mapped_s + self.best.merge_s + self.best.copy_s
+        took = (
+            f"  mapping, and merging in {len(self.best.results)} orders, took {spent_s:.1f} s "
+            f"(T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C {copy_s:.2f} s)"
+        )
+        if self.best.tried is not Orders.ALL:
+            return took
+        if self.best.rooted:
+            return f"{took}; the models of it are of centres that are new"
+        costs = order_costs(len(self.mapped), group_s, merge_s, copy_s)
+        return (
+            f"{took}: {spent_s / costs.sequential_s:.2%} of building each order "
+            f"sequentially, {spent_s / costs.sequential_tree_s:.2%} of a sequential prefix tree; "
+            f"model (8) {costs.model_s / costs.sequential_s:.2%}, prefix tree "
+            f"{costs.tree_s / costs.sequential_s:.2%}"
+        )
+
+
+def build_map(
+    centre: Path,
+    drives: Sequence[str],
+    settings: Settings,
+    options: BuildOptions,
+    *,
+    keep: bool = False,
+    progress: Progress = silent,
+) -> BuildReport:
+    """Maps groups of drives side by side and merges them into a centre.
+
+    Intermediate maps lie in ``CENTRE.build`` beside the centre until the build is complete: the
+    same call after an interruption goes on from there, and comes to the same map. A centre that
+    exists takes in all groups, and the drives that it has are left out (not those of which it has
+    a part of the path only); one that does not exist begins as the first group's map.
+
+    Args:
+        centre: NAME.engram.
+        drives: paths or fsspec URLs of frame logs or images.
+        settings: the resolved configuration.
+        options: how.
+        keep: leave the groups' maps, until the next build into this centre.
+        progress: shows how it goes.
+
+    Raises:
+        ConfigError: the groups do not fit the drives, another build lies there unfinished, there
+            are too many groups for all orders, or a drive that judges them is not held out.
+        InputError: the folder of the centre is not there.
+        MapLockedError: somebody else builds into this centre.
+        WorkerError: workers died again and again.
+        EngramError: a drive or a map cannot be used, or what is done not be kept.
+    """
+    started = time.perf_counter()
+    check_parent(centre)
+    looked_at = _look_at(drives)
+    with sole_builder(centre):
+        report = _build(centre, looked_at, settings, options, progress, keep=keep)
+    report.seconds = time.perf_counter() - started
+    return report
+
+
+def _build(
+    centre: Path,
+    looked_at: Sequence[Drive],
+    settings: Settings,
+    options: BuildOptions,
+    progress: Progress,
+    *,
+    keep: bool,
+) -> BuildReport:
+    """The build, where nobody else builds into the centre."""
+    scratch = Scratch(centre)
+    known = _known_sessions(scratch)
+    grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
+    if options.judge is not None:
+        _check_judges(options.judge, looked_at, centre)
+        if grouped:
+            check_countable(len(grouped), options.judge.orders)
+    report = BuildReport(
+        str(centre), left_out=[drive.name for drive in looked_at if drive.session.id in known]
+    )
+    if grouped:
+        if options.scheduler is not None:
+            check_scheduler(options.scheduler)
+        scratch.begin(_plan(grouped, known, settings, options, keep=keep))
+        try:
+            _map_and_merge(scratch, grouped, settings, options, progress, report)
+        except KeyboardInterrupt:
+            report.interrupted = True
+    if not report.interrupted:
+        with MapStore.open(centre) as store:
+            report.content_hash = store.content_hash()
+        report.notes += _not_as_judged(report)
+        if grouped:
+            scratch.finish()
+        else:
+            scratch.remove_leftovers()
+    return report
+
+
+def _look_at(sources: Sequence[str]) -> list[Drive]:
+    drives = []
+    for source in sources:
+        with fetched(source) as path:
+            absolute = source if "://" in source else str(path.absolute())
+            drives.append(look_at_drive(path, absolute))
+    return drives
+
+
+def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
+    """The drives that the centre had when the build began, partial paths left aside."""
+    if scratch.unfinished is not None:
+        return frozenset(SessionId(UUID(one)) for one in scratch.unfinished.known)
+    if not scratch.centre.exists():
+        return frozenset()
+    with MapStore.open(scratch.centre) as store:
+        partial = store.partial_paths()
+        return frozenset(one for one in store.frontends() if path_id(one) not in partial)
+
+
+def _check_judges(judge: JudgeOptions, drives: Sequence[Drive], centre: Path) -> None:
+    """Before hours of mapping: what judges the orders must be held out."""
+    mapped = [(one.session, f"{one.source}, which is to be built from") for one in drives]
+    if centre.exists():
+        with MapStore.open(centre) as store:
+            mapped += [(one, f"in {centre} already") for one in store.sessions()]
+    check_held_out(judge, mapped)
+
+
+def _plan(
+    grouped: Sequence[Sequence[Drive]],
+    known: frozenset[SessionId],
+    settings: Settings,
+    options: BuildOptions,
+    *,
+    keep: bool,
+) -> BuildPlan:
+    return BuildPlan(
+        groups=[[str(drive.session.id) for drive in group] for group in grouped],
+        known=sorted(map(str, known)),
+        settings=config_hash(settings),
+        mapping=to_dict(options.mapping),
+        merging=to_dict(options.merging),
+        kept=keep,
+    )
+
+
+def _map_and_merge(
+    scratch: Scratch,
+    grouped: Sequence[Sequence[Drive]],
+    settings: Settings,
+    options: BuildOptions,
+    progress: Progress,
+    report: BuildReport,
+) -> None:
+    """What a build comes to, as far as this run takes it.
+
+    Raises:
+        KeyboardInterrupt: while groups were mapped or orders tried.
+    """
+    mapped = _map(scratch, grouped, settings, options, progress)
+    begun = _settled_order(scratch, len(grouped), settings, options, progress)
+    report.best = begun.best_order()
+    report.groups = [[drive.name for drive in grouped[number]] for number in begun.order]
+    report.mapped = [mapped[number] for number in begun.order]
+    report.merged_before_s = sum(begun.seconds.values())
+    _merge(scratch, begun, settings, options, progress, report)
+
+
+def _map(
+    scratch: Scratch,
+    grouped: Sequence[Sequence[Drive]],
+    settings: Settings,
+    options: BuildOptions,
+    progress: Progress,
+) -> list[GroupResult]:
+    """Maps the groups that are not mapped yet; remembers how long each took."""
+    tasks = [
+        GroupTask(number, [drive.source for drive in group], settings, options.mapping)
+        for number, group in enumerate(grouped)
+    ]
+    missing = [task for task in tasks if scratch.result(task.number) is None]
+    frames = sum(drive.frames for task in missing for drive in grouped[task.number])
+    words = f"map {len(missing)} groups"
+    with deferred_interrupt() as check, progress(words, frames) as advance:
+        if options.scheduler is not None:
+            map_groups_on_cluster(
+                missing, scratch.group, options.scheduler, advance, check, scratch.remember
+            )
+        else:
+            map_groups(missing, scratch.group, options.workers, advance, check, scratch.remember)
+        check()  # also where the last groups were done as Ctrl-C was pressed
+    results = [scratch.result(task.number) for task in tasks]
+    return [result for result in results if result is not None]
+
+
+def _settled_order(
+    scratch: Scratch, groups: int, settings: Settings, options: BuildOptions, progress: Progress
+) -> MergingBegun:
+    """The order of merging, written down before the first merge: it is not changed half way.
+
+    Raises:
+        ConfigError: merging has begun in an order that was found otherwise.
+    """
+    judge = options.judge
+    judged_by = None if judge is None else _judged_by(judge)
+    begun = scratch.merging_begun()
+    if begun is not None:
+        if begun.judge != judged_by:
+            raise ConfigError(
+                f"the groups of {scratch.folder} are being merged already, in the order "
+                f"{' '.join(map(str, begun.order))}, which was found otherwise; finish it with the "
+                "same --best-order or --best-first, --validate and --judge-at, or delete the folder"
+            )
+        return begun
+    if judge is None:
+        begun = MergingBegun(list(range(groups)))
+    else:
+        best = find_best_order(
+            [scratch.group(number) for number in range(groups)],
+            scratch.orders,
+            settings,
+            options.merging,
+            judge,
+            progress,
+            root=scratch.centre if scratch.centre.exists() else None,
+        )
+        begun = MergingBegun(list(best.order), judged_by, best.to_dict())
+    scratch.remember_merging(begun)
+    return begun
+
+
+def _judged_by(judge: JudgeOptions) -> str:
+    """How an order was found: by which judges, and among which orders."""
+    return judge.hash() + ("" if judge.orders is Orders.ALL else f"-{judge.orders}")
+
+
+def _merge(
+    scratch: Scratch,
+    begun: MergingBegun,
+    settings: Settings,
+    options: BuildOptions,
+    progress: Progress,
+    report: BuildReport,
+) -> None:
+    """Merges the groups' maps into the centre, in their order.
+
+    A centre that is there takes in all of them, also the first: an earlier run may have made it
+    as a copy of that, or somebody else meanwhile. Handing in again changes nothing.
+    """
+    order = begun.order
+    if not scratch.centre.exists():
+        MapStore.copy(scratch.group(order[0]), scratch.centre)
+        order = order[1:]
+    for number in order:
+        report.merges += merge_maps(
+            scratch.centre, [scratch.group(number)], settings, options.merging, progress=progress
+        )
+        if report.merges[-1].interrupted:
+            report.interrupted = True
+            return
+        if report.merges[-1].changed:
+            begun = replace(
+                begun, seconds={**begun.seconds, str(number): report.merges[-1].seconds}
+            )
+            scratch.remember_merging(begun)
+
+
+def _not_as_judged(report: BuildReport) -> list[str]:
+    """Says so where the map is not the one by which its order was chosen."""
+    if report.best is None or report.content_hash == report.best.results[0].content_hash:
+        return []
+    return [
+        f"{report.centre} is not the map that was judged, content "
+        f"{report.best.results[0].content_hash}: somebody else wrote to it meanwhile"
+    ]

@@ -1,0 +1,200 @@
+"""Groups mapped on a Dask cluster: an extra, imported only where a scheduler is named."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+from uuid import uuid4
+
+from engram.errors import EngramError, MissingExtraError, WorkerError
+from engram.fleet.build.group_mapping import GroupResult, GroupTask, map_group_far_away
+from engram.fleet.build.keeping import keeping
+from engram.fleet.build.workers import LISTEN_S, MAX_RETRIES, WORDS_AT_ONCE
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+_CONNECT_S = 30
+
+# A group's map and the last words on it, or what is wrong with a drive.
+_Outcome: TypeAlias = tuple[GroupResult, bytes, list[str]] | EngramError
+
+
+class _GivenUpError(Exception):
+    """In a worker: nobody waits for this group any more."""
+
+
+def map_groups_on_cluster(
+    tasks: Sequence[GroupTask],
+    place: Callable[[int], Path],
+    scheduler: str,
+    advance: Callable[[str], None],
+    check: Callable[[], None],
+    mapped: Callable[[GroupResult], None],
+) -> None:
+    """Maps groups on the workers of a cluster, which read the drives by themselves.
+
+    Their maps come back through the scheduler's network, whole: no disk is shared.
+
+    Args:
+        tasks: the groups.
+        place: where the map of a group goes, by its number.
+        scheduler: address of the Dask scheduler.
+        advance: called once per frame with a word on how it went.
+        check: called now and then; what it raises ends the work, on the workers too.
+        mapped: told of each group that is done.
+
+    Raises:
+        MissingExtraError: Dask is not installed.
+        WorkerError: the scheduler cannot be reached or is lost, or a group's workers died again
+            and again.
+        EngramError: a group cannot be mapped.
+    """
+    heard: queue.SimpleQueue[list[str] | Future] = queue.SimpleQueue()
+    topic = f"engram-build-{uuid4().hex}"
+    with _connected(scheduler) as client:  # whose end tells the workers that nobody waits for them
+        client.subscribe_topic(topic, lambda event: heard.put(list(event[1])))
+        groups: dict[Future, int] = {}
+        for task in tasks:
+            # A pure function of its task, but what it does is work: each is submitted once.
+            future = client.submit(_map_on_worker, task, topic, pure=False, retries=MAX_RETRIES)
+            groups[future] = task.number
+            future.add_done_callback(heard.put)
+        while groups:
+            check()
+            try:
+                said = heard.get(timeout=LISTEN_S)
+            except queue.Empty:
+                continue
+            words = said
+            if not isinstance(said, list):
+                result, content, words = _outcome(said, groups.pop(said), scheduler)
+                _keep(place(result.number), content)
+                mapped(result)
+            for word in words:
+                advance(word)
+
+
+def check_scheduler(scheduler: str) -> None:
+    """Asks a scheduler whether it is there, before anything is begun.
+
+    No client is made for that: one that was made in vain tries for half a minute to say goodbye.
+
+    Raises:
+        MissingExtraError: Dask is not installed.
+        WorkerError: the address is none, or nobody answers there.
+    """
+    try:
+        from distributed import Security
+        from distributed.comm import connect
+    except ImportError as error:
+        raise _missing() from error
+
+    async def greet() -> None:
+        ways = Security().get_connection_args("client")
+        comm = await connect(scheduler, timeout=_CONNECT_S, **ways)
+        await comm.close()
+
+    try:
+        # On a thread of its own: the caller's may run an event loop, as in a notebook.
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(lambda: asyncio.run(greet())).result()
+    except OSError as error:
+        raise _silent(scheduler, error) from error
+    except Exception as error:  # each of Dask's ways to connect has errors of its own
+        raise WorkerError(
+            f"{scheduler!r} is no address of a scheduler that can be used ({error}); one is like "
+            "tcp://10.0.0.5:8786"
+        ) from error
+
+
+def _connected(scheduler: str) -> Client:
+    """A client of its own, which is nobody's default.
+
+    Raises:
+        MissingExtraError: Dask is not installed.
+        WorkerError: the scheduler does not answer.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise _missing() from error
+    check_scheduler(scheduler)
+    try:
+        return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise _silent(scheduler, error) from error
+
+
+def _missing() -> MissingExtraError:
+    return MissingExtraError("building on a cluster needs Dask: pip install 'engram[cluster]'")
+
+
+def _silent(scheduler: str, error: Exception) -> WorkerError:
+    return WorkerError(
+        f"the scheduler at {scheduler} does not answer ({error}); look whether it runs and can be "
+        "reached from here"
+    )
+
+
+def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
+    """In the worker; errors of a drive come back as values, since they would only come again."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    key = worker.get_current_task()
+    words: list[str] = []
+
+    def advance(word: str) -> None:
+        words.append(word)
+        if len(words) >= WORDS_AT_ONCE:
+            worker.log_event(topic, list(words))
+            words.clear()
+            known = worker.state.tasks.get(key)
+            if known is None or known.state == "cancelled":
+                raise _GivenUpError
+
+    try:
+        result, content = map_group_far_away(task, advance)
+    except EngramError as error:
+        return error
+    return result, content, words
+
+
+def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, bytes, list[str]]:
+    """What came of a group; its map is fetched from the worker.
+
+    Raises:
+        WorkerError: nothing came, because of the cluster.
+        EngramError: a drive cannot be mapped.
+    """
+    try:
+        outcome: _Outcome = future.result()
+    except CancelledError as error:
+        raise WorkerError(
+            f"the scheduler at {scheduler} was lost, and group {group} with it ({error}); groups "
+            "that were done are kept: give the same command again"
+        ) from error
+    except Exception as error:  # whatever Dask or a machine of the cluster may raise
+        raise WorkerError(
+            f"group {group} was not mapped on the cluster, whose workers try {MAX_RETRIES + 1} "
+            f"times: {type(error).__name__}: {error}; groups that were done are kept: give the "
+            "same command again, with fewer workers if memory was short"
+        ) from error
+    if isinstance(outcome, EngramError):
+        raise outcome
+    return outcome
+
+
+def _keep(path: Path, content: bytes) -> None:
+    """The group's map, whole or not at all, in place of what another worker left half done."""
+    draft = path.with_name(f"{path.name}.part")
+    with keeping(path.parent):
+        draft.write_bytes(content)
+        for suffix in ("", "-wal", "-shm"):  # another map's log would be taken for its own
+            path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
+        draft.replace(path)

@@ -1,0 +1,131 @@
+"""Mapping one group of sessions: what a worker of a build does."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from engram.robot import (MapOptions, Settings, map_drive, open_drive)
+from engram.monitor import ignore
+
+from engram.errors import MissingExtraError, SequenceError
+from engram.maps import (MapStore, WritableMapStore)
+
+
+@dataclass(frozen=True, slots=True)
+class GroupTask:
+    """Sessions to be mapped one after another into a map of their own.
+
+    Attributes:
+        number: of the group.
+        sources: paths or fsspec URLs of the drives, in the order of mapping.
+        settings: the resolved configuration.
+        options: how each drive is mapped.
+    """
+
+    number: int
+    sources: Sequence[str]
+    settings: Settings
+    options: MapOptions
+
+
+@dataclass(slots=True)
+class GroupResult:
+    """What mapping a group came to.
+
+    Attributes:
+        number: of the group.
+        seconds: wall time of the runs that mapped it; the last run only, after a worker died.
+        cpu_s: processor time of the same.
+        sessions: one summary each, as of ``map --json``.
+        nodes: of the group's map.
+        retries: how often a worker died over it.
+    """
+
+    number: int
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    sessions: list[dict[str, Any]] = field(default_factory=list)
+    nodes: int = 0
+    retries: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def map_group(task: GroupTask, path: Path, advance: Callable[[str], None] = ignore) -> GroupResult:
+    """Maps a group's sessions into a map, which is made if there is none.
+
+    Sessions that the map holds are passed over; one that was interrupted is begun anew, so that a
+    group whose worker died comes out as it would have otherwise.
+
+    Args:
+        task: what to map.
+        path: the group's map.
+        advance: called once per frame with a word on how it went.
+
+    Raises:
+        MapError: the map cannot be written.
+        SequenceError: a drive cannot be read.
+    """
+    result = GroupResult(task.number)
+    started, cpu_started = time.perf_counter(), time.process_time()
+    with WritableMapStore.opened_or_created(path) as store:
+        for one in store.interrupted():
+            store.resume_session(one.session.id).abandon()
+    for source in task.sources:
+        with fetched(source) as drive:
+            report = map_drive(path, open_drive(drive), task.settings, task.options, advance)
+        if report.interrupted:
+            raise KeyboardInterrupt
+        result.sessions.append({"source": source, **report.to_dict()})
+    with MapStore.open(path) as made:
+        result.nodes = made.node_count()
+    result.seconds = time.perf_counter() - started
+    result.cpu_s = time.process_time() - cpu_started
+    return result
+
+
+def map_group_far_away(
+    task: GroupTask, advance: Callable[[str], None] = ignore
+) -> tuple[GroupResult, bytes]:
+    """Maps a group on a machine that shares no disk with the caller; returns the map's bytes."""
+    with tempfile.TemporaryDirectory(prefix="engram-group-") as folder:
+        path = Path(folder) / "group.engram"
+        result = map_group(task, path, advance)
+        whole = Path(folder) / "whole.engram"
+        MapStore.copy(path, whole)  # without the write-ahead log beside it
+        return result, whole.read_bytes()
+
+
+@contextmanager
+def fetched(source: str) -> Iterator[Path]:
+    """Where a drive can be read here: its path, or a copy of what a URL names.
+
+    Raises:
+        MissingExtraError: a URL, and fsspec is not installed.
+        SequenceError: the URL cannot be read.
+    """
+    if "://" not in source:
+        yield Path(source)
+        return
+    try:
+        import fsspec
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{source}: drives at URLs need fsspec: pip install 'engram[cluster]'"
+        ) from error
+    with tempfile.TemporaryDirectory(prefix="engram-drive-") as folder:
+        copy = Path(folder) / source.rstrip("/").rsplit("/", 1)[-1]
+        try:
+            files, path = fsspec.core.url_to_fs(source)
+            files.get(path, str(copy), recursive=files.isdir(path))
+        except Exception as error:  # every kind of file system has errors of its own
+            raise SequenceError(f"{source} cannot be fetched: {error}") from error
+        yield copy

@@ -1,0 +1,309 @@
+"""What a build keeps on the disk beside its centre: wherever it is killed, it can go on."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from engram.errors import ConfigError, MapError, MapLockedError
+from engram.fleet.build.group_mapping import GroupResult
+from engram.fleet.build.keeping import keeping
+from engram.fleet.build.order_results import BestOrder
+from engram.maps import MapStore
+from engram.maps.lock import WriterLock, current_holder
+
+
+@dataclass(frozen=True, slots=True)
+class BuildPlan:
+    """What a build depends on up to its merges; equal plans have equal groups' maps.
+
+    Attributes:
+        groups: sessions of each group, in the order of mapping.
+        known: sessions that the centre had when the build began, rising.
+        settings: hash of the resolved configuration.
+        mapping: how each drive is mapped.
+        merging: how the groups' maps are merged.
+        complete: whether the centre has all groups; then the folder holds nothing of worth but
+            to those who asked for it.
+        kept: whether the groups' maps stay when the build is complete.
+    """
+
+    groups: list[list[str]]
+    known: list[str]
+    settings: str
+    mapping: dict[str, Any]
+    merging: dict[str, Any]
+    complete: bool = False
+    kept: bool = False
+
+    def same_build(self, other: BuildPlan) -> bool:
+        """Whether one goes on where the other stopped."""
+        return self.same_groups(other) and (self.known, self.merging) == (
+            other.known,
+            other.merging,
+        )
+
+    def same_groups(self, other: BuildPlan) -> bool:
+        """Whether the groups' maps of one are those of the other."""
+        mine, theirs = ((one.groups, one.settings, one.mapping) for one in (self, other))
+        return mine == theirs
+
+
+@dataclass(frozen=True, slots=True)
+class MergingBegun:
+    """The order of merging, settled before the centre is touched.
+
+    Attributes:
+        order: numbers of the groups.
+        judge: what judged the orders, as `JudgeOptions.hash`; None where none were tried.
+        best: how the order was found, as `BestOrder.to_dict`.
+        seconds: of each group's merge that stands, by its number as text.
+    """
+
+    order: list[int]
+    judge: str | None = None
+    best: dict[str, Any] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def best_order(self) -> BestOrder | None:
+        """How the order was found."""
+        return None if self.best is None else BestOrder.from_dict(self.best)
+
+
+def build_folder(centre: Path) -> Path:
+    """Where the intermediate maps of a build lie."""
+    return centre.with_name(f"{centre.name}.build")
+
+
+@contextmanager
+def sole_builder(centre: Path) -> Iterator[None]:
+    """Nobody else builds into a centre meanwhile: two would map into the same groups' maps.
+
+    The lock lies beside the folder, not in it, for the folder comes and goes; it is gone with its
+    process, so that a build that was killed can go on at once.
+
+    Raises:
+        MapLockedError: somebody else does; names process and host.
+        MapError: the lock cannot be made there.
+    """
+    folder = build_folder(centre)
+    try:
+        lock = WriterLock(folder)
+    except MapLockedError as error:
+        raise MapLockedError(
+            f"{centre} is being built by {current_holder(folder) or 'another process'}; wait until "
+            "it is done, or build another one"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class Scratch:
+    """The folder of a build.
+
+    Its plan is the first thing that is written and the last that is removed, so that what lies
+    beside it is always known to belong to it.
+
+    All that it does raises MapError where the folder cannot be read or written, and
+    StorageFullError where no space is left.
+    """
+
+    def __init__(self, centre: Path) -> None:
+        self.centre = centre
+        self.folder = build_folder(centre)
+        self.plan = self._read_plan()
+
+    @property
+    def unfinished(self) -> BuildPlan | None:
+        """The plan of a build that is not complete."""
+        return None if self.plan is None or self.plan.complete else self.plan
+
+    def begin(self, plan: BuildPlan) -> None:
+        """Starts a build, or goes on with it; groups' maps that were kept are used again.
+
+        Raises:
+            ConfigError: the folder holds something else that might be wanted.
+        """
+        if (unfinished := self.unfinished) is not None:
+            if not unfinished.same_build(plan):
+                raise ConfigError(
+                    f"{self.folder} is of another build that is not complete; finish it with its "
+                    "own command, or delete the folder"
+                )
+            self._check_left_out(plan)
+        elif self.plan is None:
+            self._check_empty()
+        elif self.plan.same_groups(plan):
+            with keeping(self.folder):
+                self._merging_path.unlink(missing_ok=True)
+        else:
+            self._check_in_centre(self.plan)
+            self._clear()
+        with keeping(self.folder):
+            self.folder.mkdir(exist_ok=True)
+        self._write_plan(plan)
+
+    def finish(self) -> None:
+        """The build is complete: removes its maps, unless they are to be kept.
+
+        Raises:
+            MapError: the centre lacks a drive of the groups; then nothing is removed.
+        """
+        assert self.plan is not None
+        missing = _missing(self.centre, self.plan)
+        if missing:
+            raise MapError(
+                f"{self.centre} lacks sessions that were merged into it: {', '.join(missing)}; has "
+                f"somebody reverted them meanwhile? The groups' maps stay in {self.folder}"
+            )
+        self._write_plan(replace(self.plan, complete=True))
+        self.remove_leftovers()
+
+    def remove_leftovers(self) -> None:
+        """What a complete build was killed before removing."""
+        if self.plan is not None and self.plan.complete and not self.plan.kept:
+            self._clear()
+            with keeping(self.folder):
+                self._plan_path.unlink()
+                self.folder.rmdir()
+            self.plan = None
+
+    def group(self, number: int) -> Path:
+        """The map of a group."""
+        return self.folder / f"group-{number}.engram"
+
+    @property
+    def orders(self) -> Path:
+        """Folder of the maps of partial orders."""
+        return self.folder / "orders"
+
+    def remember(self, result: GroupResult) -> None:
+        """A group is mapped."""
+        _write_json(self._result_path(result.number), result.to_dict())
+
+    def result(self, number: int) -> GroupResult | None:
+        """What mapping a group came to; None if that is still to be done."""
+        path = self._result_path(number)
+        if not (path.exists() and self.group(number).exists()):
+            return None
+        return GroupResult(**_read_json(path))
+
+    def merging_begun(self) -> MergingBegun | None:
+        """The order that an earlier run merges by; None if it did not come so far.
+
+        Without a centre nothing is merged yet, whatever was settled.
+        """
+        if not (self.centre.exists() and self._merging_path.exists()):
+            return None
+        return MergingBegun(**_read_json(self._merging_path))
+
+    def remember_merging(self, begun: MergingBegun) -> None:
+        """The order is settled, or one more merge stands."""
+        _write_json(self._merging_path, asdict(begun))
+
+    @property
+    def _plan_path(self) -> Path:
+        return self.folder / "build.json"
+
+    @property
+    def _merging_path(self) -> Path:
+        return self.folder / "merging.json"
+
+    def _result_path(self, number: int) -> Path:
+        return self.folder / f"group-{number}.json"
+
+    def _read_plan(self) -> BuildPlan | None:
+        if not self._plan_path.exists():
+            return None
+        values = _read_json(self._plan_path)
+        known = {name: values[name] for name in BuildPlan.__slots__ if name in values}
+        try:
+            return BuildPlan(**known)
+        except TypeError as error:
+            raise ConfigError(
+                f"{self._plan_path} is no plan ({error}); delete the folder"
+            ) from error
+
+    def _write_plan(self, plan: BuildPlan) -> None:
+        _write_json(self._plan_path, asdict(plan))
+        self.plan = plan
+
+    def _check_left_out(self, plan: BuildPlan) -> None:
+        """Drives are left out because the centre has them: it must have them still."""
+        gone = sorted(set(plan.known) - sessions_of(self.centre))
+        if gone:
+            raise ConfigError(
+                f"{self.centre} no longer has {len(gone)} of the {len(plan.known)} sessions that "
+                f"it had when this build began ({gone[0]}); restore it, or delete {self.folder} "
+                "to build what it has not"
+            )
+
+    def _check_empty(self) -> None:
+        """Nothing that a new build would take for its own."""
+        with keeping(self.folder):
+            if not self.folder.exists():
+                return
+            strange = [one.name for one in self.folder.iterdir() if one.suffix != ".part"]
+        if strange:
+            raise ConfigError(
+                f"{self.folder} holds {sorted(strange)[0]}, but no plan of a build; delete the "
+                "folder, or move it"
+            )
+
+    def _check_in_centre(self, plan: BuildPlan) -> None:
+        """Maps that were kept make room for those of another build only if nothing is lost."""
+        missing = _missing(self.centre, plan)
+        if missing:
+            raise ConfigError(
+                f"{self.folder} holds the groups' maps of an earlier build, which is complete, and "
+                f"{self.centre} lacks {len(missing)} of their sessions ({missing[0]}); move the "
+                "folder, or delete it"
+            )
+
+    def _clear(self) -> None:
+        """Everything but the plan; results before the maps that they tell of."""
+        with keeping(self.folder):
+            for path in sorted(self.folder.iterdir(), key=lambda one: one.suffix != ".json"):
+                if path.is_dir():
+                    shutil.rmtree(path)
+                elif path != self._plan_path:
+                    path.unlink()
+
+
+def sessions_of(centre: Path) -> frozenset[str]:
+    """All sessions of a map, those of which it has a part only too; none of a map that is not."""
+    if not centre.exists():
+        return frozenset()
+    with MapStore.open(centre) as store:
+        return frozenset(map(str, store.frontends()))
+
+
+def _missing(centre: Path, plan: BuildPlan) -> list[str]:
+    """Sessions of the groups that the centre lacks."""
+    wanted = {session for group in plan.groups for session in group}
+    return sorted(wanted - sessions_of(centre))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); delete {path.parent}") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} is of another kind; delete {path.parent}")
+    return values
+
+
+def _write_json(path: Path, values: dict[str, Any]) -> None:
+    """In one step: a killed build leaves no half file."""
+    draft = path.with_name(f"{path.name}.part")
+    with keeping(path.parent):
+        draft.write_text(json.dumps(values), encoding="utf-8")
+        draft.replace(path)

@@ -1,0 +1,226 @@
+"""Edges across what a download leaves out, so that it stays as connected as the centre (SPEC §7).
+
+Every node that is left out belongs to the sent node from which it is reached along the surest
+chain. Where two such basins touch, the chain from one sent node to the other is a candidate. Those
+basins' borders join all that the graph joins, so a spanning tree of candidates closes every gap;
+short candidates are sent beyond that, since a map needs to be metric near by, not just in one
+piece: two experiences that were tied every few metres through a third one stay tied every few
+metres.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from engram.geometry import SE3, propagate_covariance
+from engram.graph.model import Edge, EdgeKind, NodeId
+
+Array = NDArray[np.float64]
+
+# Beyond what a neighbourhood search looks at (`DEFAULT_MARGIN_M`), a bridge shortens nothing.
+_NEAR_M = 12.0
+# One radian counts as much as so many metres: a landmark's usual distance.
+_LEVER_M = 10.0
+# Chains of perfectly known edges still prefer fewer edges.
+_LEAST_COST = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Steps:
+    """The surest edge between every two nodes that have any.
+
+    Attributes:
+        low, high: (E,) dense indices of its ends.
+        cost: (E,) its variance in m², rotation included.
+        edge: (E,) its place among the edges.
+    """
+
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    cost: Array
+    edge: NDArray[np.int64]
+
+
+def close_gaps(
+    nodes: Sequence[NodeId], edges: Sequence[Edge], sent: NDArray[np.bool_]
+) -> list[Edge]:
+    """Bridges between sent nodes, composed through nodes that are left out.
+
+    Args:
+        nodes: all nodes of the graph.
+        edges: all its edges.
+        sent: (N,) which nodes are sent.
+
+    Returns:
+        Edges of kind `bridge`, with summed covariances, ordered by their ends. With them the sent
+        nodes are in as many components as they are in the whole graph.
+    """
+    if sent.all() or not sent.any():
+        return []
+    index = {node: at for at, node in enumerate(nodes)}
+    ends = np.array([(index[edge.a], index[edge.b]) for edge in edges], np.int64).reshape(-1, 2)
+    steps = _surest(ends, edges)
+    search = _Search(nodes, edges, ends, steps, sent)
+    needed, near = search.candidates()
+    chosen = {pair: search.bridge(*pair) for pair in needed}
+    for pair in near:
+        bridge = chosen.get(pair) or search.bridge(*pair)
+        if bridge.a_from_b.distance_m <= _NEAR_M:
+            chosen[pair] = bridge
+    return [chosen[pair] for pair in sorted(chosen)]
+
+
+def components(count: int, ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) label of each node's component."""
+    links = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
+
+
+def _surest(ends: NDArray[np.int64], edges: Sequence[Edge]) -> _Steps:
+    """Of parallel edges the surest, the earlier one of equals."""
+    cost = np.array([_variance(edge.covariance) for edge in edges], np.float64)
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    order = np.lexsort((np.arange(len(cost)), cost, high, low))
+    low, high = low[order], high[order]
+    first = np.ones(len(order), np.bool_)
+    first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+    return _Steps(low[first], high[first], cost[order][first], order[first].astype(np.int64))
+
+
+def _variance(covariance: Array) -> float:
+    diagonal = np.diag(covariance)
+    return max(float(diagonal[:3].sum() + _LEVER_M**2 * diagonal[3:].sum()), _LEAST_COST)
+
+
+class _Search:
+    """Chains from sent nodes outwards through nodes that are left out."""
+
+    def __init__(
+        self,
+        nodes: Sequence[NodeId],
+        edges: Sequence[Edge],
+        ends: NDArray[np.int64],
+        steps: _Steps,
+        sent: NDArray[np.bool_],
+    ) -> None:
+        self._nodes, self._edges, self._ends, self._steps = nodes, edges, ends, steps
+        self._sent = sent
+        # Edges between two sent nodes are sent themselves.
+        self._through = ~(sent[steps.low] & sent[steps.high])
+        inner = sent[ends].all(axis=1)
+        self._joined = components(len(nodes), ends[inner])
+        odometry = np.array([edge.kind is EdgeKind.ODOMETRY for edge in edges], np.bool_)
+        self._pieces = components(len(nodes), ends[inner & odometry])
+        self._edge_of = {
+            (int(low), int(high)): int(edge)
+            for low, high, edge in zip(steps.low, steps.high, steps.edge, strict=True)
+        }
+        self._reach()
+
+    def _reach(self) -> None:
+        """The surest chain from any sent node to each node that is left out."""
+        steps, through = self._steps, self._through
+        shape = (len(self._nodes), len(self._nodes))
+        links = csr_matrix(
+            (steps.cost[through], (steps.low[through], steps.high[through])), shape=shape
+        )
+        self._cost, self._before, self._source = dijkstra(
+            links,
+            directed=False,
+            indices=np.flatnonzero(self._sent),
+            min_only=True,
+            return_predecessors=True,
+        )
+
+    def candidates(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """Pairs of sent nodes that a bridge may join.
+
+        Returns:
+            A spanning tree over the gaps; and for each node the surest pair to every other piece
+            of an experience.
+        """
+        steps, through = self._steps, self._through
+        self._border: dict[tuple[int, int], tuple[float, int]] = {}
+        for at in np.flatnonzero(through):
+            low, high = int(steps.low[at]), int(steps.high[at])
+            sources = int(self._source[low]), int(self._source[high])
+            if min(sources) < 0 or sources[0] == sources[1]:  # unreached, or inside one basin
+                continue
+            cost = float(self._cost[low] + steps.cost[at] + self._cost[high])
+            pair = (min(sources), max(sources))
+            if pair not in self._border or cost < self._border[pair][0]:
+                self._border[pair] = (cost, int(at))
+        ordered = sorted(self._border, key=lambda pair: (self._border[pair][0], pair))
+        return self._spanning(ordered), self._nearest(ordered)
+
+    def _spanning(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Kruskal's tree over the components of what is sent."""
+        root = {int(label): int(label) for label in np.unique(self._joined)}
+
+        def find(label: int) -> int:
+            while root[label] != label:
+                root[label] = root[root[label]]
+                label = root[label]
+            return label
+
+        needed = []
+        for pair in ordered:
+            a, b = (find(int(self._joined[node])) for node in pair)
+            if a != b:
+                root[max(a, b)] = min(a, b)
+                needed.append(pair)
+        return needed
+
+    def _nearest(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Candidates that are the surest from either end to the other's piece."""
+        taken: dict[int, set[int]] = defaultdict(set)
+        kept = []
+        for a, b in ordered:
+            pieces = int(self._pieces[a]), int(self._pieces[b])
+            if pieces[0] == pieces[1]:
+                continue
+            if pieces[1] not in taken[a] or pieces[0] not in taken[b]:
+                kept.append((a, b))
+            taken[a].add(pieces[1])
+            taken[b].add(pieces[0])
+        return kept
+
+    def bridge(self, a: int, b: int) -> Edge:
+        """The chain between two sent nodes as one edge."""
+        _, at = self._border[a, b]
+        ends = [int(self._steps.low[at]), int(self._steps.high[at])]
+        if int(self._source[ends[0]]) != a:
+            ends.reverse()
+        chain = [*reversed(self._back(ends[0])), *self._back(ends[1])]
+        a_from_end, covariance = SE3.identity(), np.zeros((6, 6))
+        for near, far in pairwise(chain):
+            near_from_far, step = self._step(near, far)
+            covariance = propagate_covariance(a_from_end, covariance, step)
+            a_from_end = a_from_end @ near_from_far
+        covariance = (covariance + covariance.T) / 2
+        return Edge(self._nodes[a], self._nodes[b], EdgeKind.BRIDGE, a_from_end, covariance)
+
+    def _back(self, node: int) -> list[int]:
+        """From a node to the sent node whose basin it is in."""
+        chain = [node]
+        while not self._sent[chain[-1]]:
+            chain.append(int(self._before[chain[-1]]))
+        return chain
+
+    def _step(self, near: int, far: int) -> tuple[SE3, Array]:
+        """``near_from_far`` and its covariance."""
+        at = self._edge_of[min(near, far), max(near, far)]
+        edge = self._edges[at]
+        if int(self._ends[at, 0]) == near:
+            return edge.a_from_b, edge.covariance
+        b_from_a = edge.a_from_b.inverse()
+        adjoint = b_from_a.adjoint()
+        return b_from_a, adjoint @ edge.covariance @ adjoint.T

@@ -1,0 +1,413 @@
+"""DOWNLOAD: a smaller map for one robot and one mission, complete in itself (SPEC §7, [G16] §V-B).
+
+The same revision of the same centre and the same options give the same bytes: records go in in an
+order that only their content decides, the revision bears the time of the centre's newest one and
+no host, and the file is compacted at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.config import to_dict
+from engram.errors import InputError
+from engram.fleet.download.bridges import close_gaps, components
+from engram.fleet.download.coverage import Coverage, expected_missed
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
+from engram.fleet.download.stock import Mask, Stock
+from engram.fleet.merge.merging import Progress
+from engram.graph.model import Edge, PathId, path_id
+from engram.maps import BulkWriter, MapStore, WritableMapStore
+from engram.maps.drafts import check_parent, draft_folder
+
+# What a node takes beside its blobs: rows and indices of it, its edges and path entries; measured
+# on maps of `hamlet`. Only where the search for the budget begins: the file itself is measured.
+_ROWS_BYTES = 2500
+_PAGE_BYTES = 4096
+_TRIES = 8
+# A try that leaves less than this free is good enough.
+_FULL_ENOUGH = 0.99
+# So full a file is aimed at.
+_AIM = 0.995
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DownloadReport:
+    """What was sent, and what it promises.
+
+    Attributes:
+        out: the file.
+        policy: by which it was chosen.
+        revision: of the centre.
+        source_hash, content_hash: of the centre and of what was sent.
+        nodes, of_nodes: sent, and all.
+        sessions, partial_paths: sent; how many paths left entries behind.
+        edges, bridges: sent; how many of them were composed.
+        components: of what was sent; the centre joins the same nodes into as many.
+        size_bytes, of_bytes: of the file, and of the centre's.
+        why: what the policy found out.
+        expected_missed, copy_missed: expected share of the mission's way without a match, with
+            what was sent and with everything.
+    """
+
+    out: Path
+    policy: str
+    revision: int
+    source_hash: str
+    content_hash: str
+    nodes: int
+    of_nodes: int
+    sessions: int
+    partial_paths: int
+    edges: int
+    bridges: int
+    components: int
+    size_bytes: int
+    of_bytes: int
+    why: dict[str, Any]
+    expected_missed: float
+    copy_missed: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``download --json`` prints."""
+        return {
+            name: str(value) if name == "out" else value
+            for name in self.__slots__
+            for value in [getattr(self, name)]
+        }
+
+    def text(self) -> str:
+        """For people."""
+        share = self.nodes / self.of_nodes if self.of_nodes else 1.0
+        lost = self.expected_missed - self.copy_missed
+        lines = [
+            f"{self.policy}: {self.nodes} of {self.of_nodes} nodes ({share:.1%}), "
+            f"{self.size_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB, "
+            f"of revision {self.revision}",
+            f"{self.sessions} sessions, {self.edges} edges ({self.bridges} bridges), "
+            f"{self.components} components, {self.partial_paths} paths in part",
+            f"expected share of the way without a match: {self.expected_missed:.1%} "
+            f"({self.copy_missed:.1%} with everything, {lost:+.1%} by what is left out)",
+        ]
+        if self.why.get("epochs"):
+            lines.append(
+                f"epochs {self.why['epochs'][0]} to {self.why['epochs'][-1]}, "
+                f"{len(self.why['paths'])} paths chosen"
+            )
+        if everything_bytes := self.why.get("everything_bytes"):
+            lines.append(
+                f"{self.size_bytes / everything_bytes:.1%} of the {everything_bytes / 1e6:.1f} MB "
+                "that all nodes take, sent alike"
+            )
+        if self.why.get("nodes_without_hour"):
+            lines.append(
+                f"{self.why['nodes_without_hour']} nodes have no known hour of day and stayed"
+            )
+        return "\n".join(lines)
+
+
+def download(
+    centre: Path | str,
+    out: Path,
+    options: DownloadOptions,
+    *,
+    at: int | str | None = None,
+    progress: Progress,
+) -> DownloadReport:
+    """Write a part of a centre as a map of its own.
+
+    Args:
+        centre: the map, or its address.
+        out: NAME.engram, which must not be there yet.
+        options: which part.
+        at: revision of the centre; None for the newest.
+        progress: shows how it goes.
+
+    Raises:
+        ConfigError: an option is missing, out of range, or means nothing to the policy.
+        InputError: nothing fits the options, or `out` exists already.
+        MapError: the centre cannot be read, or `out` not be written.
+
+    Whatever is raised, `out` is not there: it gets its name last of all.
+    """
+    check_options(options)
+    if out.exists() or out.is_symlink():
+        raise InputError(f"{out} exists already; choose another name")
+    check_parent(out)
+    with MapStore.open(centre, at=at) as store:
+        stock = Stock(store)
+        if not len(stock):
+            raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
+        selection = SELECTIONS[options.policy](stock, options)
+        coverage = selection.coverage or coverage_for(stock, options)
+        with draft_folder(out) as folder:
+            sent = _fitting(stock, selection, options, folder, progress)
+            compact = folder / _COMPACT
+            MapStore.compact(folder / _DRAFT, compact)
+            report = _report(stock, sent, coverage, compact, out, options)
+            MapStore.publish(compact, out)
+    return report
+
+
+_DRAFT, _COMPACT = "draft.engram", "compact.engram"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sent:
+    selection: Selection
+    bridges: list[Edge]
+
+
+def _fitting(
+    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, progress: Progress
+) -> _Sent:
+    """Write the draft; for a budget as many nodes as fit, found by writing and measuring."""
+    if selection.order is None:
+        return _write_draft(stock, selection, options, folder, progress)
+    landmarks, thumbnails = stock.sizes
+    blobs = landmarks + thumbnails * options.with_thumbnails
+    pages = np.ceil(blobs / _PAGE_BYTES) * _PAGE_BYTES + _ROWS_BYTES
+    newest: dict[int, _Sent] = {}
+
+    def measure(count: int) -> int:
+        newest.clear()
+        part = _beginning(selection, count)
+        newest[count] = _write_draft(stock, part, options, folder, progress)
+        return _compacted_bytes(folder)
+
+    budget_bytes, why = options.budget_bytes, dict(selection.why)
+    if options.budget_percent is not None:
+        why["everything_bytes"] = everything_bytes = measure(len(selection.order))
+        budget_bytes = int(everything_bytes * options.budget_percent / 100)
+    assert budget_bytes is not None
+    count = most_that_fit(measure, np.cumsum(pages[selection.order]), budget_bytes)
+    if count not in newest:
+        measure(count)
+    return _Sent(replace(newest[count].selection, why=why), newest[count].bridges)
+
+
+def most_that_fit(
+    measure: Callable[[int], int], expected_bytes: NDArray[np.float64], budget_bytes: int
+) -> int:
+    """How many nodes fit into a budget, found by writing files and measuring them.
+
+    Every file holds something that does not shrink with the nodes: vocabulary, statistics. How much
+    is learnt from the file of one node. From there on sizes are taken to grow as expected, until
+    one file was too large; then as a line from the largest that fits to the smallest that does not.
+
+    Args:
+        measure: writes the file of the first so many nodes and returns its bytes.
+        expected_bytes: (N,) what the first 1, 2, … N nodes are expected to take; rises.
+        budget_bytes: what the file may take.
+
+    Raises:
+        InputError: not even one node fits.
+
+    Source: regula falsi, with the Illinois algorithm's halving where one end stays (Dowell and
+    Jarratt, BIT 11, 1971): sizes bend where later nodes bring fewer edges.
+    """
+    fits, fits_bytes = 1, measure(1)
+    if fits_bytes > budget_bytes:
+        raise InputError(
+            f"not one node fits into {budget_bytes} bytes: the map's vocabulary, statistics and "
+            f"the most useful node with its session take {fits_bytes}; give a larger --budget"
+        )
+    too_many, too_many_bytes = len(expected_bytes) + 1, 0
+    aimed_bytes = _AIM * budget_bytes
+    low_weight = high_weight = 1.0
+    for _ in range(_TRIES):
+        if fits + 1 == too_many or fits_bytes >= _FULL_ENOUGH * budget_bytes:
+            break
+        room = aimed_bytes - fits_bytes
+        if too_many_bytes:
+            below, above = room * low_weight, (too_many_bytes - aimed_bytes) * high_weight
+            room = expected_bytes[too_many - 1] - expected_bytes[fits - 1]
+            room *= below / (below + above)
+        wanted = np.searchsorted(expected_bytes, expected_bytes[fits - 1] + room, side="right")
+        count = int(np.clip(wanted, fits + 1, too_many - 1))
+        size_bytes = measure(count)
+        if size_bytes <= budget_bytes:
+            fits, fits_bytes = count, size_bytes
+            low_weight, high_weight = 1.0, high_weight / 2
+        else:
+            too_many, too_many_bytes = count, size_bytes
+            low_weight, high_weight = low_weight / 2, 1.0
+    return fits
+
+
+def _beginning(selection: Selection, count: int) -> Selection:
+    assert selection.order is not None
+    sent = np.zeros(len(selection.sent), np.bool_)
+    sent[selection.order[:count]] = True
+    return replace(selection, sent=sent)
+
+
+def _compacted_bytes(folder: Path) -> int:
+    compact = folder / _COMPACT
+    MapStore.compact(folder / _DRAFT, compact)
+    size_bytes = compact.stat().st_size
+    compact.unlink()
+    return size_bytes
+
+
+def _write_draft(
+    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, progress: Progress
+) -> _Sent:
+    for old in folder.iterdir():
+        old.unlink()
+    bridges = close_gaps(stock.node_ids, stock.edges, selection.sent)
+    with (
+        MapStore.create(folder / _DRAFT) as draft,
+        progress("download", int(selection.sent.sum())) as advance,
+        _begin(draft, stock, options) as writer,
+    ):
+        _write(writer, stock, selection.sent, bridges, options, advance)
+        writer.commit()
+        stock.words.give(draft, [stock.node_ids[at] for at in np.flatnonzero(selection.sent)])
+    return _Sent(selection, bridges)
+
+
+def _begin(draft: WritableMapStore, stock: Stock, options: DownloadOptions) -> BulkWriter:
+    newest = stock.store.log()[-1]
+    return draft.begin_revision(
+        author="centre",
+        message=f"download {options.policy} of revision {newest.number}",
+        configuration={
+            "download": {
+                **to_dict(options),
+                "source": stock.content_hash,
+                "revision": newest.number,
+            }
+        },
+        at_ns=newest.committed_ns,
+    )
+
+
+def _write(
+    writer: BulkWriter,
+    stock: Stock,
+    sent: Mask,
+    bridges: list[Edge],
+    options: DownloadOptions,
+    advance: Callable[[str], None],
+) -> None:
+    """All that belongs to the nodes that are sent, owners first."""
+    _write_sessions(writer, stock, sent)
+    nodes = [stock.nodes[at] for at in np.flatnonzero(sent)]
+    for stored in stock.store.frames.stored(nodes):
+        writer.add_node(stored if options.with_thumbnails else replace(stored, thumbnail=None))
+        advance("")
+    for edge in stock.edges:
+        if sent[stock.index[edge.a]] and sent[stock.index[edge.b]]:
+            writer.add_edge(edge)
+    for bridge in bridges:
+        writer.add_edge(bridge)
+    for entry in stock.entries:
+        if sent[stock.index[entry.node]]:
+            writer.add_path_entry(entry)
+    _write_attempts(writer, stock, sent)
+    if options.policy == "copy":
+        for _, omission in sorted(stock.store.omissions().items()):
+            writer.add_omission(omission)
+    for name, values in sorted(stock.store.statistics().items()):
+        writer.put_statistics(name, values)
+    vocabulary = stock.store.vocabulary()
+    if vocabulary is not None:
+        writer.put_vocabulary(vocabulary)
+
+
+def _write_sessions(writer: BulkWriter, stock: Stock, sent: Mask) -> None:
+    """Those that saved, passed or tried what is sent; all for a whole map."""
+    frontends = stock.store.frontends()
+    partial = _partial_paths(stock, sent)
+    wanted = _sessions_of(stock, sent)
+    for at, session in enumerate(stock.sessions):
+        if wanted[at]:
+            descriptor, frontend = frontends[session.id]
+            writer.add_session(
+                session,
+                stock.contents.cameras[session.camera],
+                descriptor=descriptor,
+                frontend=frontend,
+                partial=path_id(session.id) in partial,
+            )
+
+
+def _sessions_of(stock: Stock, sent: Mask) -> Mask:
+    if sent.all():
+        return np.ones(len(stock.sessions), np.bool_)
+    wanted = np.zeros(len(stock.sessions), np.bool_)
+    wanted[stock.session_of[sent]] = True
+    made = _attempts_between(stock, sent)
+    wanted[stock.attempts.session[made]] = True
+    for at, session in enumerate(stock.sessions):
+        nodes = stock.on_path.get(path_id(session.id))
+        if nodes is not None and sent[nodes].any():
+            wanted[at] = True
+    return wanted
+
+
+def _partial_paths(stock: Stock, sent: Mask) -> set[PathId]:
+    """Paths of which some entries stay, here or before."""
+    left = {path for path, nodes in stock.on_path.items() if not sent[nodes].all()}
+    return left | set(stock.store.partial_paths())
+
+
+def _attempts_between(stock: Stock, sent: Mask) -> NDArray[np.intp]:
+    """Rows of attempts whose both ends are sent."""
+    made = stock.attempts
+    return np.flatnonzero(sent[made.reference] & sent[made.node])
+
+
+def _write_attempts(writer: BulkWriter, stock: Stock, sent: Mask) -> None:
+    kept = stock.attempts.rows(_attempts_between(stock, sent))
+    for at, session in enumerate(stock.sessions):
+        rows = np.flatnonzero(kept.session == at)
+        if len(rows):
+            writer.add_attempts(session.id, kept.rows(rows), stock.node_ids)
+
+
+def _report(
+    stock: Stock,
+    done: _Sent,
+    coverage: Coverage,
+    file: Path,
+    out: Path,
+    options: DownloadOptions,
+) -> DownloadReport:
+    """What was written to a file that is to be called `out`."""
+    sent = done.selection.sent
+    with MapStore.open(file) as written:
+        info = written.info()
+        content_hash = written.content_hash()
+    ends = np.array(
+        [(stock.index[edge.a], stock.index[edge.b]) for edge in (*stock.edges, *done.bridges)],
+        np.int64,
+    ).reshape(-1, 2)
+    inner = ends[sent[ends].all(axis=1)]
+    return DownloadReport(
+        out=out,
+        policy=options.policy,
+        revision=stock.store.revision,
+        source_hash=stock.content_hash,
+        content_hash=content_hash,
+        nodes=info.nodes,
+        of_nodes=len(stock),
+        sessions=info.sessions,
+        partial_paths=len(_partial_paths(stock, sent)),
+        edges=info.edges,
+        bridges=len(done.bridges),
+        components=len(np.unique(components(len(stock), inner)[sent])),
+        size_bytes=file.stat().st_size,
+        of_bytes=stock.store.info().size_bytes,
+        why=dict(done.selection.why),
+        expected_missed=expected_missed(coverage, sent),
+        copy_missed=expected_missed(coverage, stock.everything()),
+    )

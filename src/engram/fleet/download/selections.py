@@ -1,0 +1,254 @@
+"""Which nodes go along: the policies of DOWNLOAD (SPEC §7, [G16] §V-B)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+
+from engram.errors import ConfigError, InputError
+from engram.fleet.download.coverage import Coverage, Demand, greedy_order
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.path_weights import count_paths, mission_epochs
+from engram.fleet.download.stock import Mask, Stock
+from engram.graph.model import PathId, path_id
+from engram.maps.regions import edge_lengths
+
+_HOURS = 24.0
+# Hours are told by clocks to the nanosecond; what is left over is rounding.
+_ROUNDING_H = 1e-9
+_DEFAULTS = asdict(DownloadOptions())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The nodes of a download, and why.
+
+    Attributes:
+        sent: (N,) which nodes of the stock are sent.
+        why: what the policy found out, plain data.
+        order: for `budget`: nodes by what they promise, of which a beginning is sent; else None.
+        coverage: what the mission needs, where the policy went by it; else None.
+    """
+
+    sent: Mask
+    why: Mapping[str, Any]
+    order: NDArray[np.int64] | None = None
+    coverage: Coverage | None = None
+
+
+Policy: TypeAlias = Callable[[Stock, DownloadOptions], Selection]
+
+
+def select_copy(stock: Stock, _: DownloadOptions) -> Selection:
+    """Everything. [G16] (3)."""
+    return Selection(stock.everything(), {})
+
+
+def select_tod(stock: Stock, options: DownloadOptions) -> Selection:
+    """Nodes whose time of day is within a window of the mission's start, over midnight too.
+
+    Source: [G16] (4); SPEC §7.
+    """
+    sent, unknown = _near_start(stock, options)
+    return Selection(sent, {"nodes_without_hour": unknown})
+
+
+def select_paths(stock: Stock, options: DownloadOptions) -> Selection:
+    """All nodes of the best paths of each of the mission's epochs. [G16] Algorithms 2 and 3."""
+    stock.known_hours()
+    chosen, why = _best_paths(stock, options, None)
+    return Selection(_nodes_on(stock, chosen), why)
+
+
+def select_tod_and_paths(stock: Stock, options: DownloadOptions) -> Selection:
+    """Nodes that pass `tod` and lie on a path chosen by counts over those nodes (SPEC §7)."""
+    near, unknown = _near_start(stock, options)
+    chosen, why = _best_paths(stock, options, near)
+    return Selection(near & _nodes_on(stock, chosen), {**why, "nodes_without_hour": unknown})
+
+
+def select_region(stock: Stock, options: DownloadOptions) -> Selection:
+    """What lies around some nodes, along the edges."""
+    if not options.near:
+        raise ConfigError("policy region needs --near NODE, the beginning of a node's UUID")
+    seeds = [stock.named_node(prefix) for prefix in options.near]
+    return Selection(within(stock, np.array(seeds), options.radius_m), {"seeds": len(seeds)})
+
+
+def select_route(stock: Stock, options: DownloadOptions) -> Selection:
+    """What lies along the way of one session, along the edges."""
+    if options.route is None:
+        raise ConfigError("policy route needs --route SESSION, the beginning of a session's UUID")
+    return Selection(along_route(stock, options.route, options.radius_m), {})
+
+
+def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
+    """Nodes in the order in which they promise to spare the mission most failures per byte.
+
+    How many of them fit into the budget is found when the map is written.
+    """
+    if options.budget_bytes is None and options.budget_percent is None:
+        raise ConfigError("policy budget needs --budget SIZE, such as 200MB or 25%")
+    if options.start_h is not None:
+        stock.known_hours()
+    coverage = coverage_for(stock, options)
+    landmarks, thumbnails = stock.sizes
+    size = landmarks + thumbnails * options.with_thumbnails
+    order = greedy_order(coverage, size.astype(np.float64), _spare_order(stock, options))
+    return Selection(stock.everything(), {"demand": coverage.demand.total}, order, coverage)
+
+
+SELECTIONS: dict[str, Policy] = {
+    "copy": select_copy,
+    "tod": select_tod,
+    "paths": select_paths,
+    "tod+paths": select_tod_and_paths,
+    "region": select_region,
+    "route": select_route,
+    "budget": select_budget,
+}
+
+# What each policy goes by, beside when the mission is, for which every forecast is made, and
+# whether thumbnails go along.
+UNDERSTOOD: dict[str, frozenset[str]] = {
+    "copy": frozenset(),
+    "tod": frozenset({"window_min"}),
+    "paths": frozenset({"epoch_min", "best_percent", "buffer_min"}),
+    "tod+paths": frozenset({"window_min", "epoch_min", "best_percent", "buffer_min"}),
+    "region": frozenset({"near", "radius_m"}),
+    "route": frozenset({"route", "radius_m"}),
+    "budget": frozenset({"budget_bytes", "budget_percent", "near", "route", "radius_m"}),
+}
+_FLAGS = {
+    "window_min": "--window",
+    "epoch_min": "--epoch",
+    "best_percent": "--best",
+    "buffer_min": "--buffer",
+    "budget_bytes": "--budget",
+    "budget_percent": "--budget",
+    "near": "--near",
+    "route": "--route",
+    "radius_m": "--radius",
+}
+# Where a mission may have an end and no beginning: it begins with the first epoch that has data.
+_OPEN_START = frozenset({"paths", "tod+paths"})
+
+
+def check_options(options: DownloadOptions) -> None:
+    """Refuses what a policy would pass over in silence.
+
+    Raises:
+        ConfigError: the policy is unknown, or an option that is not its default means nothing to it
+            or nothing without another one.
+    """
+    policy = options.policy
+    if policy not in SELECTIONS:
+        raise ConfigError(f"policy {policy!r} is unknown; known: {', '.join(SELECTIONS)}")
+    for name, flag in _FLAGS.items():
+        if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[policy]:
+            continue
+        takers = [one for one, understood in UNDERSTOOD.items() if name in understood]
+        raise ConfigError(
+            f"policy {policy} does not go by {flag}; leave it out, or choose --policy "
+            f"{' or '.join(takers)}"
+        )
+    if policy == "budget":
+        _check_where(options)
+    if options.start_h is None:
+        _check_no_mission(options)
+
+
+def _check_where(options: DownloadOptions) -> None:
+    if options.near and options.route is not None:
+        raise ConfigError("the mission is along --route or around --near; give one of the two")
+    if options.radius_m != _DEFAULTS["radius_m"] and not options.near and options.route is None:
+        raise ConfigError("--radius is of --near or --route; give one of the two with it")
+
+
+def _check_no_mission(options: DownloadOptions) -> None:
+    """What tells more of a mission's time says nothing where it has none."""
+    if options.end_h is not None and options.policy not in _OPEN_START:
+        raise ConfigError(f"policy {options.policy} needs --start with --end")
+    if options.day is not None or options.latitude_deg is not None:
+        raise ConfigError(
+            "--date and --latitude tell how high the sun stands at --start; give it too"
+        )
+
+
+def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
+    """What a mission is expected to need, and what each node gives it."""
+    where = None
+    if options.route is not None:
+        where = along_route(stock, options.route, options.radius_m)
+    elif options.near:
+        where = select_region(stock, options).sent
+    return Coverage(stock, Demand.of(stock, options, where))
+
+
+def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
+    """(N,) the nodes within a distance of any seed, along the edges."""
+    distance_m = dijkstra(
+        edge_lengths(stock.graph), directed=False, indices=seeds, min_only=True, limit=radius_m
+    )
+    return np.asarray(np.isfinite(distance_m), np.bool_)
+
+
+def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
+    """(N,) the nodes within a distance of the way of a session.
+
+    Raises:
+        InputError: no session, or several, begin so, or it came past no node.
+    """
+    found = stock.named_session(session)
+    seeds = stock.on_path.get(path_id(found.id))
+    if seeds is None:
+        raise InputError(f"session {found.id} of {found.robot} came past no node of the map")
+    return within(stock, np.unique(seeds), radius_m)
+
+
+def _near_start(stock: Stock, options: DownloadOptions) -> tuple[Mask, int]:
+    if options.start_h is None:
+        raise ConfigError(f"policy {options.policy} needs --start, the mission's time of day")
+    hours = stock.known_hours()
+    apart = np.abs(hours - options.start_h)
+    apart = np.minimum(apart, _HOURS - apart)
+    allowed_h = options.window_min / 60
+    sent = np.nan_to_num(apart, nan=np.inf) <= allowed_h + _ROUNDING_H
+    if not sent.any():
+        minutes = round(60 * options.start_h) % (24 * 60)
+        raise InputError(
+            f"no node was saved within {allowed_h * 60:.0f} minutes of "
+            f"{minutes // 60}:{minutes % 60:02d}; widen the --window"
+        )
+    return sent, int(np.isnan(hours).sum())
+
+
+def _best_paths(
+    stock: Stock, options: DownloadOptions, counted: Mask | None
+) -> tuple[list[PathId], dict[str, Any]]:
+    counts = count_paths(stock.on_path, stock.hours, options.epoch_min, counted)
+    epochs = mission_epochs(counts, options.start_h, options.end_h, options.buffer_min)
+    rows = sorted({row for epoch in epochs for row in counts.best(epoch, options.best_percent)})
+    chosen = [counts.paths[row] for row in rows]
+    return chosen, {"epochs": epochs, "paths": [str(path) for path in chosen]}
+
+
+def _nodes_on(stock: Stock, paths: list[PathId]) -> Mask:
+    sent = np.zeros(len(stock), np.bool_)
+    for path in paths:
+        sent[stock.on_path[path]] = True
+    return sent
+
+
+def _spare_order(stock: Stock, options: DownloadOptions) -> NDArray[np.int64]:
+    """All nodes, those nearest in time of day first: for room that nothing else asks for."""
+    if options.start_h is None:
+        return np.arange(len(stock))
+    apart = np.abs(stock.hours - options.start_h)
+    apart = np.nan_to_num(np.minimum(apart, _HOURS - apart), nan=_HOURS)
+    return np.argsort(apart, kind="stable")

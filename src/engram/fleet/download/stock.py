@@ -1,0 +1,171 @@
+"""What a centre has to give: its records in an order that only its content decides."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import InputError
+from engram.fleet.merge.words import CentreWords
+from engram.graph.basin import BasinCounts
+from engram.graph.clock import hour_of_day
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
+from engram.maps import AttemptArrays, MapStore
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LISTED = 3
+
+
+class Stock:
+    """A centre as of one revision, for choosing from it.
+
+    Attributes:
+        store: the map.
+        contents: its records as the store gives them.
+        sessions: in the order of their starts, then UUIDs.
+        nodes: by session, then stamp, then UUID.
+        index: place of each node in `nodes`.
+        edges: by their ends and kind.
+        graph: of these nodes and edges; dense indices are places in `nodes`.
+    """
+
+    def __init__(self, store: MapStore) -> None:
+        self.store = store
+        self.contents = store.load()
+        self.sessions: list[Session] = sorted(
+            self.contents.sessions, key=lambda one: (one.start_ns, one.id)
+        )
+        place = {one.id: at for at, one in enumerate(self.sessions)}
+        self.nodes: list[Node] = sorted(
+            self.contents.nodes, key=lambda one: (place[one.session], one.stamp_ns, one.id)
+        )
+        self.index = {node.id: at for at, node in enumerate(self.nodes)}
+        self.edges: list[Edge] = sorted(
+            self.contents.edges, key=lambda edge: (edge.a, edge.b, edge.kind)
+        )
+        self.graph = ExperienceGraph()
+        for node in self.nodes:
+            self.graph.add_node(node)
+        self.graph.add_edges(self.edges)
+        self.session_of: NDArray[np.int64] = np.array(
+            [place[node.session] for node in self.nodes], np.int64
+        )
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def everything(self) -> Mask:
+        """All nodes."""
+        return np.ones(len(self), np.bool_)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Of the centre at this revision."""
+        return self.store.content_hash()
+
+    @cached_property
+    def words(self) -> CentreWords:
+        """Words of the nodes."""
+        return CentreWords(self.store)
+
+    @cached_property
+    def node_ids(self) -> list[NodeId]:
+        """UUIDs of `nodes`."""
+        return [node.id for node in self.nodes]
+
+    @cached_property
+    def hours(self) -> Array:
+        """(N,) hour of day of each node (SPEC §2.8), NaN where no clock tells."""
+        by_id = {one.id: one for one in self.sessions}
+        known = (hour_of_day(by_id[node.session], node.stamp_ns) for node in self.nodes)
+        return np.array([np.nan if hour is None else hour for hour in known], np.float64)
+
+    def known_hours(self) -> Array:
+        """`hours`, some of which are known.
+
+        Raises:
+            InputError: none is.
+        """
+        if not np.isfinite(self.hours).any():
+            without = [one for one in self.sessions if hour_of_day(one, one.start_ns) is None]
+            listed = ", ".join(f"{one.robot} {str(one.id)[:8]}" for one in without[:_LISTED])
+            raise InputError(
+                f"no node of {self.store.location} has a known hour of day: {len(without)} of "
+                f"{len(self.sessions)} sessions ({listed}…) have no UTC clock or neither longitude "
+                "nor time zone; map drives with --start and --longitude or --zone, or use --policy "
+                "copy, region or route"
+            )
+        return self.hours
+
+    @cached_property
+    def on_path(self) -> dict[PathId, NDArray[np.int64]]:
+        """The nodes on each path, in its order, each as often as the path comes there."""
+        found: dict[PathId, list[int]] = {}
+        for entry in self.contents.path_entries:
+            found.setdefault(entry.path, []).append(self.index[entry.node])
+        return {path: np.array(nodes, np.int64) for path, nodes in found.items()}
+
+    @cached_property
+    def entries(self) -> list[PathEntry]:
+        """Path entries by path and sequence."""
+        return sorted(self.contents.path_entries, key=lambda entry: (entry.path, entry.sequence))
+
+    @cached_property
+    def attempts(self) -> AttemptArrays:
+        """Remembered attempts; sessions and nodes are places in `sessions` and `nodes`."""
+        made = self.contents.attempts
+        place = {one.id: at for at, one in enumerate(self.sessions)}
+        session = np.array([place[one.id] for one in self.contents.sessions], np.int32)
+        node = np.array([self.index[one.id] for one in self.contents.nodes], np.int32)
+        columns = {name: getattr(made, name) for name in AttemptArrays.__slots__}
+        columns["session"] = session[made.session] if len(made) else made.session
+        for name in ("reference", "node"):
+            columns[name] = node[columns[name]] if len(made) else columns[name]
+        found = AttemptArrays(**columns)
+        return found.rows(np.argsort(found.session, kind="stable"))
+
+    @cached_property
+    def basin_counts(self) -> BasinCounts:
+        """From which match basins are learnt."""
+        places = [self.graph.index(node.id) for node in self.contents.nodes]
+        return self.contents.basin_counts(self.graph.experiences[places])
+
+    @cached_property
+    def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(N,) bytes of the landmarks of each node, and (N,) of its thumbnail."""
+        found = self.store.blob_sizes()
+        both = np.array([found[node] for node in self.node_ids], np.int64).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
+
+    def named_node(self, prefix: str) -> int:
+        """The one node whose UUID begins so.
+
+        Raises:
+            InputError: no node, or several, begin so, or it was taken back.
+        """
+        origin = self.store.origin(prefix)
+        if origin.node not in self.index:
+            raise InputError(f"node {origin.node} was taken back in revision {origin.told[-1][0]}")
+        return self.index[origin.node]
+
+    def named_session(self, prefix: str) -> Session:
+        """The one session whose UUID begins so.
+
+        Raises:
+            InputError: no session, or several, begin so.
+        """
+        wanted = prefix.strip().lower()
+        found = [one for one in self.sessions if str(one.id).startswith(wanted)]
+        if not wanted or len(found) != 1:
+            listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or self.sessions)
+            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose of: {listed}")
+        return found[0]
+
+    def place_of(self, session: SessionId) -> int:
+        """Place of a session in `sessions`."""
+        return next(at for at, one in enumerate(self.sessions) if one.id == session)

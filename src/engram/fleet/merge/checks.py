@@ -1,0 +1,182 @@
+"""Whether a map may be merged at all, and what about it somebody should look at."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from engram.errors import IncompatibleError
+from engram.fleet.merge.centre import Centre
+from engram.fleet.merge.handed_in import HandedIn
+from engram.graph.model import Clock, Node, NodeId, Session, SessionId
+
+_NS_PER_S = 1_000_000_000
+# Stamps count as running backwards only where odometry says that the robot drove on by as much.
+_DRIVEN_SLACK_M = 0.5
+# Pairs of drives at the same time that are named for each robot: a name shared by two makes many.
+_TOLD_OVERLAPS = 5
+
+
+def check_fits(centre: Centre, robot: HandedIn) -> None:
+    """Refuse a map that would spoil the centre.
+
+    Raises:
+        IncompatibleError: it has another kind of descriptors; or it has a node or a session under
+            the UUID of one of the centre's, and another content.
+    """
+    kind, theirs = centre.opened.descriptor, robot.store.descriptor()
+    if None not in {kind, theirs} and kind is not theirs:
+        raise IncompatibleError(
+            f"{robot.name} holds {theirs} descriptors, the centre {kind}; the two cannot be "
+            "matched: extract and map the drives again"
+        )
+    for session in robot.sessions:
+        ours = centre.opened.sessions.get(session.id)
+        if ours is not None and _drive(ours) != _drive(session):
+            raise IncompatibleError(
+                f"session {session.id} is a drive of {session.robot} in {robot.name} and another "
+                f"one, of {ours.robot}, in the centre: one of the two maps is not what it says"
+            )
+    _check_nodes(centre, robot)
+
+
+def _check_nodes(centre: Centre, robot: HandedIn) -> None:
+    """Refuse nodes that the centre has, or once omitted, with another content."""
+    for node, theirs in robot.landmark_hashes.items():
+        ours = centre.landmark_hashes.get(node, theirs)
+        if ours != theirs or not _same_record(centre, robot, node):
+            raise IncompatibleError(
+                f"node {node}{_told(robot, node)} has one content in {robot.name} and another in "
+                f"the centre, landmarks {theirs.hex()} and {ours.hex()}: a node never changes, so "
+                "one of the two maps is not what it says"
+            )
+
+
+def check_readable(robot: HandedIn, nodes: Sequence[Node]) -> None:
+    """Reads all landmarks that may be taken once, before a byte of the centre is written.
+
+    Raises:
+        MapError: something of them was damaged on the way.
+    """
+    for _ in robot.store.frames.stored(list(nodes)):
+        pass
+
+
+def notes(centre: Centre, robot: HandedIn, now_ns: int) -> list[str]:
+    """What is odd about a map and does not stand in the way of a merge.
+
+    Drives that the centre has are left out: what is odd about them was told when they came.
+
+    Args:
+        centre: before the merge.
+        robot: the map.
+        now_ns: the time, UTC.
+    """
+    told = [
+        f"session {one.session.id} of {one.session.robot} was interrupted in {robot.name}: it is "
+        "not handed in before it is resumed or sealed there"
+        for one in robot.store.interrupted()
+    ]
+    new = [one for one in robot.sessions if one.id not in centre.opened.sessions]
+    for session in new:
+        told += _backwards(session, robot.nodes_of[session])
+        if session.clock is Clock.UTC and session.start_ns > now_ns:
+            told.append(
+                f"session {session.id} of {session.robot} begins "
+                f"{(session.start_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
+                "was wrong"
+            )
+    return told + list(_overlaps(centre, robot, new))
+
+
+def _drive(session: Session) -> tuple[str, str, int]:
+    """What a session's UUID is made of; clock, longitude and zone may be told later (SPEC §2.8)."""
+    return session.robot, session.camera, session.start_ns
+
+
+def _same_record(centre: Centre, robot: HandedIn, node: NodeId) -> bool:
+    """Whether a node that both have is of the same drive, moment and camera."""
+    if node not in centre.graph or node not in robot.nodes:
+        return True
+    ours, theirs = centre.graph.node(centre.graph.index(node)), robot.nodes[node]
+    return (ours.session, ours.stamp_ns, ours.camera) == (
+        theirs.session,
+        theirs.stamp_ns,
+        theirs.camera,
+    )
+
+
+def _told(robot: HandedIn, node: NodeId) -> str:
+    """Where a node comes from; nothing of one that the robot's map has omitted itself."""
+    if node not in robot.nodes:
+        return ""
+    return f" (session {robot.nodes[node].session}, stamp {robot.nodes[node].stamp_ns})"
+
+
+def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
+    """Stamps that fall while the distance driven rises."""
+    back = [
+        (before.driven_m - after.driven_m, before, after)
+        for before, after in pairwise(nodes)
+        if after.driven_m < before.driven_m - _DRIVEN_SLACK_M
+    ]
+    if back:
+        _, before, after = max(back, key=lambda one: one[0])
+        yield (
+            f"the clock of session {session.id} ({session.robot}) runs backwards {len(back)} "
+            f"times: {(after.stamp_ns - before.stamp_ns) / _NS_PER_S:.1f} s after "
+            f"{before.driven_m:.0f} m driven it stamped {after.driven_m:.0f} m; nodes are replayed "
+            "in the order of their stamps"
+        )
+
+
+def _overlaps(centre: Centre, robot: HandedIn, new: Sequence[Session]) -> Iterator[str]:
+    """Drives of one robot at the same time: two robots of one name, or a clock that was wrong."""
+    spans = _spans(centre, robot)
+    ids = {session.id for session in new}
+    for name in sorted({session.robot for session in new}):
+        pairs = list(overlapping([one for one in spans if one.session.robot == name], ids))
+        for one, other in pairs[:_TOLD_OVERLAPS]:
+            yield (
+                f"sessions {one.id} and {other.id} are both of a robot named {name!r} and overlap "
+                "in time: two robots have the same name, or a clock was wrong"
+            )
+        if len(pairs) > _TOLD_OVERLAPS:
+            yield f"… and {len(pairs) - _TOLD_OVERLAPS} more pairs of drives of {name!r}"
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A session and its first and last stamp, UTC."""
+
+    session: Session
+    first_ns: int
+    last_ns: int
+
+
+def overlapping(
+    spans: Iterable[Span], new: Container[SessionId]
+) -> Iterator[tuple[Session, Session]]:
+    """The pairs of sessions that overlap in time, at least one of them new; the earlier first.
+
+    One sweep over the starts, beside which only the sessions that have not ended are kept.
+    """
+    running: list[Span] = []
+    for span in sorted(spans, key=lambda one: (one.first_ns, one.session.id)):
+        running = [one for one in running if one.last_ns >= span.first_ns]
+        for one in running:
+            if span.session.id in new or one.session.id in new:
+                yield one.session, span.session
+        running.append(span)
+
+
+def _spans(centre: Centre, robot: HandedIn) -> list[Span]:
+    """Of every session whose clock is UTC."""
+    sessions = {**centre.opened.sessions, **{one.id: one for one in robot.sessions}}
+    last = {one.id: one.start_ns for one in sessions.values()}
+    for node in (*centre.graph.nodes, *robot.contents.nodes):
+        last[node.session] = max(last[node.session], node.stamp_ns)
+    return [
+        Span(one, one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC
+    ]

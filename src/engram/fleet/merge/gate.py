@@ -1,0 +1,239 @@
+"""A gate before the centre: held-out drives must not localise worse in what a merge made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError, RefusedError
+from engram.fleet.merge.report import HeldOutFigures, HeldOutReport
+from engram.graph.model import Session, session_id
+from engram.localiser import Budget, Localisation
+from engram.maps import MapStore
+from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
+from engram.monitor import ignore
+from engram.robot import OpenMap, Settings, live_frames, measured, open_drive, session_of_drive
+from engram.robot.session import DriveSequence
+from engram.sequences import FrameLog, first_pair_hash
+
+# SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
+_JUDGED_M = np.arange(0.0, 20.5, 0.5)
+_LONGEST_GAP_RATIO = 1.5
+# Where reports tell the failure curve (SPEC §8).
+_TOLD_M = (5, 10, 20)
+# Sums of the same gaps in another order differ by this much.
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class GateOptions:
+    """How held-out drives are localised.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each frame.
+        relocaliser: key of `RELOCALISERS`; drives begin lost.
+    """
+
+    policy: str = "recall"
+    lanes: int = 2
+    rounds: int = 2
+    relocaliser: str | None = "fabmap"
+
+
+def check_held_out(
+    drives: Iterable[tuple[Path | str, DriveSequence]],
+    sessions: Iterable[Session],
+    where: Path | str,
+    option: str,
+) -> None:
+    """Refuses to judge by what is judged: a drive localises well in a map of itself.
+
+    A drive that was mapped under another robot's name has another session, and is told all the
+    same: by camera, first stamp and the images of its first frame. First stamps alone would not
+    do, since many data sets count from 0.
+
+    Args:
+        drives: that judge, each with what people call it.
+        sessions: of a map that is judged, or takes part in it.
+        where: the map.
+        option: by which the drives were given.
+
+    Raises:
+        ConfigError: one of them is one of the drives.
+        SequenceError: a drive cannot be read.
+    """
+    sessions = list(sessions)
+    for name, sequence in drives:
+        held = held_as(sequence, sessions)
+        if held is not None:
+            raise ConfigError(
+                f"{name} is not held out: {where} holds this very drive (session {held.id} of "
+                f"{held.robot}); give {option} drives that are in none of the maps"
+            )
+
+
+def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
+    """The session that this drive became, whatever the robot was called; None if it became none.
+
+    Raises:
+        SequenceError: the drive cannot be read.
+    """
+    own = session_of_drive(sequence)
+    for one in sessions:
+        if one.id == own.id:
+            return one
+        if (one.camera, one.start_ns) != (own.camera, own.start_ns):
+            continue
+        if one.id == session_id(one.robot, one.camera, one.start_ns, _first_pair(sequence)):
+            return one
+    return None
+
+
+def _first_pair(sequence: DriveSequence) -> str:
+    """`first_pair_hash` of a drive of which `session_of_drive` found that it has a frame."""
+    if isinstance(sequence, FrameLog):
+        return sequence.first_pair_hash
+    return first_pair_hash(next(iter(sequence)))
+
+
+class Gate:
+    """Compares how held-out drives localise in the centre before and after.
+
+    Args:
+        drives: folders of images or frame logs; no part of what is merged.
+        settings: of localiser and odometry.
+        options: policy and budget.
+
+    Raises:
+        SequenceError: a drive cannot be read.
+    """
+
+    def __init__(
+        self, drives: Sequence[Path], settings: Settings, options: GateOptions | None = None
+    ) -> None:
+        self._paths = list(drives)
+        self._sequences = [open_drive(path) for path in drives]
+        self._settings = settings
+        self._options = options or GateOptions()
+        self._before: list[Drive] | None = None
+
+    def check_held_out(self, sessions: Iterable[Session], where: Path) -> None:
+        """See the function of this name.
+
+        Args:
+            sessions: of a map that takes part in the merge.
+            where: the map.
+
+        Raises:
+            ConfigError: one of them is one of the drives.
+        """
+        drives = zip(self._paths, self._sequences, strict=True)
+        check_held_out(drives, sessions, where, "--require-better")
+
+    def look_at(self, store: MapStore, advance: Callable[[str], None] = ignore) -> None:
+        """The centre as it is; once, before the first merge.
+
+        Args:
+            store: the centre.
+            advance: called once for each frame.
+        """
+        self._before = self._localise(store, advance)
+
+    def __call__(
+        self, store: MapStore, robot: str, advance: Callable[[str], None] = ignore
+    ) -> HeldOutReport:
+        """The centre as it would become.
+
+        Args:
+            store: with what is being merged.
+            robot: name of the map that is.
+            advance: called once for each frame.
+
+        Raises:
+            RefusedError: the drives localise worse in it.
+        """
+        assert self._before is not None
+        before, after = self._before, self._localise(store, advance)
+        names = [path.name for path in self._paths]
+        worse = what_is_worse(after, before)
+        if worse:
+            raise RefusedError(
+                f"{robot} is refused: {', '.join(names)} localise worse in the result: {worse}; "
+                "the centre is as it was before this map"
+            )
+        self._before = after
+        return HeldOutReport(names, _figures(before), _figures(after))
+
+    def _localise(self, store: MapStore, advance: Callable[[str], None]) -> list[Drive]:
+        opened = OpenMap(store)
+        return [
+            localise_drive(opened, one, self._settings, self._options, advance)
+            for one in self._sequences
+        ]
+
+
+def localise_drive(
+    opened: OpenMap,
+    sequence: DriveSequence,
+    settings: Settings,
+    options: GateOptions,
+    advance: Callable[[str], None] = ignore,
+) -> Drive:
+    """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
+    settings = settings.for_descriptor(opened.descriptor)
+    localiser = opened.localiser(
+        sequence.camera,
+        settings,
+        policy=options.policy,
+        budget=Budget(options.lanes, options.rounds),
+        relocaliser=options.relocaliser,
+        live=session_of_drive(sequence).id,
+        clock=sequence.info,
+    )
+    found: list[Localisation] = []
+    with localiser, closing(live_frames(sequence, settings)) as frames:
+        for live in frames:
+            found.append(localiser.localise(live.frame, live.odometry))
+            advance(found[-1].status.value)
+    return measured(found)
+
+
+def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
+    """Where one map is worse than another (SPEC §8, "A beats B"); "" if it is not.
+
+    Args:
+        after, before: the same drives in both maps.
+    """
+    facts = []
+    curves = [_curve(drives) for drives in (after, before)]
+    excess = curves[0] - curves[1]
+    at = int(np.argmax(excess))
+    if excess[at] > _ROUNDING:
+        facts.append(
+            f"P(no match within {_JUDGED_M[at]:.1f} m) {curves[0][at]:.2%}, was {curves[1][at]:.2%}"
+        )
+    longest = [longest_gap_m(drives) for drives in (after, before)]
+    if longest[0] > _LONGEST_GAP_RATIO * longest[1] + _ROUNDING:
+        facts.append(f"longest gap {longest[0]:.1f} m, was {longest[1]:.1f} m")
+    if facts:
+        shares = [route_not_localised(drives) for drives in (after, before)]
+        facts.append(f"route not localised {shares[0]:.2%}, was {shares[1]:.2%}")
+    return "; ".join(facts)
+
+
+def _figures(drives: Sequence[Drive]) -> HeldOutFigures:
+    return HeldOutFigures(
+        route_not_localised(drives),
+        longest_gap_m(drives),
+        {within_m: failure_route(drives, float(within_m)) for within_m in _TOLD_M},
+    )
+
+
+def _curve(drives: Sequence[Drive]) -> NDArray[np.float64]:
+    return np.array([failure_route(drives, float(at)) for at in _JUDGED_M])

@@ -1,0 +1,40 @@
+"""A centre from above, before and after a merge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from engram.graph.layout import lay_out
+from engram.robot import OpenMap, open_map
+from engram.viewing import Track, draw_panels
+
+
+def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
+    """Draws the nodes of a centre by robot, as of a revision and now.
+
+    Args:
+        centre: the map.
+        before: number of the revision to compare with.
+        path: image file.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    panels = []
+    for at in (before, None):
+        with open_map(centre, at) as opened:
+            words = f"{len(opened.graph)} nodes, revision {opened.store.revision}"
+            panels.append((f"{'before' if at is not None else 'after'}: {words}", _tracks(opened)))
+    draw_panels(panels, path)
+
+
+def _tracks(opened: OpenMap) -> list[Track]:
+    """One per robot."""
+    places_m = lay_out(opened.graph)
+    robots = np.array([opened.sessions[node.session].robot for node in opened.graph.nodes], object)
+    return [
+        Track(f"{robot} ({int((robots == robot).sum())})", places_m[robots == robot])
+        for robot in sorted(set(robots.tolist()))
+    ]

@@ -1,0 +1,92 @@
+"""Hour of day at a stamp (SPEC §2.8)."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import Protocol
+from zoneinfo import ZoneInfo
+
+from engram.errors import ConfigError
+from engram.graph.model import Clock
+
+_NS_PER_HOUR = 3_600_000_000_000
+_HOURS_PER_DAY = 24
+
+
+class Clocked(Protocol):
+    """A session, or what is known of a sequence: anything with a clock and a place on Earth."""
+
+    @property
+    def clock(self) -> Clock:
+        """What the stamps mean."""
+        ...
+
+    @property
+    def longitude_deg(self) -> float | None:
+        """East positive, degrees; None if unknown."""
+        ...
+
+    @property
+    def zone(self) -> str | None:
+        """IANA time zone; None if unknown."""
+        ...
+
+
+def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
+    """Hour of day in [0, 24) at a stamp, or None where it cannot be known.
+
+    Mean solar time (UTC + longitude / 15) where a longitude is known, else civil time of the zone.
+    None for a clock that is not UTC, and without either.
+
+    Source: SPEC §2.8.
+    """
+    if source.clock is not Clock.UTC:
+        return None
+    if source.longitude_deg is not None:
+        hour = stamp_ns / _NS_PER_HOUR + source.longitude_deg / 15
+    elif source.zone is not None:
+        # To the second: the zones' offsets are whole seconds, the rest of the stamp is added after.
+        seconds, nanos = divmod(stamp_ns, 1_000_000_000)
+        offset = datetime.fromtimestamp(seconds, UTC).astimezone(ZoneInfo(source.zone)).utcoffset()
+        if offset is None:
+            return None
+        hour = (seconds + offset.total_seconds()) / 3600 + nanos / _NS_PER_HOUR
+    else:
+        return None
+    wrapped = hour % _HOURS_PER_DAY
+    # A tiny negative hour rounds up to 24.0 itself.
+    return 0.0 if wrapped >= _HOURS_PER_DAY else wrapped
+
+
+def day_of(source: Clocked, stamp_ns: int) -> float | None:
+    """Days since 1970 at a stamp, with their fraction; None for a clock that is not UTC."""
+    return stamp_ns / (_HOURS_PER_DAY * _NS_PER_HOUR) if source.clock is Clock.UTC else None
+
+
+def check_longitude(longitude_deg: float | None) -> None:
+    """Refuse what is no longitude.
+
+    Raises:
+        ConfigError: it is not a number in [-180, 180].
+    """
+    if longitude_deg is not None and not (
+        math.isfinite(longitude_deg) and -180 <= longitude_deg <= 180
+    ):
+        raise ConfigError(f"longitude is {longitude_deg}, must be in [-180, 180] degrees east")
+
+
+def check_zone(zone: str | None) -> None:
+    """Refuse what is no time zone of the IANA database.
+
+    Raises:
+        ConfigError: the zone is unknown here.
+    """
+    if zone is None:
+        return
+    try:
+        ZoneInfo(zone)
+    except (KeyError, ValueError, OSError):  # not found; malformed; a folder of the database
+        raise ConfigError(
+            f"time zone {zone!r} is unknown; give an IANA name such as Europe/Berlin"
+        ) from None

@@ -1,0 +1,476 @@
+"""The experience graph in memory: nodes, edges, and the search for what is near."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from engram import _core
+from engram.errors import InputError
+from engram.geometry import SE3
+from engram.graph.chain_error import ChainError, edge_error_rows
+from engram.graph.growing import Column
+from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
+from engram.graph.neighbourhood import Neighbourhood
+
+# Routes that bend out of the search radius and back must not be cut off: a block's corner or a
+# turning loop fits into this.
+DEFAULT_MARGIN_M = 12.0
+# A node that is predicted just outside may truly lie inside. Two sigmas keep 95 % of them.
+DEFAULT_SLACK_SIGMAS = 2.0
+# Beyond this the map does not know where the node is, and looking for it there costs too much.
+DEFAULT_SLACK_M = 30.0
+# Chains through a gap of odometry are vaguer. 0.5 and 2 m give nearly the same candidates.
+DEFAULT_VAGUE_M = 1.0
+# How much further out a better chain is looked for: about a block of houses. From 30 m on
+# candidates change by an eighth at most, and the search gets slower.
+DEFAULT_DETOUR_M = 60.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """The least uncertain chain between two nodes.
+
+    Attributes:
+        nodes: dense indices, both ends included.
+        edges: the edges used, one fewer than nodes; each may run either way.
+        start_from_end: pose of the last node in the first one's frame.
+        covariance: (6, 6) of `start_from_end`, left perturbation, [translation, rotation].
+    """
+
+    nodes: list[int]
+    edges: list[Edge]
+    start_from_end: SE3
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChainTree:
+    """Least uncertain chains from one root to all that it reaches, a struct of arrays.
+
+    Attributes:
+        root: the root's dense index.
+        row_of: dense index of a node to its row here.
+        nodes: (N,) int32, dense indices, least uncertain first; the root is row 0.
+        parents: (N,) int32, row of the node before; -1 for the root.
+        half_edges: (N,) int32, edge·2, plus 1 if it was used from b to a; -1 for the root.
+        root_from_node: (N, 12) float64, rotation row by row, then translation.
+        moments: (N, 6) float64, `ChainError.moments` in the root's frame.
+    """
+
+    root: int
+    row_of: dict[int, int]
+    nodes: NDArray[np.int32]
+    parents: NDArray[np.int32]
+    half_edges: NDArray[np.int32]
+    root_from_node: NDArray[np.float64]
+    moments: NDArray[np.float64]
+
+    def pose(self, node: int) -> SE3:
+        """``root_from_node`` of a node that the tree reaches."""
+        values = self.root_from_node[self.row_of[node]]
+        return SE3(values[:9].reshape(3, 3).copy(), values[9:].copy())
+
+    def error(self, node: int) -> ChainError:
+        """Error of ``root_from_node``, in the root's frame."""
+        return ChainError(self.moments[self.row_of[node]])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HalfEdges:
+    """Every edge both ways, a struct of arrays.
+
+    Attributes:
+        sources, targets: (H,) int32, dense indices.
+        target_in_source: (H, 3) float64, metres: where the target's camera is, seen from the
+            source.
+        of_edges: edges of the graph when these were taken.
+    """
+
+    sources: NDArray[np.int32]
+    targets: NDArray[np.int32]
+    target_in_source: NDArray[np.float64]
+    of_edges: int
+
+    def rows(self, rows: NDArray[np.bool_]) -> HalfEdges:
+        """Some of them."""
+        return HalfEdges(
+            self.sources[rows], self.targets[rows], self.target_in_source[rows], self.of_edges
+        )
+
+
+class ExperienceGraph:
+    """All nodes and edges of a map; metric over short distances, topological over long ones.
+
+    Nodes have dense indices 0, 1, 2, … in the order of adding. Edges are kept in a forward star
+    over growing arrays and serve in both directions; of edges with the same (a, b, kind) the one
+    added last counts.
+
+    Threads: one thread adds, and only that thread may search meanwhile (the localiser and the
+    mapper share it). Other threads may hold on to `Node` and `Edge` records: they never change.
+    """
+
+    def __init__(self) -> None:
+        self._nodes: list[Node] = []
+        self._index: dict[NodeId, int] = {}
+        self._sessions: list[SessionId] = []
+        self._session_index: dict[SessionId, int] = {}
+        self._edges: list[Edge] = []
+        self._edge_index: dict[tuple[int, int, EdgeKind], int] = {}
+        self._node_sessions = Column(np.int32)
+        self._driven_m = Column(np.float64)
+        self._uuid_words = Column(np.uint64, (2,))
+        self._experiences = Column(np.int32)
+        self._experience_sizes = Column(np.int32)
+        self._first_half = Column(np.int32)
+        self._next_half = Column(np.int32)
+        self._target = Column(np.int32)
+        self._a_from_b = Column(np.float64, (12,))
+        self._errors = Column(np.float64, (8,))
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def __contains__(self, node: NodeId) -> bool:
+        return node in self._index
+
+    # -- building
+
+    def add_node(self, node: Node) -> int:
+        """Add a node and return its dense index; one that is there already keeps its index."""
+        known = self._index.get(node.id)
+        if known is not None:
+            return known
+        index = len(self._nodes)
+        session = self._session_index.setdefault(node.session, len(self._sessions))
+        if session == len(self._sessions):
+            self._sessions.append(node.session)
+        self._nodes.append(node)
+        self._index[node.id] = index
+        self._node_sessions.append(session)
+        self._driven_m.append(node.driven_m)
+        self._uuid_words.append((node.id.int >> 64, node.id.int & 0xFFFF_FFFF_FFFF_FFFF))
+        self._experiences.append(index)
+        self._experience_sizes.append(1)
+        self._first_half.append(-1)
+        return index
+
+    def add_edge(self, edge: Edge) -> None:
+        """Add an edge, or supersede the one with the same (a, b, kind).
+
+        Raises:
+            InputError: an end is not in the graph, both ends are the same node, or the covariance
+                is none.
+        """
+        self.add_edges([edge])
+
+    def add_edges(self, edges: Sequence[Edge]) -> None:
+        """Add many edges, in this order; see `add_edge`. Where one is refused none is added."""
+        ends = [(self.index(edge.a), self.index(edge.b)) for edge in edges]
+        for (a, b), edge in zip(ends, edges, strict=True):
+            if a == b:
+                raise InputError(f"an edge joins two nodes; both ends are {edge.a}")
+        error_rows = edge_error_rows([(edge.a_from_b, edge.covariance) for edge in edges])
+        for (a, b), edge, error_row in zip(ends, edges, error_rows, strict=True):
+            known = self._edge_index.get((a, b, edge.kind))
+            if known is None:
+                known = self._link(a, b, edge)
+            self._edges[known] = edge
+            self._a_from_b.rows[known, :9] = edge.a_from_b.rotation.ravel()
+            self._a_from_b.rows[known, 9:] = edge.a_from_b.translation
+            self._errors.rows[known] = error_row
+
+    def _link(self, a: int, b: int, edge: Edge) -> int:
+        number = len(self._edges)
+        self._edges.append(edge)
+        self._edge_index[a, b, edge.kind] = number
+        self._a_from_b.append(0.0)
+        self._errors.append(0.0)
+        for half, source, target in ((2 * number, a, b), (2 * number + 1, b, a)):
+            self._next_half.append(self._first_half.rows[source])
+            self._target.append(target)
+            self._first_half.rows[source] = half
+        if (
+            edge.kind is EdgeKind.ODOMETRY
+            and self._node_sessions.rows[a] == (self._node_sessions.rows[b])
+        ):
+            self._join_experiences(a, b)
+        return number
+
+    def _join_experiences(self, a: int, b: int) -> None:
+        labels, sizes = self._experiences.rows, self._experience_sizes.rows
+        kept, dropped = int(labels[a]), int(labels[b])
+        if kept == dropped:
+            return
+        if sizes[kept] < sizes[dropped]:
+            kept, dropped = dropped, kept
+        if sizes[dropped] == 1:  # the usual case: a chain grows by a new node
+            labels[dropped] = kept
+        else:
+            labels[labels == dropped] = kept
+        sizes[kept] += sizes[dropped]
+        sizes[dropped] = 0
+
+    # -- reading
+
+    def index(self, node: NodeId) -> int:
+        """Dense index of a node.
+
+        Raises:
+            InputError: the graph does not have it.
+        """
+        try:
+            return self._index[node]
+        except KeyError:
+            raise InputError(f"node {node} is not in the graph of {len(self)} nodes") from None
+
+    def node(self, index: int) -> Node:
+        """The record of a node."""
+        return self._nodes[index]
+
+    @property
+    def nodes(self) -> Sequence[Node]:
+        """All nodes, by dense index. Do not change it."""
+        return self._nodes
+
+    @property
+    def edges(self) -> Sequence[Edge]:
+        """All edges that count (superseded ones are gone), oldest key first. Do not change it."""
+        return self._edges
+
+    def node_ids(self, indices: NDArray[np.int32]) -> list[NodeId]:
+        """UUIDs of nodes, in the order given."""
+        return [self._nodes[i].id for i in indices]
+
+    @property
+    def sessions(self) -> NDArray[np.int32]:
+        """(N,) int32: for each node the number of its session (`session_number`). A view."""
+        return self._node_sessions.rows
+
+    def session_number(self, session: SessionId) -> int | None:
+        """Number of a session in this graph; None if no node is of it."""
+        return self._session_index.get(session)
+
+    @property
+    def session_count(self) -> int:
+        """How many sessions saved nodes; their numbers are below it."""
+        return len(self._sessions)
+
+    def session(self, number: int) -> SessionId:
+        """The session with a number."""
+        return self._sessions[number]
+
+    @property
+    def driven_m(self) -> NDArray[np.float64]:
+        """(N,) float64: for each node the odometry distance from its session's start. A view."""
+        return self._driven_m.rows
+
+    @property
+    def uuid_words(self) -> NDArray[np.uint64]:
+        """(N, 2) uint64: each node's UUID, high word first, for ordering. A view."""
+        return self._uuid_words.rows
+
+    @property
+    def experiences(self) -> NDArray[np.int32]:
+        """(N,) int32: equal for the nodes of one experience, a chain of odometry edges. A view.
+
+        The number is the dense index of one of its nodes; it may change when chains are joined.
+        """
+        return self._experiences.rows
+
+    def find_edge(self, a: NodeId, b: NodeId, kind: EdgeKind) -> Edge | None:
+        """The edge of this key; None if there is none, or an end is not in the graph."""
+        if a not in self._index or b not in self._index:
+            return None
+        number = self._edge_index.get((self._index[a], self._index[b], kind))
+        return None if number is None else self._edges[number]
+
+    def components(self) -> NDArray[np.int32]:
+        """(N,) int32: the connected component of each node, numbered from 0 by first node."""
+        ends = self.edge_ends
+        links = coo_matrix((np.ones(len(ends)), (ends[:, 1], ends[:, 0])), shape=(len(self),) * 2)
+        labels = connected_components(links, directed=False)[1]
+        return np.asarray(labels, dtype=np.int32)
+
+    @property
+    def edge_ends(self) -> NDArray[np.int32]:
+        """(E, 2) int32: dense indices of the ends b and a of each of `edges`. A view."""
+        return self._target.rows.reshape(-1, 2)
+
+    def edges_of(self, node: int) -> list[Edge]:
+        """The edges at a node, newest key first."""
+        return [edge for edge, _ in self.numbered_edges_of(node)]
+
+    def numbered_edges_of(self, node: int) -> list[tuple[Edge, int]]:
+        """The edges at a node, newest key first, each with its place in `edges`."""
+        edges = []
+        half = int(self._first_half.rows[node])
+        while half != -1:
+            edges.append((self._edges[half // 2], half // 2))
+            half = int(self._next_half.rows[half])
+        return edges
+
+    # -- searching
+
+    def half_edges(self, reach_m: float) -> HalfEdges:
+        """All edges both ways, between nodes no further apart than `reach_m`."""
+        poses = self._a_from_b.rows
+        b_in_a = poses[:, 9:]
+        a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
+        targets = self._target.rows  # of half 2e an edge's b, of half 2e + 1 its a
+        short = np.linalg.norm(b_in_a, axis=1) <= reach_m
+        b, a = targets[0::2][short], targets[1::2][short]
+        return HalfEdges(
+            np.concatenate([a, b]),
+            np.concatenate([b, a]),
+            np.concatenate([b_in_a[short], a_in_b[short]]),
+            len(self._edges),
+        )
+
+    def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
+        """The nodes that an edge no longer than `reach_m` joins to a node."""
+        found: set[int] = set()
+        half = int(self._first_half.rows[node])
+        while half >= 0:
+            if np.linalg.norm(self._a_from_b.rows[half // 2, 9:]) <= reach_m:
+                found.add(int(self._target.rows[half]))
+            half = int(self._next_half.rows[half])
+        return np.array(sorted(found), np.int32)
+
+    def neighbourhood(
+        self,
+        reference: int,
+        reference_from_live: SE3,
+        covariance: NDArray[np.float64],
+        *,
+        radius_m: float,
+        view_gate_rad: float,
+        own_session: SessionId | None = None,
+        own_driven_m: float = 0.0,
+        own_exclusion_m: float = 30.0,
+        margin_m: float = DEFAULT_MARGIN_M,
+        slack_sigmas: float = DEFAULT_SLACK_SIGMAS,
+        slack_m: float = DEFAULT_SLACK_M,
+        vague_m: float = DEFAULT_VAGUE_M,
+        detour_m: float = DEFAULT_DETOUR_M,
+    ) -> Neighbourhood:
+        """The candidates Y near the live camera (SPEC §3.1).
+
+        The search goes out from the reference over the edges, least uncertain chain first, through
+        every node within `margin_m` beyond the radius (or beyond the reference, if that is
+        farther). SPEC says breadth-first: that takes the chain with the fewest edges, which is
+        the least uncertain one where edges are equally good and wherever there is only one chain.
+        Where a few loose proximity edges compete with many tight odometry edges it is not, and its
+        predictions would be as bad as the loosest edge.
+
+        A node is a candidate if its predicted distance is at most `radius_m`, and its heading
+        within the gate (yaw alone, SPEC §2.6), each plus `slack_sigmas` standard deviations of
+        the prediction (the distance by no more than `slack_m`): so nodes that are truly within are
+        in, also where the map is loose. The search's reach is extended alike.
+
+        Sharp chains end at the reach, vague ones lead back into it: through a gap of odometry a
+        node may seem to be near of which the road around knows that it is not. For such nodes a
+        better chain is looked for that may go `detour_m` further out.
+
+        Args:
+            reference: dense index of the node that the position refers to.
+            reference_from_live: the live camera in that node.
+            covariance: (6, 6) of it, left perturbation, [translation, rotation].
+            radius_m: search radius.
+            view_gate_rad: greatest difference of heading.
+            own_session: the live session; its nodes saved within the last `own_exclusion_m` before
+                `own_driven_m` are no candidates (but are gone through).
+            own_driven_m: distance driven by the live session.
+            own_exclusion_m: see above.
+            margin_m: see above.
+            slack_sigmas: see above.
+            slack_m: see above.
+            vague_m: standard deviation of a chain past which a better one is looked for.
+            detour_m: see above.
+        """
+        number = None if own_session is None else self._session_index.get(own_session)
+        columns = _core.graph_candidates(
+            *self._arrays(),
+            reference,
+            _pose_row(reference_from_live),
+            _core.pivoted_error(np.ascontiguousarray(covariance)),
+            radius_m,
+            margin_m,
+            view_gate_rad,
+            slack_sigmas,
+            slack_m,
+            vague_m,
+            detour_m,
+            self._node_sessions.rows,
+            self._driven_m.rows,
+            -1 if number is None else number,
+            own_driven_m,
+            own_exclusion_m,
+        )
+        return Neighbourhood(*columns)
+
+    def chains_from(
+        self, root: int, *, goals: Sequence[int] = (), usable: NDArray[np.uint8] | None = None
+    ) -> ChainTree:
+        """Least uncertain chains from a node to all others, or until all goals are reached.
+
+        Args:
+            root: dense index.
+            goals: dense indices of the nodes to stop at; none to go on to the end.
+            usable: (E,) uint8, 0 for edges (by their place in `edges`) to leave out.
+        """
+        columns = _core.graph_chains(*self._arrays(), root, np.array(goals, dtype=np.int32), usable)
+        row_of = {int(node): row for row, node in enumerate(columns[0])}
+        return ChainTree(root, row_of, *columns)
+
+    def shortest_chain(self, a: int, b: int) -> Chain | None:
+        """The least uncertain chain from node a to node b; None if they are not connected."""
+        tree = self.chains_from(a, goals=[b])
+        if b not in tree.row_of:
+            return None
+        rows = [tree.row_of[b]]
+        while tree.parents[rows[-1]] >= 0:
+            rows.append(int(tree.parents[rows[-1]]))
+        rows.reverse()
+        pose = tree.pose(b)
+        return Chain(
+            nodes=[int(tree.nodes[row]) for row in rows],
+            edges=[self._edges[int(tree.half_edges[row]) // 2] for row in rows[1:]],
+            start_from_end=pose,
+            covariance=tree.error(b).pivoted(pose.translation).covariance(),
+        )
+
+    def predict(self, reference: int, node: int) -> tuple[SE3, NDArray[np.float64]] | None:
+        """``reference_from_node`` and its (6, 6) covariance along the least uncertain chain.
+
+        None if the two are not connected.
+        """
+        chain = self.shortest_chain(reference, node)
+        return None if chain is None else (chain.start_from_end, chain.covariance)
+
+    def _arrays(
+        self,
+    ) -> tuple[
+        NDArray[np.int32],
+        NDArray[np.int32],
+        NDArray[np.int32],
+        NDArray[np.float64],
+        NDArray[np.float64],
+    ]:
+        return (
+            self._first_half.rows,
+            self._next_half.rows,
+            self._target.rows,
+            self._a_from_b.rows,
+            self._errors.rows,
+        )
+
+
+def _pose_row(transform: SE3) -> NDArray[np.float64]:
+    """(12,) rotation row by row, then translation."""
+    return np.concatenate([transform.rotation.ravel(), transform.translation])

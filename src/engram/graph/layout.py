@@ -1,0 +1,30 @@
+"""A map laid out on a sheet, for pictures: true near by, and only so far as its chains are."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.graph.graph import ExperienceGraph
+
+_APART_M = 20.0
+
+
+def lay_out(graph: ExperienceGraph) -> NDArray[np.float64]:
+    """(N, 2) float64, metres: each node's place seen from above, x to the right and z forward.
+
+    Each component is placed along the least uncertain chains from its first node; components
+    stand beside each other, since nothing says where they are to each other.
+    """
+    components = graph.components()
+    placed = np.zeros((len(graph), 2))
+    right_m = 0.0
+    for component in range(int(components.max(initial=-1)) + 1):
+        nodes = np.flatnonzero(components == component)
+        tree = graph.chains_from(int(nodes[0]))
+        rows = [tree.row_of[int(node)] for node in nodes]
+        points = tree.root_from_node[rows][:, [9, 11]]
+        points[:, 0] += right_m - points[:, 0].min()
+        right_m = float(points[:, 0].max()) + _APART_M
+        placed[nodes] = points
+    return placed

@@ -1,0 +1,203 @@
+"""The records of a map: sessions, nodes, edges, paths, attempts (SPEC §1). Immutable."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import lru_cache
+from typing import NewType, Protocol
+from uuid import UUID, uuid5
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import Frame
+from engram.geometry import SE3, CameraId
+
+SessionId = NewType("SessionId", UUID)
+NodeId = NewType("NodeId", UUID)
+PathId = NewType("PathId", UUID)
+
+# The namespace below which all of Engram's name-based UUIDs lie.
+ENGRAM_NAMESPACE = UUID("6f1d1f0e-27e5-5c0e-9d6b-3c8a5c1e7a10")
+
+
+class Clock(StrEnum):
+    """What a session's stamps mean (SPEC §2.8)."""
+
+    UTC = "utc"
+    RELATIVE = "relative"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One drive of one robot.
+
+    Attributes:
+        id: equal whenever the same drive is read (`session_id`).
+        robot: name of the robot.
+        camera: its camera.
+        start_ns: stamp of the first pair, ns.
+        clock: what the stamps mean.
+        longitude_deg: where the drive was, for mean solar time; None if unknown.
+        zone: IANA time zone, where no longitude is known; None if unknown.
+    """
+
+    id: SessionId
+    robot: str
+    camera: CameraId
+    start_ns: int
+    clock: Clock = Clock.UNKNOWN
+    longitude_deg: float | None = None
+    zone: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A frame that was saved in a map. Never changed once written.
+
+    Attributes:
+        id: equal whenever the same frame of the same drive is saved (`node_id`).
+        session: the drive that saved it.
+        stamp_ns: stamp of its frame, ns.
+        camera: camera of its frame.
+        driven_m: odometry distance from the session's start to this node, metres.
+    """
+
+    id: NodeId
+    session: SessionId
+    stamp_ns: int
+    camera: CameraId
+    driven_m: float
+
+
+class EdgeKind(StrEnum):
+    """How an edge came about (SPEC §1, §3.1)."""
+
+    ODOMETRY = "odometry"
+    MATCH = "match"
+    TIE = "tie"
+    PROXIMITY = "proximity"
+    BRIDGE = "bridge"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edge:
+    """A 6DoF transform between two nodes; usable in both directions.
+
+    Attributes:
+        a, b: its ends. The key of an edge is (a, b, kind); a newer one supersedes an older one.
+        kind: how it came about.
+        a_from_b: node b's camera in node a's camera frame.
+        covariance: (6, 6) float64 of `a_from_b`, left perturbation, [translation, rotation].
+    """
+
+    a: NodeId
+    b: NodeId
+    kind: EdgeKind
+    a_from_b: SE3
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Omission:
+    """A node that a merge did not take, since the map shows the same place alike (SPEC §7).
+
+    Attributes:
+        omitted: the node that was handed in.
+        node: its equivalent in the map.
+        node_from_omitted: the omitted node's camera in the equivalent's camera frame.
+        landmark_hash: the 16 bytes that stand for its landmarks; None where they were not kept,
+            as by maps of format 2.
+    """
+
+    omitted: NodeId
+    node: NodeId
+    node_from_omitted: SE3
+    landmark_hash: bytes | None = None
+
+
+class PathEntryKind(StrEnum):
+    """Why a node is on a path."""
+
+    MATCHED = "matched"
+    SAVED = "saved"
+    REPLAYED = "replayed"
+
+
+@dataclass(frozen=True, slots=True)
+class PathEntry:
+    """One step of a session's walk through experience space; (path, sequence) is its key."""
+
+    path: PathId
+    sequence: int
+    node: NodeId
+    kind: PathEntryKind
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One remembered match attempt (SPEC §3.5).
+
+    Attributes:
+        iteration: the localiser's iteration in this session.
+        reference: node in which the robot was localised when predicting.
+        node: node that was attempted.
+        along_m, across_m: predicted offset of the live camera from the node, along and across
+            the node's viewing direction.
+        yaw_rad: predicted heading of the live camera relative to the node.
+        sigma_m, sigma_yaw_rad: standard deviations of the prediction.
+        accepted: whether the match was accepted.
+        inliers: inliers of the match, 0 if there was none.
+        rank: place in the ranked order, 0 first.
+        policy: name of the ranking policy.
+    """
+
+    iteration: int
+    reference: NodeId
+    node: NodeId
+    along_m: float
+    across_m: float
+    yaw_rad: float
+    sigma_m: float
+    sigma_yaw_rad: float
+    accepted: bool
+    inliers: int
+    rank: int
+    policy: str
+
+
+class LandmarkSource(Protocol):
+    """Where the frames of nodes come from; `engram.maps` implements it."""
+
+    def frame(self, node: NodeId) -> Frame:
+        """The frame that was saved as `node`. Safe to call from several threads.
+
+        Raises:
+            MapCorruptError: its bytes do not match their hash.
+        """
+        ...
+
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        """Hint that these are likely to be asked for next. Returns at once."""
+        ...
+
+
+def session_id(robot: str, camera: CameraId, start_ns: int, first_pair_hash: str) -> SessionId:
+    """The same drive read twice gets the same UUID (SPEC §2.7)."""
+    name = f"session:{robot}:{camera}:{start_ns}:{first_pair_hash}"
+    return SessionId(uuid5(ENGRAM_NAMESPACE, name))
+
+
+@lru_cache(maxsize=1024)  # localisers in step ask for the same frame one after another
+def node_id(session: SessionId, stamp_ns: int) -> NodeId:
+    """The same frame of the same drive gets the same UUID (SPEC §2.7)."""
+    return NodeId(uuid5(session, f"node:{stamp_ns}"))
+
+
+@lru_cache(maxsize=4096)  # policies ask for the paths of all sessions on every frame
+def path_id(session: SessionId) -> PathId:
+    """A session has one path through experience space."""
+    return PathId(uuid5(session, "path"))

@@ -1,0 +1,211 @@
+"""Path memory: every session's walk through experience space [L15 §IV]."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.graph.basin import BIN_M, MatchBasin
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import PathEntry, PathEntryKind, PathId
+from engram.graph.neighbourhood import Neighbourhood
+
+ALL_KINDS = frozenset(PathEntryKind)
+# [L15 §IV]'s text records matches only (SPEC §4).
+MATCHES_ONLY = frozenset({PathEntryKind.MATCHED, PathEntryKind.REPLAYED})
+
+
+class PathMemory:
+    """All paths of a map, each an ordered sequence of entries, and which nodes share paths.
+
+    For each node a bitset over paths is kept up to date as entries arrive, so that "how many paths
+    hold both" is a popcount. The same thread rule as for `ExperienceGraph`.
+
+    Args:
+        graph: the graph whose dense indices are used.
+        kinds: which kinds of entry put a node on a path, for counting. Entries of other kinds are
+            kept, and do not count.
+    """
+
+    def __init__(
+        self, graph: ExperienceGraph, kinds: Collection[PathEntryKind] = ALL_KINDS
+    ) -> None:
+        self._graph = graph
+        self.kinds = frozenset(kinds)
+        self._entries: list[list[PathEntry]] = []
+        self._paths: list[PathId] = []
+        self._number: dict[PathId, int] = {}
+        self._bits = np.zeros((16, 1), dtype=np.uint64)
+        self._observed = _core.ObservedPaths()
+
+    def __len__(self) -> int:
+        return len(self._paths)
+
+    @property
+    def paths(self) -> Sequence[PathId]:
+        """All paths, in the order of their first entries. Do not change it."""
+        return self._paths
+
+    def entries(self, path: PathId) -> Sequence[PathEntry]:
+        """A path's entries by sequence number; none if the path is unknown. Do not change it."""
+        number = self._number.get(path)
+        return () if number is None else self._entries[number]
+
+    def add(self, entry: PathEntry) -> None:
+        """Add an entry; one with the same (path, sequence) is there already and stays.
+
+        Raises:
+            InputError: its node is not in the graph.
+        """
+        node = self._graph.index(entry.node)
+        number = self._number.setdefault(entry.path, len(self._paths))
+        if number == len(self._paths):
+            self._paths.append(entry.path)
+            self._entries.append([])
+        if _insert(self._entries[number], entry) and entry.kind in self.kinds:
+            self._make_room()
+            self._bits[node, number // 64] |= np.uint64(1 << (number % 64))
+            self._observed.add(node, number)
+
+    def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """(P, N) bool: whether each path holds each node; unknown paths hold none.
+
+        Args:
+            paths: (P,) any paths.
+            nodes: (N,) int32, dense node indices.
+        """
+        self._make_room()
+        numbers = np.array([self._number.get(path, -1) for path in paths], np.int64)
+        words = self._bits[nodes][:, numbers // 64].T
+        held = (words >> (numbers % 64).astype(np.uint64)[:, None]) & np.uint64(1)
+        return np.asarray((held != 0) & (numbers >= 0)[:, None])
+
+    def co_occurrence(
+        self, a: NDArray[np.int32], b: NDArray[np.int32], *, excluded: PathId | None = None
+    ) -> NDArray[np.int32]:
+        """(A, B) int32: how many paths hold both a[i] and b[j]: Z and N of [L15 §V].
+
+        Args:
+            a: (A,) int32, dense node indices.
+            b: (B,) int32, dense node indices.
+            excluded: a path that does not count, such as the live session's own.
+        """
+        self._make_room()
+        return _core.co_occurrence(self._bits, len(self._paths), a, b, self._excluded(excluded))
+
+    def scores(
+        self,
+        candidates: NDArray[np.int32],
+        observed: NDArray[np.int32],
+        outcomes: NDArray[np.bool_],
+        reference: int | None,
+        *,
+        excluded: PathId | None = None,
+        alpha: float = 1.0,
+        gamma: float = 1.0,
+    ) -> NDArray[np.float64]:
+        """(Y,) float64: log p(y = i | Z, θ, π) of each candidate, up to a common constant.
+
+        Source: SPEC §4, [L15 §V, eqs. (1)–(7)]. Observing none or one node leaves the prior alone.
+        What is worked out for the observed nodes is kept for the next call, which should ask for
+        much the same ones.
+
+        Args:
+            candidates: (Y,) int32, dense node indices.
+            observed: (W,) int32, the nodes attempted lately, each once.
+            outcomes: (W,) bool, z: whether the latest attempt on each succeeded.
+            reference: node k in which the robot is localised; None makes the prior uniform.
+            excluded: a path that does not count, such as the live session's own.
+            alpha: pseudo-count of the likelihood.
+            gamma: pseudo-count of the prior.
+        """
+        self._make_room()
+        return _core.path_scores(
+            self._observed,
+            self._bits,
+            len(self._paths),
+            candidates,
+            observed,
+            outcomes,
+            -1 if reference is None else reference,
+            alpha,
+            gamma,
+            self._excluded(excluded),
+        )
+
+    def order(
+        self,
+        neighbourhood: Neighbourhood,
+        basin: MatchBasin,
+        level: float,
+        observed: NDArray[np.int32],
+        outcomes: NDArray[np.bool_],
+        reference: int | None,
+        *,
+        excluded: PathId | None = None,
+        alpha: float = 1.0,
+        gamma: float = 1.0,
+    ) -> NDArray[np.int64]:
+        """(Y,) int64: rows by `scores` where g >= `level`, then the others, by distance.
+
+        Ties break by distance, then by UUID. One call to the core, where ranking by the parts
+        takes a handful.
+
+        Args:
+            neighbourhood: the candidates Y.
+            basin: gives g.
+            level: of g.
+            observed, outcomes, reference, excluded, alpha, gamma: see `scores`.
+        """
+        self._make_room()
+        return _core.path_order(
+            self._observed,
+            self._bits,
+            len(self._paths),
+            neighbourhood.nodes,
+            neighbourhood.along_m,
+            neighbourhood.across_m,
+            neighbourhood.distance_m,
+            self._graph.uuid_words,
+            basin.rates,
+            BIN_M,
+            level,
+            observed,
+            outcomes,
+            -1 if reference is None else reference,
+            alpha,
+            gamma,
+            self._excluded(excluded),
+        )
+
+    def _excluded(self, path: PathId | None) -> int:
+        return -1 if path is None else self._number.get(path, -1)
+
+    def _make_room(self) -> None:
+        """Rows for all nodes of the graph, words for all paths; both double when they run out."""
+        rows, words = self._bits.shape
+        if len(self._graph) <= rows and len(self._paths) <= 64 * words:
+            return
+        while rows < len(self._graph):
+            rows *= 2
+        while 64 * words < len(self._paths):
+            words *= 2
+        grown = np.zeros((rows, words), dtype=np.uint64)
+        grown[: self._bits.shape[0], : self._bits.shape[1]] = self._bits
+        self._bits = grown
+
+
+def _insert(entries: list[PathEntry], entry: PathEntry) -> bool:
+    """Insert by sequence number; False if that number is taken."""
+    if not entries or entries[-1].sequence < entry.sequence:  # the usual case: in order
+        entries.append(entry)
+        return True
+    place = bisect_left(entries, entry.sequence, key=lambda known: known.sequence)
+    if entries[place].sequence == entry.sequence:
+        return False
+    entries.insert(place, entry)
+    return True

@@ -1,0 +1,63 @@
+"""A map on disk: revisions, transactions, integrity, history."""
+
+from engram.maps.bulk_writer import BulkWriter
+from engram.maps.difference import MapDifference, diff_revisions
+from engram.maps.hiding import Reverted
+from engram.maps.history import (
+    RevertReport,
+    blame_node,
+    delete_tag,
+    map_log,
+    map_tags,
+    revert_revision,
+    show_revision,
+    tag_revision,
+)
+from engram.maps.map_store import MapStore, WritableMapStore
+from engram.maps.provenance import Origin
+from engram.maps.records import (
+    AttemptArrays,
+    CheckReport,
+    InterruptedSession,
+    MapContents,
+    MapInfo,
+    Problem,
+    Revision,
+    SessionState,
+    StoredNode,
+    StoredSession,
+)
+from engram.maps.schema import FORMAT_VERSION
+from engram.maps.session_writer import SessionWriter
+from engram.maps.tags import Tag
+
+__all__ = [
+    "FORMAT_VERSION",
+    "AttemptArrays",
+    "BulkWriter",
+    "CheckReport",
+    "InterruptedSession",
+    "MapContents",
+    "MapDifference",
+    "MapInfo",
+    "MapStore",
+    "Origin",
+    "Problem",
+    "RevertReport",
+    "Reverted",
+    "Revision",
+    "SessionState",
+    "SessionWriter",
+    "StoredNode",
+    "StoredSession",
+    "Tag",
+    "WritableMapStore",
+    "blame_node",
+    "delete_tag",
+    "diff_revisions",
+    "map_log",
+    "map_tags",
+    "revert_revision",
+    "show_revision",
+    "tag_revision",
+]

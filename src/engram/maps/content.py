@@ -1,0 +1,184 @@
+"""The content hash: equal for equal maps, wherever and whenever they were made (SPEC §7.5)."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import msgspec
+import numpy as np
+from sqlalchemy import Connection, Table, select
+
+from engram.errors import MapCorruptError
+from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, unpack
+from engram.maps.reading import load_cameras, load_frontends
+from engram.maps.rows import Row, verified
+from engram.maps.schema import (
+    NEWER,
+    VERSIONED,
+    attempts,
+    frames,
+    hidden,
+    nodes,
+    paths,
+    revisions,
+    sessions,
+)
+from engram.maps.view import View
+
+_encode = msgspec.msgpack.Encoder().encode
+
+# What a column refers to, by its name: keys differ between equal maps, so identities stand in.
+_REFERENCES = {
+    "revision": "revisions",
+    "session": "sessions",
+    "camera": "cameras",
+    "frontend": "frontends",
+    "node": "nodes",
+    "a": "nodes",
+    "b": "nodes",
+    "path": "paths",
+}
+# Landmarks stand in their nodes' hashes; thumbnails are for people and differ between decoders.
+_HASHED = tuple(table for table in VERSIONED if table is not frames)
+_LEFT_OUT = {"key", "checksum"}
+# A map that could do without them is the same in every format.
+_IF_ANY = {str(table.name) for news in NEWER.values() for table in news}
+
+Identities = dict[str, dict[int, Any]]
+
+
+def content_hash(connection: Connection, at: int) -> str:
+    """32 hexadecimal digits over all rows of the committed revisions up to `at`.
+
+    Rows go in in canonical order, with UUIDs and revision numbers for keys, without when and
+    where they were written, and whatever order they were written in.
+
+    Raises:
+        MapCorruptError: a row is damaged or points at nothing.
+    """
+    view = View(at)
+    identities = _identities(connection, view)
+    digest = hashlib.sha256(_history(connection, view))
+    canonical = {
+        str(table.name): _canonical_rows(connection, view, table, identities)
+        for table in _HASHED
+        if table is not hidden
+    }
+    canonical[str(hidden.name)] = _hidden_rows(connection, view, identities, canonical)
+    for name, rows in canonical.items():
+        if not rows and name in _IF_ANY:
+            continue
+        canonical_rows = sorted(set(rows.values()))  # attempts: one for all bodies of a session
+        digest.update(_encode([name, len(canonical_rows)]))
+        for row in canonical_rows:
+            digest.update(row)
+    return digest.hexdigest()[:32]
+
+
+def _history(connection: Connection, view: View) -> bytes:
+    query = (
+        select(revisions)
+        .where(revisions.c.key.in_(view.revision_keys()))
+        .order_by(revisions.c.number)
+    )
+    told = ("number", "parent", "author", "message", "tool_version", "configuration")
+    rows = verified(revisions, connection.execute(query))
+    return _encode([[row[name] for name in told] for row in rows])
+
+
+def _identities(connection: Connection, view: View) -> Identities:
+    """What names a row in every equal map, by table and key."""
+    numbers = select(revisions.c.key, revisions.c.number).where(
+        revisions.c.key.in_(view.revision_keys())
+    )
+    found: Identities = {
+        "revisions": {row[0]: row[1] for row in connection.execute(numbers)},
+        "cameras": {key: camera.id for key, camera in load_cameras(connection).items()},
+        "frontends": {
+            key: [str(descriptor), digest]
+            for key, (descriptor, digest) in load_frontends(connection).items()
+        },
+    }
+    for table in (sessions, nodes, paths):
+        uuids = select(table.c.key, table.c.uuid).order_by(table.c.key)
+        found[str(table.name)] = {row[0]: row[1] for row in connection.execute(uuids)}
+    return found
+
+
+def _canonical_rows(
+    connection: Connection, view: View, table: Table, identities: Identities
+) -> dict[int, bytes]:
+    """One byte string per row, by key; the same for all attempts of a revision and session."""
+    query = (
+        select(table)
+        .where(table.c.revision.in_(view.revision_keys()))
+        .order_by(*table.primary_key.columns)
+    )
+    rows = verified(table, connection.execute(query))
+    if table is attempts:
+        return _canonical_attempts(list(rows), identities)
+    return {row["key"]: _canonical_row(row, identities) for row in rows}
+
+
+def _canonical_row(row: Row, identities: Identities) -> bytes:
+    values = [
+        _identity(identities, _REFERENCES[name], value) if name in _REFERENCES else value
+        for name, value in row.items()
+        if name not in _LEFT_OUT
+    ]
+    return _encode(values)
+
+
+def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, bytes]:
+    """Free of how they were packed."""
+    packed: dict[tuple[int, int], list[Row]] = {}
+    for row in rows:
+        packed.setdefault((row["revision"], row["session"]), []).append(row)
+    found: dict[int, bytes] = {}
+    for (revision, session), bodies in packed.items():
+        table = concatenate([unpack(row["body"], row["count"]) for row in bodies])
+        content = _encode(
+            [
+                _identity(identities, "revisions", revision),
+                _identity(identities, "sessions", session),
+                list(table.policies),
+                table.policy.astype("<i4").tobytes(),
+                *(_column_bytes(table, name, identities) for name, _ in COLUMNS),
+            ]
+        )
+        found.update((row["key"], content) for row in bodies)
+    return found
+
+
+def _column_bytes(table: AttemptTable, name: str, identities: Identities) -> bytes:
+    values = table.columns[name]
+    if name in {"reference", "node"}:
+        keys, index = np.unique(values, return_inverse=True)
+        uuids = [_identity(identities, "nodes", int(key)) for key in keys]
+        return b"".join(uuids[at] for at in index)
+    return values.astype(values.dtype.newbyteorder("<")).tobytes()
+
+
+def _hidden_rows(
+    connection: Connection,
+    view: View,
+    identities: Identities,
+    canonical: dict[str, dict[int, bytes]],
+) -> dict[int, bytes]:
+    query = select(hidden).where(hidden.c.revision.in_(view.revision_keys())).order_by(hidden.c.key)
+    found = {}
+    for row in verified(hidden, connection.execute(query)):
+        target = canonical.get(row["record"], {}).get(row["target"])
+        if target is None:
+            raise MapCorruptError(f"table hidden: row {row['key']} hides a row that is missing")
+        revision = _identity(identities, "revisions", row["revision"])
+        found[row["key"]] = _encode([revision, row["record"], target, row["hidden"]])
+    return found
+
+
+def _identity(identities: Identities, table: str, key: int) -> Any:
+    try:
+        return identities[table][key]
+    except KeyError:
+        raise MapCorruptError(f"table {table}: row {key}, which others name, is missing") from None

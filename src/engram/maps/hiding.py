@@ -1,0 +1,207 @@
+"""Rows that are hidden, and shown again: how history is undone without being rewritten.
+
+A revert writes one `hidden` row for each row that its revision brought. What is handed in again
+later is shown again by a newer `hidden` row; of the rows for one target the newest counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Table, func, insert, select
+
+from engram.errors import InputError, RevisionError
+from engram.graph.model import Node, Session
+from engram.maps.keys import KeyBook
+from engram.maps.reading import load
+from engram.maps.records import MapContents, Revision
+from engram.maps.rows import Row, sealed, session_row, verified
+from engram.maps.schema import (
+    VERSIONED,
+    attempts,
+    edges,
+    frames,
+    hidden,
+    metadata,
+    nodes,
+    omissions,
+    path_entries,
+    paths,
+    revisions,
+    sessions,
+)
+from engram.maps.view import View
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reverted:
+    """What a revert did, or would do.
+
+    Attributes:
+        number: the revision that was taken back.
+        revision: the new one that does it; None where nothing was written.
+        before, after: the map without and with it.
+        lost_by_others: how many rows of other revisions, by table, are no longer seen: they refer
+            to nodes that are hidden now, or the revision had shown them again.
+        regained_by_others: how many, by table, are seen again.
+    """
+
+    number: int
+    revision: Revision | None
+    before: MapContents
+    after: MapContents
+    lost_by_others: Mapping[str, int]
+    regained_by_others: Mapping[str, int]
+
+
+def hidden_row(keys: KeyBook, revision_key: int, table: Table, target: int, *, hide: bool) -> Row:
+    """A row of `hidden` that hides a row of another table, or shows it again."""
+    row = {
+        "key": keys.next(hidden),
+        "revision": revision_key,
+        "record": str(table.name),
+        "target": target,
+        "hidden": int(hide),
+    }
+    return sealed(hidden, row)
+
+
+def hidden_rows(connection: Connection, view: View, table: Table) -> dict[Any, Row]:
+    """The rows that a revert has hidden, by what names them: UUID, or path and sequence."""
+    query = (
+        select(table)
+        .where(table.c.key.in_(view.hidden_keys(table)))
+        .where(table.c.revision.in_(view.revision_keys()))
+        .order_by(table.c.key)
+    )
+    rows: Iterable[Row] = verified(table, connection.execute(query))
+    if table is path_entries:
+        return {(row["path"], row["sequence"]): row for row in rows}
+    return {row["uuid"]: row for row in rows}
+
+
+def check_same_node(row: Row, node: Node, landmark_hash: bytes) -> None:
+    """A hidden node may come back only as what it was.
+
+    Raises:
+        InputError: it has other landmarks or another stamp.
+    """
+    if (row["landmark_hash"], row["stamp_ns"]) != (landmark_hash, node.stamp_ns):
+        raise InputError(
+            f"node {node.id} was in the map before, with other landmarks; a node never changes: "
+            "hand it in with the front-end settings of then, or map the drive into another map"
+        )
+
+
+def check_same_session(row: Row, session: Session, camera: int, frontend: int) -> None:
+    """A hidden session may come back only as what it was.
+
+    Raises:
+        InputError: its robot, camera, front-end, clock or place on Earth differ.
+    """
+    now = session_row(session, row["key"], row["revision"], camera, frontend)
+    for name in ("robot", "camera", "frontend", "start_ns", "clock", "longitude_deg", "zone"):
+        if now[name] != row[name]:
+            raise InputError(
+                f"session {session.id} was in the map before with {name} {row[name]}, now "
+                f"{now[name]}; a session never changes: give what was given then, or map the "
+                "drive into another map"
+            )
+
+
+def hide_revision(
+    connection: Connection, keys: KeyBook, view: View, number: int, revision_key: int
+) -> None:
+    """Write the rows that take a revision back.
+
+    What it brought is hidden, and what it hid or showed is shown or hidden again. Sessions and
+    paths on which later revisions built stay, so that what those brought keeps its owner.
+
+    Args:
+        connection: inside a transaction.
+        keys: the writer's.
+        view: the newest revision, and the open one.
+        number: of the revision to take back.
+        revision_key: of the open revision that takes it back.
+
+    Raises:
+        RevisionError: nothing of it is left to take back.
+    """
+    query = select(revisions.c.key).where(revisions.c.number == number)
+    target = connection.execute(query).scalar_one()
+    written = _invert_hidden(connection, keys, view, target, revision_key)
+    # Owners last: they stay while anything that is still seen belongs to them.
+    owned = [table for table in VERSIONED if table not in {hidden, frames, paths, sessions}]
+    for table in (*owned, paths, sessions):
+        brought = (
+            select(table.c.key)
+            .where(table.c.revision == target, table.c.key.not_in(view.hidden_keys(table)))
+            .order_by(table.c.key)
+        )
+        found = set(connection.execute(brought).scalars()) - _used(connection, view, table)
+        rows = [hidden_row(keys, revision_key, table, one, hide=True) for one in sorted(found)]
+        if rows:
+            connection.execute(insert(hidden), rows)
+        written += len(rows)
+    if not written:
+        raise RevisionError(
+            f"revision {number} has nothing left to take back: it brought nothing that is seen"
+        )
+
+
+def _used(connection: Connection, view: View, table: Table) -> set[int]:
+    """Keys of sessions or paths to which rows that are still seen belong."""
+    owned = {sessions: (nodes, paths, attempts), paths: (path_entries,)}.get(table, ())
+    column = {sessions: "session", paths: "path"}.get(table, "")
+    return {
+        key
+        for owner in owned
+        for key in connection.execute(
+            view.select(owner).with_only_columns(owner.c[column]).distinct().order_by(None)
+        ).scalars()
+    }
+
+
+def _invert_hidden(
+    connection: Connection, keys: KeyBook, view: View, target: int, revision_key: int
+) -> int:
+    """Undo those hidings and showings of a revision that are still the newest."""
+    query = select(hidden).where(hidden.c.revision == target).order_by(hidden.c.key)
+    made = list(verified(hidden, connection.execute(query)))
+    if not made:
+        return 0
+    newest = {(row["record"], row["target"]): row for row in view.rows(connection, hidden)}
+    rows = [
+        hidden_row(
+            keys,
+            revision_key,
+            metadata.tables[row["record"]],
+            row["target"],
+            hide=not row["hidden"],
+        )
+        for row in made
+        if newest[row["record"], row["target"]]["key"] == row["key"]
+    ]
+    if rows:
+        connection.execute(insert(hidden), rows)
+    return len(rows)
+
+
+def compare(connection: Connection, number: int, before: View, after: View) -> Reverted:
+    """The map without and with a revert that is not committed yet."""
+    lost, regained = {}, {}
+    for table in (edges, path_entries, omissions):
+        # By row, not by count: what goes and what comes back must not cancel.
+        old, new = (_of_others(connection, view, table, number) for view in (before, after))
+        lost[str(table.name)] = len(old - new)
+        regained[str(table.name)] = len(new - old)
+    contents = load(connection, before), load(connection, after)
+    return Reverted(number, None, *contents, lost, regained)
+
+
+def _of_others(connection: Connection, view: View, table: Table, number: int) -> set[int]:
+    """Keys of the rows that are seen and that the revision did not bring."""
+    rows = view.select(table).where(func.coalesce(revisions.c.number, 0) != number)
+    return set(connection.execute(rows.with_only_columns(table.c.key).order_by(None)).scalars())

@@ -1,0 +1,294 @@
+"""The history of a map as users of version control know it: log, show, tag, revert, blame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Clock, Session
+from engram.maps.difference import MapDifference, difference, hours_of_nodes
+from engram.maps.hiding import Reverted
+from engram.maps.map_store import MapStore
+from engram.maps.records import MapContents, Revision
+from engram.maps.tags import Tag
+
+# What a revision brought, in the order in which `log` tells it.
+_TOLD = {
+    "sessions": "sessions",
+    "nodes": "nodes",
+    "edges": "edges",
+    "path_entries": "path entries",
+    "attempts": "attempts",
+    "omissions": "nodes omitted",
+    "vocabularies": "vocabularies",
+    "hidden": "rows hidden or shown again",
+}
+
+
+def map_log(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
+    """The revisions of a map, newest first, for ``engram log``.
+
+    Raises:
+        MapError: the map cannot be read, or has no such revision.
+    """
+    with MapStore.open(path, at=at) as store:
+        names = _names(store.tags())
+        return [_revision(one, names) for one in reversed(store.log())]
+
+
+def log_text(revision: Mapping[str, Any], *, oneline: bool = False) -> str:
+    """One revision of `map_log` for people."""
+    tags = f" (tag: {', '.join(revision['tags'])})" if revision["tags"] else ""
+    message = revision["message"]
+    if oneline:
+        return f"{revision['number']:5d}  {revision['when']}  {revision['author']}: {message}{tags}"
+    lines = [
+        f"revision {revision['number']}{tags}",
+        f"Author: {revision['author']} on {revision['host']}",
+        f"Date:   {revision['when']}",
+        f"        {_contents_text(revision['contents'])}",
+    ]
+    lines += ["", *(f"    {line}" for line in message.splitlines()), ""] if message else [""]
+    return "\n".join(lines)
+
+
+def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDifference]:
+    """One revision, and what it changed in the map.
+
+    Raises:
+        MapError: the map cannot be read, or has no such revision.
+    """
+    with MapStore.open(path, at=named) as store:
+        number = store.revision
+        revision = _revision(store.log()[-1], _names(store.tags())) if number else {}
+        new = store.load()
+        shown = {
+            **revision,
+            "number": number,
+            "content_hash": store.content_hash(),
+            "configuration": dict(store.log()[-1].configuration) if number else {},
+            "sessions": _sessions(new),
+            "hours": hours_of_nodes(new),
+        }
+    with MapStore.open(path, at=max(number - 1, 0)) as store:
+        return shown, difference(max(number - 1, 0), store.load(), number, new)
+
+
+def tag_revision(
+    path: Path,
+    name: str,
+    named: int | str | None,
+    *,
+    author: str,
+    message: str = "",
+    move: bool = False,
+) -> Tag:
+    """Give a revision a name; see `WritableMapStore.tag` for the errors."""
+    with MapStore.open_for_writing(path) as store:
+        return store.tag(name, named, author=author, message=message, move=move)
+
+
+def delete_tag(path: Path, name: str, *, author: str) -> Tag:
+    """Take a name away; see `WritableMapStore.untag` for the errors."""
+    with MapStore.open_for_writing(path) as store:
+        return store.untag(name, author=author)
+
+
+def map_tags(path: Path) -> list[dict[str, Any]]:
+    """The tags of a map, by name.
+
+    Raises:
+        MapError: the map cannot be read.
+    """
+    with MapStore.open(path) as store:
+        return [tag_dict(tag) for tag in store.tags().values()]
+
+
+def tag_dict(tag: Tag) -> dict[str, Any]:
+    """A tag as plain values."""
+    return {
+        "name": tag.name,
+        "revision": tag.number,
+        "author": tag.author,
+        "message": tag.message,
+        "when": when(tag.tagged_ns),
+    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RevertReport:
+    """What taking a revision back did, or would do.
+
+    Attributes:
+        reverted: the map before and after.
+        difference: between the two.
+    """
+
+    reverted: Reverted
+    difference: MapDifference
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``revert --json`` prints."""
+        revision = self.reverted.revision
+        return {
+            "reverted": self.reverted.number,
+            "revision": None if revision is None else revision.number,
+            "lost_by_others": dict(self.reverted.lost_by_others),
+            "regained_by_others": dict(self.reverted.regained_by_others),
+            "difference": self.difference.to_dict(),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        told = self.difference.to_dict()
+        revision = self.reverted.revision
+        done = "would be taken back" if revision is None else f"taken back by {revision.number}"
+        lines = [
+            f"revision {self.reverted.number} {done}",
+            f"nodes      {told['nodes']['before']} → {told['nodes']['after']}",
+            f"components {told['components']['before']} → {told['components']['after']}",
+        ]
+        if lost := _rows_text(self.reverted.lost_by_others):
+            lines.append(f"other revisions had built on it: {lost} of theirs disappear with it")
+        if regained := _rows_text(self.reverted.regained_by_others):
+            lines.append(f"of other revisions, {regained} are seen again")
+        if told["components"]["after"] > told["components"]["before"]:
+            lines.append("the map falls into more pieces: robots cannot be carried between them")
+        lines.append(f"to undo: engram revert MAP {revision.number}" if revision else "dry run")
+        return "\n".join(lines)
+
+
+def _rows_text(counts: Mapping[str, int]) -> str:
+    """How many rows of which tables, those without any left out."""
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+
+
+def revert_revision(
+    path: Path, named: int | str, *, author: str, message: str = "", dry_run: bool = False
+) -> RevertReport:
+    """Take a revision back by a new one, and say what went with it.
+
+    Raises:
+        RevisionError: there is no such revision, or nothing of it is left.
+        MapError: the map cannot be written.
+    """
+    with MapStore.open_for_writing(path) as store:
+        head = store.revision
+        done = store.revert(named, author=author, message=message, dry_run=dry_run)
+    after = head + 1 if done.revision is None else done.revision.number
+    return RevertReport(done, difference(head, done.before, after, done.after))
+
+
+def blame_node(path: Path, prefix: str, at: int | str | None = None) -> dict[str, Any]:
+    """Who brought a node into a map, when, and what became of it.
+
+    Raises:
+        InputError: no node, or several, begin so.
+        MapError: the map cannot be read, or has no such revision.
+    """
+    with MapStore.open(path, at=at) as store:
+        origin = store.origin(prefix)
+        log = {one.number: one for one in store.log()}
+        contents = store.load()
+    session = next((one for one in contents.sessions if one.id == origin.session), None)
+    brought = log[origin.brought]
+    place = {node.id: at for at, node in enumerate(contents.nodes)}.get(origin.node, -1)
+    tried = contents.attempts.node == place
+    return {
+        "node": str(origin.node),
+        "robot": origin.robot,
+        "session": str(origin.session),
+        "when": _stamp(session, origin.stamp_ns),
+        "stamp_ns": origin.stamp_ns,
+        "hour": None if session is None else hour_of_day(session, origin.stamp_ns),
+        "driven_m": origin.driven_m,
+        "revision": origin.brought,
+        "author": brought.author,
+        "committed": when(brought.committed_ns),
+        "message": brought.message,
+        "visible": origin.visible,
+        "told": [{"revision": by, "hidden": hidden} for by, hidden in origin.told],
+        "edges": dict(
+            Counter(str(edge.kind) for edge in contents.edges if origin.node in {edge.a, edge.b})
+        ),
+        "paths": len({e.path for e in contents.path_entries if e.node == origin.node}),
+        "attempts": int(tried.sum()),
+        "matches": int(contents.attempts.accepted[tried].sum()),
+    }
+
+
+def blame_text(found: Mapping[str, Any]) -> str:
+    """`blame_node` for people."""
+    hour = "hour of day unknown" if found["hour"] is None else f"hour of day {found['hour']:.2f}"
+    edges = ", ".join(f"{count} {kind}" for kind, count in found["edges"].items()) or "none"
+    lines = [
+        f"node {found['node']}",
+        f"  saved by {found['robot']} in session {found['session']}, {found['driven_m']:.1f} m in",
+        f"  at {found['when']}, {hour}",
+        f"  brought by revision {found['revision']} of {found['author']}, {found['committed']}"
+        + (f": {found['message']}" if found["message"] else ""),
+        f"  edges: {edges}; on {found['paths']} paths; matched in {found['matches']} of "
+        f"{found['attempts']} attempts",
+    ]
+    for said in found["told"]:
+        done = "taken back" if said["hidden"] else "shown again"
+        lines.append(f"  {done} by revision {said['revision']}")
+    return "\n".join(lines)
+
+
+def when(stamp_ns: int) -> str:
+    """UTC, to the second."""
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="seconds")
+
+
+def _stamp(session: Session | None, stamp_ns: int) -> str:
+    if session is not None and session.clock is Clock.UTC:
+        return when(stamp_ns)
+    return f"{stamp_ns / 1e9:.3f} s of a clock that is not UTC"
+
+
+def _names(tags: Mapping[str, Tag]) -> dict[int, list[str]]:
+    names: dict[int, list[str]] = {}
+    for tag in tags.values():
+        names.setdefault(tag.number, []).append(tag.name)
+    return names
+
+
+def _revision(revision: Revision, names: Mapping[int, list[str]]) -> dict[str, Any]:
+    return {
+        "number": revision.number,
+        "parent": revision.parent,
+        "when": when(revision.committed_ns),
+        "author": revision.author,
+        "host": revision.host,
+        "message": revision.message,
+        "tool_version": revision.tool_version,
+        "tags": names.get(revision.number, []),
+        "contents": dict(revision.contents),
+    }
+
+
+def _contents_text(contents: Mapping[str, float]) -> str:
+    told = [f"{contents[key]:.0f} {name}" for key, name in _TOLD.items() if contents.get(key)]
+    if contents.get("mapped_m"):
+        told.append(f"{contents['mapped_m']:.1f} m mapped")
+    return ", ".join(told) or "nothing"
+
+
+def _sessions(contents: MapContents) -> list[dict[str, Any]]:
+    nodes = Counter(node.session for node in contents.nodes)
+    return [
+        {
+            "session": str(session.id),
+            "robot": session.robot,
+            "start": _stamp(session, session.start_ns),
+            "hour": hour_of_day(session, session.start_ns),
+            "nodes": nodes[session.id],
+        }
+        for session in contents.sessions
+    ]

@@ -1,0 +1,82 @@
+"""Keys of rows: 64-bit integers, given out by the one writer in order of writing."""
+
+from __future__ import annotations
+
+from sqlalchemy import Connection, Table, func, insert, select
+
+from engram.frontend import DescriptorKind
+from engram.geometry import StereoCamera
+from engram.graph.model import NodeId
+from engram.maps.database import Database
+from engram.maps.rows import camera_row, sealed
+from engram.maps.schema import KEYED, cameras, frontends, nodes
+from engram.maps.view import View
+
+
+class KeyBook:
+    """The next free key of each table, and the keys of nodes by their UUIDs.
+
+    For the holder of the writer lock only: nobody else gives out keys meanwhile.
+    """
+
+    def __init__(self, database: Database, view: View) -> None:
+        self._database = database
+        self._view = view
+        self._nodes: dict[bytes, int] | None = None  # read when first asked for
+        with database.reading() as connection:
+            self._next = {
+                table: (connection.execute(select(func.max(table.c.key))).scalar() or 0) + 1
+                for table in KEYED
+            }
+
+    def next(self, table: Table) -> int:
+        """A key that no row of the table has."""
+        key = self._next[table]
+        self._next[table] = key + 1
+        return key
+
+    def set_view(self, view: View) -> None:
+        """Find nodes as of another revision."""
+        self._view = view
+
+    def find_node(self, node: NodeId) -> int | None:
+        """Key of a node that is seen or was announced by `learn_node`; None if there is none."""
+        return self._known_nodes().get(node.bytes)
+
+    def learn_node(self, node: NodeId, key: int) -> None:
+        """A node that is on its way into the map."""
+        self._known_nodes()[node.bytes] = key
+
+    def forget_nodes(self) -> None:
+        """Nodes on their way did not arrive."""
+        self._nodes = None
+
+    def _known_nodes(self) -> dict[bytes, int]:
+        if self._nodes is None:
+            query = self._view.select(nodes).with_only_columns(nodes.c.uuid, nodes.c.key)
+            with self._database.reading() as connection:
+                self._nodes = {row[0]: row[1] for row in connection.execute(query)}
+        return self._nodes
+
+    def ensure_camera(self, connection: Connection, camera: StereoCamera) -> int:
+        """Key of the camera, stored if it is new."""
+        query = select(cameras.c.key).where(cameras.c.id == camera.id).order_by(cameras.c.key)
+        key = connection.execute(query).scalar()
+        if key is None:
+            key = self.next(cameras)
+            connection.execute(insert(cameras), [sealed(cameras, camera_row(camera, key))])
+        return key
+
+    def ensure_frontend(
+        self, connection: Connection, descriptor: DescriptorKind, frontend: str
+    ) -> int:
+        """Key of the front-end, stored if it is new."""
+        query = select(frontends.c.key).where(
+            frontends.c.descriptor == str(descriptor), frontends.c.hash == frontend
+        )
+        key = connection.execute(query.order_by(frontends.c.key)).scalar()
+        if key is None:
+            key = self.next(frontends)
+            row = {"key": key, "descriptor": str(descriptor), "hash": frontend}
+            connection.execute(insert(frontends), [sealed(frontends, row)])
+        return key

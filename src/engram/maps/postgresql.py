@@ -1,0 +1,318 @@
+"""A map as one schema of a PostgreSQL database: the same tables, another lock.
+
+The address is an SQLAlchemy URL with the map's name in its query, for example
+``postgresql+psycopg://engram@centre/fleet?map=town``.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import (
+    URL,
+    Connection,
+    Engine,
+    Select,
+    Table,
+    create_engine,
+    event,
+    insert,
+    inspect,
+    make_url,
+    text,
+)
+from sqlalchemy.dialects.postgresql import Insert
+from sqlalchemy.exc import ArgumentError, DBAPIError
+from sqlalchemy.schema import CreateTable
+
+from engram import __version__
+from engram.errors import (
+    FormatVersionError,
+    InputError,
+    MapCorruptError,
+    MapError,
+    MapLockedError,
+    MissingExtraError,
+    NotAMapError,
+    StorageFullError,
+)
+from engram.maps.database import damage_named
+from engram.maps.lock import Holder
+from engram.maps.raising import raise_tables
+from engram.maps.rows import sealed
+from engram.maps.schema import (
+    FORMAT_VERSION,
+    map_format,
+    metadata,
+    missing_in,
+)
+
+# The first half of the advisory lock's key says that it is ours, the second which map.
+_LOCK_CLASS = 0x4547524D
+# PostgreSQL cuts application names there.
+_NAME_BYTES = 63
+
+
+class PostgresDatabase:
+    """One map in a PostgreSQL database.
+
+    Args:
+        address: URL with ``map=NAME`` in its query.
+
+    Raises:
+        InputError: the address cannot be understood.
+        NotAMapError: the database has no such map.
+        FormatVersionError: written by a newer Engram.
+        MapError: no connection.
+    """
+
+    def __init__(self, address: str) -> None:
+        url, self._schema = _parse(address)
+        self.name = f"{url.render_as_string(hide_password=True)} map {self._schema}"
+        self._url = url
+        self._engine = _engine(url, self._schema)
+        self.format_version = self._read_version()
+        if self.format_version < FORMAT_VERSION:
+            _show_missing_tables(self._engine, self.format_version)
+            self._engine.dispose()
+
+    def _read_version(self) -> int:
+        with self.reading() as connection:
+            if not inspect(connection).has_table(map_format.name, schema=self._schema):
+                raise NotAMapError(f"{self.name}: there is no such map")
+            found = connection.execute(text("SELECT version FROM map_format ORDER BY key"))
+            version = int(found.scalar() or 0)
+        if version > FORMAT_VERSION:
+            raise FormatVersionError(
+                f"{self.name} is of format {version}, this Engram ({__version__}) reads up to "
+                f"{FORMAT_VERSION}; install a newer one"
+            )
+        return version
+
+    @staticmethod
+    def create(address: str) -> None:
+        """Make an empty map: all of it or nothing.
+
+        Raises:
+            InputError: the address cannot be understood, or the map exists.
+        """
+        url, schema = _parse(address)
+        engine = _engine(url, schema)
+        try:
+            with _translated(schema), engine.begin() as connection:
+                if inspect(connection).has_schema(schema):
+                    raise InputError(
+                        f"map {schema} exists already; open it, or choose another name"
+                    )
+                connection.execute(text(f'CREATE SCHEMA "{schema}"'))
+                metadata.create_all(connection, checkfirst=False)
+                row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
+                connection.execute(insert(map_format), sealed(map_format, row))
+        finally:
+            engine.dispose()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection for selects."""
+        with damage_named(self.name), _translated(self.name), self._engine.connect() as connection:
+            yield connection
+
+    def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
+        """The first row of a select."""
+        with self.reading() as connection:
+            return connection.execute(query, parameters).first()
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """One durable transaction."""
+        with damage_named(self.name), _translated(self.name), self._engine.begin() as connection:
+            yield connection
+
+    def lock_for_writing(self) -> AdvisoryLock:
+        """Become the only writer."""
+        lock = AdvisoryLock(self._url, self._schema, self)
+        try:
+            self._raise_format()
+        except BaseException:
+            lock.release()
+            raise
+        return lock
+
+    def _raise_format(self) -> None:
+        """Bring an older map to the newest format: all of it, in one transaction."""
+        if self._read_version() < FORMAT_VERSION:
+            self._engine.dispose()
+            self._engine = _engine(self._url, self._schema)
+            with self.writing() as connection:
+                raise_tables(connection, self.format_version, _free_names)
+        if self.format_version < FORMAT_VERSION:
+            self._engine.dispose()
+            self._engine = _engine(self._url, self._schema)
+            self.format_version = FORMAT_VERSION
+
+    def writer(self) -> Holder | None:
+        """Who writes now."""
+        query = text(
+            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a ON a.pid = l.pid "
+            "WHERE l.locktype = 'advisory' AND l.granted AND l.classid = :class "
+            "AND l.objid = :map AND l.database = (SELECT oid FROM pg_database "
+            "WHERE datname = current_database()) ORDER BY a.pid"
+        )
+        with self.reading() as connection:
+            name = connection.execute(
+                query, {"class": _LOCK_CLASS, "map": _map_number(self._schema)}
+            ).scalar()
+        if name is None:
+            return None
+        match name.split(" ", 3):
+            case ["engram", pid, token, host] if pid.isdigit():
+                return Holder(int(pid), host, token)
+            case _:
+                return Holder(0, name, "")
+
+    def replace(self, table: Table, key: tuple[str, ...]) -> Insert:
+        """An upsert."""
+        statement = Insert(table)
+        return statement.on_conflict_do_update(
+            index_elements=list(key),
+            set_={
+                column.name: statement.excluded[column.name]
+                for column in table.columns
+                if column.name not in key
+            },
+        )
+
+    def integrity_problems(self) -> list[str]:
+        """PostgreSQL checks its pages itself where data checksums are on."""
+        return []
+
+    def size_bytes(self) -> int:
+        """Tables with their indices."""
+        query = text(
+            "SELECT coalesce(sum(pg_total_relation_size(c.oid)), 0) FROM pg_class c "
+            "JOIN pg_namespace n ON n.oid = c.relnamespace "
+            "WHERE n.nspname = :schema AND c.relkind = 'r'"
+        )
+        with self.reading() as connection:
+            return int(connection.execute(query, {"schema": self._schema}).scalar_one())
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+
+class AdvisoryLock:
+    """The right to be a map's only writer; the server drops it with the connection.
+
+    Attributes:
+        holder: who has it: this process.
+
+    Raises:
+        MapLockedError: somebody else has it.
+    """
+
+    def __init__(self, url: URL, schema: str, database: PostgresDatabase) -> None:
+        self.holder = Holder.this_process()
+        name = f"engram {self.holder.pid} {self.holder.token} {self.holder.host}"
+        self._engine = _engine(url, schema, application_name=name[:_NAME_BYTES])
+        with _translated(database.name):
+            self._connection = self._engine.connect().execution_options(
+                isolation_level="AUTOCOMMIT"
+            )
+            taken = self._connection.execute(
+                text("SELECT pg_try_advisory_lock(:class, :map)"),
+                {"class": _LOCK_CLASS, "map": _signed(_map_number(schema))},
+            ).scalar_one()
+        if not taken:
+            self.release()
+            raise MapLockedError(
+                f"{database.name} is being written by {database.writer() or 'another process'}; "
+                "wait until it is done, or read the map meanwhile"
+            )
+
+    def release(self) -> None:
+        """Let others write."""
+        self._connection.close()
+        self._engine.dispose()
+
+
+def _parse(address: str) -> tuple[URL, str]:
+    try:
+        url = make_url(address)
+    except ArgumentError as error:
+        raise InputError(f"{address!r} is no database address: {error}") from error
+    schema = url.query.get("map")
+    if not isinstance(schema, str) or not schema.isidentifier():
+        raise InputError(
+            f"{url.render_as_string(hide_password=True)} must name the map in its query, for "
+            "example ?map=town (letters, digits, underscores)"
+        )
+    return url.difference_update_query(["map"]), schema
+
+
+def _engine(url: URL, schema: str, **options: str) -> Engine:
+    try:
+        return create_engine(
+            url,
+            connect_args={"options": f"-csearch_path={schema}", **options},
+            pool_size=5,
+            max_overflow=-1,
+        )
+    except ImportError as error:
+        raise MissingExtraError(
+            "maps in PostgreSQL need its driver: pip install 'engram[server]'"
+        ) from error
+
+
+def _show_missing_tables(engine: Engine, version: int) -> None:
+    """What a map of an older format lacks is seen as empty tables of each connection alone."""
+    definitions = [
+        str(CreateTable(table).compile(dialect=engine.dialect)).replace(
+            "CREATE TABLE", "CREATE TEMP TABLE", 1
+        )
+        for table in missing_in(version)
+    ]
+
+    @event.listens_for(engine, "connect")
+    def connect(connection: Any, _: object) -> None:
+        for definition in definitions:
+            connection.execute(definition)
+        connection.commit()
+
+
+def _free_names(connection: Connection, renamed: str) -> None:
+    """Constraints keep their names when their table is renamed; the new table needs them."""
+    names = connection.execute(
+        text("SELECT conname FROM pg_constraint WHERE conrelid = CAST(:table AS regclass)"),
+        {"table": renamed},
+    )
+    for name in names.scalars().all():
+        connection.execute(text(f'ALTER TABLE {renamed} RENAME CONSTRAINT "{name}" TO "o_{name}"'))
+
+
+def _map_number(schema: str) -> int:
+    return zlib.crc32(schema.encode())
+
+
+def _signed(number: int) -> int:
+    return number - 2**32 if number >= 2**31 else number
+
+
+@contextmanager
+def _translated(name: str) -> Iterator[None]:
+    """PostgreSQL's errors as ours, by SQLSTATE."""
+    try:
+        yield
+    except DBAPIError as error:
+        state = getattr(error.orig, "sqlstate", None) or ""
+        if state.startswith("53"):
+            raise StorageFullError(
+                f"{name} has no room left ({error.orig}); everything up to the last checkpoint is "
+                "safe"
+            ) from error
+        if state in {"XX001", "XX002"}:
+            raise MapCorruptError(f"{name} is damaged: {error.orig}") from error
+        raise MapError(f"{name}: {error.orig}") from error

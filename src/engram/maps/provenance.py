@@ -1,0 +1,100 @@
+"""Where the records of a map come from: which revision brought a node, and who took it back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from uuid import UUID
+
+from sqlalchemy import Connection, func, select
+
+from engram.errors import InputError
+from engram.graph.model import NodeId, SessionId
+from engram.maps.rows import Row, verified
+from engram.maps.schema import hidden, nodes, revisions, sessions
+from engram.maps.view import View, place_in_history
+
+_HEX = frozenset("0123456789abcdef")
+_LISTED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """A node and its history.
+
+    Attributes:
+        node: its id.
+        session: of the drive that saved it.
+        robot: of that drive.
+        stamp_ns: of its frame.
+        driven_m: odometry distance from the session's start.
+        brought: number of the revision that brought it.
+        told: (number, hidden) for each later revision that took it back or showed it again.
+    """
+
+    node: NodeId
+    session: SessionId
+    robot: str
+    stamp_ns: int
+    driven_m: float
+    brought: int
+    told: tuple[tuple[int, bool], ...]
+
+    @property
+    def visible(self) -> bool:
+        """Whether it is part of the map at the revision that was asked."""
+        return not (self.told and self.told[-1][1])
+
+
+def origin_of(connection: Connection, view: View, prefix: str) -> Origin:
+    """The one node whose UUID begins so, hidden ones too.
+
+    Args:
+        connection: of the map.
+        view: up to which revision.
+        prefix: hexadecimal digits, with or without hyphens.
+
+    Raises:
+        InputError: no node, or several, begin so, or the prefix is none.
+    """
+    digits = prefix.strip().lower().replace("-", "")
+    if not digits or not _HEX.issuperset(digits) or len(digits) > 32:
+        raise InputError(f"{prefix!r} is no UUID, nor the beginning of one")
+    brought = nodes.c.revision.in_(view.revision_keys())
+    begins = _between(digits)
+    query = select(nodes).where(brought, nodes.c.uuid >= begins[0], nodes.c.uuid <= begins[1])
+    rows = list(verified(nodes, connection.execute(query.order_by(nodes.c.uuid))))
+    if not rows:
+        count = connection.execute(select(func.count()).select_from(nodes).where(brought)).scalar()
+        raise InputError(f"none of the map's {count} nodes begins with {prefix!r}")
+    if len(rows) > 1:
+        listed = ", ".join(str(UUID(bytes=row["uuid"])) for row in rows[:_LISTED])
+        more = f" and {len(rows) - _LISTED} more" if len(rows) > _LISTED else ""
+        raise InputError(f"{len(rows)} nodes begin with {prefix!r}, give more: {listed}{more}")
+    return _origin(connection, view, rows[0])
+
+
+def _between(digits: str) -> tuple[bytes, bytes]:
+    """The least and the greatest UUID that begin so."""
+    return bytes.fromhex(digits.ljust(32, "0")), bytes.fromhex(digits.ljust(32, "f"))
+
+
+def _origin(connection: Connection, view: View, row: Row) -> Origin:
+    number = select(revisions.c.number).where(revisions.c.key == row["revision"])
+    owner = select(sessions).where(sessions.c.key == row["session"])
+    session = next(verified(sessions, connection.execute(owner)))
+    told = (
+        select(revisions.c.number, hidden.c.hidden)
+        .select_from(hidden.join(revisions, revisions.c.key == hidden.c.revision))
+        .where(hidden.c.record == nodes.name, hidden.c.target == row["key"])
+        .where(hidden.c.revision.in_(view.revision_keys()))
+        .order_by(place_in_history(), hidden.c.key)
+    )
+    return Origin(
+        node=NodeId(UUID(bytes=row["uuid"])),
+        session=SessionId(UUID(bytes=session["uuid"])),
+        robot=session["robot"],
+        stamp_ns=row["stamp_ns"],
+        driven_m=row["driven_m"],
+        brought=connection.execute(number).scalar_one(),
+        told=tuple((by, bool(hid)) for by, hid in connection.execute(told)),
+    )

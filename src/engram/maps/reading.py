@@ -1,0 +1,378 @@
+"""Rows → records: the graph, the paths and the attempts of a map as of one revision."""
+
+from __future__ import annotations
+
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Select, func, select, union
+
+from engram.errors import MapCorruptError
+from engram.frontend import DescriptorKind
+from engram.frontend.blobs import content_digest
+from engram.geometry import CameraId, StereoCamera
+from engram.graph.model import (
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    Omission,
+    PathEntry,
+    PathId,
+    Session,
+    SessionId,
+)
+from engram.maps.attempts import AttemptTable, concatenate, unpack
+from engram.maps.records import AttemptArrays, MapContents, MapInfo, Revision
+from engram.maps.rows import (
+    Row,
+    camera_from_row,
+    edges_from_rows,
+    from_json,
+    node_from_row,
+    path_entry_from_row,
+    session_from_row,
+    transform_from_bytes,
+    uuid_from_bytes,
+    verified,
+)
+from engram.maps.schema import (
+    attempts,
+    cameras,
+    edges,
+    frames,
+    frontends,
+    nodes,
+    omissions,
+    omitted_landmarks,
+    path_entries,
+    paths,
+    revisions,
+    sessions,
+    statistics,
+    vocabularies,
+)
+from engram.maps.view import View
+
+
+def load(connection: Connection, view: View) -> MapContents:
+    """Everything but the landmarks.
+
+    Raises:
+        MapCorruptError: a row does not match its checksum or points at nothing.
+    """
+    known_cameras = load_cameras(connection)
+    session_by_key = _sessions(connection, view, known_cameras)
+    session_ids = {key: one.id for key, one in session_by_key.items()}
+    node_rows = list(view.rows(connection, nodes))
+    node_list = [_node(row, known_cameras, session_ids) for row in node_rows]
+    node_ids = {row["key"]: one.id for row, one in zip(node_rows, node_list, strict=True)}
+    used = {one.camera for one in session_by_key.values()} | {one.camera for one in node_list}
+    return MapContents(
+        cameras={one.id: one for one in known_cameras.values() if one.id in used},
+        sessions=tuple(session_by_key.values()),
+        nodes=tuple(node_list),
+        edges=_edges(connection, view, node_ids),
+        path_entries=_path_entries(connection, view, node_ids),
+        attempts=_attempts(connection, view, list(session_ids), list(node_ids)),
+    )
+
+
+def load_sessions(connection: Connection, view: View) -> tuple[Session, ...]:
+    """The drives of the map."""
+    return tuple(_sessions(connection, view, load_cameras(connection)).values())
+
+
+def _sessions(
+    connection: Connection, view: View, known_cameras: dict[int, StereoCamera]
+) -> dict[int, Session]:
+    """By key."""
+    return {
+        row["key"]: session_from_row(row, _camera_id(known_cameras, row, "session"))
+        for row in view.rows(connection, sessions)
+    }
+
+
+def load_cameras(connection: Connection) -> dict[int, StereoCamera]:
+    """All cameras by key."""
+    rows = connection.execute(select(cameras).order_by(cameras.c.key))
+    return {row["key"]: camera_from_row(row) for row in verified(cameras, rows)}
+
+
+def load_frontends(connection: Connection) -> dict[int, tuple[DescriptorKind, str]]:
+    """Descriptor kind and hash of all front-ends by key."""
+    rows = connection.execute(select(frontends).order_by(frontends.c.key))
+    try:
+        return {
+            row["key"]: (DescriptorKind(row["descriptor"]), row["hash"])
+            for row in verified(frontends, rows)
+        }
+    except ValueError as error:
+        raise MapCorruptError(f"table frontends: {error}") from error
+
+
+def descriptor_of(connection: Connection, view: View) -> DescriptorKind | None:
+    """The kind of all descriptors of the map; None before its first session."""
+    known = load_frontends(connection)
+    query = view.select(sessions).with_only_columns(sessions.c.frontend).limit(1)
+    key = connection.execute(query).scalar()
+    if key is None:
+        return None
+    if key not in known:
+        raise MapCorruptError(f"table frontends: row {key}, which a session names, is missing")
+    return known[key][0]
+
+
+def log(connection: Connection, view: View) -> list[Revision]:
+    """The committed revisions that are seen, oldest first."""
+    query = (
+        select(revisions)
+        .where(revisions.c.status == "committed", revisions.c.number <= view.at)
+        .order_by(revisions.c.number)
+    )
+    return [revision_from_row(row) for row in verified(revisions, connection.execute(query))]
+
+
+def revision_from_row(row: Row) -> Revision:
+    """A committed revision."""
+    what = f"revision {row['number']}"
+    return Revision(
+        number=row["number"],
+        parent=row["parent"],
+        author=row["author"],
+        message=row["message"],
+        tool_version=row["tool_version"],
+        configuration=from_json(row["configuration"], f"{what}: configuration"),
+        opened_ns=row["opened_ns"],
+        committed_ns=row["committed_ns"],
+        host=row["host"],
+        contents=from_json(row["contents"], f"{what}: contents"),
+    )
+
+
+def info(connection: Connection, view: View, *, format_version: int, size_bytes: int) -> MapInfo:
+    """The map in numbers, without reading it whole."""
+    by_kind = dict.fromkeys(EdgeKind, 0)
+    mapped_m = 0.0
+    for row in _newest_edges(connection, view):
+        kind = EdgeKind(row["kind"])
+        by_kind[kind] += 1
+        if kind is EdgeKind.ODOMETRY:
+            mapped_m += transform_from_bytes(row["a_from_b"], f"edge {row['key']}").distance_m
+    used = union(
+        *(
+            view.select(table).with_only_columns(table.c.camera).order_by(None)
+            for table in (sessions, nodes)
+        )
+    )
+    counted = view.select(attempts).with_only_columns(func.sum(attempts.c.count)).order_by(None)
+    return MapInfo(
+        format_version=format_version,
+        revision=view.at,
+        descriptor=descriptor_of(connection, view),
+        cameras=connection.execute(select(func.count()).select_from(used.subquery())).scalar_one(),
+        sessions=_count(connection, view.select(sessions)),
+        nodes=node_count(connection, view),
+        edges=sum(by_kind.values()),
+        edges_of_kind={str(kind): count for kind, count in by_kind.items() if count},
+        path_entries=_count(connection, _entry_places(view)),
+        attempts=int(connection.execute(counted).scalar() or 0),
+        mapped_m=mapped_m,
+        size_bytes=size_bytes,
+    )
+
+
+def node_count(connection: Connection, view: View) -> int:
+    """How many nodes are seen."""
+    return _count(connection, view.select(nodes))
+
+
+def load_statistics(connection: Connection, view: View) -> dict[str, dict[str, Any]]:
+    """The newest of every statistic by name."""
+    rows = view.rows(connection, statistics)
+    return {row["name"]: from_json(row["body"], f"statistic {row['name']}") for row in rows}
+
+
+def load_vocabulary(connection: Connection, view: View) -> bytes | None:
+    """The newest vocabulary; None if there is none."""
+    kept = list(view.rows(connection, vocabularies))
+    if not kept:
+        return None
+    body: bytes = kept[-1]["body"]
+    if content_digest(body) != kept[-1]["hash"]:
+        raise MapCorruptError("the vocabulary does not match its hash; run engram check")
+    return body
+
+
+def load_omissions(connection: Connection, view: View) -> dict[NodeId, Omission]:
+    """Nodes that were not taken, each with its newest equivalent that is seen."""
+    query = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
+    node_ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
+    landmarks = {
+        row["uuid"]: row["landmark_hash"] for row in view.rows(connection, omitted_landmarks)
+    }
+    found = {}
+    for row in view.rows(connection, omissions):
+        omitted = NodeId(uuid_from_bytes(row["uuid"], f"omission {row['key']}"))
+        if row["node"] in node_ids:
+            transform = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")
+            landmark_hash = landmarks.get(row["uuid"])
+            found[omitted] = Omission(omitted, node_ids[row["node"]], transform, landmark_hash)
+    return found
+
+
+def frontends_of_sessions(
+    connection: Connection, view: View
+) -> dict[SessionId, tuple[DescriptorKind, str]]:
+    """Descriptor kind and hash of each session's front-end."""
+    known = load_frontends(connection)
+    found = {}
+    for row in view.rows(connection, sessions):
+        session = SessionId(uuid_from_bytes(row["uuid"], f"session {row['key']}"))
+        if row["frontend"] not in known:
+            raise MapCorruptError(f"session {session}: its front-end is missing")
+        found[session] = known[row["frontend"]]
+    return found
+
+
+def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
+    """The hash of each node's landmarks; of omitted ones, too, as far as it was kept."""
+    found: dict[NodeId, bytes] = {}
+    for table in (omitted_landmarks, nodes):
+        query = view.select(table).with_only_columns(table.c.uuid, table.c.landmark_hash)
+        found |= {NodeId(UUID(bytes=row[0])): row[1] for row in connection.execute(query)}
+    return found
+
+
+def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:
+    """Bytes of each node's landmarks and of its thumbnail."""
+    seen = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
+    ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(seen)}
+    query = select(
+        frames.c.node, func.length(frames.c.landmarks), func.length(frames.c.thumbnail)
+    ).order_by(frames.c.node)
+    return {
+        ids[key]: (landmarks, thumbnail or 0)
+        for key, landmarks, thumbnail in connection.execute(query)
+        if key in ids
+    }
+
+
+def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:
+    """Paths of which some entries stayed elsewhere."""
+    return frozenset(
+        PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}"))
+        for row in view.rows(connection, paths)
+        if row["partial"]
+    )
+
+
+def attempt_tables(connection: Connection, view: View) -> dict[int, AttemptTable]:
+    """Remembered attempts by key of their session."""
+    found: dict[int, list[AttemptTable]] = {}
+    for row in view.rows(connection, attempts):
+        found.setdefault(row["session"], []).append(unpack(row["body"], row["count"]))
+    return {session: concatenate(tables) for session, tables in found.items()}
+
+
+def _node(
+    row: Row, known_cameras: dict[int, StereoCamera], session_ids: dict[int, SessionId]
+) -> Node:
+    if row["session"] not in session_ids:
+        name = uuid_from_bytes(row["uuid"], "node")
+        raise MapCorruptError(f"node {name}: its session, row {row['session']}, is missing")
+    return node_from_row(row, session_ids[row["session"]], _camera_id(known_cameras, row, "node"))
+
+
+def _camera_id(known: dict[int, StereoCamera], row: Row, what: str) -> CameraId:
+    if row["camera"] not in known:
+        raise MapCorruptError(f"{what} {row['key']}: its camera, row {row['camera']}, is missing")
+    return known[row["camera"]].id
+
+
+def _newest_edges(connection: Connection, view: View) -> list[Row]:
+    """Of each (a, b, kind) the newest, in order of writing."""
+    newest: dict[tuple[int, int, str], Row] = {}
+    for row in view.rows(connection, edges):
+        key = (row["a"], row["b"], row["kind"])
+        newest.pop(key, None)
+        newest[key] = row
+    return list(newest.values())
+
+
+def _edges(connection: Connection, view: View, node_ids: dict[int, NodeId]) -> tuple[Edge, ...]:
+    """Edges between nodes that are seen: those of hidden nodes are hidden with them."""
+    seen = [
+        row
+        for row in _newest_edges(connection, view)
+        if row["a"] in node_ids and row["b"] in node_ids
+    ]
+    return edges_from_rows(seen, [(node_ids[row["a"]], node_ids[row["b"]]) for row in seen])
+
+
+def _path_entries(
+    connection: Connection, view: View, node_ids: dict[int, NodeId]
+) -> tuple[PathEntry, ...]:
+    path_ids = {
+        row["key"]: PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}"))
+        for row in view.rows(connection, paths)
+    }
+    place = {key: at for at, key in enumerate(path_ids)}
+    newest = {
+        (row["path"], row["sequence"]): row
+        for row in view.rows(connection, path_entries)
+        if row["path"] in path_ids and row["node"] in node_ids
+    }
+    rows = sorted(newest.values(), key=lambda row: (place[row["path"]], row["sequence"]))
+    return tuple(
+        path_entry_from_row(row, path_ids[row["path"]], node_ids[row["node"]]) for row in rows
+    )
+
+
+def _entry_places(view: View) -> Select[Any]:
+    """Path and sequence of the entries that are seen, once each: newer ones supersede older."""
+    seen = view.select(path_entries).order_by(None)
+    return seen.with_only_columns(path_entries.c.path, path_entries.c.sequence).distinct()
+
+
+def _attempts(
+    connection: Connection, view: View, session_keys: list[int], node_keys: list[int]
+) -> AttemptArrays:
+    """All attempts between nodes that are seen, with keys turned into dense indices."""
+    by_session = attempt_tables(connection, view)
+    order = [key for key in session_keys if key in by_session]
+    table = concatenate([by_session[key] for key in order])
+    place = {key: at for at, key in enumerate(session_keys)}
+    session = np.repeat(
+        np.array([place[key] for key in order], np.int32),
+        np.array([len(by_session[key]) for key in order], np.int64),
+    )
+    reference, reference_seen = _dense(table.columns["reference"], node_keys)
+    node, node_seen = _dense(table.columns["node"], node_keys)
+    seen = reference_seen & node_seen
+    columns: dict[str, Any] = {**table.columns, "reference": reference, "node": node}
+    return AttemptArrays(
+        session=session[seen],
+        policy=table.policy[seen],
+        policies=table.policies,
+        **{name: values[seen] for name, values in columns.items()},
+    )
+
+
+def _dense(keys: NDArray[Any], known: list[int]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """Index of each key in `known`, and whether it is there."""
+    if not known:
+        return np.zeros(len(keys), np.int32), np.zeros(len(keys), np.bool_)
+    known_keys = np.array(known, np.int64)
+    order = np.argsort(known_keys)
+    at = np.minimum(np.searchsorted(known_keys, keys, sorter=order), len(known) - 1)
+    index = order[at].astype(np.int32)
+    return index, known_keys[index] == keys
+
+
+def _count(connection: Connection, rows: Select[Any]) -> int:
+    return connection.execute(
+        select(func.count()).select_from(rows.order_by(None).subquery())
+    ).scalar_one()

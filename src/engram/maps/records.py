@@ -1,0 +1,295 @@
+"""What the store hands out beside the records of `engram.graph`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import DescriptorKind, FrameStatus
+from engram.geometry import CameraId, StereoCamera
+from engram.graph.basin import BasinCounts, count_attempts
+from engram.graph.model import Edge, Node, PathEntry, Session, SessionId
+
+
+class RevisionStatus(StrEnum):
+    """Where a revision is in its life."""
+
+    OPEN = "open"
+    COMMITTED = "committed"
+    ABANDONED = "abandoned"
+
+
+class SessionState(StrEnum):
+    """What a map knows of a session."""
+
+    ABSENT = "absent"
+    OPEN = "open"
+    INTERRUPTED = "interrupted"
+    COMMITTED = "committed"
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """One committed step of a map's history.
+
+    Attributes:
+        number: what `--at` takes; 1 is the first.
+        parent: number of the revision before; None for the first.
+        author: who, or which robot.
+        message: why; "" if nothing was said.
+        tool_version: version of Engram that wrote it.
+        configuration: the resolved settings that made it.
+        opened_ns, committed_ns: when, UTC, ns.
+        host: where.
+        contents: how many rows of each table it brought, and `mapped_m`, the metres of its
+            odometry edges.
+    """
+
+    number: int
+    parent: int | None
+    author: str
+    message: str
+    tool_version: str
+    configuration: Mapping[str, Any]
+    opened_ns: int
+    committed_ns: int
+    host: str
+    contents: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class InterruptedSession:
+    """A session whose writer is gone before it committed: resume it or seal it.
+
+    Attributes:
+        session: which drive.
+        author, host, pid, opened_ns: who was writing, where and since when (UTC, ns).
+        nodes: how many were checkpointed.
+        last_stamp_ns: stamp of the newest of them; None without nodes.
+    """
+
+    session: Session
+    author: str
+    host: str
+    pid: int
+    opened_ns: int
+    nodes: int
+    last_stamp_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredSession:
+    """What an open session has stored already: where a resumed mapper goes on.
+
+    Attributes:
+        nodes: its nodes in order of saving.
+        last_entry: the newest entry of its path; None if it has none.
+        next_sequence: sequence number of its next path entry.
+        next_iteration: one past the newest iteration among its attempts.
+    """
+
+    nodes: tuple[Node, ...] = ()
+    last_entry: PathEntry | None = None
+    next_sequence: int = 0
+    next_iteration: int = 0
+
+    @property
+    def last_stamp_ns(self) -> int | None:
+        """Newest stamp among nodes and path entries; None if there are none."""
+        stamps_ns = [node.stamp_ns for node in self.nodes[-1:]]
+        if self.last_entry is not None:
+            stamps_ns.append(self.last_entry.stamp_ns)
+        return max(stamps_ns, default=None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttemptArrays:
+    """Remembered attempts (SPEC §3.5) as a struct of arrays, in order of session and iteration.
+
+    Attributes:
+        session: (A,) int32, index into `MapContents.sessions`.
+        iteration: (A,) int64.
+        reference, node: (A,) int32, indices into `MapContents.nodes`.
+        along_m, across_m, yaw_rad, sigma_m, sigma_yaw_rad: (A,) float32, as in `Attempt`.
+        accepted: (A,) bool.
+        inliers: (A,) int32.
+        rank: (A,) int32, 255 stands for all above.
+        policy: (A,) int32, index into `policies`.
+        policies: names of the ranking policies.
+    """
+
+    session: NDArray[np.int32]
+    iteration: NDArray[np.int64]
+    reference: NDArray[np.int32]
+    node: NDArray[np.int32]
+    along_m: NDArray[np.float32]
+    across_m: NDArray[np.float32]
+    yaw_rad: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+    sigma_yaw_rad: NDArray[np.float32]
+    accepted: NDArray[np.bool_]
+    inliers: NDArray[np.int32]
+    rank: NDArray[np.int32]
+    policy: NDArray[np.int32]
+    policies: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> AttemptArrays:
+        """Some of the attempts: a mask, or their places in the order wanted."""
+        columns = {
+            field.name: getattr(self, field.name)[rows]
+            for field in fields(self)
+            if field.name != "policies"
+        }
+        return AttemptArrays(**columns, policies=self.policies)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredNode:
+    """A node with its landmarks as they lie in the map: to be copied, not to be looked at.
+
+    Attributes:
+        node: the record.
+        descriptor: kind of its descriptors.
+        frontend: hash of the front-end that made its frame.
+        status: of its frame.
+        landmark_hash: the 16 bytes that stand for its landmarks.
+        landmarks: the blob.
+        thumbnail: JPEG; None if none was saved.
+    """
+
+    node: Node
+    descriptor: DescriptorKind
+    frontend: str
+    status: FrameStatus
+    landmark_hash: bytes
+    landmarks: bytes
+    thumbnail: bytes | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapContents:
+    """Everything of a map but its landmarks, in order of writing.
+
+    Attributes:
+        cameras: by id, those of the sessions and nodes.
+        sessions, nodes: each once.
+        edges: for each (a, b, kind) the newest only.
+        path_entries: ordered by path, then sequence.
+        attempts: all remembered ones between nodes that are visible.
+    """
+
+    cameras: Mapping[CameraId, StereoCamera]
+    sessions: tuple[Session, ...]
+    nodes: tuple[Node, ...]
+    edges: tuple[Edge, ...]
+    path_entries: tuple[PathEntry, ...]
+    attempts: AttemptArrays
+
+    def basin_counts(self, experiences: NDArray[np.int32]) -> BasinCounts:
+        """From which match basins are learnt: all remembered attempts.
+
+        Args:
+            experiences: (N,) of each of `nodes`, numbered from 0.
+        """
+        made = self.attempts
+        return count_attempts(
+            made.session.astype(np.int64),
+            experiences[made.node].astype(np.int64),
+            made.iteration,
+            (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
+            made.sigma_m.astype(np.float64),
+            made.accepted,
+        )
+
+    def last_iterations(self) -> dict[SessionId, int]:
+        """Number of the newest remembered iteration of each session that has any."""
+        made = self.attempts
+        newest = np.flatnonzero(np.diff(made.session, append=-1))  # they stand session by session
+        return {
+            self.sessions[place].id: iteration
+            for place, iteration in zip(
+                made.session[newest].tolist(), made.iteration[newest].tolist(), strict=True
+            )
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    """A map in numbers.
+
+    Attributes:
+        format_version: of the file.
+        revision: number of the newest visible revision; 0 for an empty map.
+        descriptor: kind of all its descriptors; None before the first session.
+        cameras, sessions, nodes, edges, path_entries, attempts: how many are visible.
+        edges_of_kind: edges by kind.
+        mapped_m: metres of its odometry edges.
+        size_bytes: of the file with its write-ahead log, or of the tables.
+    """
+
+    format_version: int
+    revision: int
+    descriptor: DescriptorKind | None
+    cameras: int
+    sessions: int
+    nodes: int
+    edges: int
+    edges_of_kind: Mapping[str, int]
+    path_entries: int
+    attempts: int
+    mapped_m: float
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that `check` found.
+
+    Attributes:
+        table: where; "file" for the file as a whole.
+        record: UUID, number or key of the row; "" for the table as a whole.
+        fact: what is wrong.
+    """
+
+    table: str
+    record: str
+    fact: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.table} {self.record}: {self.fact}"
+            if self.record
+            else f"{self.table}: {self.fact}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class CheckReport:
+    """What `check` found.
+
+    Attributes:
+        problems: empty for a sound map.
+        rows, blobs: how many were verified.
+        interrupted: sessions that wait to be resumed or sealed; no problem.
+        abandoned_rows: rows of abandoned revisions that are still in the file, until
+            `WritableMapStore.clean`; no problem.
+    """
+
+    problems: tuple[Problem, ...]
+    rows: int
+    blobs: int
+    interrupted: tuple[SessionId, ...]
+    abandoned_rows: int
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems

@@ -1,0 +1,329 @@
+"""Records ↔ rows: how each value is written, and the checksum of every row."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from enum import StrEnum
+from functools import cache
+from itertools import product
+from typing import Any, TypeVar
+from uuid import UUID
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Table
+
+from engram.errors import CalibrationError, InputError, MapCorruptError
+from engram.geometry import SE3, CameraId, StereoCamera
+from engram.graph.model import (
+    Clock,
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    PathId,
+    Session,
+    SessionId,
+)
+
+Row = dict[str, Any]
+_Kind = TypeVar("_Kind", bound=StrEnum)
+
+_UPPER = np.triu_indices(6)
+_encode = msgspec.msgpack.Encoder().encode
+
+
+def checksum(values: Sequence[Any]) -> int:
+    """CRC-32 of a row's columns (all but the checksum) as a MessagePack array.
+
+    It guards against damage, not against malice; landmark blobs carry a cryptographic hash.
+    """
+    return zlib.crc32(_encode(values))
+
+
+def sealed(table: Table, values: Row) -> Row:
+    """The row with its checksum."""
+    names, _ = _shape(table)
+    values["checksum"] = checksum([values[name] for name in names[:-1]])
+    return values
+
+
+def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
+    """Rows of one table as dicts, each checked against its checksum.
+
+    Args:
+        table: all of whose columns the rows begin with, in order; what follows is dropped.
+        rows: from a select.
+
+    Raises:
+        MapCorruptError: when met; names the table and the row.
+    """
+    names, kinds = _shape(table)
+    count = len(names)
+    for row in rows:
+        values = list(row[:count])
+        if checksum(values[:-1]) != values[-1] or tuple(map(type, values)) not in kinds:
+            raise MapCorruptError(
+                f"table {table.name}: {describe(table, values)} does not match its checksum; "
+                "run engram check, and restore a copy"
+            )
+        yield dict(zip(names, values, strict=True))
+
+
+@cache
+def _shape(table: Table) -> tuple[list[str], set[tuple[type, ...]]]:
+    """Names of a table's columns, and all that the types of a row's values may be."""
+    kinds = product(
+        *(
+            (column.type.python_type, *([type(None)] if column.nullable else []))
+            for column in table.columns
+        )
+    )
+    return [column.name for column in table.columns], set(kinds)
+
+
+def describe(table: Table, values: Sequence[Any]) -> str:
+    """How a row is named to people: its UUID where it has one, else its key."""
+    named = dict(zip((column.name for column in table.columns), values, strict=False))
+    if isinstance(named.get("uuid"), bytes) and len(named["uuid"]) == 16:
+        return str(UUID(bytes=named["uuid"]))
+    if "id" in named:
+        return str(named["id"])
+    return f"row {next(iter(values), '?')}"
+
+
+def to_json(values: Mapping[str, Any]) -> str:
+    """Canonical JSON text: equal values give equal text.
+
+    Raises:
+        InputError: a value is no plain data, or not finite.
+    """
+    try:
+        return json.dumps(dict(values), sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"cannot be kept as JSON: {error}") from error
+
+
+def from_json(text: str, what: str) -> dict[str, Any]:
+    """Undoes `to_json`."""
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MapCorruptError(f"{what} is no JSON: {error}") from error
+    if not isinstance(values, dict):
+        raise MapCorruptError(f"{what} is no JSON object")
+    return values
+
+
+def checked_text(value: str, what: str) -> str:
+    """A text that every database takes.
+
+    Raises:
+        InputError: it is not valid Unicode, or holds a zero character.
+    """
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{what} {value!r} is not valid Unicode") from error
+    if "\0" in value:
+        raise InputError(f"{what} {value!r} holds a zero character")
+    return value
+
+
+def checked_int(value: int, what: str) -> int:
+    """An integer of 64 bits.
+
+    Raises:
+        InputError: it has more.
+    """
+    if not -(2**63) <= value < 2**63:
+        raise InputError(f"{what} is {value}, must fit into 64 bits")
+    return int(value)
+
+
+def transform_bytes(target_from_source: SE3) -> bytes:
+    """96 bytes: rotation row by row, then translation, little-endian float64."""
+    return _floats(
+        np.concatenate([target_from_source.rotation.ravel(), target_from_source.translation])
+    )
+
+
+def transform_from_bytes(data: bytes, what: str) -> SE3:
+    """Undoes `transform_bytes`, bit for bit."""
+    (values,) = _arrays([data], 12, lambda _: what)
+    return SE3(values[:9].reshape(3, 3), values[9:])
+
+
+def covariance_bytes(covariance: NDArray[np.float64]) -> bytes:
+    """168 bytes: the upper triangle of a (6, 6) matrix row by row, little-endian float64."""
+    return _floats(covariance[_UPPER])
+
+
+def uuid_from_bytes(data: bytes, what: str) -> UUID:
+    """A UUID from its 16 bytes."""
+    try:
+        return UUID(bytes=data)
+    except (ValueError, TypeError) as error:
+        raise MapCorruptError(f"{what} has no UUID of 16 bytes: {error}") from error
+
+
+def camera_row(camera: StereoCamera, key: int) -> Row:
+    """Columns of `cameras`."""
+    mounting = camera.cam_from_rig
+    return {
+        "key": key,
+        "id": camera.id,
+        **{name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "baseline_m")},
+        "width": int(camera.width),
+        "height": int(camera.height),
+        "cam_from_rig": None if mounting is None else transform_bytes(mounting),
+        "rectification": checked_text(camera.rectification, "rectification"),
+    }
+
+
+def camera_from_row(row: Row) -> StereoCamera:
+    """The camera; its id, a hash of the rest, must come out the same."""
+    what = f"camera {row['id']}"
+    mounting = row["cam_from_rig"]
+    try:
+        camera = StereoCamera(
+            **{name: row[name] for name in ("fx", "fy", "cx", "cy", "baseline_m")},
+            width=row["width"],
+            height=row["height"],
+            cam_from_rig=None if mounting is None else transform_from_bytes(mounting, what),
+            rectification=row["rectification"],
+        )
+    except (CalibrationError, TypeError) as error:
+        raise MapCorruptError(f"{what}: {error}") from error
+    if camera.id != row["id"]:
+        raise MapCorruptError(f"{what}: its values belong to camera {camera.id}")
+    return camera
+
+
+def session_row(session: Session, key: int, revision: int, camera: int, frontend: int) -> Row:
+    """Columns of `sessions`."""
+    return {
+        "key": key,
+        "uuid": session.id.bytes,
+        "revision": revision,
+        "robot": checked_text(session.robot, "robot"),
+        "camera": camera,
+        "frontend": frontend,
+        "start_ns": checked_int(session.start_ns, "start_ns"),
+        "clock": str(session.clock),
+        "longitude_deg": None if session.longitude_deg is None else float(session.longitude_deg),
+        "zone": None if session.zone is None else checked_text(session.zone, "zone"),
+    }
+
+
+def session_from_row(row: Row, camera: CameraId) -> Session:
+    """The session."""
+    return Session(
+        id=SessionId(uuid_from_bytes(row["uuid"], f"session {row['key']}")),
+        robot=row["robot"],
+        camera=camera,
+        start_ns=row["start_ns"],
+        clock=_member(Clock, row["clock"], "sessions"),
+        longitude_deg=row["longitude_deg"],
+        zone=row["zone"],
+    )
+
+
+def node_from_row(row: Row, session: SessionId, camera: CameraId) -> Node:
+    """The node."""
+    return Node(
+        id=NodeId(uuid_from_bytes(row["uuid"], f"node {row['key']}")),
+        session=session,
+        stamp_ns=row["stamp_ns"],
+        camera=camera,
+        driven_m=row["driven_m"],
+    )
+
+
+def edge_row(edge: Edge, key: int, revision: int, a: int, b: int) -> Row:
+    """Columns of `edges`."""
+    return {
+        "key": key,
+        "revision": revision,
+        "a": a,
+        "b": b,
+        "kind": str(edge.kind),
+        "a_from_b": transform_bytes(edge.a_from_b),
+        "covariance": covariance_bytes(edge.covariance),
+    }
+
+
+def edge_from_row(row: Row, a: NodeId, b: NodeId) -> Edge:
+    """The edge."""
+    return edges_from_rows([row], [(a, b)])[0]
+
+
+def edges_from_rows(rows: Sequence[Row], ends: Sequence[tuple[NodeId, NodeId]]) -> tuple[Edge, ...]:
+    """The edges, each with its ends (a, b); many at a time, for a map has tens of thousands."""
+
+    def named(at: int) -> str:
+        return f"edge {ends[at][0]} {ends[at][1]} {rows[at]['kind']}"
+
+    transforms = _arrays([row["a_from_b"] for row in rows], 12, named)
+    halves = _arrays([row["covariance"] for row in rows], 21, named)
+    covariances = np.empty((len(rows), 6, 6))
+    covariances[:, _UPPER[0], _UPPER[1]] = halves
+    covariances[:, _UPPER[1], _UPPER[0]] = halves
+    rotations, translations = transforms[:, :9].reshape(-1, 3, 3), transforms[:, 9:]
+    return tuple(
+        Edge(
+            a=a,
+            b=b,
+            kind=_member(EdgeKind, row["kind"], "edges"),
+            a_from_b=SE3(rotations[at], translations[at]),
+            covariance=covariances[at],
+        )
+        for at, (row, (a, b)) in enumerate(zip(rows, ends, strict=True))
+    )
+
+
+def path_entry_from_row(row: Row, path: PathId, node: NodeId) -> PathEntry:
+    """The path entry."""
+    return PathEntry(
+        path=path,
+        sequence=row["sequence"],
+        node=node,
+        kind=_member(PathEntryKind, row["kind"], "path_entries"),
+        stamp_ns=row["stamp_ns"],
+    )
+
+
+def _member(kind: type[_Kind], value: str, table: str) -> _Kind:
+    found: _Kind | None = _members(kind).get(value)
+    if found is None:
+        raise MapCorruptError(f"table {table}: {value!r} is not a valid {kind.__name__}")
+    return found
+
+
+@cache
+def _members(kind: type[_Kind]) -> dict[str, _Kind]:
+    """By their text: asking the class is ten times slower."""
+    return {str(one): one for one in kind}
+
+
+def _floats(values: NDArray[np.float64]) -> bytes:
+    return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def _arrays(parts: Sequence[bytes], count: int, named: Callable[[int], str]) -> NDArray[np.float64]:
+    """(N, count) numbers of N rows; `named` says which row one of them is."""
+    for at, data in enumerate(parts):
+        if len(data) != 8 * count:
+            raise MapCorruptError(
+                f"{named(at)}: {count} numbers take {8 * count} bytes, not {data!r:.40}"
+            )
+    values = np.frombuffer(b"".join(parts), "<f8").astype(np.float64).reshape(-1, count)
+    infinite = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if infinite.size:
+        raise MapCorruptError(f"{named(int(infinite[0]))}: holds numbers that are not finite")
+    return values

@@ -1,0 +1,141 @@
+"""What a map knows of a session: who brought it, whether its writer is gone, what was saved."""
+
+from __future__ import annotations
+
+from uuid import UUID
+
+from sqlalchemy import Connection, select
+
+from engram.errors import MapCorruptError
+from engram.graph.model import NodeId, PathEntry, PathEntryKind, SessionId, path_id
+from engram.maps import reading
+from engram.maps.records import InterruptedSession, RevisionStatus, StoredSession
+from engram.maps.rows import Row, node_from_row, session_from_row, verified
+from engram.maps.schema import hidden, nodes, path_entries, paths, revisions, sessions
+from engram.maps.view import View, place_in_history
+
+
+def session_and_revision(
+    connection: Connection, session: SessionId, at: int
+) -> tuple[Row, Row] | None:
+    """Rows of a session and of the revision that brought it, or showed it again, last.
+
+    None if the map never had it, or if the last word on it, up to revision `at`, is that it is
+    hidden. The revision may have any status.
+    """
+    query = select(sessions).where(sessions.c.uuid == session.bytes).order_by(sessions.c.key)
+    row = next(verified(sessions, connection.execute(query)), None)
+    if row is None:
+        return None
+    said = _last_word(connection, row["key"], at)
+    if said is not None and said["hidden"]:
+        return None
+    by = row["revision"] if said is None else said["revision"]
+    query = select(revisions).where(revisions.c.key == by).order_by(revisions.c.key)
+    revision = next(verified(revisions, connection.execute(query)), None)
+    if revision is None:
+        raise MapCorruptError(f"session {session}: its revision is missing; run engram check")
+    return row, revision
+
+
+def _last_word(connection: Connection, session_key: int, at: int) -> Row | None:
+    """The newest `hidden` row for a session, of open revisions or committed ones up to `at`."""
+    place = place_in_history()
+    query = (
+        select(*hidden.columns)
+        .join(revisions, revisions.c.key == hidden.c.revision)
+        .where(hidden.c.record == sessions.name, hidden.c.target == session_key)
+        .where(
+            (revisions.c.status == str(RevisionStatus.OPEN))
+            | ((revisions.c.status == str(RevisionStatus.COMMITTED)) & (revisions.c.number <= at))
+        )
+        .order_by(place.desc(), hidden.c.key.desc())
+        .limit(1)
+    )
+    return next(verified(hidden, connection.execute(query)), None)
+
+
+def sessions_of(connection: Connection, revision_key: int) -> list[Row]:
+    """The sessions that a revision brought or showed again, oldest key first."""
+    shown = select(hidden.c.target).where(
+        hidden.c.record == sessions.name,
+        hidden.c.hidden == 0,
+        hidden.c.revision == revision_key,
+    )
+    query = (
+        select(sessions)
+        .where((sessions.c.revision == revision_key) | sessions.c.key.in_(shown))
+        .order_by(sessions.c.key)
+    )
+    return list(verified(sessions, connection.execute(query)))
+
+
+def open_sessions(connection: Connection) -> frozenset[bytes]:
+    """UUIDs of the sessions that nobody has committed or abandoned."""
+    query = select(revisions.c.key).where(revisions.c.status == str(RevisionStatus.OPEN))
+    keys = connection.execute(query.order_by(revisions.c.key)).scalars().all()
+    return frozenset(row["uuid"] for key in keys for row in sessions_of(connection, key))
+
+
+def interrupted_sessions(
+    connection: Connection, revision: Row, at: int
+) -> list[InterruptedSession]:
+    """The sessions of one open revision: one, or none for a revision of another kind."""
+    cameras = reading.load_cameras(connection)
+    found = []
+    for row in sessions_of(connection, revision["key"]):
+        session = session_from_row(row, cameras[row["camera"]].id)
+        stored = stored_session(connection, View(at, revision["key"]), row)
+        found.append(
+            InterruptedSession(
+                session=session,
+                author=revision["author"],
+                host=revision["host"],
+                pid=revision["pid"],
+                opened_ns=revision["opened_ns"],
+                nodes=len(stored.nodes),
+                last_stamp_ns=max((node.stamp_ns for node in stored.nodes), default=None),
+            )
+        )
+    return found
+
+
+def stored_session(connection: Connection, view: View, session: Row) -> StoredSession:
+    """What an open session has checkpointed, as its own view sees it."""
+    cameras = reading.load_cameras(connection)
+    session_id = session_from_row(session, cameras[session["camera"]].id).id
+    query = view.select(nodes).where(nodes.c.session == session["key"])
+    saved = sorted(
+        (
+            node_from_row(row, session_id, cameras[row["camera"]].id)
+            for row in verified(nodes, connection.execute(query))
+        ),
+        key=lambda node: node.stamp_ns,
+    )
+    last_entry = _last_path_entry(connection, view, session["key"], session_id)
+    made = reading.attempt_tables(connection, view).get(session["key"])
+    return StoredSession(
+        nodes=tuple(saved),
+        last_entry=last_entry,
+        next_sequence=0 if last_entry is None else last_entry.sequence + 1,
+        next_iteration=0 if made is None else int(made.columns["iteration"].max()) + 1,
+    )
+
+
+def _last_path_entry(
+    connection: Connection, view: View, session_key: int, session: SessionId
+) -> PathEntry | None:
+    owned = select(paths.c.key).where(paths.c.session == session_key)
+    query = view.select(path_entries).where(path_entries.c.path.in_(owned))
+    query = query.order_by(None).order_by(path_entries.c.sequence.desc()).limit(1)
+    row = next(verified(path_entries, connection.execute(query)), None)
+    if row is None:
+        return None
+    uuid = connection.execute(select(nodes.c.uuid).where(nodes.c.key == row["node"])).scalar_one()
+    return PathEntry(
+        path_id(session),
+        row["sequence"],
+        NodeId(UUID(bytes=uuid)),
+        PathEntryKind(row["kind"]),
+        row["stamp_ns"],
+    )

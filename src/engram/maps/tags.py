@@ -1,0 +1,121 @@
+"""How people name revisions: by number, by tag, as `head`, or so many steps before one."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, insert, select
+
+from engram.errors import InputError, RevisionError
+from engram.maps.keys import KeyBook
+from engram.maps.rows import checked_text, sealed, verified
+from engram.maps.schema import tags
+from engram.maps.view import head
+
+HEAD = "head"
+# A letter first, so that no tag looks like a number or an option; no `~`, which counts steps back.
+_TAG = re.compile(r"[A-Za-z][A-Za-z0-9._/+-]{0,99}")
+_STEPS = re.compile(r"(?P<base>.*?)(?:~(?P<steps>\d{1,9})?)?", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """A name that somebody gave to a revision.
+
+    Attributes:
+        name: as given.
+        number: of the revision.
+        author: who gave it.
+        message: why; "" if nothing was said.
+        tagged_ns: when, UTC, ns.
+    """
+
+    name: str
+    number: int
+    author: str
+    message: str
+    tagged_ns: int
+
+
+def load_tags(connection: Connection) -> dict[str, Tag]:
+    """All tags that stand, by name, in the order of their names."""
+    newest: dict[str, Tag | None] = {}
+    for row in verified(tags, connection.execute(select(tags).order_by(tags.c.key))):
+        newest[row["name"]] = (
+            None
+            if row["number"] is None
+            else Tag(row["name"], row["number"], row["author"], row["message"], row["tagged_ns"])
+        )
+    return {name: tag for name, tag in sorted(newest.items()) if tag is not None}
+
+
+def resolve(connection: Connection, named: int | str | None, where: str) -> int:
+    """Number of the revision that somebody named.
+
+    Args:
+        connection: of the map.
+        named: a number, a tag, "head" or None for the newest; a text may end in ``~N`` for N
+            revisions before, ``~`` for one.
+        where: the map's name, for messages.
+
+    Raises:
+        RevisionError: the map has no such revision.
+    """
+    newest = head(connection)
+    if named is None:
+        return newest
+    number = named if isinstance(named, int) else _number(connection, named, newest, where)
+    if not 0 <= number <= newest:
+        told = f" ({named})" if str(named) != str(number) else ""
+        raise RevisionError(f"{where} has revisions 1 to {newest}, not {number}{told}")
+    return number
+
+
+def _number(connection: Connection, named: str, newest: int, where: str) -> int:
+    found = _STEPS.fullmatch(named)
+    assert found is not None  # the expression fits every text
+    base = found["base"]
+    back = int(found["steps"] or 1) if "~" in named else 0
+    if re.fullmatch(r"-?\d{1,18}", base, re.ASCII):
+        return int(base) - back
+    if base.lower() == HEAD:
+        return newest - back
+    known = load_tags(connection)
+    if base not in known:
+        told = f"; its tags: {', '.join(known)}" if known else "; it has no tags"
+        raise RevisionError(
+            f"{where} has no revision named {named!r}: give a number from 1 to {newest}, "
+            f"{HEAD}, or a tag{told}"
+        )
+    return known[base].number - back
+
+
+def checked_tag(name: str) -> str:
+    """A name that a tag may have.
+
+    Raises:
+        InputError: it may not.
+    """
+    if not _TAG.fullmatch(name) or name.lower() == HEAD:
+        raise InputError(
+            f"{name!r} cannot be a tag: a letter, then letters, digits and . _ / + -, 100 at "
+            f"most, and not {HEAD!r}"
+        )
+    return name
+
+
+def write_tag(
+    connection: Connection, keys: KeyBook, name: str, number: int | None, author: str, message: str
+) -> None:
+    """A name for a revision, or with None the name taken away."""
+    row = {
+        "key": keys.next(tags),
+        "name": name,
+        "number": number,
+        "author": checked_text(author, "author"),
+        "message": checked_text(message, "message"),
+        "tagged_ns": time.time_ns(),
+    }
+    connection.execute(insert(tags), [sealed(tags, row)])

@@ -1,0 +1,261 @@
+"""Why the candidates of one frame stand in the order in which they do: `engram explain`."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import ConfigError
+from engram.graph.model import Clock, NodeId, SessionId
+from engram.localiser import Budget, LocalisationStatus
+from engram.ranking import (
+    Foreseen,
+    RankingContext,
+    RankingPolicy,
+    Reasons,
+    check_for_robot,
+    policy_named,
+    reasons_of,
+)
+from engram.robot.live import live_frames
+from engram.robot.opened_map import OpenMap, open_map
+from engram.robot.session import DriveSequence, session_of_drive
+from engram.robot.settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class ExplainOptions:
+    """What is explained.
+
+    Attributes:
+        frame: number of the frame in the drive, from 0.
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each frame, up to this one and in it.
+        relocaliser: key of `RELOCALISERS`; None for none.
+        at: number or tag of the map's revision; None for the newest.
+    """
+
+    frame: int
+    policy: str = "recall"
+    lanes: int = 2
+    rounds: int = 2
+    relocaliser: str | None = "fabmap"
+    at: int | str | None = None
+
+    def __post_init__(self) -> None:
+        check_for_robot(self.policy)
+        if self.frame < 0:
+            raise ConfigError(f"frame is {self.frame}, must be 0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class ExplainedCandidate:
+    """One candidate of the frame.
+
+    Attributes:
+        node, session: which.
+        drive: the session in words: robot and start.
+        distance_m, along_m, across_m, yaw_rad: where the live camera is expected from the node.
+        success_rate: g, how likely a match is at that distance if the appearance is alike.
+        chance: of success, as the policy reckons; None if it reckons no chances.
+        by_turn: whether it stands here because its turn has come, whatever its chance: a robot
+            that has lost its place tries others, too, than those it thinks the best.
+        terms: what the policy's score is made of.
+        attempted: whether the budget reached it.
+        would_match: whether it matched, or would have.
+        inliers: of that match.
+    """
+
+    node: NodeId
+    session: SessionId
+    drive: str
+    distance_m: float
+    along_m: float
+    across_m: float
+    yaw_rad: float
+    success_rate: float
+    chance: float | None
+    by_turn: bool
+    terms: dict[str, float]
+    attempted: bool
+    would_match: bool
+    inliers: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for JSON."""
+        return {
+            "node": str(self.node),
+            "session": str(self.session),
+            "drive": self.drive,
+            "distance_m": self.distance_m,
+            "along_m": self.along_m,
+            "across_m": self.across_m,
+            "yaw_rad": self.yaw_rad,
+            "success_rate": self.success_rate,
+            "chance": self.chance,
+            "by_turn": self.by_turn,
+            "terms": {
+                name: value if math.isfinite(value) else None for name, value in self.terms.items()
+            },
+            "attempted": self.attempted,
+            "would_match": self.would_match,
+            "inliers": self.inliers,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """The order of one frame's candidates, with reasons.
+
+    Attributes:
+        frame: number of the frame.
+        stamp_ns: its stamp.
+        policy: which ordered them.
+        status: how the frame was localised.
+        meaning: what the terms are, one line each.
+        rule: how they make the order; empty where the policy says no more than its name.
+        candidates: best first; none where the robot had no position, or the frame was unusable.
+    """
+
+    frame: int
+    stamp_ns: int
+    policy: str
+    status: LocalisationStatus
+    meaning: dict[str, str] = field(default_factory=dict)
+    rule: str = ""
+    candidates: tuple[ExplainedCandidate, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``explain --json`` prints."""
+        return {
+            "frame": self.frame,
+            "stamp_ns": self.stamp_ns,
+            "policy": self.policy,
+            "status": self.status.value,
+            "meaning": self.meaning,
+            "rule": self.rule,
+            "candidates": [one.to_dict() for one in self.candidates],
+        }
+
+
+class _Watching:
+    """Ranks as another policy does and keeps what it was asked, and what would have matched."""
+
+    def __init__(self, policy: RankingPolicy) -> None:
+        self._policy = policy
+        self.name = policy.name
+        self.watches = False
+        self.asked: tuple[RankingContext, NDArray[np.int64], Reasons, Foreseen] | None = None
+
+    def rank(self, context: RankingContext) -> NDArray[np.int64]:
+        """See `RankingPolicy`."""
+        order = self._policy.rank(context)
+        if self.watches and context.foresee is not None:
+            self.asked = context, order, reasons_of(self._policy, context), context.foresee()
+        return order
+
+
+def explain_frame(
+    map_path: Path, sequence: DriveSequence, settings: Settings, options: ExplainOptions
+) -> Explanation:
+    """Localises a drive up to a frame, and tells why its candidates stand as they do.
+
+    Every candidate of the frame is attempted, to see which would have matched; on the way there
+    only what the budget allows.
+
+    Args:
+        map_path: NAME.engram.
+        sequence: the drive.
+        settings: the resolved configuration.
+        options: which frame, policy and budget.
+
+    Raises:
+        ConfigError: the drive has no such frame, or there is no such policy.
+        MapError: the map cannot be read.
+        SequenceError: the drive's images cannot be used.
+    """
+    watching = _Watching(policy_named(options.policy))
+    with open_map(map_path, options.at) as opened:
+        settings = settings.for_descriptor(opened.descriptor)
+        localiser = opened.localiser(
+            sequence.camera,
+            settings,
+            policy=watching,
+            budget=Budget(options.lanes, options.rounds),
+            relocaliser=options.relocaliser,
+            live=session_of_drive(sequence).id,
+            clock=sequence.info,
+        )
+        with localiser, closing(live_frames(sequence, settings)) as frames:
+            for number, live in enumerate(frames):
+                watching.watches = number == options.frame
+                found = localiser.localise(live.frame, live.odometry)
+                if number == options.frame:
+                    attempted = {outcome.candidate.index for outcome in localiser.outcomes}
+                    return _explained(opened, options, found.status, live.frame.stamp_ns, watching,
+                                      attempted)  # fmt: skip
+    raise ConfigError(f"the drive has no frame {options.frame}; it has {len(sequence)}")
+
+
+def _explained(
+    opened: OpenMap,
+    options: ExplainOptions,
+    status: LocalisationStatus,
+    stamp_ns: int,
+    watching: _Watching,
+    attempted: set[int],
+) -> Explanation:
+    if watching.asked is None:
+        return Explanation(options.frame, stamp_ns, options.policy, status)
+    context, order, reasons, foreseen = watching.asked
+    near, rates = context.neighbourhood, context.success_rates()
+    drives = _drives(opened)
+    candidates = []
+    for row in order.tolist():
+        node = opened.graph.node(int(near.nodes[row]))
+        candidates.append(
+            ExplainedCandidate(
+                node=node.id,
+                session=node.session,
+                drive=drives.get(node.session, "unknown"),
+                distance_m=float(near.distance_m[row]),
+                along_m=float(near.along_m[row]),
+                across_m=float(near.across_m[row]),
+                yaw_rad=float(near.yaw_rad[row]),
+                success_rate=float(rates[row]),
+                chance=None if reasons.chances is None else float(reasons.chances[row]),
+                by_turn=reasons.by_turn is not None and bool(reasons.by_turn[row]),
+                terms={name: float(values[row]) for name, values in reasons.terms.items()},
+                attempted=int(near.nodes[row]) in attempted,
+                would_match=bool(foreseen.accepted[row]),
+                inliers=int(foreseen.inliers[row]),
+            )
+        )
+    return Explanation(
+        options.frame,
+        stamp_ns,
+        options.policy,
+        status,
+        reasons.meaning,
+        reasons.rule,
+        tuple(candidates),
+    )
+
+
+def _drives(opened: OpenMap) -> dict[SessionId, str]:
+    """Each session in words."""
+    words = {}
+    for session in opened.sessions.values():
+        if session.clock is Clock.UTC:
+            began = datetime.fromtimestamp(session.start_ns / 1e9, UTC)
+            words[session.id] = f"{session.robot} {began:%Y-%m-%d %H:%M}"
+        else:
+            words[session.id] = f"{session.robot} {str(session.id)[:8]}"
+    return words

@@ -1,0 +1,138 @@
+"""Recording a drive's frames and odometry as a frame log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from engram.config import config_hash
+from engram.errors import SequenceError
+from engram.frontend import Frame, FrameStatus
+from engram.monitor import ignore
+from engram.odometry import OdometryStatus
+from engram.robot.live import live_frames
+from engram.robot.session import DriveSequence
+from engram.robot.settings import Settings
+from engram.sequences import (
+    FrameLogHeader,
+    FrameLogWriter,
+    ImageSequence,
+    LoggedFrame,
+    first_pair_hash,
+)
+
+
+@dataclass(slots=True)
+class ExtractReport:
+    """What recording a drive came to.
+
+    Attributes:
+        log: the file.
+        frames: frames recorded by this run.
+        already_recorded: frames that an earlier run had recorded.
+        unusable: frames of no use on their own: dark, covered, too few landmarks.
+        without_motion: frames whose odometry failed.
+        skipped: pairs left out under `skip_bad`.
+        bytes: size of the file.
+        interrupted: whether it was stopped; the same command goes on.
+    """
+
+    log: str
+    frames: int = 0
+    already_recorded: int = 0
+    unusable: int = 0
+    without_motion: int = 0
+    skipped: int = 0
+    bytes: int = 0
+    interrupted: bool = False
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``extract --json`` prints."""
+        return asdict(self)
+
+    def text(self) -> str:
+        """For people."""
+        total = self.frames + self.already_recorded
+        line = (
+            f"{total} frames in {self.log}, {self.bytes / max(total, 1) / 1e3:.1f} kB each; "
+            f"{self.unusable} unusable, {self.without_motion} without motion, "
+            f"{self.skipped} pairs skipped"
+        )
+        if self.interrupted:
+            line += "\ninterrupted: what was done is saved; give the same command to go on"
+        return line
+
+
+def extract_log(
+    sequence: DriveSequence,
+    out: Path,
+    settings: Settings,
+    advance: Callable[[str], None] = ignore,
+) -> ExtractReport:
+    """Runs a drive's images through front-end and odometry and records the result.
+
+    An interrupted log is gone on with: odometry depends on what came before, so all frames are
+    run again and those that are recorded already are not written twice. The log of a run that was
+    interrupted is equal to that of one that was not.
+
+    Args:
+        sequence: the drive; images.
+        out: NAME.framelog.
+        settings: of front-end and odometry.
+        advance: called once per frame with a word on how it went.
+
+    Raises:
+        SequenceError: the drive is a frame log already, or its images cannot be used.
+        IncompatibleError: the file is the log of another drive or of other frames.
+        MapError: the log cannot be written; what was recorded is intact.
+    """
+    report = ExtractReport(str(out))
+    header: FrameLogHeader | None = None
+    writer: FrameLogWriter | None = None
+    try:
+        with closing(live_frames(sequence, settings)) as frames:
+            for live in frames:
+                if live.pair is None:
+                    raise SequenceError(f"{sequence.info.name}: is a frame log already")
+                if writer is None:
+                    header = _header(sequence, live.frame, settings)
+                    writer = FrameLogWriter(out, header)
+                _count(report, live.frame.status, live.odometry.status)
+                pair_hash = first_pair_hash(live.pair)
+                if writer.holds(live.frame.stamp_ns, pair_hash):
+                    report.already_recorded += 1
+                    advance("recorded already")
+                    continue
+                writer.append(LoggedFrame(live.frame, live.odometry), pair_hash)
+                report.frames += 1
+                advance(live.odometry.status.value)
+        if writer is None:
+            raise SequenceError(f"{sequence.info.name}: no frame can be read")
+        writer.close(complete=True)
+    except KeyboardInterrupt:
+        report.interrupted = True
+    finally:
+        if writer is not None:
+            writer.close()  # after an error or an interruption: what was done is kept
+    report.skipped = sequence.skipped
+    report.bytes = out.stat().st_size if out.exists() else 0
+    return report
+
+
+def _header(sequence: DriveSequence, frame: Frame, settings: Settings) -> FrameLogHeader:
+    return FrameLogHeader(
+        sequence.info,
+        sequence.camera,
+        frame.descriptor,
+        frame.frontend,
+        config_hash(settings.odometry),
+        str(sequence.frames) if isinstance(sequence, ImageSequence) else "",
+    )
+
+
+def _count(report: ExtractReport, frame: FrameStatus, odometry: OdometryStatus) -> None:
+    report.unusable += frame is not FrameStatus.OK
+    report.without_motion += odometry not in {OdometryStatus.OK, OdometryStatus.FIRST}

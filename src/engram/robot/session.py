@@ -1,0 +1,51 @@
+"""From a path to a drive and its session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from engram.errors import SequenceError
+from engram.graph.model import Session
+from engram.sequences import (
+    FrameLog,
+    ImageSequence,
+    StereoSequence,
+    first_pair_hash,
+    open_sequence,
+    session_of,
+)
+
+DriveSequence: TypeAlias = StereoSequence | FrameLog
+
+
+def open_drive(path: Path, **options: Any) -> ImageSequence | FrameLog:
+    """Opens a drive.
+
+    Args:
+        path: a folder of stereo images, or a frame log.
+        **options: of `open_sequence`.
+
+    Raises:
+        SequenceError: the drive cannot be used.
+        CalibrationError: its calibration cannot.
+        ConfigError: an option is out of range.
+    """
+    return open_sequence(path, **options)
+
+
+def session_of_drive(sequence: DriveSequence) -> Session:
+    """The session of a drive: the same drive read twice is the same session (SPEC §2.7).
+
+    Raises:
+        SequenceError: the drive has no usable frame.
+    """
+    info = sequence.info
+    if isinstance(sequence, FrameLog):
+        return session_of(
+            info, sequence.camera, int(sequence.stamps_ns[0]), sequence.first_pair_hash
+        )
+    first = next(iter(sequence), None)
+    if first is None:
+        raise SequenceError(f"{info.name}: no frame can be used")
+    return session_of(info, sequence.camera, first.stamp_ns, first_pair_hash(first))

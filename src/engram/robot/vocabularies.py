@@ -1,0 +1,226 @@
+"""A map's vocabulary: trained from maps and drives, kept in the map, described."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.config import to_dict
+from engram.errors import IncompatibleError, InputError, MapCorruptError
+from engram.frontend import DescriptorKind, Frame, FrameStatus
+from engram.graph.model import NodeId
+from engram.maps import MapStore
+from engram.places import (
+    TrainingConfig,
+    Vocabulary,
+    decode_vocabulary,
+    default_vocabulary,
+    encode_vocabulary,
+    hash_of,
+    train_vocabulary,
+)
+from engram.places.stored_words import keep_missing_words
+from engram.robot.live import live_frames
+from engram.robot.opened_map import OpenMap
+from engram.robot.session import DriveSequence, open_drive
+from engram.robot.settings import Settings
+
+MAP_SUFFIX = ".engram"
+
+
+@dataclass(frozen=True, slots=True)
+class VocabularyReport:
+    """What a map's vocabulary is.
+
+    Attributes:
+        descriptor: kind of its words.
+        words: their number.
+        images: training frames.
+        hash: 32 hexadecimal digits that name it.
+        trained_on: what it was trained on, in words.
+        default: whether it is the one that ships with the package.
+        revision: number of the revision that brought it; None where nothing was stored.
+    """
+
+    descriptor: str
+    words: int
+    images: int
+    hash: str
+    trained_on: str
+    default: bool
+    revision: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``vocabulary --json`` prints."""
+        found: dict[str, Any] = to_dict(self)
+        return found
+
+    def text(self) -> str:
+        """For people."""
+        whose = "the default vocabulary" if self.default else f"vocabulary {self.hash[:12]}"
+        stored = "" if self.revision is None else f", revision {self.revision}"
+        return (
+            f"{whose}: {self.words} words of {self.descriptor} from {self.images} frames "
+            f"({self.trained_on}){stored}"
+        )
+
+
+def describe_vocabulary(map_path: Path, at: int | str | None = None) -> VocabularyReport:
+    """The vocabulary by which robots find themselves in a map.
+
+    Args:
+        map_path: the map.
+        at: number or tag of its revision; None for the newest.
+
+    Raises:
+        MapError: the map cannot be read, or has no such revision.
+    """
+    with OpenMap(MapStore.open(map_path, at=at)) as opened:
+        own = opened.vocabulary
+        kind = opened.descriptor or DescriptorKind.BRIEF
+        return _report(own or default_vocabulary(kind), default=own is None)
+
+
+def train_map_vocabulary(
+    map_path: Path,
+    sources: Sequence[Path],
+    config: TrainingConfig,
+    *,
+    author: str,
+    advance: Callable[[str, float], None],
+) -> VocabularyReport:
+    """Trains a vocabulary and keeps it in a map, in a revision of its own.
+
+    Args:
+        map_path: the map.
+        sources: maps and drives to train on; the map itself where there are none.
+        config: how it is trained.
+        author: who asked for it.
+        advance: called now and then with what is done and the share of it, 0…1.
+
+    Raises:
+        InputError: too few descriptors for so many words.
+        IncompatibleError: a source has another kind of descriptor than the map.
+        MapError: a map cannot be read, or this one not written.
+    """
+    with MapStore.open(map_path) as store:
+        kind = store.descriptor()
+    frames: list[NDArray[np.uint8]] = []
+    for at, source in enumerate(sources or [map_path]):
+        for frame in _frames(source, kind):
+            kind = kind or frame.descriptor
+            if frame.descriptor is not kind:
+                raise IncompatibleError(
+                    f"{source} has {frame.descriptor} descriptors, the map {kind}; a vocabulary "
+                    "has words of one kind"
+                )
+            frames.append(frame.landmarks.descriptors)
+        advance("read", (at + 1) / max(len(sources), 1))
+    if kind is None:
+        raise InputError(f"{map_path} is empty: map a drive first, or name drives to train on")
+    trained_on = ", ".join(source.name for source in sources or [map_path])
+    vocabulary = train_vocabulary(frames, kind, config, trained_on=trained_on, advance=advance)
+    with MapStore.open_for_writing(map_path) as writable:
+        revision = writable.put_vocabulary(
+            encode_vocabulary(vocabulary),
+            author=author,
+            message=f"vocabulary of {len(vocabulary)} words",
+            configuration={"vocabulary": to_dict(config), "trained_on": trained_on},
+        )
+        keep_missing_words(writable, vocabulary, _node_ids(writable), advance)
+    return _report(vocabulary, default=False, revision=revision.number)
+
+
+def use_vocabulary(
+    map_path: Path,
+    source: Path,
+    *,
+    author: str,
+    advance: Callable[[str, float], None],
+) -> VocabularyReport:
+    """Gives a map the vocabulary of another one, in a revision of its own.
+
+    Maps of a fleet that share a vocabulary share the words of their nodes.
+
+    Args:
+        map_path: the map.
+        source: a map with a vocabulary, or an encoded vocabulary.
+        author: who asked for it.
+        advance: called now and then with what is done and the share of it, 0…1.
+
+    Raises:
+        InputError: the source has no vocabulary of its own.
+        IncompatibleError: its words are of another kind of descriptor than the map's.
+        MapError: a map cannot be read, or this one not written.
+    """
+    vocabulary = _read_vocabulary(source)
+    with MapStore.open_for_writing(map_path) as writable:
+        kind = writable.descriptor()
+        if kind not in {None, vocabulary.descriptor}:
+            raise IncompatibleError(
+                f"the words of {source} are of {vocabulary.descriptor} descriptors, those of "
+                f"{map_path} are {kind}; train a vocabulary for it with engram vocabulary train"
+            )
+        body = encode_vocabulary(vocabulary)
+        if writable.vocabulary() == body:
+            return _report(vocabulary, default=False)
+        revision = writable.put_vocabulary(
+            body,
+            author=author,
+            message=f"vocabulary of {source.name}",
+            configuration={"used": source.name},
+        )
+        keep_missing_words(writable, vocabulary, _node_ids(writable), advance)
+    return _report(vocabulary, default=False, revision=revision.number)
+
+
+def _read_vocabulary(source: Path) -> Vocabulary:
+    if source.suffix != MAP_SUFFIX:
+        try:
+            return decode_vocabulary(source.read_bytes())
+        except OSError as error:
+            raise InputError(f"{source} cannot be read: {error.strerror}") from error
+        except MapCorruptError as error:
+            raise InputError(f"{source}: {error}") from error
+    with MapStore.open(source) as store:
+        body = store.vocabulary()
+    if body is None:
+        raise InputError(
+            f"{source} has no vocabulary of its own; train one with engram vocabulary train"
+        )
+    return decode_vocabulary(body)
+
+
+def _node_ids(store: MapStore) -> list[NodeId]:
+    return [node.id for node in store.load().nodes]
+
+
+def _report(
+    vocabulary: Vocabulary, *, default: bool, revision: int | None = None
+) -> VocabularyReport:
+    return VocabularyReport(
+        descriptor=str(vocabulary.descriptor),
+        words=len(vocabulary),
+        images=vocabulary.statistics.images,
+        hash=hash_of(vocabulary).hex(),
+        trained_on=vocabulary.trained_on,
+        default=default,
+        revision=revision,
+    )
+
+
+def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
+    """The frames of a map's nodes, or those of a drive that are of use."""
+    if source.suffix == MAP_SUFFIX:
+        with MapStore.open(source) as store:
+            return [store.frames.frame(node.id) for node in store.load().nodes]
+    sequence: DriveSequence = open_drive(source)
+    settings = Settings().for_descriptor(kind)
+    with closing(live_frames(sequence, settings)) as live:
+        return [one.frame for one in live if one.frame.status is FrameStatus.OK]

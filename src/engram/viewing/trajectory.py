@@ -1,0 +1,90 @@
+"""A localised drive as one trajectory, for programs that want one (ARCHITECTURE, TUM format).
+
+The map has no global frame. The trajectory's frame is the camera of the first localised node;
+other nodes are placed by the least uncertain chain of edges, and frames that were not localised by
+odometry from the frame before. It is therefore not globally consistent, and its header says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from engram.geometry import SE3
+from engram.graph.graph import ChainTree, ExperienceGraph
+from engram.graph.model import NodeId
+from engram.robot.results import FrameResult
+from engram.sequences.trajectories import Trajectory, write_tum
+
+HEADER = (
+    "timestamp x y z qx qy qz qw; seconds, metres; frame: camera of the first localised node",
+    "chained along the least uncertain edges, gaps by odometry: not globally consistent",
+)
+
+
+def chain_trajectory(
+    graph: ExperienceGraph, results: Sequence[FrameResult]
+) -> list[tuple[int, SE3]]:
+    """Poses of the live camera in the frame of the first localised node.
+
+    Frames before the first localised one, and frames after the motion was lost, are left out
+    until the next match.
+
+    Returns:
+        (stamp_ns, first_from_live) of each placed frame, in the order of time.
+    """
+    placed = _PlacedNodes(graph)
+    trajectory: list[tuple[int, SE3]] = []
+    first_from_live: SE3 | None = None
+    for result in results:
+        found = result.localisation
+        if found.node is not None and found.node_from_live is not None:
+            first_from_node = placed.place(found.node, first_from_live, found.node_from_live)
+            first_from_live = (
+                None if first_from_node is None else first_from_node @ found.node_from_live
+            )
+        elif first_from_live is not None:
+            first_from_live = (
+                None if result.prev_from_curr is None else first_from_live @ result.prev_from_curr
+            )
+        if first_from_live is not None:
+            trajectory.append((found.stamp_ns, first_from_live))
+    return trajectory
+
+
+class _PlacedNodes:
+    """Where nodes stand in the trajectory's frame."""
+
+    def __init__(self, graph: ExperienceGraph) -> None:
+        self._graph = graph
+        self._tree: ChainTree | None = None
+        self._first_from: dict[NodeId, SE3] = {}
+
+    def place(self, node: NodeId, first_from_live: SE3 | None, node_from_live: SE3) -> SE3 | None:
+        """Pose of a node: by the graph, else by where odometry says the live camera is."""
+        if node not in self._first_from:
+            placed = self._by_the_graph(self._graph.index(node))
+            if placed is None and first_from_live is not None:
+                placed = first_from_live @ node_from_live.inverse()
+            if placed is None:
+                return None
+            self._first_from[node] = placed
+        return self._first_from[node]
+
+    def _by_the_graph(self, index: int) -> SE3 | None:
+        if self._tree is None:
+            self._tree = self._graph.chains_from(index)
+        return self._tree.pose(index) if index in self._tree.row_of else None
+
+
+def write_trajectory(path: Path, graph: ExperienceGraph, results: Sequence[FrameResult]) -> None:
+    """Writes a localised drive in TUM format.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    placed = chain_trajectory(graph, results)
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in placed], dtype=np.int64)
+    write_tum(path, Trajectory(stamps_ns, [pose for _, pose in placed]), HEADER)

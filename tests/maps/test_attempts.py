@@ -1,0 +1,127 @@
+"""Packed attempts: small, and right to what is said of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from engram.errors import MapCorruptError
+from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, pack, unpack
+
+
+def table(count: int, seed: int = 0, iterations: int = 2000, nodes: int = 300) -> AttemptTable:
+    rng = np.random.default_rng(seed)
+    columns = {
+        "iteration": np.sort(rng.integers(0, iterations, count)),
+        "reference": rng.integers(1, nodes + 1, count) * 1_000_003,
+        "node": rng.integers(1, nodes + 1, count) * 1_000_003,
+        "along_m": rng.normal(0, 4, count),
+        "across_m": rng.normal(0, 1, count),
+        "yaw_rad": rng.uniform(-np.pi, np.pi, count),
+        "sigma_m": rng.lognormal(-1, 2, count),
+        "sigma_yaw_rad": rng.lognormal(-4, 1, count),
+        "accepted": rng.random(count) < 0.5,
+        "inliers": rng.integers(0, 900, count),
+        "rank": rng.integers(0, 255, count),
+    }
+    kinds = dict(COLUMNS)
+    typed = {name: values.astype(kinds[name]) for name, values in columns.items()}
+    return AttemptTable(typed, rng.integers(0, 3, count).astype(np.int32), ("path", "x", "bandit"))
+
+
+def unpack_all(bodies: list[tuple[int, bytes]]) -> AttemptTable:
+    return concatenate([unpack(body, count) for count, body in bodies])
+
+
+def assert_close(read: AttemptTable, written: AttemptTable) -> None:
+    for name in ("iteration", "reference", "node", "accepted", "inliers", "rank"):
+        np.testing.assert_array_equal(read.columns[name], written.columns[name], err_msg=name)
+    for name in ("along_m", "across_m", "yaw_rad"):  # half precision: 11 bits
+        np.testing.assert_allclose(
+            read.columns[name], written.columns[name], rtol=2**-11, atol=1e-6
+        )
+    for name in ("sigma_m", "sigma_yaw_rad"):  # steps of 2^(1/12): half of one is 2.93 %
+        inside = (written.columns[name] > 0.001) & (written.columns[name] < 1900)
+        np.testing.assert_allclose(
+            read.columns[name][inside], written.columns[name][inside], rtol=0.0294
+        )
+    names = [[one.policies[at] for at in one.policy] for one in (read, written)]
+    assert names[0] == names[1]
+
+
+def test_an_attempt_takes_at_most_20_bytes():
+    # 8 candidates in each of 500 iterations along 300 nodes.
+    bodies = pack(table(4000, iterations=500))
+    assert sum(len(body) for _, body in bodies) / 4000 < 20
+
+
+@given(count=st.integers(1, 400), seed=st.integers(0, 1000))
+@settings(max_examples=30)
+def test_attempts_come_back(count, seed):
+    written = table(count, seed)
+    assert_close(unpack_all(pack(written)), written)
+
+
+@given(seed=st.integers(0, 100))
+@settings(max_examples=10)
+def test_packing_what_was_unpacked_changes_nothing(seed):
+    bodies = pack(table(200, seed))
+    assert pack(unpack_all(bodies)) == bodies
+
+
+def test_the_order_of_policies_is_of_no_account():
+    written = table(200)
+    place = [2, 0, 1]
+    other = replace(
+        written,
+        policy=np.argsort(place).astype(np.int32)[written.policy],
+        policies=tuple(written.policies[at] for at in place),
+    )
+    assert_close(other, written)
+    assert pack(other) == pack(written)
+    assert concatenate([other]).policies == concatenate([written]).policies
+
+
+def test_long_sessions_are_split_where_indices_end():
+    for written in (table(140_000), table(3000, iterations=400_000), table(70_000, nodes=400_000)):
+        bodies = pack(written)
+        assert len(bodies) > 1
+        assert_close(unpack_all(bodies), written)
+
+
+def test_what_is_unknown_or_out_of_range_stays_so():
+    written = table(4)
+    written.columns["along_m"][:] = [np.inf, -np.inf, 1e6, -0.0]
+    written.columns["sigma_m"][:] = [np.inf, 0.0, 1e5, 1e-9]
+    written.columns["rank"][:] = [255, 300, 70_000, 0]
+    written.columns["inliers"][:] = [65_535, 65_536, 0, -1]
+    read = unpack_all(pack(written)).columns
+    np.testing.assert_array_equal(read["along_m"], [np.inf, -np.inf, np.inf, 0])
+    np.testing.assert_array_equal(read["sigma_m"], [np.inf, 0, np.inf, 0])
+    np.testing.assert_array_equal(read["rank"], [255, 255, 255, 0])
+    np.testing.assert_array_equal(read["inliers"], [65_535, 65_535, 0, 0])
+
+
+@given(data=st.data())
+@settings(max_examples=200)
+def test_hostile_bodies_give_attempts_or_a_clear_error(data):
+    ((count, body),) = pack(table(20))
+    broken = bytearray(body)
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(broken) - 1))
+        broken[at] = data.draw(st.integers(0, 255))
+    try:
+        read = unpack(bytes(broken[: data.draw(st.integers(0, len(broken)))]), count)
+    except MapCorruptError:
+        return
+    assert len(read) == count
+
+
+def test_another_count_is_refused():
+    ((count, body),) = pack(table(20))
+    with pytest.raises(MapCorruptError, match="expected"):
+        unpack(body, count + 1)

@@ -1,0 +1,471 @@
+"""A file that is no map, or no longer the one that was written: found, named, never a crash."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import shutil
+import sqlite3
+import threading
+from collections.abc import Callable
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from sqlalchemy import Table
+
+from engram.errors import (
+    EngramError,
+    FormatVersionError,
+    InputError,
+    MapCorruptError,
+    MapError,
+    MapLockedError,
+    NotAMapError,
+    StorageFullError,
+)
+from engram.graph.model import path_id
+from engram.maps import MapStore, sqlite
+from engram.maps.rows import sealed
+from engram.maps.schema import FORMAT_VERSION, edges, nodes, path_entries
+
+from .frames import assert_same_landmarks
+from .maps import Drive, assert_same_edges, begin, session, write_drive
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A map of two committed sessions, and what is in it."""
+    path = tmp_path_factory.mktemp("sound") / "town.engram"
+    drives = []
+    with MapStore.create(path) as store:
+        for name in ("robot-1", "robot-2"):
+            writer = begin(store, session(name))
+            drives.append(write_drive(writer, 3))
+            writer.put_statistics("basin", {"g": [1, 2]})
+            writer.commit()
+    return path, drives
+
+
+@pytest.fixture
+def broken(sound, tmp_path):
+    """A copy to break."""
+    return shutil.copy(sound[0], tmp_path / "broken.engram")
+
+
+def assert_unharmed(path, drives: list[Drive]) -> None:
+    with MapStore.open(path) as store:
+        contents = store.load()
+        assert contents.sessions == tuple(drive.session for drive in drives)
+        assert contents.nodes == tuple(node for drive in drives for node in drive.nodes)
+        assert_same_edges(contents.edges, [edge for drive in drives for edge in drive.edges])
+        assert contents.path_entries == tuple(e for drive in drives for e in drive.entries)
+        assert len(contents.attempts) == sum(len(drive.attempts) for drive in drives)
+        assert len(store.log()) == 2
+        for drive in drives:
+            for node, frame in drive.frames.items():
+                assert_same_landmarks(store.frames.frame(node).landmarks, frame.landmarks)
+
+
+def read_all(path) -> None:
+    with MapStore.open(path) as store:
+        for node in store.load().nodes:
+            store.frames.frame(node.id)
+            store.frames.thumbnail(node.id)
+        store.log()
+        store.info()
+        store.content_hash()
+
+
+def assert_found_or_harmless(path, drives: list[Drive]) -> None:
+    try:
+        report = MapStore.check(path)
+    except MapError:
+        return
+    if report.sound:
+        assert_unharmed(path, drives)
+        return
+    with contextlib.suppress(EngramError):  # any other error is a failure
+        read_all(path)
+
+
+@given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_flipped_bit_anywhere_is_found_or_harmless(sound, tmp_path, where, bit):
+    original, drives = sound
+    content = bytearray(original.read_bytes())
+    content[int(where * len(content))] ^= 1 << bit
+    path = tmp_path / "flipped.engram"
+    path.write_bytes(content)
+    assert_found_or_harmless(path, drives)
+
+
+@given(share=st.floats(0, 1, exclude_max=True))
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_truncated_file_is_found(sound, tmp_path, share):
+    original, _ = sound
+    content = original.read_bytes()
+    path = tmp_path / "cut.engram"
+    path.write_bytes(content[: int(share * len(content))])
+    try:
+        report = MapStore.check(path)
+    except MapError:
+        return
+    assert not report.sound
+
+
+@given(content=st.binary(max_size=300), head=st.sampled_from([0, 16, 100, 4096]))
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_random_bytes_are_no_map(sound, tmp_path, content, head):
+    path = tmp_path / "random.engram"
+    path.write_bytes(sound[0].read_bytes()[:head] + content)
+    with pytest.raises(MapError):
+        MapStore.open(path)
+
+
+def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
+    empty, text, folder = tmp_path / "empty", tmp_path / "text", tmp_path / "folder"
+    empty.touch()
+    text.write_text("not a map, but long enough to have a header" * 5)
+    folder.mkdir()
+    other = tmp_path / "other.sqlite"
+    with sqlite3.connect(other) as connection:
+        connection.execute("CREATE TABLE t (x)")
+    for path, fact in (
+        (tmp_path / "missing", "no such file"),
+        (empty, "empty file"),
+        (text, "no map file"),
+        (folder, "folder"),
+        (other, "no Engram map"),
+    ):
+        for opener in (MapStore.open, MapStore.open_for_writing, MapStore.check):
+            with pytest.raises(NotAMapError, match=fact):
+                opener(path)
+
+
+def test_a_newer_format_is_named(broken):
+    with sqlite3.connect(broken) as connection:
+        connection.execute(f"PRAGMA user_version={FORMAT_VERSION + 1}")
+    connection.close()
+    told = rf"format {FORMAT_VERSION + 1}.*up to {FORMAT_VERSION}"
+    for opener in (MapStore.open, MapStore.open_for_writing, MapStore.check):
+        with pytest.raises(FormatVersionError, match=told):
+            opener(broken)
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE VIEW sneaky AS SELECT 1",
+        "CREATE TRIGGER sneaky AFTER INSERT ON nodes BEGIN DELETE FROM edges; END",
+        "CREATE TABLE sneaky (x)",
+        "DROP TABLE vocabularies",
+        "ALTER TABLE nodes ADD COLUMN sneaky INTEGER",
+        "ALTER TABLE nodes ADD COLUMN sneaky INTEGER AS (key + 1) VIRTUAL",
+    ],
+)
+def test_a_strangers_tables_views_and_triggers_are_refused(broken, statement):
+    with sqlite3.connect(broken) as connection:
+        connection.execute(statement)
+    connection.close()
+    with pytest.raises(MapCorruptError, match=r"sneaky|vocabularies"):
+        MapStore.open(broken)
+
+
+def test_creating_never_replaces_anything(tmp_path, broken):
+    before = broken.read_bytes()
+    with pytest.raises(InputError, match="exists already"):
+        MapStore.create(broken)
+    assert broken.read_bytes() == before
+    with pytest.raises(InputError, match="no folder"):
+        MapStore.create(tmp_path / "nowhere" / "town.engram")
+
+
+def test_a_link_to_a_map_is_the_same_map(tmp_path, broken):
+    link = tmp_path / "link.engram"
+    link.symlink_to(broken)
+    with MapStore.open_for_writing(broken), pytest.raises(MapLockedError):
+        MapStore.open_for_writing(link)
+
+
+def test_a_map_is_made_where_there_are_no_hard_links(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "no hard links")
+
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "town.engram"
+    MapStore.create(path).close()
+    assert MapStore.check(path).problems == ()
+    with pytest.raises(InputError, match="exists already"):
+        MapStore.create(path)
+
+
+def change(path, statement: str, *values: object) -> None:
+    with sqlite3.connect(path) as connection:
+        assert connection.execute(statement, values).rowcount == 1
+    connection.close()
+
+
+def insert_row(path, table: Table, row: dict[str, object]) -> None:
+    sealed(table, row)
+    marks = ", ".join("?" * len(row))
+    names = ", ".join(row)
+    change(path, f"INSERT INTO {table.name} ({names}) VALUES ({marks})", *row.values())
+
+
+def problems(path) -> list[str]:
+    return [str(problem) for problem in MapStore.check(path).problems]
+
+
+class TestCheckNamesTableUuidAndFact:
+    def test_a_flipped_byte_of_a_landmark_blob(self, broken, sound):
+        node = sound[1][0].nodes[1].id
+        change(
+            broken,
+            "UPDATE frames SET landmarks = CAST(substr(landmarks, 1, 99) || x'ff' || "
+            "substr(landmarks, 101) AS BLOB) WHERE node = (SELECT key FROM nodes WHERE uuid = ?)",
+            node.bytes,
+        )
+        (fact, *_) = problems(broken)
+        assert fact == f"frames {node}: does not match its checksum"
+        with MapStore.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
+            store.frames.frame(node)
+
+    def test_a_changed_stamp(self, broken, sound):
+        node = sound[1][1].nodes[2].id
+        change(broken, "UPDATE nodes SET stamp_ns = stamp_ns + 1 WHERE uuid = ?", node.bytes)
+        assert f"nodes {node}: does not match its checksum" in problems(broken)
+        with MapStore.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
+            store.load()
+
+    def test_whoever_meets_damage_is_told_the_map_once(self, broken, sound):
+        node = sound[1][1].nodes[2]
+        with MapStore.open(broken) as store:
+            change(broken, "UPDATE nodes SET stamp_ns = 0 WHERE uuid = ?", node.id.bytes)
+            for read in (
+                store.load,
+                store.content_hash,
+                lambda: store.frames.frame(node.id),
+                lambda: list(store.frames.stored([node])),
+            ):
+                with pytest.raises(MapCorruptError) as raised:
+                    read()
+                assert str(raised.value).startswith(f"{broken.resolve()}: table nodes: {node.id}")
+                assert str(raised.value).count(broken.name) == 1
+
+    def test_a_missing_node(self, broken, sound):
+        node = sound[1][0].nodes[1].id
+        change(broken, "DELETE FROM nodes WHERE uuid = ?", node.bytes)
+        found = problems(broken)
+        first = sound[1][0].nodes[0].id
+        expected = f"edges {first} → row 2 (odometry): its b (row 2 of nodes) is missing"
+        assert expected in found
+        assert any("path_entries" in fact and "is missing" in fact for fact in found)
+        assert "nodes: revision 1 brought 3 rows, 2 are there" in found
+
+    def test_a_missing_frame(self, broken, sound):
+        node = sound[1][0].nodes[1].id
+        change(
+            broken,
+            "DELETE FROM frames WHERE node = (SELECT key FROM nodes WHERE uuid = ?)",
+            node.bytes,
+        )
+        assert f"nodes {node}: its frame is missing" in problems(broken)
+
+    def test_a_missing_session_and_a_missing_camera(self, broken, sound):
+        drive = sound[1][1]
+        change(broken, "DELETE FROM sessions WHERE uuid = ?", drive.session.id.bytes)
+        expected = f"nodes {drive.nodes[0].id}: its session (row 2 of sessions) is missing"
+        assert expected in problems(broken)
+        change(broken, "DELETE FROM cameras")
+        assert any("camera (row 1 of cameras) is missing" in fact for fact in problems(broken))
+
+    def test_a_dangling_edge_with_a_right_checksum(self, broken, sound):
+        insert_row(
+            broken,
+            edges,
+            {
+                "key": 99,
+                "revision": 1,
+                "a": 1,
+                "b": 77,
+                "kind": "match",
+                "a_from_b": bytes(96),
+                "covariance": bytes(168),
+            },
+        )
+        found = problems(broken)
+        name = f"edges {sound[1][0].nodes[0].id} → row 77 (match)"
+        assert f"{name}: its b (row 77 of nodes) is missing" in found
+        assert any(fact.startswith(f"{name}: its rotation is off") for fact in found)
+
+    def test_an_edge_that_is_not_finite(self, broken):
+        row = {
+            "key": 99,
+            "revision": 1,
+            "a": 1,
+            "b": 2,
+            "kind": "match",
+            "a_from_b": b"\xff" * 96,
+            "covariance": bytes(168),
+        }
+        insert_row(broken, edges, row)
+        assert any("(match)" in fact and "not finite" in fact for fact in problems(broken))
+
+    def test_a_reference_into_a_later_revision(self, broken, sound):
+        row = {
+            "key": 99,
+            "revision": 1,
+            "path": 1,
+            "sequence": 50,
+            "node": 5,
+            "kind": "matched",
+            "stamp_ns": 0,
+        }
+        insert_row(broken, path_entries, row)
+        node = sound[1][1].nodes[1].id
+        expected = (
+            f"path_entries {path_id(sound[1][0].session.id)} #50: its node ({node} of nodes) is of "
+            "a revision that is not before its own"
+        )
+        assert expected in problems(broken)
+
+    def test_a_uuid_that_is_none(self, broken):
+        row = {
+            "key": 99,
+            "uuid": b"short",
+            "revision": 1,
+            "session": 1,
+            "camera": 1,
+            "frontend": 1,
+            "stamp_ns": 0,
+            "driven_m": 0.0,
+            "status": "ok",
+            "landmark_hash": bytes(16),
+        }
+        insert_row(broken, nodes, row)
+        assert any("nodes row 99" in fact and "UUID" in fact for fact in problems(broken))
+
+    def test_a_broken_index(self, broken):
+        with sqlite3.connect(broken) as connection:
+            page_bytes = connection.execute("PRAGMA page_size").fetchone()[0]
+            (page,) = connection.execute(
+                "SELECT rootpage FROM sqlite_schema WHERE name = 'sqlite_autoindex_nodes_1'"
+            ).fetchone()
+        connection.close()
+        content = bytearray(broken.read_bytes())
+        content[page * page_bytes - 5] ^= 1
+        broken.write_bytes(content)
+        assert any(fact.startswith("file: ") for fact in problems(broken))
+
+
+def in_a_child_without_rights(work: Callable[[], list[str]]) -> list[str]:
+    """Permissions do not bind root: do the work in a child process that is somebody else."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            if os.geteuid() == 0:
+                os.setgroups([])
+                os.setgid(65534)
+                os.setuid(65534)
+            os.write(write, "\n".join(work()).encode())
+        except BaseException as error:
+            os.write(write, repr(error).encode())
+        finally:
+            os._exit(0)
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        lines = pipe.read().splitlines()
+    os.waitpid(child, 0)
+    return lines
+
+
+def test_a_map_on_read_only_media_is_read(sound, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("media")
+    path = shutil.copy(sound[0], folder / "town.engram")
+    for parent in folder.parents[:3]:
+        if parent.owner() == folder.owner():
+            parent.chmod(0o755)
+    path.chmod(0o444)
+    folder.chmod(0o555)
+
+    def read() -> list[str]:
+        with MapStore.open(path) as store:
+            frames = [store.frames.frame(node.id) for node in store.load().nodes]
+        try:
+            MapStore.open_for_writing(path)
+        except MapError as error:
+            refusal = str(error)
+        return [str(len(frames)), str(MapStore.check(path).problems), refusal]
+
+    count, found, refusal = in_a_child_without_rights(read)
+    assert (count, found) == ("6", "()")
+    assert "read-only" in refusal
+    assert sorted(file.name for file in folder.iterdir()) == ["town.engram"]
+    folder.chmod(0o755)
+
+
+def test_a_map_written_under_a_reader_without_rights_is_no_damaged_one(sound, tmp_path_factory):
+    """SQLite cannot follow what others write from a folder where nothing can be made."""
+    folder = tmp_path_factory.mktemp("shared")
+    path = shutil.copy(sound[0], folder / "town.engram")
+    for parent in folder.parents[:3]:
+        if parent.owner() == folder.owner():
+            parent.chmod(0o755)
+    folder.chmod(0o555)
+    opened, go_on = folder.parent / "opened", folder.parent / "go-on"
+    for pipe in (opened, go_on):
+        os.mkfifo(pipe)
+        pipe.chmod(0o666)
+
+    def write() -> None:
+        opened.read_bytes()
+        folder.chmod(0o755)
+        with MapStore.open_for_writing(path) as store:
+            store.tag("seen", author="tester")
+        folder.chmod(0o555)
+        go_on.write_bytes(b"")
+
+    def read() -> list[str]:
+        with MapStore.open(path) as store:
+            first = len(store.load().nodes)
+            opened.write_bytes(b"")
+            go_on.read_bytes()
+            try:
+                told = str(len(store.load().nodes))
+            except MapError as error:
+                told = f"{type(error).__name__}: {error}"
+        with MapStore.open(path) as store:
+            return [str(first), told, str(len(store.load().nodes))]
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    first, told, again = in_a_child_without_rights(read)
+    writer.join()
+    folder.chmod(0o755)
+    assert (first, again) == ("6", "6")
+    assert told.startswith("MapError: ")
+    assert "was written since it was opened" in told
+
+
+def test_a_map_on_a_full_disk_is_read(sound, tmp_path, monkeypatch):
+    """There is no room for the file in which readers and writers agree."""
+    path = shutil.copy(sound[0], tmp_path / "town.engram")
+    connect = sqlite._connect
+
+    def no_room(uri: str, prepare: object) -> object:
+        if "immutable" in uri or str(path) not in uri:
+            return connect(uri, prepare)
+        error = sqlite3.OperationalError("disk I/O error")
+        error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE
+        raise error
+
+    monkeypatch.setattr(sqlite, "_connect", no_room)
+    with MapStore.open(path) as store:
+        assert len(store.load().nodes) == 6
+    # A log may hold what the file does not have yet.
+    path.with_name("town.engram-wal").write_bytes(b"something")
+    with pytest.raises(StorageFullError, match="cannot grow"):
+        MapStore.open(path)
