@@ -1,10 +1,14 @@
 """Settings: strict at any depth."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
 
+import numpy as np
 import pytest
+from msgspec import Meta
 
-from engram.config import config_hash, load_toml, to_dict
+from engram.config import check_bounds, config_hash, load_toml, plain, to_dict
 from engram.errors import ConfigError
 
 
@@ -44,3 +48,37 @@ def test_hash_changes_with_any_setting_and_only_then() -> None:
 
 def test_round_trip_through_plain_values() -> None:
     assert to_dict(Outer(inner=Inner(size=9)))["inner"] == {"size": 9, "share": 0.5}
+
+
+@dataclass(frozen=True)
+class Bounded:
+    radius_m: Annotated[float, Meta(gt=0, le=100, description="m")] = 8.0
+    most: Annotated[int | None, Meta(ge=1)] = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"radius_m": 0.0}, "bounded: radius_m is 0.0, must be > 0 and <= 100"),
+        ({"radius_m": 101.0}, "must be > 0 and <= 100"),
+        ({"radius_m": float("nan")}, "must be finite"),
+        ({"most": 0}, "most is 0, must be >= 1"),
+    ],
+)
+def test_bounds_declared_with_a_field_are_kept(values, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        Bounded(**values)
+    assert Bounded(radius_m=100.0, most=1).most == 1
+
+
+def test_plain_values_of_what_json_does_not_know() -> None:
+    value = {"path": Path("a/b"), "points": np.eye(2), "worst": float("inf"), "config": Bounded()}
+    assert plain(value) == {
+        "path": "a/b",
+        "points": [[1.0, 0.0], [0.0, 1.0]],
+        "worst": None,
+        "config": {"radius_m": 8.0, "most": None},
+    }

@@ -1,16 +1,25 @@
-"""Settings: TOML text → frozen dataclasses and back. Unknown keys are errors at any depth."""
+"""Settings: TOML text → frozen dataclasses and back. Unknown keys are errors at any depth.
+
+A field says its bounds and what it means where it is declared:
+``Annotated[float, Meta(ge=0, description="search radius, m. Source: [L15] §III")] = 8.0``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
+import math
+import operator
+import os
 import tomllib
 import types
 import typing
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 
 from engram.errors import ConfigError
 
@@ -56,6 +65,69 @@ def _spread(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _spread(one) for key, one in value.items()}
     return value
+
+
+def plain(value: Any) -> Any:
+    """What JSON can say of a value: dataclasses as objects, arrays as lists, ids and paths as text.
+
+    Not-a-number and infinities become None, which JSON knows.
+    """
+    return msgspec.json.decode(_encode(_spread(value)))
+
+
+def _of_other_kinds(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise NotImplementedError(f"{type(value).__name__} has no plain form")
+
+
+_encode = msgspec.json.Encoder(enc_hook=_of_other_kinds).encode
+
+
+def check_bounds(config: Any) -> None:
+    """Checks the fields of a dataclass against the bounds declared with them; for __post_init__.
+
+    Raises:
+        ConfigError: a value is out of its bounds or not a finite number.
+    """
+    kind: type = type(config)
+    hints = _annotations(kind)
+    for one in dataclasses.fields(config):
+        value = getattr(config, one.name)
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"{_prose(kind)}: {one.name} is {value}, must be finite")
+        for bound in getattr(hints[one.name], "__metadata__", ()):
+            if value is not None and (says := _broken(value, bound)):
+                raise ConfigError(f"{_prose(kind)}: {one.name} is {value}, must be {says}")
+
+
+@functools.cache
+def _annotations(kind: type) -> dict[str, Any]:
+    return typing.get_type_hints(kind, include_extras=True)
+
+
+def _prose(kind: type) -> str:
+    """The section that a configuration stands in, as people read it: "mapper" of MapperConfig."""
+    name = kind.__name__.removesuffix("Config").removesuffix("Options")
+    return "".join(f" {c.lower()}" if c.isupper() else c for c in name).strip()
+
+
+def _broken(value: Any, bound: Any) -> str:
+    """What a value must be and is not; empty where it is."""
+    if not isinstance(bound, msgspec.Meta):
+        return ""
+    limits = (
+        (bound.ge, ">=", operator.ge),
+        (bound.gt, ">", operator.gt),
+        (bound.le, "<=", operator.le),
+        (bound.lt, "<", operator.lt),
+    )
+    broken = [(sign, limit) for limit, sign, holds in limits if limit is not None]
+    if all(holds(value, limit) for limit, _, holds in limits if limit is not None):
+        return ""
+    return " and ".join(f"{sign} {limit:g}" for sign, limit in broken)
 
 
 def config_hash(config: Any) -> str:

@@ -1,12 +1,40 @@
-"""Progress and cancelling of long work: Ctrl-C is asked about where nothing is half done."""
+"""Progress and cancelling of long work, and files that are written whole or not at all."""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from pathlib import Path
 from types import FrameType
+from typing import Any
+
+
+class Monitor:
+    """Watches long work and may stop it. This one is silent and never stops anything.
+
+    Work calls `stage` for each of its parts, `advance` once per item of the part, and `check`
+    wherever it can stop with nothing half done.
+    """
+
+    def stage(self, what: str, total: int) -> AbstractContextManager[Monitor]:
+        """A part of the work: its name and how many items it has; yields who hears of them."""
+        del what, total
+        return nullcontext(self)
+
+    def advance(self, word: str = "") -> None:
+        """One item is done; `word` says what became of it."""
+
+    def hear(self, report: Any) -> None:
+        """A part of the result that is there for good, whatever becomes of the rest."""
+
+    def check(self) -> None:
+        """Raises KeyboardInterrupt where the work is to stop."""
+
+
+QUIET = Monitor()
 
 
 @contextmanager
@@ -43,6 +71,23 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
         yield raise_if_asked
     finally:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def write_whole(path: Path) -> Iterator[Path]:
+    """Yields where to write; the file gets its name when the block ends, whole and on the disk.
+
+    An error, or a killed process, leaves what was under the name before. The folder must be there.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield draft
+        with draft.open("rb") as written:
+            os.fsync(written.fileno())
+        draft.replace(path)
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
 
 
 def ignore(word: str) -> None:
