@@ -402,6 +402,21 @@ class TestContentHash:
                 hashes.add(other.content_hash())
         assert len(hashes) == 6
 
+    def test_hashes_of_records_do_not_tell_who_wrote_them_or_how(self, store, tmp_path):
+        writer = begin(store, session())
+        write_drive(writer)
+        writer.commit()
+        found = store.record_hashes()
+        assert set(found) == {"sessions", "nodes", "edges", "paths", "path_entries", "attempts"}
+        for number, (author, count) in enumerate([("else", 5), ("tests", 4)]):
+            with MapStore.create(tmp_path / f"{number}.engram") as other:
+                writer = begin(other, session(), author=author, configuration={"a": number})
+                write_drive(writer, count)
+                writer.commit()
+                same = {name for name, one in other.record_hashes().items() if one == found[name]}
+                assert same == (set(found) if count == 5 else {"sessions", "paths"})
+                assert other.content_hash() != store.content_hash()
+
     def test_the_hash_of_an_old_revision_stays(self, store, location):
         writer = begin(store, session())
         write_drive(writer)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from typing import Any
 
 import msgspec
@@ -58,22 +59,49 @@ def content_hash(connection: Connection, at: int) -> str:
         MapCorruptError: a row is damaged or points at nothing.
     """
     view = View(at)
-    identities = _identities(connection, view)
     digest = hashlib.sha256(_history(connection, view))
-    canonical = {
+    for name, rows in _canonical(connection, view).items():
+        if not rows and name in _IF_ANY:
+            continue
+        for part in _parts(name, rows):
+            digest.update(part)
+    return digest.hexdigest()[:32]
+
+
+def record_hashes(connection: Connection, at: int) -> dict[str, str]:
+    """16 hexadecimal digits for each table that has rows, by its name.
+
+    They cover what `content_hash` covers but for the history: maps of equal records whose
+    revisions tell other authors, messages, versions or configurations are equal here.
+
+    Raises:
+        MapCorruptError: a row is damaged or points at nothing.
+    """
+    found = {}
+    for name, rows in _canonical(connection, View(at)).items():
+        if rows:
+            digest = hashlib.sha256()
+            for part in _parts(name, rows):
+                digest.update(part)
+            found[name] = digest.hexdigest()[:16]
+    return found
+
+
+def _canonical(connection: Connection, view: View) -> dict[str, list[bytes]]:
+    """The rows of each table in canonical order; one for all attempts of a session."""
+    identities = _identities(connection, view)
+    by_key = {
         str(table.name): _canonical_rows(connection, view, table, identities)
         for table in _HASHED
         if table is not hidden
     }
-    canonical[str(hidden.name)] = _hidden_rows(connection, view, identities, canonical)
-    for name, rows in canonical.items():
-        if not rows and name in _IF_ANY:
-            continue
-        canonical_rows = sorted(set(rows.values()))  # attempts: one for all bodies of a session
-        digest.update(_encode([name, len(canonical_rows)]))
-        for row in canonical_rows:
-            digest.update(row)
-    return digest.hexdigest()[:32]
+    by_key[str(hidden.name)] = _hidden_rows(connection, view, identities, by_key)
+    return {name: sorted(set(rows.values())) for name, rows in by_key.items()}
+
+
+def _parts(name: str, rows: list[bytes]) -> Iterator[bytes]:
+    yield _encode([name, len(rows)])
+    yield from rows
 
 
 def _history(connection: Connection, view: View) -> bytes:

@@ -30,7 +30,7 @@ from engram.maps.bulk_writer import BulkWriter
 from engram.maps.checking import check
 from engram.maps.collecting import collect_abandoned
 from engram.maps.committing import change_revision, commit_revision
-from engram.maps.content import content_hash
+from engram.maps.content import content_hash, record_hashes
 from engram.maps.database import Database, Lock
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import (
@@ -320,6 +320,11 @@ class MapStore:
         """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
         with self._database.reading() as connection:
             return content_hash(connection, self._view.at)
+
+    def record_hashes(self) -> dict[str, str]:
+        """16 hexadecimal digits of each table's rows, free of what revisions tell of themselves."""
+        with self._database.reading() as connection:
+            return record_hashes(connection, self._view.at)
 
     @staticmethod
     def copy(source: Path, target: Path) -> None:
