@@ -13,7 +13,7 @@ export ENGRAM_DATA := $(abspath ../shared/data)
 endif
 endif
 
-.PHONY: setup demo test test-long check format clean
+.PHONY: setup demo test test-long goldens check format clean
 
 setup: $(STAMP)
 
@@ -34,6 +34,9 @@ test: setup
 
 test-long: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
+
+goldens: setup
+	$(BIN)/python -m tests.goldens check --all
 
 check: setup
 	$(BIN)/ruff format --check src lab tests

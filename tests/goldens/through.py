@@ -1,0 +1,229 @@
+"""The few calls by which goldens reach Engram; nothing else here imports it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import engram
+from engram import _core
+from engram.bench.data import synthetic_drive
+from engram.cli.simulation import campaigns_folder
+from engram.drive import (
+    DriveSequence,
+    LocaliseOptions,
+    LocaliseRun,
+    MapOptions,
+    Settings,
+    ThereAndBack,
+    map_drive,
+    open_drive,
+    open_map,
+    revert_revision,
+    session_of_drive,
+    simulate,
+)
+from engram.fleet import (
+    BuildOptions,
+    DownloadOptions,
+    MergeOptions,
+    build_map,
+    download,
+    merge_maps,
+    silent,
+)
+from engram.frontend import Frame, Frontend, StereoPair
+from engram.localiser import Budget, Localisation
+from engram.odometry import Odometry
+from engram.simulation.campaigns import campaign_named
+from engram.store import MapStore
+
+Values = dict[str, Any]
+CODE = Path(engram.__file__).parent
+ISA: str = _core.isa
+
+
+def rendered(campaign: str, sessions: list[int]) -> list[Path]:
+    """Frame logs of a campaign's sessions; those that the cache lacks are rendered."""
+    report = simulate(campaign_named(campaign), campaigns_folder(), sessions=sessions)
+    return [Path(file) for file in report.files]
+
+
+def write_street(folder: Path) -> Path:
+    """Twelve pairs of a street of planes, in the plain layout."""
+    pairs = synthetic_drive(frames=12, step_m=0.8)
+    camera = pairs[0].camera
+    for side in ("left", "right"):
+        (folder / side).mkdir(parents=True)
+        for number, pair in enumerate(pairs):
+            cv2.imwrite(str(folder / side / f"{number:06d}.png"), getattr(pair, side))
+    stamps = "".join(f"{number / 10:.6f}\n" for number in range(len(pairs)))
+    (folder / "times.txt").write_text(stamps)
+    names = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
+    lines = ["[rectified]", *(f"{name} = {getattr(camera, name)}" for name in names), ""]
+    (folder / "calibration.toml").write_text("\n".join(lines))
+    return folder
+
+
+def drive(path: Path, **how: Any) -> DriveSequence:
+    return open_drive(path, **how)
+
+
+def session_prefix(path: Path) -> str:
+    """Beginning of the UUID of a drive's session."""
+    return str(session_of_drive(drive(path)).id)[:13]
+
+
+def input_hash(sequence: DriveSequence) -> str:
+    """Of all that is read of a drive: pixels, or what its frame log recorded."""
+    digest = hashlib.sha256()
+    for one in sequence:
+        if isinstance(one, StereoPair):
+            digest.update(one.stamp_ns.to_bytes(8, "little"))
+            digest.update(np.ascontiguousarray(one.left).data)
+            digest.update(np.ascontiguousarray(one.right).data)
+        else:
+            digest.update(one.frame.stamp_ns.to_bytes(8, "little"))
+            digest.update(_landmark_bytes(one.frame))
+            motion = one.odometry.prev_from_curr
+            digest.update(b"-" if motion is None else motion.matrix().tobytes())
+    return digest.hexdigest()[:32]
+
+
+def measured(sequence: DriveSequence) -> Iterator[Values]:
+    """Front-end and odometry over a drive's images, frame by frame."""
+    settings = Settings()
+    frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
+    for pair in sequence:
+        frame = frontend.extract(pair)
+        step = odometry.step(frame)
+        yield {
+            "frame": str(frame.status),
+            "landmarks": len(frame.landmarks),
+            "landmark_bytes": _landmark_bytes(frame),
+            "status": str(step.status),
+            "inliers": step.inliers,
+            "prev_from_curr": None if step.prev_from_curr is None else step.prev_from_curr.matrix(),
+            "covariance": step.covariance,
+        }
+
+
+def map_one(path: Path, sequence: DriveSequence, *, threads: bool, **how: Any) -> list[Values]:
+    """Maps a drive; what was found of each frame."""
+    report = map_drive(path, sequence, Settings(), MapOptions(threads=threads, **how))
+    return [_found(one.localisation, one.prev_from_curr) for one in report.results]
+
+
+def localise(path: Path, sequence: DriveSequence, *, policy: str, threads: bool) -> list[Values]:
+    """Localises a drive by the budget of the command line; what was found of each frame."""
+    settings = Settings()
+    with LocaliseRun(path, sequence, settings, LocaliseOptions(policy=policy)) as run:
+        if not threads:
+            run.localiser.close()
+            run.localiser = run.opened.localiser(
+                sequence.camera,
+                settings,
+                policy=policy,
+                budget=Budget(2, 2),
+                live=session_of_drive(sequence).id,
+                clock=sequence.info,
+                threads=False,
+            )
+        return [_found(one.localisation, one.prev_from_curr) for _, one in run]
+
+
+def live(path: Path, sequence: DriveSequence) -> list[Values]:
+    """The same pair by pair, as a robot that embeds Engram does; its odometry is not shown."""
+    with open_map(path) as opened, opened.robot(sequence.camera) as robot:
+        return [_found(robot.localise(pair), None) for pair in sequence]
+
+
+def merge(centre: Path, *robots: Path) -> list[Values]:
+    """Merges maps into a centre; the counts of each merge."""
+    names = (
+        "sessions", "known", "known_omissions", "taken", "omitted", "edges", "path_entries",
+        "attempts", "match_attempts", "proposed_attempts", "lookups", "components",
+    )  # fmt: skip
+    reports = merge_maps(centre, list(robots), Settings(), MergeOptions())
+    return [{name: getattr(report, name) for name in names} for report in reports]
+
+
+def send(centre: Path, out: Path, **options: Any) -> Values:
+    """Downloads a part of a centre; its counts, and what its nodes promise."""
+    names = (
+        "nodes", "of_nodes", "sessions", "partial_paths", "edges", "bridges", "components",
+        "expected_missed", "copy_missed",
+    )  # fmt: skip
+    report = download(centre, out, DownloadOptions(**options), progress=silent)
+    return {name: getattr(report, name) for name in names}
+
+
+def build(centre: Path, drives: list[Path], *, groups: int, threads: bool) -> Values:
+    """Builds a centre of drives."""
+    options = BuildOptions(workers=1, groups=groups, mapping=MapOptions(threads=threads))
+    report = build_map(centre, [str(path) for path in drives], Settings(), options)
+    return {"groups": [" ".join(names) for names in report.groups]}
+
+
+def revert(path: Path, revision: int) -> Values:
+    """Takes a revision back; how many rows of others went with it."""
+    report = revert_revision(path, revision, author="golden")
+    lost = report.reverted.lost_by_others
+    return {"lost_by_others": {name: count for name, count in sorted(lost.items()) if count}}
+
+
+def contents(path: Path) -> Values:
+    """A map: counts, and hashes of its records by table."""
+    with MapStore.open(path) as store:
+        info = store.info()
+        names = ("revision", "sessions", "nodes", "edges", "path_entries", "attempts")
+        return {
+            "counts": {name: getattr(info, name) for name in names},
+            "mapped_m": info.mapped_m,
+            "records": store.record_hashes(),
+        }
+
+
+def copy_map(source: Path, target: Path) -> None:
+    MapStore.copy(source, target)
+
+
+def robot_over(path: Path, sequence: DriveSequence, frames: int) -> Iterator[object]:
+    """A robot that drives there and back through its map: one result per `next`, for timing."""
+    driven = ThereAndBack(sequence, frames)
+    with open_map(path) as opened, opened.robot(driven.camera) as robot:
+        for pair in driven:
+            yield robot.localise(pair)
+
+
+def _landmark_bytes(frame: Frame) -> bytes:
+    columns = ("pixels", "disparity_px", "disparity_sigma_px", "points_in_cam", "descriptors",
+               "octaves")  # fmt: skip
+    parts = (np.ascontiguousarray(getattr(frame.landmarks, name)) for name in columns)
+    return b"".join(part.tobytes() for part in parts)
+
+
+def _found(found: Localisation, prev_from_curr: Any) -> Values:
+    position = found.position
+    return {
+        "status": str(found.status),
+        "node": None if found.node is None else str(found.node),
+        "inliers": found.inliers,
+        "attempts": found.attempts,
+        "candidates": found.candidates,
+        "proposed": found.proposed,
+        "usable": found.usable,
+        "open_loop_m": found.open_loop_m,
+        "moved_m": found.moved_m,
+        "node_from_live": None if found.node_from_live is None else found.node_from_live.matrix(),
+        "covariance": found.covariance,
+        "position": None
+        if position is None
+        else (str(position.node), position.node_from_live.matrix(), position.covariance),
+        "prev_from_curr": None if prev_from_curr is None else prev_from_curr.matrix(),
+    }
