@@ -126,6 +126,7 @@ def kitti(group: Group) -> None:
     group.live("live-odd", even, path, frames="1::2")
     odd = group.map("map-odd", group.folder / "odd.engram", path, frames="1::2", robot="odd")
     group.merge("merge", group.folder / "centre.engram", even, odd)
+    group.map("map-there-and-back", group.folder / "back.engram", path, there_and_back=101)
 
 
 def raw(group: Group) -> None:
@@ -159,6 +160,7 @@ def hamlet(group: Group) -> None:
     group.localise("localise-afternoon", robot, afternoon)
     other = group.map("map-other", group.folder / "other.engram", afternoon)
     centre = group.merge("merge", group.folder / "centre.engram", robot, other)
+    group.merge("merge-other-way", group.folder / "way.engram", other, robot)
     for policy in ("recall", "path", "path-literal", "distance"):
         group.localise(f"localise-{policy}", centre, later, policy=policy, frames="::3")
     group.send("download-budget", centre, policy="budget", budget_bytes=BUDGET_BYTES)

@@ -35,7 +35,9 @@ def work(frames: int) -> int:
 
 def compare(other: Path, blocks: int, frames: int) -> int:
     """Prints the median ratio of this checkout's blocks to the other's."""
-    here = Path(__file__).parents[2]
+    here, other = Path(__file__).parents[2], other.resolve()
+    if not (other / "tests" / "goldens" / "through.py").exists():
+        raise SystemExit(f"{other}: has no tests/goldens by which its code could be run")
     with ExitStack() as stack:
         ours, theirs = (stack.enter_context(_worker(one, frames)) for one in (here, other))
         _expect(ours, here)
@@ -57,7 +59,7 @@ def compare(other: Path, blocks: int, frames: int) -> int:
 
 
 def _worker(checkout: Path, frames: int) -> subprocess.Popen[str]:
-    sources = [checkout.resolve() / "src", checkout.resolve() / "lab" / "src"]
+    sources = [checkout / "src", checkout / "lab" / "src"]
     return subprocess.Popen(
         [sys.executable, "-m", "tests.goldens", "worker", "--frames", str(frames)],
         cwd=checkout,
@@ -72,7 +74,7 @@ def _expect(worker: subprocess.Popen[str], checkout: Path) -> None:
     """An installed Engram may stand before PYTHONPATH: then both would time the same code."""
     assert worker.stdout is not None
     code = worker.stdout.readline().strip()
-    if not code or not Path(code).is_relative_to(checkout.resolve()):
+    if not code or not Path(code).is_relative_to(checkout):
         raise SystemExit(f"{checkout}: its worker runs the code of {code or 'nothing'}")
 
 
