@@ -31,5 +31,5 @@ attempts and counts are compared exactly, poses to 1e-6, hashes not at all; and 
 Of another checkout, `time` asks for its own ``through.py``: take the commit that brought the
 goldens as the oldest. On a machine that does other things too, ask for more blocks.
 
-``through.py`` alone imports Engram: whoever moves a package follows there.
+``through.py`` alone imports Engram and its lab: whoever moves a package follows there.
 """

@@ -3,45 +3,40 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from platformdirs import user_cache_path
 
 import engram
 from engram import _core
-from engram.bench.data import synthetic_drive
-from engram.cli.simulation import campaigns_folder
-from engram.drive import (
+from engram.fleet.build.building import BuildOptions, build_map
+from engram.fleet.download import DownloadOptions, download
+from engram.fleet.merge import MergeOptions, merge_maps, silent
+from engram.frontend import Frame, Frontend, StereoPair
+from engram.localiser import Budget, Localisation
+from engram.maps import MapStore
+from engram.maps.history import revert_revision
+from engram.odometry import Odometry
+from engram.robot import (
     DriveSequence,
     LocaliseOptions,
     LocaliseRun,
     MapOptions,
     Settings,
-    ThereAndBack,
     map_drive,
     open_drive,
     open_map,
-    revert_revision,
     session_of_drive,
-    simulate,
 )
-from engram.fleet import (
-    BuildOptions,
-    DownloadOptions,
-    MergeOptions,
-    build_map,
-    download,
-    merge_maps,
-    silent,
-)
-from engram.frontend import Frame, Frontend, StereoPair
-from engram.localiser import Budget, Localisation
-from engram.odometry import Odometry
-from engram.simulation.campaigns import campaign_named
-from engram.store import MapStore
+from engram_lab.bench.data import synthetic_drive
+from engram_lab.there_and_back import ThereAndBack
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.simulating import simulate
 
 Values = dict[str, Any]
 CODE = Path(engram.__file__).parent
@@ -50,7 +45,9 @@ ISA: str = _core.isa
 
 def rendered(campaign: str, sessions: list[int]) -> list[Path]:
     """Frame logs of a campaign's sessions; those that the cache lacks are rendered."""
-    report = simulate(campaign_named(campaign), campaigns_folder(), sessions=sessions)
+    named = os.environ.get("ENGRAM_CAMPAIGNS")  # the cache of `engram simulate`
+    folder = Path(named) if named else user_cache_path("engram") / "campaigns"
+    report = simulate(campaign_named(campaign), folder, sessions=sessions)
     return [Path(file) for file in report.files]
 
 
@@ -70,8 +67,10 @@ def write_street(folder: Path) -> Path:
     return folder
 
 
-def drive(path: Path, **how: Any) -> DriveSequence:
-    return open_drive(path, **how)
+def drive(path: Path, there_and_back: int | None = None, **how: Any) -> DriveSequence:
+    """A drive, or so many frames of it there and back again."""
+    sequence = open_drive(path, **how)
+    return sequence if there_and_back is None else ThereAndBack(sequence, there_and_back)
 
 
 def session_prefix(path: Path) -> str:
@@ -193,11 +192,10 @@ def copy_map(source: Path, target: Path) -> None:
     MapStore.copy(source, target)
 
 
-def robot_over(path: Path, sequence: DriveSequence, frames: int) -> Iterator[object]:
-    """A robot that drives there and back through its map: one result per `next`, for timing."""
-    driven = ThereAndBack(sequence, frames)
-    with open_map(path) as opened, opened.robot(driven.camera) as robot:
-        for pair in driven:
+def robot_over(path: Path, sequence: DriveSequence) -> Iterator[object]:
+    """A robot on a drive through its map: one result per `next`, for timing."""
+    with open_map(path) as opened, opened.robot(sequence.camera) as robot:
+        for pair in sequence:
             yield robot.localise(pair)
 
 

@@ -21,7 +21,7 @@ def work(frames: int) -> int:
         path = Path(folder) / "there.engram"
         drive = data(KITTI_06)
         through.map_one(path, through.drive(drive), threads=True)
-        robot = through.robot_over(path, through.drive(drive), 10**6)
+        robot = through.robot_over(path, through.drive(drive, there_and_back=10**6))
         for _ in range(frames):
             next(robot)
         print(through.CODE, flush=True)
