@@ -28,8 +28,8 @@ Bits depend on NumPy, SciPy, OpenCV and on the processor by which they choose th
 ``fingerprint.json`` tells where these goldens were made. Where it differs, statuses, nodes,
 attempts and counts are compared exactly, poses to 1e-6, hashes not at all; and it is said.
 
-Of another checkout, `time` asks for its own ``through.py``: take the commit that brought the
-goldens as the oldest. On a machine that does other things too, ask for more blocks.
+`time` runs each checkout by its own ``through.py``. On a machine that does other things too, ask
+for more blocks.
 
 ``through.py`` alone imports Engram and its lab: whoever moves a package follows there.
 """
