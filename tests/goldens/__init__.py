@@ -14,12 +14,12 @@ Groups of cases, each one JSON file here:
 
 - ``street``: twelve pairs of a street of planes; needs nothing;
 - ``kitti``, ``raw``, ``euroc``: the real clips that ``ENGRAM_DATA`` names;
-- ``hamlet``: three drives through the simulated hamlet. They are rendered once into
+- ``hamlet``: four drives through the simulated hamlet. They are rendered once into
   ``$ENGRAM_CAMPAIGNS`` or the user's cache (about a minute) and kept as frame logs by version of
   the world; logs of another front-end or odometry are refused.
 
-A case holds rows, one per frame, and values. Columns of a row end in four hexadecimal digits of
-SHA-256 where bits are compared: over the float64 matrix of a pose, its covariance, a distance.
+A case holds rows, one per frame, and values. Where bits are compared, a column holds four
+hexadecimal digits of SHA-256: over the float64 matrix of a pose, its covariance, a distance.
 ``pose`` is readable: translation in metres and rotation vector in radians of the live camera in its
 node or of the frame in the one before. Of maps there are counts and `record_hashes`: every row of
 every table, without what a revision tells of itself (author, message, version, configuration).
