@@ -1,10 +1,11 @@
-"""Files that are written whole or not at all."""
+"""Ctrl-C where nothing is half done; files that are written whole or not at all."""
 
+import signal
 from pathlib import Path
 
 import pytest
 
-from engram.monitor import write_whole
+from engram.monitor import QUIET, interruptible, write_whole
 
 
 def test_a_file_gets_its_name_when_it_is_whole(tmp_path: Path) -> None:
@@ -23,3 +24,12 @@ def test_an_error_leaves_what_was_there(tmp_path: Path) -> None:
         (tmp_path / "no folder" / "file").write_text("new")
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_ctrl_c_waits_for_the_next_check() -> None:
+    with interruptible(QUIET) as monitor, monitor.stage("work", 3) as part:
+        part.check()
+        signal.raise_signal(signal.SIGINT)
+        part.advance()
+        with pytest.raises(KeyboardInterrupt):
+            part.check()

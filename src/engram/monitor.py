@@ -74,6 +74,30 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
+def interruptible(monitor: Monitor) -> Iterator[Monitor]:
+    """The same monitor, whose `check` also raises where Ctrl-C was pressed; see above."""
+    with deferred_interrupt() as raise_if_asked:
+        yield _Interruptible(monitor, raise_if_asked)
+
+
+class _Interruptible(Monitor):
+    def __init__(self, monitor: Monitor, raise_if_asked: Callable[[], None]) -> None:
+        self._monitor = monitor
+        self._raise_if_asked = raise_if_asked
+        self.advance = monitor.advance  # type: ignore[method-assign]  # called once per frame
+        self.hear = monitor.hear  # type: ignore[method-assign]
+
+    @contextmanager
+    def stage(self, what: str, total: int) -> Iterator[Monitor]:
+        with self._monitor.stage(what, total) as part:
+            yield _Interruptible(part, self._raise_if_asked)
+
+    def check(self) -> None:
+        self._raise_if_asked()
+        self._monitor.check()
+
+
+@contextmanager
 def write_whole(path: Path) -> Iterator[Path]:
     """Yields where to write; the file gets its name when the block ends, whole and on the disk.
 

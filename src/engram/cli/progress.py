@@ -5,6 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from engram.monitor import Monitor
+
+
+class Bars(Monitor):
+    """Shows a bar for each part of the work."""
+
+    @contextmanager
+    def stage(self, what: str, total: int) -> Iterator[Monitor]:
+        """One bar."""
+        with progress(what, total) as advance:
+            yield _Bar(advance)
+
+
+class _Bar(Monitor):
+    def __init__(self, advance: Callable[[str], None]) -> None:
+        self.advance = advance  # type: ignore[method-assign]
+
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[str], None]]:
