@@ -84,8 +84,12 @@ class _Interruptible(Monitor):
     def __init__(self, monitor: Monitor, raise_if_asked: Callable[[], None]) -> None:
         self._monitor = monitor
         self._raise_if_asked = raise_if_asked
-        self.advance = monitor.advance  # type: ignore[method-assign]  # called once per frame
-        self.hear = monitor.hear  # type: ignore[method-assign]
+
+    def advance(self, word: str = "") -> None:
+        self._monitor.advance(word)
+
+    def hear(self, report: Any) -> None:
+        self._monitor.hear(report)
 
     @contextmanager
     def stage(self, what: str, total: int) -> Iterator[Monitor]:

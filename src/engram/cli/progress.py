@@ -20,7 +20,10 @@ class Bars(Monitor):
 
 class _Bar(Monitor):
     def __init__(self, advance: Callable[[str], None]) -> None:
-        self.advance = advance  # type: ignore[method-assign]
+        self._advance = advance
+
+    def advance(self, word: str = "") -> None:
+        self._advance(word)
 
 
 @contextmanager

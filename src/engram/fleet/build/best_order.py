@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from engram.config import config_hash, to_dict
-from engram.robot import (OpenMap, Settings, open_drive)
+from engram.robot import OpenMap, Settings, open_drive
 from engram.errors import MapError
 from engram.graph.model import Session
 from engram.fleet.merge.docking import merge_maps
@@ -25,7 +25,7 @@ from engram.fleet.build.keeping import keeping
 from engram.fleet.merge.merging import Progress
 from engram.fleet.build.order_results import BestOrder, OrderResult, Spent
 from engram.fleet.merge.replay import MergeOptions
-from engram.measures import (failure_curve, failure_route, route_not_localised)
+from engram.measures import failure_curve, failure_route, route_not_localised
 from engram.maps import MapStore
 from engram.maps.drafts import remove_left_drafts
 

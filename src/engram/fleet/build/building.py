@@ -10,7 +10,7 @@ from typing import Any
 from uuid import UUID
 
 from engram.config import config_hash, to_dict
-from engram.robot import (MapOptions, Settings)
+from engram.robot import MapOptions, Settings
 from engram.monitor import deferred_interrupt
 from engram.errors import ConfigError
 from engram.graph.model import SessionId, path_id

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from engram.robot import (MapOptions, Settings, map_drive, open_drive)
+from engram.robot import MapOptions, Settings, map_drive, open_drive
 from engram.monitor import ignore
 
 from engram.errors import MissingExtraError, SequenceError
-from engram.maps import (MapStore, WritableMapStore)
+from engram.maps import MapStore, WritableMapStore
 
 
 @dataclass(frozen=True, slots=True)

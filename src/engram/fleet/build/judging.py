@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from engram.config import config_hash, to_dict
-from engram.robot import (DriveSequence, OpenMap, Settings, open_drive, session_of_drive)
+from engram.robot import DriveSequence, OpenMap, Settings, open_drive, session_of_drive
 from engram.errors import ConfigError
 from engram.graph.model import Session
 from engram.fleet.merge.gate import GateOptions, held_as
