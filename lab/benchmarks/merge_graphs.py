@@ -39,7 +39,7 @@ from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_by
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeOptions, MergeReport, merge_maps, silent
+from engram.fleet.merge import MergeOptions, MergeReport, merge, silent
 from engram.fleet.merge.attempts import from_records
 from engram.geometry import SE3
 from engram.graph.model import (
@@ -56,7 +56,7 @@ from engram.graph.model import (
     path_id,
 )
 from engram.maps import MapStore
-from engram.robot import OpenMap, Settings
+from engram.robot import OpenMap
 
 OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")
 # Turn about: every match omits; as by default; what other drives rely on is never omitted.
@@ -208,7 +208,7 @@ def shuffled(items, rng: random.Random) -> list:  # noqa: ANN001, any iterable
 
 def merged(centre: Path, robot: Path, seed: int) -> MergeReport:
     options = replace(OPTIONS, sure_inliers=SURE_INLIERS[seed % len(SURE_INLIERS)])
-    return merge_maps(centre, [robot], Settings(), options)[0]
+    return merge(centre, [robot], options)[0]
 
 
 def parts(path: Path) -> tuple[dict[NodeId, int], int]:

@@ -23,11 +23,10 @@ from pathlib import Path
 import numpy as np
 from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_bytes, node_of, stored
 
-from engram.fleet.merge import MergeOptions, merge_maps
+from engram.fleet.merge import merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
 from engram.maps import BulkWriter, MapStore
-from engram.robot import Settings
 
 SESSION_NODES = 500
 LANDMARKS = 100
@@ -81,7 +80,7 @@ def robot_places(nodes: int, centre: int) -> list[range]:
 def merge_once(centre: str, robot: str) -> None:
     """In a process of its own: the merge, then its figures as JSON."""
     started = time.perf_counter()
-    (report,) = merge_maps(Path(centre), [Path(robot)], Settings(), MergeOptions())
+    (report,) = merge(Path(centre), [Path(robot)])
     seconds = time.perf_counter() - started
     used = resource.getrusage(resource.RUSAGE_SELF)
     peak = used.ru_maxrss * 1024

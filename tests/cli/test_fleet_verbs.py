@@ -41,11 +41,11 @@ def failing(monkeypatch):
     """The second map of every merge fails, with this error."""
 
     def fail(error):
-        def merge_maps(centre, robots, *_, told, **__):
-            told(MergeReport(str(robots[0]), "", ["r1"], revision=2, taken=3))
+        def merge(centre, robots, options, monitor, **_):
+            monitor.hear(MergeReport(str(robots[0]), "", ["r1"], revision=2, taken=3))
             raise error
 
-        monkeypatch.setattr("engram.fleet.merge.merge_maps", merge_maps)
+        monkeypatch.setattr("engram.fleet.merge.merge", merge)
 
     return fail
 
@@ -69,7 +69,7 @@ def test_merge_tells_what_stands_where_it_is_stopped_between_two_maps(engram, fa
     ran = engram("merge", tmp_path / "c.engram", "r1.engram", "r2.engram", "--json")
     assert ran.status == 130
     assert [one["revision"] for one in ran.json["merges"]] == [2]
-    assert "stand" in ran.json["error"]["message"]
+    assert "kept" in ran.json["error"]["message"]
 
 
 def test_build_maps_and_merges(engram, street, tmp_path):

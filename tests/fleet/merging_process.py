@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from engram.fleet.merge import merge_maps
+from engram.fleet.merge import merge
 from engram.maps import bulk_writer
-from engram.robot import Settings
 
 from .robots import OPTIONS
 
@@ -15,7 +14,7 @@ from .robots import OPTIONS
 def main(centre: str, robot: str) -> None:
     bulk_writer._BATCH_BYTES = 100_000  # so that a merge is written in several transactions
     print("merging", flush=True)
-    merge_maps(Path(centre), [Path(robot)], Settings(), OPTIONS)
+    merge(Path(centre), [Path(robot)], OPTIONS)
     print("merged", flush=True)
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from tests.mapping_rig import Mapped, map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.fleet.merge import MergeOptions, MergeReport, merge_maps
+from engram.fleet.merge import MergeOptions, MergeReport, merge
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId
-from engram.robot import Settings
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
 
 DAY_NS = 86_400_000_000_000
@@ -40,7 +39,7 @@ def robot_map(
 def merged(
     centre: Path, *robots: Path, asked: MergeOptions = OPTIONS, **options: object
 ) -> list[MergeReport]:
-    return merge_maps(centre, robots, Settings(), asked, **options)
+    return merge(centre, robots, asked, **options)
 
 
 def truth_of(*maps: Mapped) -> dict[NodeId, SE3]:

@@ -80,7 +80,7 @@ def test_verdicts_on_other_maps_or_by_other_judges_are_not_used(
         "groups": ([maps[0], maps[2]], by),
     }
     shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
-    monkeypatch.setattr(best_order, "merge_maps", killed)
+    monkeypatch.setattr(best_order, "merge", killed)
     search(tmp_path, groups, by)
     with pytest.raises(KilledError):
         search(tmp_path, *others[what])
@@ -144,11 +144,11 @@ def test_what_a_search_of_firsts_judged_all_orders_need_not_judge_again(
 
 def test_a_build_that_began_with_the_best_first_goes_on_as_such(tmp_path, logs, monkeypatch):
     centre, by = tmp_path / "centre.engram", judge(logs["held-out"], orders=Orders.FIRST)
-    merge_maps = building.merge_maps
-    monkeypatch.setattr(building, "merge_maps", killed)
+    merge = building.merge
+    monkeypatch.setattr(building, "merge", killed)
     with pytest.raises(KilledError):
         build(centre, logs, "ab", judge=by)
-    monkeypatch.setattr(building, "merge_maps", merge_maps)
+    monkeypatch.setattr(building, "merge", merge)
     with pytest.raises(ConfigError, match="which was found otherwise"):
         build(centre, logs, "ab", judge=judge(logs["held-out"]))
     report = build(centre, logs, "ab", judge=by)
@@ -206,7 +206,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
 
     def meanwhile(*arguments):
         found = best_order.localise_drive(*arguments)
-        building.merge_maps(centre, [maps[1]], Settings(), OPTIONS)
+        building.merge(centre, [maps[1]], OPTIONS)
         return found
 
     with pytest.raises(MapError, match="written to while the orders were tried"):
@@ -218,7 +218,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
 def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch):
     centre = tmp_path / "centre.engram"
     with monkeypatch.context() as patch:
-        patch.setattr(building, "merge_maps", killed)
+        patch.setattr(building, "merge", killed)
         with pytest.raises(KilledError):
             build(centre, logs, "ab", judge=judge(logs["held-out"]))
     for other in (None, judge(logs["other"])):

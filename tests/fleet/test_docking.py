@@ -10,6 +10,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,7 +29,7 @@ from engram.errors import (
     RefusedError,
     SequenceError,
 )
-from engram.fleet.merge import MergeOptions, docking, gate, merge_maps, merging
+from engram.fleet.merge import MergeOptions, gate, merge, merging, steps
 from engram.fleet.merge.gate import check_held_out, what_is_worse
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.frontend import DescriptorKind
@@ -36,9 +37,10 @@ from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
 from engram.maps import MapStore
 from engram.measures import Drive
+from engram.monitor import QUIET, Monitor
 from engram.robot import MapOptions, Settings, map_drive, open_drive, session_of_drive
 
-from .robots import OPTIONS, frame_log, merged, robot_map
+from .robots import frame_log, merged, robot_map
 
 HOUR_NS = 3_600_000_000_000
 OLDER_FORMAT = Path(__file__).parents[1] / "maps" / "data" / "format-2.engram"
@@ -139,6 +141,13 @@ def judged(monkeypatch):
         monkeypatch.setattr("engram.fleet.merge.gate.session_of_drive", lambda sequence: named)
 
     return say
+
+
+class Told(Monitor):
+    """Keeps the reports."""
+
+    def __init__(self, reports: list) -> None:
+        self.hear = reports.append
 
 
 class TestRefused:
@@ -295,7 +304,7 @@ class TestReported:
         bad = damaged(fleet["other"][0], tmp_path / "damaged.engram")
         told = []
         with pytest.raises(MapError):
-            merged(centre, fleet["longer"][0], bad, told=told.append)
+            merged(centre, fleet["longer"][0], bad, monitor=Told(told))
         (report,) = told
         assert (report.source, report.revision) == (str(fleet["longer"][0]), 2)
         assert report.content_hash == hash_of(centre)
@@ -311,7 +320,7 @@ class TestReported:
         again, town = tmp_path / "again.engram", tmp_path / "town.engram"
         robot_map(again, np.arange(0, 24, 0.8), 1, name="r5", day=5)
         apart = MergeOptions(relocaliser=None)
-        merge_maps(town, [fleet["other"][0], again], Settings(), apart)
+        merge(town, [fleet["other"][0], again], apart)
         (report,) = merged(centre, town)
         assert report.omitted
         assert report.taken
@@ -320,7 +329,7 @@ class TestReported:
     def test_a_drive_of_which_a_part_was_not_found(self, tmp_path, centre, fleet):
         mixed = tmp_path / "mixed.engram"
         apart = MergeOptions(relocaliser=None)
-        merge_maps(mixed, [fleet["other"][0], fleet["longer"][0]], Settings(), apart)
+        merge(mixed, [fleet["other"][0], fleet["longer"][0]], apart)
         (report,) = merged(centre, mixed)
         (note,) = [note for note in report.notes if "hang together with nothing" in note]
         assert note.startswith(f"{nodes_in(fleet['other'][0])} of")
@@ -430,7 +439,7 @@ class TestGate:
         judged(WELL, WELL, BADLY)
         maps, told = [fleet["same"][0], fleet["longer"][0]], []
         with pytest.raises(RefusedError) as raised:
-            merged(centre, *maps, require_better=[tmp_path / "held-out"], told=told.append)
+            merged(centre, *maps, require_better=[tmp_path / "held-out"], monitor=Told(told))
         assert str(maps[1]) in str(raised.value)
         assert "held-out localise worse" in str(raised.value)
         assert "as it was before this map" in str(raised.value)
@@ -496,26 +505,18 @@ def test_ctrl_c_ends_a_merge_between_two_nodes_and_the_next_one_completes_it(
     tmp_path, centre, fleet
 ):
     before = hash_of(centre)
-    count = 0
 
-    def interrupted(what, total):
-        from contextlib import contextmanager
+    class Impatient(Monitor):
+        count = 0
 
-        @contextmanager
-        def shown():
-            def advance(word):
-                nonlocal count
-                count += 1
-                if count == 5:
-                    signal.raise_signal(signal.SIGINT)
+        def advance(self, word=""):
+            self.count += 1
+            if self.count == 5:
+                signal.raise_signal(signal.SIGINT)
 
-            yield advance
-
-        return shown()
-
-    (report,) = merge_maps(centre, [fleet["longer"][0]], Settings(), OPTIONS, progress=interrupted)
+    (report,) = merged(centre, fleet["longer"][0], monitor=(impatient := Impatient()))
     assert report.interrupted
-    assert count == 5
+    assert impatient.count == 5
     assert hash_of(centre) == before
     whole = tmp_path / "whole.engram"
     expected = merged(whole, fleet["first"][0], fleet["longer"][0])[-1].content_hash
@@ -548,24 +549,28 @@ class TestInterrupted:
 
         return press_at
 
-    def test_at_the_gate_between_two_frames(self, monkeypatch, centre, fleet, held_out):
-        before, frames, really = hash_of(centre), 0, docking.Gate.__call__
+    def test_at_the_gate_between_two_frames(self, centre, fleet, held_out):
+        before = hash_of(centre)
 
-        def judged(judge, store, robot, advance):
-            def pressing(word):
-                nonlocal frames
-                frames += 1
-                if frames == 3:
+        class Impatient(Monitor):
+            """Counts frames, and nodes not: those are of a stage."""
+
+            frames = 0
+
+            def stage(self, what, total):
+                return nullcontext(QUIET)
+
+            def advance(self, word=""):
+                self.frames += 1
+                if self.frames == self.at:
                     signal.raise_signal(signal.SIGINT)
-                advance(word)
 
-            return really(judge, store, robot, pressing)
-
-        monkeypatch.setattr(docking.Gate, "__call__", judged)
+        impatient = Impatient()
+        impatient.at = len(open_drive(held_out)) + 3  # all before the first merge
         maps = [fleet[name][0] for name in ("same", "longer")]
-        (report,) = merged(centre, *maps, require_better=[held_out])
+        (report,) = merged(centre, *maps, require_better=[held_out], monitor=impatient)
         assert report.interrupted
-        assert frames == 3
+        assert impatient.frames == impatient.at
         assert hash_of(centre) == report.content_hash == before
         assert MapStore.check(centre).problems == ()
 
@@ -578,26 +583,26 @@ class TestInterrupted:
 
     def test_before_the_first_merge(self, centre, fleet, held_out, pressed):
         before, told = hash_of(centre), []
-        pressed(docking.Gate, "look_at")
+        pressed(merging.Gate, "look_at")
         with pytest.raises(KeyboardInterrupt):
-            merged(centre, fleet["longer"][0], require_better=[held_out], told=told.append)
+            merged(centre, fleet["longer"][0], require_better=[held_out], monitor=Told(told))
         assert told == []
         assert hash_of(centre) == before
 
     def test_when_all_nodes_were_looked_at(self, centre, fleet, pressed):
         before = hash_of(centre)
-        pressed(merging._Merging, "_carry_attempts")
+        pressed(steps._Merging, "_carry_attempts")
         (report,) = merged(centre, fleet["longer"][0])
         assert report.interrupted
         assert hash_of(centre) == before
 
     def test_in_a_map_with_nothing_new(self, centre, fleet, pressed):
-        pressed(merging, "notes")
+        pressed(steps, "notes")
         (report,) = merged(centre, fleet["first"][0], fleet["longer"][0])
         assert report.interrupted
 
     def test_when_a_merge_was_done_the_next_one_is_not_begun(self, centre, fleet, pressed):
-        pressed(merging.BulkWriter, "commit")
+        pressed(steps.BulkWriter, "commit")
         maps = [fleet[name][0] for name in ("other", "longer")]
         done, stopped = merged(centre, *maps)
         assert (done.interrupted, done.revision) == (False, 2)
@@ -607,9 +612,9 @@ class TestInterrupted:
 
     def test_when_the_last_merge_was_done_whoever_called_hears_of_it(self, centre, fleet, pressed):
         told = []
-        pressed(merging.BulkWriter, "commit")
+        pressed(steps.BulkWriter, "commit")
         with pytest.raises(KeyboardInterrupt):
-            merged(centre, fleet["longer"][0], told=told.append)
+            merged(centre, fleet["longer"][0], monitor=Told(told))
         assert [report.revision for report in told] == [2]
         assert hash_of(centre) == told[0].content_hash
 
@@ -676,7 +681,5 @@ def test_a_centre_with_an_interrupted_session_of_that_robot_says_so(tmp_path, fl
 
 def test_an_unknown_policy_is_refused_before_anything_is_made(tmp_path, fleet):
     with pytest.raises(InputError, match="nonsense"):
-        merge_maps(
-            tmp_path / "c.engram", [fleet["first"][0]], Settings(), MergeOptions(policy="nonsense")
-        )
+        merge(tmp_path / "c.engram", [fleet["first"][0]], MergeOptions(policy="nonsense"))
     assert not (tmp_path / "c.engram").exists()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeOptions, MergeReport, merge_maps, silent
+from engram.fleet.merge import MergeReport, silent
+from engram.fleet.merge import merge as merge_maps
 from engram.graph.model import NodeId, Omission
 from engram.maps import MapStore
 from engram.robot import (
@@ -38,7 +39,7 @@ def robot_map(folder: Path, robot: str, drive: Path, **how: str) -> Path:
 
 
 def merge(centre: Path, *robots: Path) -> list[MergeReport]:
-    return merge_maps(centre, list(robots), Settings(), MergeOptions())
+    return merge_maps(centre, list(robots))
 
 
 def stamps_of(*maps: Path) -> dict[NodeId, int]:

@@ -81,7 +81,7 @@ def test_a_build_killed_after_the_first_copy_comes_to_the_same_map(
 ):
     centre = tmp_path / "centre.engram"
     with monkeypatch.context() as patch:
-        patch.setattr(building, "merge_maps", killed)
+        patch.setattr(building, "merge", killed)
         with pytest.raises(KilledError):
             build(centre, logs, "ab")
     assert sessions_of(centre) == {session(logs["a"])}
@@ -153,7 +153,7 @@ def test_maps_that_were_kept_and_are_nowhere_else_are_not_removed(begun, logs):
 
 def test_a_build_that_left_drives_out_wants_the_centre_that_has_them(begun, logs, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(building, "merge_maps", killed)
+        patch.setattr(building, "merge", killed)
         with pytest.raises(KilledError):
             build(begun, logs, "abc", groups=1)
     begun.unlink()

@@ -16,7 +16,8 @@ import engram
 from engram import _core
 from engram.fleet.build.building import BuildOptions, build_map
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeOptions, merge_maps, silent
+from engram.fleet.merge import merge as merge_maps
+from engram.fleet.merge import silent
 from engram.frontend import Frame, Frontend, StereoPair
 from engram.localiser import Budget, Localisation
 from engram.maps import MapStore
@@ -148,7 +149,7 @@ def merge(centre: Path, *robots: Path) -> list[Values]:
         "sessions", "known", "known_omissions", "taken", "omitted", "edges", "path_entries",
         "attempts", "match_attempts", "proposed_attempts", "lookups", "components",
     )  # fmt: skip
-    reports = merge_maps(centre, list(robots), Settings(), MergeOptions())
+    reports = merge_maps(centre, list(robots))
     return [{name: getattr(report, name) for name in names} for report in reports]
 
 

@@ -65,12 +65,12 @@ def merge(
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
-    """Merge what robots have seen and the centre is lacking into the centre.
+    """Merge robots' maps into the fleet map, adding only what it lacks.
 
-    Every map handed in is one revision, whole or not at all. Nodes that the centre has are not
-    taken again; the others are replayed as if they were a live drive, and only those that do not
-    localise are taken, or barely do and other drives rely on them. The same map handed in twice
-    changes nothing. Where a later map fails, the merges before it stand, and are told of.
+    Each robot's map becomes one revision, or none. Its new nodes are replayed like a live drive:
+    what localises is already covered; what does not is added, and so is what barely does and other
+    drives rely on. Merging the same map twice changes nothing. If a later map fails, earlier merges
+    are kept and reported.
 
     \b
     Examples:
@@ -78,8 +78,9 @@ def merge(
       engram merge centre.engram r1.engram --dry-run --picture merge.png
       engram merge centre.engram r1.engram --require-better held-out.framelog
     """
-    from engram.cli.progress import progress
-    from engram.fleet.merge import MergeOptions, merge_maps
+    from engram.cli.progress import Bars
+    from engram.fleet.merge import MergeOptions
+    from engram.fleet.merge import merge as merge_maps
     from engram.robot import load_settings
 
     asked = MergeOptions(
@@ -92,29 +93,29 @@ def merge(
     )
     reports: list[MergeReport] = []
 
-    def tell(report: MergeReport) -> None:
-        reports.append(report)
-        if not as_json:
-            typer.echo(report.text())
+    class Told(Bars):
+        def hear(self, report: MergeReport) -> None:
+            reports.append(report)
+            if not as_json:
+                typer.echo(report.text())
 
     try:
         merge_maps(
             centre,
             robots,
-            load_settings(config),
             asked,
+            Told(),
+            settings=load_settings(config),
             dry_run=dry_run,
             require_better=require_better or (),
             picture=picture,
-            progress=progress,
-            told=tell,
         )
     except EngramError as error:
         raise PartlyDoneError(error, _told(reports)) from error
     except KeyboardInterrupt:
         if not reports:
             raise
-        stopped = VerbInterruptedError("interrupted; the merges told of stand")
+        stopped = VerbInterruptedError("interrupted; the merges reported are kept")
         raise PartlyDoneError(stopped, _told(reports)) from None
     if as_json:
         print(json.dumps(_told(reports)))

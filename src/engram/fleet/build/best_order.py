@@ -18,11 +18,10 @@ from engram.config import config_hash, to_dict
 from engram.robot import OpenMap, Settings, open_drive
 from engram.errors import MapError
 from engram.graph.model import Session
-from engram.fleet.merge.docking import merge_maps
 from engram.fleet.merge.gate import localise_drive
 from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
 from engram.fleet.build.keeping import keeping
-from engram.fleet.merge.merging import Progress
+from engram.fleet.merge.merging import Progress, merge
 from engram.fleet.build.order_results import BestOrder, OrderResult, Spent
 from engram.fleet.merge.replay import MergeOptions
 from engram.measures import failure_curve, failure_route, route_not_localised
@@ -171,7 +170,7 @@ class _Search:
 
     def _merge(self, place: Path, added: Path) -> dict[str, Any]:
         started = time.perf_counter()
-        (report,) = merge_maps(place, [added], self._settings, self._merging)
+        (report,) = merge(place, [added], self._merging, settings=self._settings)
         if report.interrupted:
             raise KeyboardInterrupt
         return {

@@ -16,11 +16,10 @@ from engram.errors import ConfigError
 from engram.graph.model import SessionId, path_id
 from engram.fleet.build.best_order import find_best_order
 from engram.fleet.build.cluster import check_scheduler, map_groups_on_cluster
-from engram.fleet.merge.docking import merge_maps
 from engram.fleet.build.group_mapping import GroupResult, GroupTask, fetched
 from engram.fleet.build.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
-from engram.fleet.merge.merging import Progress, silent
+from engram.fleet.merge.merging import Progress, Shown, merge, silent
 from engram.fleet.build.order_costs import order_costs
 from engram.fleet.build.order_results import BestOrder
 from engram.fleet.merge.replay import MergeOptions
@@ -407,8 +406,12 @@ def _merge(
         MapStore.copy(scratch.group(order[0]), scratch.centre)
         order = order[1:]
     for number in order:
-        report.merges += merge_maps(
-            scratch.centre, [scratch.group(number)], settings, options.merging, progress=progress
+        report.merges += merge(
+            scratch.centre,
+            [scratch.group(number)],
+            options.merging,
+            Shown(progress),
+            settings=settings,
         )
         if report.merges[-1].interrupted:
             report.interrupted = True

@@ -1,9 +1,8 @@
 """Merging robots' maps into the fleet's."""
 
-from engram.fleet.merge.docking import merge_maps
 from engram.fleet.merge.gate import Gate, GateOptions, what_is_worse
 from engram.fleet.merge.handed_in import HandedIn
-from engram.fleet.merge.merging import Progress, merge_map, silent
+from engram.fleet.merge.merging import Progress, merge, silent
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment, string_segments
@@ -20,8 +19,7 @@ __all__ = [
     "Seed",
     "Segment",
     "SegmentReport",
-    "merge_map",
-    "merge_maps",
+    "merge",
     "silent",
     "string_segments",
     "what_is_worse",

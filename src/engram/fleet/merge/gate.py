@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from engram.graph.model import Session, session_id
 from engram.localiser import Budget, Localisation
 from engram.maps import MapStore
 from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
-from engram.monitor import ignore
+from engram.monitor import QUIET, Monitor
 from engram.robot import OpenMap, Settings, live_frames, measured, open_drive, session_of_drive
 from engram.robot.session import DriveSequence
 from engram.sequences import FrameLog, first_pair_hash
@@ -136,30 +136,24 @@ class Gate:
         drives = zip(self._paths, self._sequences, strict=True)
         check_held_out(drives, sessions, where, "--require-better")
 
-    def look_at(self, store: MapStore, advance: Callable[[str], None] = ignore) -> None:
-        """The centre as it is; once, before the first merge.
+    def look_at(self, centre: Path, monitor: Monitor) -> None:
+        """The centre as it is; once, before the first merge."""
+        with MapStore.open(centre) as store:
+            self._before = self._localise(store, monitor)
 
-        Args:
-            store: the centre.
-            advance: called once for each frame.
-        """
-        self._before = self._localise(store, advance)
-
-    def __call__(
-        self, store: MapStore, robot: str, advance: Callable[[str], None] = ignore
-    ) -> HeldOutReport:
+    def __call__(self, store: MapStore, robot: str, monitor: Monitor) -> HeldOutReport:
         """The centre as it would become.
 
         Args:
             store: with what is being merged.
             robot: name of the map that is.
-            advance: called once for each frame.
+            monitor: is asked between two frames whether to go on.
 
         Raises:
             RefusedError: the drives localise worse in it.
         """
         assert self._before is not None
-        before, after = self._before, self._localise(store, advance)
+        before, after = self._before, self._localise(store, monitor)
         names = [path.name for path in self._paths]
         worse = what_is_worse(after, before)
         if worse:
@@ -170,10 +164,10 @@ class Gate:
         self._before = after
         return HeldOutReport(names, _figures(before), _figures(after))
 
-    def _localise(self, store: MapStore, advance: Callable[[str], None]) -> list[Drive]:
+    def _localise(self, store: MapStore, monitor: Monitor) -> list[Drive]:
         opened = OpenMap(store)
         return [
-            localise_drive(opened, one, self._settings, self._options, advance)
+            localise_drive(opened, one, self._settings, self._options, monitor)
             for one in self._sequences
         ]
 
@@ -183,7 +177,7 @@ def localise_drive(
     sequence: DriveSequence,
     settings: Settings,
     options: GateOptions,
-    advance: Callable[[str], None] = ignore,
+    monitor: Monitor = QUIET,
 ) -> Drive:
     """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
     settings = settings.for_descriptor(opened.descriptor)
@@ -200,7 +194,8 @@ def localise_drive(
     with localiser, closing(live_frames(sequence, settings)) as frames:
         for live in frames:
             found.append(localiser.localise(live.frame, live.odometry))
-            advance(found[-1].status.value)
+            monitor.advance(found[-1].status.value)
+            monitor.check()
     return measured(found)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -40,6 +40,7 @@ from engram.localiser import (
 from engram.localiser.attempts import Outcome
 from engram.mapper import match_edges
 from engram.maps import BulkWriter, StoredNode
+from engram.monitor import Monitor
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import check_for_robot, policy_named
 from engram.robot import Settings
@@ -98,7 +99,7 @@ class Replay:
         settings: of localiser and mapper.
         options: policy and budget.
         relocaliser: shared by all segments.
-        advance: called once for each node with a word on what became of it.
+        monitor: hears of each node what became of it, and is asked behind each whether to go on.
 
     Attributes:
         edges: how many were written.
@@ -117,7 +118,7 @@ class Replay:
         settings: Settings,
         options: MergeOptions,
         relocaliser: Relocaliser | None,
-        advance: Callable[[str], None],
+        monitor: Monitor,
     ) -> None:
         self.edges = 0
         self.match_attempts = 0
@@ -131,7 +132,7 @@ class Replay:
         self._settings = settings
         self._options = options
         self._relocaliser = relocaliser
-        self._advance = advance
+        self._monitor = monitor
         self._taken: set[NodeId] = set()
         self._parts = Parts()
         self._run: list[int] = []  # nodes taken one after another, by their dense indices
@@ -175,7 +176,8 @@ class Replay:
                 self.match_attempts += found.attempts
                 self.proposed_attempts += found.proposed
                 self.lookups += "places" in found.stage_ms
-                self._advance("taken" if reason else "omitted")
+                self._monitor.advance("added" if reason else "covered")
+                self._monitor.check()
             self._end_run()
             self._remember(session, localiser)
         return report

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, DownloadReport, download
-from engram.fleet.merge import merge_maps, silent
+from engram.fleet.merge import merge as merge_maps
+from engram.fleet.merge import silent
 from engram.frontend.matching import matcher_hash
 from engram.graph.clock import hour_of_day
 from engram.graph.model import path_id
@@ -107,8 +108,8 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
     (report,) = merge_maps(
         draft,
         [map_path(plan, arm, fold, robot)],
-        plan.settings,
         arm.merging(plan.options.relocaliser),
+        settings=plan.settings,
     )
     if report.interrupted:
         raise KeyboardInterrupt
