@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 
 from engram.config import config_hash, to_dict
-from engram.robot import OpenMap, Settings, open_drive
 from engram.errors import MapError
-from engram.graph.model import Session
-from engram.fleet.merge.gate import localise_drive
 from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
 from engram.fleet.build.keeping import keeping
-from engram.fleet.merge.merging import Progress, merge
 from engram.fleet.build.order_results import BestOrder, OrderResult, Spent
+from engram.fleet.merge.gate import localise_drive
+from engram.fleet.merge.merging import Progress, merge
 from engram.fleet.merge.replay import MergeOptions
-from engram.measures import failure_curve, failure_route, route_not_localised
+from engram.graph.model import Session
 from engram.maps import MapStore
 from engram.maps.drafts import remove_left_drafts
+from engram.measures import failure_curve, failure_route, route_not_localised
+from engram.robot import OpenMap, Settings, open_drive
 
 # [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
 _AREA_TO_M = 50.0

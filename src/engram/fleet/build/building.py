@@ -10,24 +10,24 @@ from typing import Any
 from uuid import UUID
 
 from engram.config import config_hash, to_dict
-from engram.robot import MapOptions, Settings
-from engram.monitor import deferred_interrupt
 from engram.errors import ConfigError
-from engram.graph.model import SessionId, path_id
 from engram.fleet.build.best_order import find_best_order
 from engram.fleet.build.cluster import check_scheduler, map_groups_on_cluster
 from engram.fleet.build.group_mapping import GroupResult, GroupTask, fetched
 from engram.fleet.build.grouping import Drive, group_drives, look_at_drive
 from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
-from engram.fleet.merge.merging import Progress, Shown, merge, silent
 from engram.fleet.build.order_costs import order_costs
 from engram.fleet.build.order_results import BestOrder
-from engram.fleet.merge.replay import MergeOptions
-from engram.fleet.merge.report import MergeReport
 from engram.fleet.build.scratch import BuildPlan, MergingBegun, Scratch, sole_builder
 from engram.fleet.build.workers import map_groups
+from engram.fleet.merge.merging import Progress, Shown, merge, silent
+from engram.fleet.merge.replay import MergeOptions
+from engram.fleet.merge.report import MergeReport
+from engram.graph.model import SessionId, path_id
 from engram.maps import MapStore
 from engram.maps.drafts import check_parent
+from engram.monitor import deferred_interrupt
+from engram.robot import MapOptions, Settings
 
 
 @dataclass(frozen=True, slots=True)
