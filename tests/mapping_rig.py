@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from tests.synthetic_world import Seen
 
+from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Session, session_id
-from engram.localiser import Budget, Localisation
+from engram.localiser import Budget, Localisation, Localiser
 from engram.mapper import Mapper, MappingStep, Saver
 from engram.maps import MapStore
+from engram.odometry import GapFiller, Motion
 from engram.robot import OpenMap, Settings
 from engram.robot.mapping import loop_search
 
@@ -89,11 +92,27 @@ def map_simulated(
             searching = loop_search(opened, localiser, Settings())
         with localiser, searching as loops:
             mapper = Mapper(opened.graph, localiser, saver, session, loops=loops)
-            steps = [mapper.process(seen.frame, seen.odometry) for seen in drive]
+            steps = [mapper.process(frame, motion) for frame, motion in moving(drive)]
             mapper.finish()
         saver.finish()
         writer.commit()
     return Mapped(steps, drive)
+
+
+def moving(drive: Iterable[Seen]) -> Iterator[tuple[Frame, Motion]]:
+    """Frames with their motion, gaps filled."""
+    gaps = GapFiller()
+    for seen in drive:
+        yield seen.frame, gaps.motion(seen.odometry, seen.frame.stamp_ns)
+
+
+def localised(localiser: Localiser, drive: Iterable[Seen]) -> list[Localisation]:
+    """What a localiser finds of frames, one after another."""
+    found = []
+    for frame, motion in moving(drive):
+        localiser.move(motion)
+        found.append(localiser.localise(frame))
+    return found
 
 
 def localise_simulated(
@@ -112,7 +131,7 @@ def localise_simulated(
             relocaliser=relocaliser,
         )
         with localiser:
-            return [localiser.localise(seen.frame, seen.odometry) for seen in drive]
+            return localised(localiser, drive)
 
 
 def errors_m(found: list[Localisation], drive: list[Seen], nodes: dict[NodeId, SE3]) -> np.ndarray:

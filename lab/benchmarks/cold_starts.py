@@ -38,7 +38,7 @@ from engram.localiser import (
     LocaliserConfig,
     Relocaliser,
 )
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
 from engram.robot import MapOptions, OpenMap, Settings, map_drive, open_drive, open_map
 from engram.robot.session import session_of_drive
@@ -215,11 +215,14 @@ def cold_start(
         basin=MatchBasin.of(drive.camera.fx, opened.attempts),
         live=drive.session,
     ) as localiser:
+        gaps = GapFiller()
         for at in range(first, len(drive.frames)):
             odometry = drive.frames[at].odometry
             if at == first:
                 odometry = OdometryStep(OdometryStatus.FIRST)
-            found = localiser.localise(drive.frames[at].frame, odometry)
+            live = drive.frames[at].frame
+            localiser.move(gaps.motion(odometry, live.stamp_ns))
+            found = localiser.localise(live)
             attempts += found.attempts
             driven_m = localiser.driven_m
             if found.node is not None and found.node_from_live is not None:

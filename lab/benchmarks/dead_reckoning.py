@@ -46,15 +46,16 @@ def ways(drive: EvaluatedDrive, length: int) -> Iterator[tuple[float, float, flo
     truth = drive.truth()
     if truth is None:
         return
-    gaps, motions, poses = GapFiller(), list[Motion | None](), list[SE3 | None]()
+    gaps, motions, poses = GapFiller(), list[Motion](), list[SE3 | None]()
     for logged in drive.frames():
         motions.append(gaps.motion(logged.odometry, logged.frame.stamp_ns))
         poses.append(truth.at(logged.frame.stamp_ns))
     for start in range(0, len(poses) - length, EVERY):
         end = start + length
-        if motions[end] is None or (start > 0 and motions[start] is None):
+        spanned = motions[end].prev_from_curr is None
+        if spanned or (start > 0 and motions[start].prev_from_curr is None):
             continue  # a frame of no use: the next step spans it
-        steps = [one for one in motions[start + 1 : end + 1] if one is not None]
+        steps = motions[start + 1 : end + 1]
         world_from_start, world_from_end = poses[start], poses[end]
         if world_from_start is None or world_from_end is None:
             continue
@@ -62,7 +63,8 @@ def ways(drive: EvaluatedDrive, length: int) -> Iterator[tuple[float, float, flo
             continue  # the robot counts as lost
         there = Position.at(node_id(drive.session.id, 0))
         for one in steps:
-            there = there.carried_on(one.prev_from_curr, one.covariance)
+            if one.prev_from_curr is not None and one.covariance is not None:
+                there = there.carried_on(one.prev_from_curr, one.covariance)
         pose, true = there.node_from_live, world_from_start.inverse() @ world_from_end
         yield (
             float(np.linalg.norm(pose.translation - true.translation)),

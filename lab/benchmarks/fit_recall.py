@@ -28,7 +28,7 @@ from scipy.optimize import minimize
 
 from engram.frontend.matching import matcher_hash
 from engram.localiser import Budget, FrameMatcher
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.ranking import (
     Foreseen,
     RankingContext,
@@ -131,13 +131,15 @@ def record(
         clock=drive.session,
     ) as localiser:
         localiser.start_at(start)
+        gaps = GapFiller()
         for number, one in enumerate(logged):
             odometry = one.odometry if number else OdometryStep(OdometryStatus.FIRST)
             motion = odometry.prev_from_curr
             step_m = 0.0 if motion is None else motion.distance_m
+            localiser.move(gaps.motion(odometry, one.frame.stamp_ns))
             length_m += step_m
             before = len(recording.seen)
-            localiser.localise(one.frame, odometry)
+            localiser.localise(one.frame)
             frames += [Seen(*seen, localiser.driven_m, step_m) for seen in recording.seen[before:]]
     memo.save()
     return Recorded(drive.name, tuple(frames), length_m)

@@ -216,9 +216,9 @@ def _found(found: Localisation, prev_from_curr: Any) -> Values:
         "attempts": found.attempts,
         "candidates": found.candidates,
         "proposed": found.proposed,
-        "usable": found.usable,
+        "usable": found.motion.usable,
         "open_loop_m": found.open_loop_m,
-        "moved_m": found.moved_m,
+        "moved_m": found.motion.moved_m,
         "node_from_live": None if found.node_from_live is None else found.node_from_live.matrix(),
         "covariance": found.covariance,
         "position": None

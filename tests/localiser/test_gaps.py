@@ -5,7 +5,7 @@ import pytest
 
 from engram.geometry import SE3
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.odometry.motion import GapFiller, driven_steps_m, shared_out
+from engram.odometry.motion import GapFiller, Motion, driven_steps_m
 
 FIRST = OdometryStep(OdometryStatus.FIRST)
 BLIND = OdometryStep(OdometryStatus.NO_CONSENSUS)
@@ -20,7 +20,7 @@ def ahead(metres: float) -> OdometryStep:
 
 def test_what_was_measured_passes_through() -> None:
     gaps = GapFiller()
-    assert gaps.motion(FIRST, 0) is None
+    assert gaps.motion(FIRST, 0).prev_from_curr is None
     step = ahead(0.5)
     motion = gaps.motion(step, 100 * MS)
     assert motion.prev_from_curr is step.prev_from_curr
@@ -55,7 +55,7 @@ def test_an_unusable_frame_says_nothing_and_the_next_step_spans_it() -> None:
     gaps = GapFiller()
     gaps.motion(FIRST, 0)
     gaps.motion(ahead(0.5), 100 * MS)
-    assert gaps.motion(DARK, 200 * MS) is None
+    assert gaps.motion(DARK, 200 * MS).prev_from_curr is None
     gaps.motion(ahead(1.0), 300 * MS)  # spans both: still 5 m/s
     guess = gaps.motion(BLIND, 400 * MS)
     np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 0.5])
@@ -113,14 +113,18 @@ def test_a_robot_that_sets_off_is_believed_in_the_end() -> None:
 def test_what_was_driven_blindly_counts() -> None:
     odometry = [FIRST, ahead(0.5), BLIND, DARK, ahead(1.0)]
     stamps_ns = [0, 100 * MS, 200 * MS, 300 * MS, 400 * MS]
-    np.testing.assert_allclose(driven_steps_m(odometry, stamps_ns), [0.0, 0.5, 0.5, 0.5, 0.5])
+    gaps = GapFiller()
+    motions = [gaps.motion(*one) for one in zip(odometry, stamps_ns, strict=True)]
+    np.testing.assert_allclose(driven_steps_m(motions, stamps_ns), [0.0, 0.5, 0.5, 0.5, 0.5])
 
 
 def test_way_past_frames_of_no_use_is_theirs() -> None:
     """By time; before the first usable frame nothing is known of it, nor after the last."""
-    usable = [False, True, False, False, True, True, False]
+    far, near = (Motion(ahead(m), ahead(m).prev_from_curr) for m in (2.0, 0.5))
+    dark = Motion(DARK)
+    motions = [dark, Motion(FIRST), dark, dark, far, near, dark]
     stamps_ns = [stamp * MS for stamp in (0, 100, 200, 400, 500, 600, 700)]
-    found = shared_out([0, 0, 0, 0, 2.0, 0.5, 0], usable, stamps_ns)
+    found = driven_steps_m(motions, stamps_ns)
     np.testing.assert_allclose(found, [0, 0, 0.5, 1.0, 0.5, 0.5, 0], atol=1e-12)
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tests.mapping_rig import map_simulated
+from tests.mapping_rig import localised, map_simulated, moving
 from tests.synthetic_world import World, drive
 
 from engram.errors import MapCorruptError
@@ -67,7 +67,7 @@ def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candida
             search=search,
         ) as localiser:
             localiser.start_at(Position.at(opened.graph.node(0).id))
-            found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+            found = localised(localiser, live)
     assert all(one.node is not None for one in found)
     assert matcher.calls == sum(one.attempts for one in found) > 0
     assert len(searched) == len(live)
@@ -93,8 +93,9 @@ def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_
             live[0].frame.camera, settings, policy="distance", relocaliser=None, search=search
         ) as localiser:
             localiser.start_at(Position.at(opened.graph.node(0).id))
-            known = [localiser.localise(seen.frame, seen.odometry) for seen in live[:10]]
-            lost = [localiser.localise(seen.frame, blind) for seen in elsewhere[10:16] * 20]
+            gone = [replace(seen, odometry=blind) for seen in elsewhere[10:16] * 20]
+            found = localised(localiser, [*live[:10], *gone])
+    known, lost = found[:10], found[10:]
     assert known[-1].status is LocalisationStatus.LOCALISED
     assert all(one.node is None for one in lost)
     before, after = known[-1].position, lost[5].position
@@ -122,8 +123,9 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
         ) as localiser,
     ):
         localiser.start_at(Position.at(opened.graph.node(0).id))
-        for seen in live:
-            localiser.localise(seen.frame, seen.odometry)
+        for frame, motion in moving(live):
+            localiser.move(motion)
+            localiser.localise(frame)
             foreseen, order, count = policy.seen[-1]
             assert foreseen.accepted.shape == foreseen.inliers.shape == (count,)
             made = localiser.outcomes
@@ -164,7 +166,7 @@ def test_what_is_damaged_is_foreseen_to_fail(tmp_path: Path, monkeypatch) -> Non
         ) as localiser,
     ):
         localiser.start_at(Position.at(opened.graph.node(0).id))
-        found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+        found = localised(localiser, live)
         assert found[0].damaged == (opened.graph.node(0).id,)
     foreseen = policy.seen[0][0]
     assert foreseen.accepted.any()
@@ -205,7 +207,7 @@ def test_a_lost_robot_has_a_budget_of_its_own_and_a_matcher_that_gives_up_sooner
             relocaliser=relocaliser,
         ) as localiser,
     ):
-        found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+        found = localised(localiser, live)
     assert relocaliser.asked == [10]
     assert found[0].node is not None
     assert all(one.attempts <= 2 for one in found[1:])
@@ -236,7 +238,7 @@ def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
     ):
         nodes = sorted(opened.graph.nodes, key=lambda node: node.stamp_ns)
         localiser.start_at(Position.at(nodes[4].id))  # some four metres too far on
-        found = [localiser.localise(seen.frame, seen.odometry) for seen in live]
+        found = localised(localiser, live)
     where = [k for k, one in enumerate(found) if one.node is not None]
     # Lost after ten metres; a second witness must be four metres on.
     assert 20 <= where[0] <= 26

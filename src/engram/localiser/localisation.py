@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from engram.errors import ConfigError
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.model import NodeId
+from engram.odometry.motion import UNMOVED, Motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +111,7 @@ class Localisation:
             they cost a quarter of the others (`LocaliserConfig.lost_max_samples`).
         candidates: nodes that could have been tried.
         open_loop_m: distance driven on odometry alone since the last match.
-        moved_m: distance since the usable frame before; guessed where odometry failed.
-        usable: whether the frame was of any use; what was moved until one that was not stands with
-            the next that is.
+        motion: how the robot moved since the usable frame before, as far as it is known.
         position: the best estimate, measured or carried on by odometry; None while `LOST` with
             no estimate.
         new_place: probability, before matching, that the frame shows nothing of the map; None
@@ -127,8 +126,7 @@ class Localisation:
     attempts: int
     candidates: int
     open_loop_m: float
-    moved_m: float = 0.0
-    usable: bool = True
+    motion: Motion = UNMOVED
     proposed: int = 0
     node: NodeId | None = None
     node_stamp_ns: int | None = None

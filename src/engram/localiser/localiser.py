@@ -43,8 +43,7 @@ from engram.localiser.localisation import Budget, Localisation, LocalisationStat
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig
 from engram.localiser.walk import Walk
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.odometry.motion import GapFiller, Motion
+from engram.odometry import UNMOVED, Motion, OdometryStatus
 from engram.ranking import (
     Background,
     Foreseen,
@@ -87,8 +86,6 @@ class Localiser:
         threads: whether lanes run on threads; a `matcher` that is given says so itself.
         search: finds the candidates; None for the graph's own `neighbourhood`. Localisers in step
             with each other, in a graph that does not grow, may share one that remembers.
-        motion: fills the gaps of odometry; None for a `GapFiller` of its own. Localisers in step
-            with each other may share one that remembers.
         background: what policies may know of the map beyond its graph and paths.
         clock: what the live frames' stamps mean, and where the robot is; None if unknown.
     """
@@ -109,7 +106,6 @@ class Localiser:
         matcher: Matcher | None = None,
         threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
-        motion: Callable[[OdometryStep, int], Motion | None] | None = None,
         background: Background | None = None,
         clock: Clocked | None = None,
     ) -> None:
@@ -141,8 +137,7 @@ class Localiser:
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
-        self._motion_of = GapFiller().motion if motion is None else motion
-        self._motion: Motion | None = None
+        self._motion = UNMOVED
         # Variance of the motion guessed since the robot last knew where it was, m².
         self._guessed_m2 = 0.0
         self._attempts: list[Attempt] = []
@@ -229,14 +224,11 @@ class Localiser:
         self._guessed_m2 = 0.0
         self.walk.visit(node, PathEntryKind.SAVED, stamp_ns)
 
-    def localise(
-        self, live: Frame, odometry: OdometryStep, deadline: float | None = None
-    ) -> Localisation:
-        """One iteration of SPEC §3: carry on, gather candidates, rank, attempt, settle.
+    def localise(self, live: Frame, deadline: float | None = None) -> Localisation:
+        """One iteration of SPEC §3: gather candidates, rank, attempt, settle.
 
         Args:
-            live: the live frame.
-            odometry: its motion since the frame before.
+            live: the live frame; `move` was told how the robot came there.
             deadline: `time.perf_counter` value after which no attempt starts; by default that of
                 the budget, counted from this call.
 
@@ -246,7 +238,6 @@ class Localiser:
         clock = _StageClock()
         if deadline is None and self._budget.deadline_ms is not None:
             deadline = clock.started + self._budget.deadline_ms / 1e3
-        self.carry_on(odometry, live.stamp_ns)
         self._new_place = None
         self._new_damaged = ()
         self._recent.begin_frame(self._driven_m)
@@ -277,39 +268,29 @@ class Localiser:
                 ]
             )
         clock.lap("remember")
-        return self._result(live, odometry, success, neighbourhood, clock.stage_ms)
+        return self._result(live, success, neighbourhood, clock.stage_ms)
 
-    def carry_on(self, odometry: OdometryStep, stamp_ns: int) -> None:
-        """Propagates the position by odometry (SPEC §3).
+    def move(self, motion: Motion) -> None:
+        """Propagates the position by the motion that led to the next frame (SPEC §3).
 
         A frame that odometry could not use changes nothing: the next usable one brings the motion
-        since the last. Where odometry lost track the motion is guessed (`GapFiller`), and past
-        `LocaliserConfig.greatest_gap_m` of uncertainty the robot is lost.
-
-        Args:
-            odometry: the step that ends in the frame.
-            stamp_ns: stamp of the frame.
+        since the last. Past `LocaliserConfig.greatest_gap_m` of uncertainty in motion that was
+        guessed the robot is lost.
         """
-        self._motion = motion = self._motion_of(odometry, stamp_ns)
-        if motion is None:
+        self._motion = motion
+        if motion.prev_from_curr is None or motion.covariance is None:
             return
-        moved_m = motion.prev_from_curr.distance_m
-        self._open_loop_m += moved_m
+        self._open_loop_m += motion.moved_m
         if motion.guessed_m:
             self._guessed_m2 += motion.guessed_m**2
             self._hypotheses.forget()
         else:
-            self._driven_m += moved_m
-            self._hypotheses.carry_on(odometry)
+            self._driven_m += motion.moved_m
+            self._hypotheses.carry_on(motion.odometry)
         if self._relocaliser is not None:
             self._relocaliser.carry_on(None if motion.guessed_m else motion.prev_from_curr)
         if self.position is not None:
             self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
-
-    @property
-    def motion(self) -> Motion | None:
-        """How the robot moved up to the last frame; None where the next one will tell."""
-        return self._motion
 
     @property
     def certain(self) -> bool:
@@ -530,19 +511,17 @@ class Localiser:
     def _result(
         self,
         live: Frame,
-        odometry: OdometryStep,
         success: Outcome | None,
         neighbourhood: Neighbourhood | None,
         stage_ms: dict[str, float],
     ) -> Localisation:
         unmatched = Localisation(
             stamp_ns=live.stamp_ns,
-            status=self._status_without_match(odometry),
+            status=self._status_without_match(),
             attempts=len(self._outcomes),
             proposed=sum(one.candidate.prediction is None for one in self._outcomes),
             candidates=0 if neighbourhood is None else len(neighbourhood),
-            moved_m=0.0 if self._motion is None else self._motion.prev_from_curr.distance_m,
-            usable=odometry.status is not OdometryStatus.UNUSABLE_FRAME,
+            motion=self._motion,
             open_loop_m=self._open_loop_m,
             position=self.position,
             new_place=self._new_place,
@@ -562,8 +541,8 @@ class Localiser:
             inliers=success.match.inliers,
         )
 
-    def _status_without_match(self, odometry: OdometryStep) -> LocalisationStatus:
-        if odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:
+    def _status_without_match(self) -> LocalisationStatus:
+        if self._motion.odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:
             return LocalisationStatus.NO_ODOMETRY
         return LocalisationStatus.LOST if self._lost else LocalisationStatus.DEAD_RECKONING
 

@@ -15,7 +15,7 @@ from engram.localiser import Localisation, LocalisationStatus, Localiser, Positi
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch
 from engram.mapper.saver import Records, Saver
-from engram.odometry import OdometryStep
+from engram.odometry import Motion
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +95,7 @@ class Mapper:
         # The experience being saved, first node first; empty while localisation succeeds.
         self._experience: list[NodeId] = []
 
-    def process(
-        self, live: Frame, odometry: OdometryStep, deadline: float | None = None
-    ) -> MappingStep:
+    def process(self, live: Frame, motion: Motion, deadline: float | None = None) -> MappingStep:
         """Localises one frame, saves it if that failed, and ties experiences to their neighbours.
 
         Raises:
@@ -107,8 +105,9 @@ class Mapper:
         # A robot that hangs together with the map is not lost, however far it drifts: its loops
         # are looked for beside the drive.
         self._localiser.proposes_when_certain = self._loops is None or not self._joined
-        localisation = self._localiser.localise(live, odometry, deadline)
-        self._move_on()
+        self._localiser.move(motion)
+        localisation = self._localiser.localise(live, deadline)
+        self._move_on(motion)
         saved: Node | None = None
         if localisation.status is LocalisationStatus.LOCALISED:
             self._joined = True
@@ -118,7 +117,7 @@ class Mapper:
             )
             self._add_to_graph(matched)
             edges += matched
-        elif self._worth_saving(live):
+        elif self._worth_saving(live, motion):
             saved, laid = self._save(live, localisation.position)
             edges += laid
         records = Records(
@@ -144,10 +143,10 @@ class Mapper:
         if edges:
             self._saver.put(Records(edges=edges))
 
-    def follow(self, odometry: OdometryStep, stamp_ns: int) -> None:
+    def follow(self, motion: Motion) -> None:
         """Carries on over a frame that an interrupted run of this session had mapped already."""
-        self._localiser.carry_on(odometry, stamp_ns)
-        self._move_on()
+        self._localiser.move(motion)
+        self._move_on(motion)
 
     def resume_in(self, saved: NodeId) -> None:
         """The frame just followed is the last that this session had saved as a node."""
@@ -160,10 +159,9 @@ class Mapper:
         self._experience = []
         self._localiser.resume_near(matched)
 
-    def _move_on(self) -> None:
+    def _move_on(self, motion: Motion) -> None:
         """Carries the last saved node on as the robot moved; None after too long a gap."""
-        motion = self._localiser.motion
-        if motion is None:
+        if motion.prev_from_curr is None or motion.covariance is None:
             return
         self._gap_m2 = self._gap_m2 + motion.guessed_m**2 if motion.guessed_m else 0.0
         if self._since_saved is None:
@@ -175,7 +173,7 @@ class Mapper:
                 motion.prev_from_curr, motion.covariance
             )
 
-    def _worth_saving(self, live: Frame) -> bool:
+    def _worth_saving(self, live: Frame, motion: Motion) -> bool:
         """A usable frame, far enough from the last saved one (SPEC §5).
 
         In the midst of a long gap of odometry none is: a node that hangs on nothing serves nobody.
@@ -183,8 +181,7 @@ class Mapper:
         if live.status is not FrameStatus.OK:
             return False
         if self._since_saved is None:
-            motion = self._localiser.motion
-            return motion is None or not motion.guessed_m
+            return not motion.guessed_m
         moved = self._since_saved.node_from_live
         return (
             moved.distance_m >= self.config.save_every_m

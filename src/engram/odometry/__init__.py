@@ -1,11 +1,12 @@
 """Frame stream → motion between successive frames, with covariance."""
 
-from engram.odometry.motion import GapFiller, Motion, driven_steps_m, shared_out
+from engram.odometry.motion import UNMOVED, GapFiller, Motion, driven_steps_m
 from engram.odometry.odometry import Odometry, OdometryConfig
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.window import WindowConfig
 
 __all__ = [
+    "UNMOVED",
     "GapFiller",
     "Motion",
     "Odometry",
@@ -14,5 +15,4 @@ __all__ = [
     "OdometryStep",
     "WindowConfig",
     "driven_steps_m",
-    "shared_out",
 ]

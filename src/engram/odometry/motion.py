@@ -10,7 +10,7 @@ and the robot counts as lost.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,58 +52,63 @@ _LEAST_SIGMA_RAD = float(np.deg2rad(0.5))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """How the camera moved since the usable frame before.
+    """How the camera moved since the usable frame before, with the gaps of odometry filled.
 
     Attributes:
-        prev_from_curr: pose of this frame in that one.
-        covariance: (6, 6) float64 of it, left perturbation, [translation, rotation].
+        odometry: what odometry measured.
+        prev_from_curr: pose of this frame in the usable one before; None where the next usable
+            frame will tell: at the first frame of a drive, and at one of no use.
+        covariance: (6, 6) float64 of it, left perturbation, [translation, rotation]; None with it.
         guessed_m: standard deviation of a guess, metres; 0 where odometry measured the motion.
     """
 
-    prev_from_curr: SE3
-    covariance: NDArray[np.float64]
+    odometry: OdometryStep
+    prev_from_curr: SE3 | None = None
+    covariance: NDArray[np.float64] | None = None
     guessed_m: float = 0.0
 
+    @property
+    def moved_m(self) -> float:
+        """Distance since the usable frame before, metres."""
+        return 0.0 if self.prev_from_curr is None else self.prev_from_curr.distance_m
 
-_ANY_MOTION = Motion(SE3.identity(), np.eye(6) * np.pi**2, guessed_m=np.inf)
-
-
-def driven_steps_m(
-    odometry: Iterable[OdometryStep], stamps_ns: Iterable[int]
-) -> NDArray[np.float64]:
-    """Distance of each step of a drive, (F,) metres, guessed where odometry failed.
-
-    Args:
-        odometry: (F) steps, each ending in one frame.
-        stamps_ns: (F) stamps of these frames.
-    """
-    gaps, steps, stamps = GapFiller(), list(odometry), list(stamps_ns)
-    motions = (gaps.motion(step, stamp) for step, stamp in zip(steps, stamps, strict=True))
-    moved_m = [0.0 if one is None else one.prev_from_curr.distance_m for one in motions]
-    usable = [one.status is not OdometryStatus.UNUSABLE_FRAME for one in steps]
-    return shared_out(moved_m, usable, stamps)
+    @property
+    def usable(self) -> bool:
+        """Whether the frame is of any use; what was moved until one that is not comes later."""
+        return self.odometry.status is not OdometryStatus.UNUSABLE_FRAME
 
 
-def shared_out(
-    moved_m: Sequence[float], usable: Sequence[bool], stamps_ns: Sequence[int]
-) -> NDArray[np.float64]:
-    """Distances of steps, (F,) metres, when each frame bears its own part of the way.
+UNMOVED = Motion(OdometryStep(OdometryStatus.FIRST))
+
+
+def driven_steps_m(motions: Sequence[Motion], stamps_ns: Sequence[int]) -> NDArray[np.float64]:
+    """Distance of each step of a drive, (F,) metres, where each frame has its own part of the way.
 
     What was driven past frames of no use is known at the next usable one. It is shared among all
     of them by time: way on which a robot saw nothing was not localised (SPEC §8), whatever came
     after. What was driven after the last usable frame is not known.
 
     Args:
-        moved_m: (F) distances since the usable frame before, 0 at frames of no use.
-        usable: (F) whether each frame is.
-        stamps_ns: (F), rising.
+        motions: (F) motions, each ending in one frame.
+        stamps_ns: (F) stamps of these frames, rising.
     """
-    steps_m, seen = np.array(moved_m, np.float64), np.array(usable, np.bool_)
+    steps_m = np.array([one.moved_m for one in motions], np.float64)
+    seen = np.array([one.usable for one in motions], np.bool_)
     if seen.all() or not seen.any():
         return steps_m
     since_ns = np.array([stamp - stamps_ns[0] for stamp in stamps_ns], np.float64)
     driven_m = np.interp(since_ns, since_ns[seen], np.cumsum(steps_m)[seen])
     return np.diff(driven_m, prepend=driven_m[0]).clip(0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Guess:
+    prev_from_curr: SE3
+    covariance: NDArray[np.float64]
+    sigma_m: float
+
+
+_ANY_MOTION = _Guess(SE3.identity(), np.eye(6) * np.pi**2, np.inf)
 
 
 class GapFiller:
@@ -144,18 +149,18 @@ class GapFiller:
         # How long the robot has moved at a speed that is not known yet.
         self._unknown_s = 0.0
 
-    def motion(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
-        """The motion since the usable frame before; None where the next one will tell.
+    def motion(self, odometry: OdometryStep, stamp_ns: int) -> Motion:
+        """The motion since the usable frame before.
 
         Args:
             odometry: the step that ends in this frame.
             stamp_ns: stamp of the frame.
         """
         if odometry.status is OdometryStatus.UNUSABLE_FRAME:
-            return None
+            return Motion(odometry)
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         if odometry.status is OdometryStatus.FIRST:
-            return None
+            return Motion(odometry)
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         guess = self._guess(seconds)
@@ -171,7 +176,7 @@ class GapFiller:
             self._gap_m += guess.prev_from_curr.distance_m
             if guess is _ANY_MOTION:
                 self._unknown_s += max(seconds, 0.0)
-            return guess
+            return Motion(odometry, guess.prev_from_curr, guess.covariance, guess.sigma_m)
         self._missing.append(False)
         self._gap_m = 0.0
         self._believed_ns = stamp_ns
@@ -180,8 +185,8 @@ class GapFiller:
         if any(self._missing):
             covariance = covariance + self._doubt(measured, seconds)
         if self._unknown_s and seconds > 0:
-            return self._made_up_for(measured, covariance, seconds)
-        return Motion(measured, covariance)
+            measured, covariance = self._made_up_for(measured, covariance, seconds)
+        return Motion(odometry, measured, covariance)
 
     def _learn(self, measured: SE3, covariance: NDArray[np.float64], seconds: float) -> None:
         """Speed and turn for guesses to come; vague steps say little of them."""
@@ -203,7 +208,7 @@ class GapFiller:
 
     def _made_up_for(
         self, measured: SE3, covariance: NDArray[np.float64], seconds: float
-    ) -> Motion:
+    ) -> tuple[SE3, NDArray[np.float64]]:
         """The first measured step, behind all that the robot moved before at its speed.
 
         The turn is left out: over several steps it is no longer that of the last.
@@ -213,7 +218,7 @@ class GapFiller:
         wrong = np.repeat([_SIGMA_PER_M, _SIGMA_RAD_PER_M], 3) * before.distance_m
         adjoint = before.adjoint()
         carried = adjoint @ covariance @ adjoint.T
-        return Motion(before @ measured, carried + steps**2 * covariance + np.diag(wrong**2))
+        return before @ measured, carried + steps**2 * covariance + np.diag(wrong**2)
 
     def _doubt(self, measured: SE3, seconds: float) -> NDArray[np.float64]:
         """(6, 6) what a measured step among missing ones is to be doubted by.
@@ -225,8 +230,8 @@ class GapFiller:
         variances = np.repeat([step_m**2, (_SIGMA_RAD_PER_M * step_m) ** 2], 3)
         return np.diag(share * variances)
 
-    def _too_vague(self, covariance: NDArray[np.float64], guess: Motion) -> bool:
-        vague = _sigma_m(covariance) > guess.guessed_m
+    def _too_vague(self, covariance: NDArray[np.float64], guess: _Guess) -> bool:
+        vague = _sigma_m(covariance) > guess.sigma_m
         self._vague = self._vague + 1 if vague else 0
         return vague and self._vague <= _STEPS
 
@@ -248,7 +253,7 @@ class GapFiller:
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * _sigma_m(covariance))
 
-    def _guess(self, seconds: float) -> Motion:
+    def _guess(self, seconds: float) -> _Guess:
         """On at the last speed and turn; where these are not known, any motion whatever."""
         if not self._velocities or seconds <= 0:
             return _ANY_MOTION
@@ -259,7 +264,7 @@ class GapFiller:
         sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_M))
         sigma_rad = float(np.hypot(_SIGMA_RAD_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_RAD))
         covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
-        return Motion(guess, covariance, sigma_m)
+        return _Guess(guess, covariance, sigma_m)
 
 
 def _sigma_m(covariance: NDArray[np.float64]) -> float:

@@ -196,7 +196,8 @@ def explain_frame(
         with localiser, closing(live_frames(sequence, settings)) as frames:
             for number, live in enumerate(frames):
                 watching.watches = number == options.frame
-                found = localiser.localise(live.frame, live.odometry)
+                localiser.move(live.motion)
+                found = localiser.localise(live.frame)
                 if number == options.frame:
                     attempted = {outcome.candidate.index for outcome in localiser.outcomes}
                     return _explained(opened, options, found.status, live.frame.stamp_ns, watching,

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from engram.frontend import Frame, Frontend, StereoPair
 from engram.monitor import deferred_interrupt
-from engram.odometry import Odometry, OdometryStep
+from engram.odometry import GapFiller, Motion, Odometry
 from engram.robot.settings import Settings
 from engram.sequences import FrameSequence, LoggedFrame, StereoSequence
 
@@ -28,14 +28,14 @@ class LiveFrame:
 
     Attributes:
         frame: the frame.
-        odometry: its motion since the frame before.
+        motion: how the camera moved since the usable frame before.
         arrived: `time.perf_counter` when its images arrived.
         pair: its images; None when read from a frame log.
         stage_ms: time of each stage so far.
     """
 
     frame: Frame
-    odometry: OdometryStep
+    motion: Motion
     arrived: float
     pair: StereoPair | None
     stage_ms: dict[str, float]
@@ -62,15 +62,17 @@ def live_frames(
         KeyboardInterrupt: between two frames.
     """
     frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
+    gaps = GapFiller()
     # Closed by hand: after an error its traceback would keep the reading thread alive to the end
     # of the process, and a thread that is in the midst of C++ then takes the process down with it.
     with closing(_entries(sequence, preload)) as entries, deferred_interrupt() as raise_if_asked:
         for arrived, entry in paced(entries, rate_hz):
             raise_if_asked()
             if isinstance(entry, LoggedFrame):
-                yield LiveFrame(entry.frame, entry.odometry, arrived, None, {})
+                motion = gaps.motion(entry.odometry, entry.frame.stamp_ns)
+                yield LiveFrame(entry.frame, motion, arrived, None, {})
             else:
-                yield _run(frontend, odometry, entry, arrived)
+                yield _run(frontend, odometry, gaps, entry, arrived)
             raise_if_asked()
 
 
@@ -81,17 +83,19 @@ def _entries(
     yield from list(entries) if preload else read_ahead(entries, _READ_AHEAD)
 
 
-def _run(frontend: Frontend, odometry: Odometry, pair: StereoPair, arrived: float) -> LiveFrame:
+def _run(
+    frontend: Frontend, odometry: Odometry, gaps: GapFiller, pair: StereoPair, arrived: float
+) -> LiveFrame:
     started = time.perf_counter()
     frame = frontend.extract(pair)
     extracted = time.perf_counter()
-    step = odometry.step(frame)
+    motion = gaps.motion(odometry.step(frame), frame.stamp_ns)
     finished = time.perf_counter()
     stage_ms = {
         "frontend": (extracted - started) * 1e3,
         "odometry": (finished - extracted) * 1e3,
     }
-    return LiveFrame(frame, step, arrived, pair, stage_ms)
+    return LiveFrame(frame, motion, arrived, pair, stage_ms)
 
 
 def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]]:

@@ -89,10 +89,11 @@ class LocaliseRun:
             deadline = (
                 None if options.deadline_ms is None else live.arrived + options.deadline_ms / 1e3
             )
-            found = self.localiser.localise(live.frame, live.odometry, deadline)
+            self.localiser.move(live.motion)
+            found = self.localiser.localise(live.frame, deadline)
             late = self._is_late(time.perf_counter() - live.arrived)
             stage_ms = {**live.stage_ms, **found.stage_ms}
-            yield live, FrameResult(found, live.odometry.prev_from_curr, stage_ms, late)
+            yield live, FrameResult(found, live.motion.odometry.prev_from_curr, stage_ms, late)
 
     def _is_late(self, seconds: float) -> bool:
         """In real time, an answer is late after the deadline or, without one, the next frame."""

@@ -271,12 +271,12 @@ def _map_frames(
                     if options.deadline_ms is None
                     else live.arrived + options.deadline_ms / 1e3
                 )
-                step = mapper.process(live.frame, live.odometry, deadline)
+                step = mapper.process(live.frame, live.motion, deadline)
                 report.saved += step.saved is not None
                 report.results.append(
                     FrameResult(
                         step.localisation,
-                        live.odometry.prev_from_curr,
+                        live.motion.odometry.prev_from_curr,
                         {**live.stage_ms, **step.localisation.stage_ms},
                     )
                 )
@@ -341,7 +341,7 @@ def _from_where_it_stopped(
             yield live
             continue
         advance("resuming")
-        mapper.follow(live.odometry, stamp_ns)
+        mapper.follow(live.motion)
         if stored.nodes and stamp_ns == stored.nodes[-1].stamp_ns:
             mapper.resume_in(stored.nodes[-1].id)
         entry = stored.last_entry

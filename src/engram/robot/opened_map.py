@@ -31,8 +31,7 @@ from engram.localiser import (
     Searched,
 )
 from engram.maps import MapStore
-from engram.odometry import Odometry, OdometryStep
-from engram.odometry.motion import Motion
+from engram.odometry import GapFiller, Odometry
 from engram.places import Vocabulary, decode_vocabulary, default_vocabulary
 from engram.places.stored_words import stored_words
 from engram.ranking import (
@@ -175,7 +174,6 @@ class OpenMap:
         matcher: Matcher | None = None,
         threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
-        motion: Callable[[OdometryStep, int], Motion | None] | None = None,
         clock: Clocked | None = None,
     ) -> Localiser:
         """A localiser for one session in this map.
@@ -189,7 +187,7 @@ class OpenMap:
             live: the live session.
             saves: whether it is being mapped.
             threads: whether lanes run on threads.
-            matcher, search, motion: in place of the usual ones; see `Localiser`.
+            matcher, search: in place of the usual ones; see `Localiser`.
             clock: what its stamps mean, and where it is; None if unknown.
 
         Raises:
@@ -215,7 +213,6 @@ class OpenMap:
             matcher=matcher,
             threads=threads,
             search=search,
-            motion=motion,
             background=background,
             clock=clock,
         )
@@ -277,7 +274,7 @@ class LiveRobot:
         check_for_robot(policy)
         self.camera = camera
         self._frontend = Frontend(settings.for_descriptor(opened.descriptor).frontend)
-        self._odometry = Odometry(settings.odometry)
+        self._odometry, self._gaps = Odometry(settings.odometry), GapFiller()
         self._localiser = opened.localiser(
             camera,
             settings,
@@ -312,9 +309,9 @@ class LiveRobot:
         """
         arrived = time.perf_counter()
         frame = self._frontend.extract(pair)
-        odometry = self._odometry.step(frame)
+        self._localiser.move(self._gaps.motion(self._odometry.step(frame), frame.stamp_ns))
         deadline = None if deadline_ms is None else arrived + deadline_ms / 1e3
-        return self._localiser.localise(frame, odometry, deadline)
+        return self._localiser.localise(frame, deadline)
 
 
 def open_map(path: str | Path, at: int | str | None = None) -> OpenMap:

@@ -100,15 +100,15 @@ def extract_log(
                 if writer is None:
                     header = _header(sequence, live.frame, settings)
                     writer = FrameLogWriter(out, header)
-                _count(report, live.frame.status, live.odometry.status)
+                _count(report, live.frame.status, live.motion.odometry.status)
                 pair_hash = first_pair_hash(live.pair)
                 if writer.holds(live.frame.stamp_ns, pair_hash):
                     report.already_recorded += 1
                     advance("recorded already")
                     continue
-                writer.append(LoggedFrame(live.frame, live.odometry), pair_hash)
+                writer.append(LoggedFrame(live.frame, live.motion.odometry), pair_hash)
                 report.frames += 1
-                advance(live.odometry.status.value)
+                advance(live.motion.odometry.status.value)
         if writer is None:
             raise SequenceError(f"{sequence.info.name}: no frame can be read")
         writer.close(complete=True)

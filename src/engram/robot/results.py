@@ -11,7 +11,7 @@ import numpy as np
 from engram.geometry import SE3
 from engram.localiser import Localisation, LocalisationStatus
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
-from engram.odometry.motion import shared_out
+from engram.odometry.motion import driven_steps_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,11 +66,7 @@ def measured(found: Sequence[Localisation]) -> Drive:
     Steps that odometry could not measure are guessed, and those past frames of no use are shared
     among them: without these the worst stretches of a drive would count as nothing.
     """
-    steps_m = shared_out(
-        [one.moved_m for one in found],
-        [one.usable for one in found],
-        [one.stamp_ns for one in found],
-    )
+    steps_m = driven_steps_m([one.motion for one in found], [one.stamp_ns for one in found])
     localised = [one.status is LocalisationStatus.LOCALISED for one in found]
     return Drive(steps_m, np.array(localised, np.bool_))
 

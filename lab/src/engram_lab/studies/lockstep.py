@@ -17,8 +17,7 @@ from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import NodeId
 from engram.graph.neighbourhood import Neighbourhood
 from engram.localiser import Localiser, Matcher, Position
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.odometry.motion import GapFiller, Motion, driven_steps_m
+from engram.odometry import GapFiller, driven_steps_m
 from engram.robot import OpenMap, Settings
 from engram.sequences import LoggedFrame
 from engram_lab.studies.configurations import EVERYTHING, Configuration, PathKinds, Radius
@@ -61,22 +60,6 @@ class SharedSearch:
             found = self._search(reference, reference_from_live, covariance, **options)
             self._known[key] = found
         return found
-
-
-class SharedMotion:
-    """Fills the gaps of odometry for all: it depends on the drive alone."""
-
-    def __init__(self) -> None:
-        self._gaps = GapFiller()
-        self._asked: tuple[OdometryStep, int] | None = None
-        self._motion: Motion | None = None
-
-    def __call__(self, odometry: OdometryStep, stamp_ns: int) -> Motion | None:
-        """See `GapFiller.motion`; asked again for the very same step it says the same."""
-        if self._asked is None or odometry is not self._asked[0] or stamp_ns != self._asked[1]:
-            self._motion = self._gaps.motion(odometry, stamp_ns)
-            self._asked = odometry, stamp_ns
-        return self._motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,30 +156,27 @@ def run_in_step(
     # With a memo everything runs on this thread, beside other workers on a busy machine; as on a
     # robot, on several threads, the time until the answer counts.
     clock = perf_counter if matcher is None else thread_time
-    step_m = driven_steps_m(
-        (one.odometry for one in frames), (one.frame.stamp_ns for one in frames)
-    )
+    gaps = GapFiller()
+    motions = [gaps.motion(one.odometry, one.frame.stamp_ns) for one in frames]
+    step_m = driven_steps_m(motions, [one.frame.stamp_ns for one in frames])
     runs = Runs.empty(configurations, step_m)
     search = SharedSearch(situation.opened.graph.neighbourhood)
     with _localisers(
         situation, configurations, settings, matcher, search, relocaliser
     ) as localisers:
         for number, logged in enumerate(frames):
-            odometry = logged.odometry
             if situation.start is None or number < situation.start[0]:
                 for localiser in localisers:
-                    localiser.carry_on(odometry, logged.frame.stamp_ns)
+                    localiser.move(motions[number])
                 continue
-            if number == situation.start[0]:
-                for localiser in localisers:
-                    localiser.carry_on(odometry, logged.frame.stamp_ns)
-                    localiser.start_at(situation.start[1])
-                odometry = OdometryStep(OdometryStatus.FIRST)
             search.next_frame()
             judge = _Judge(situation, logged.frame)
             for row, localiser in enumerate(localisers):
                 started, made = clock(), cost_so_far()
-                found = localiser.localise(logged.frame, odometry)
+                localiser.move(motions[number])
+                if number == situation.start[0]:
+                    localiser.start_at(situation.start[1])
+                found = localiser.localise(logged.frame)
                 seconds = clock() - started - (cost_so_far() - made)
                 runs.step_ms[row] += 1e3 * seconds
                 runs.matched[row, number] = found.node is not None
@@ -254,7 +234,6 @@ def _localisers(
 ) -> Iterator[list[Localiser]]:
     """One per configuration; in one map they share what is known of it."""
     views: dict[PathKinds, OpenMap] = {}
-    motion = SharedMotion()
     with ExitStack() as stack:
         localisers = []
         for one in configurations:
@@ -270,7 +249,6 @@ def _localisers(
                 live=situation.drive.session.id,
                 matcher=matcher,
                 search=search,
-                motion=motion,
                 clock=situation.drive.session,
             )
             localiser.keeps_attempts = False  # nothing is written

@@ -17,8 +17,7 @@ from engram.frontend import Frame
 from engram.graph.model import NodeId
 from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
 from engram.localiser.attempts import Outcome
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.odometry.motion import GapFiller
+from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
 
 # A guess over a longer way is none. Source: SPEC §3.4, after which a robot counts as lost.
 _GUESS_WITHIN_M = 10.0
@@ -63,8 +62,9 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
         gaps.motion(OdometryStep(OdometryStatus.OK, motion, covariance), other.stamp_ns)
     lost = OdometryStep(OdometryStatus.NO_CONSENSUS)
     guess = gaps.motion(lost, segment.nodes[0].stamp_ns)
-    assert guess is not None
-    if guess.guessed_m > _GUESS_WITHIN_M or guess.prev_from_curr.distance_m > _GUESS_WITHIN_M:
+    assert guess.prev_from_curr is not None
+    assert guess.covariance is not None
+    if guess.guessed_m > _GUESS_WITHIN_M or guess.moved_m > _GUESS_WITHIN_M:
         return None
     return end.carried_on(guess.prev_from_curr, guess.covariance)
 
@@ -72,7 +72,7 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
 def look_along(
     localiser: Localiser,
     start: Position,
-    frames: Iterable[tuple[NodeId, Frame, OdometryStep]],
+    frames: Iterable[tuple[NodeId, Frame, Motion]],
 ) -> tuple[FoundNode | None, int]:
     """Looks for the first frames of a segment from a guess of where it begins.
 
@@ -89,12 +89,13 @@ def look_along(
     driven_m = first_at_m = 0.0
     attempts = 0
     localiser.start_at(start)
-    for node, frame, odometry in frames:
-        if odometry.prev_from_curr is not None:
-            driven_m += odometry.prev_from_curr.distance_m
+    for node, frame, motion in frames:
+        if motion.odometry.prev_from_curr is not None:
+            driven_m += motion.odometry.prev_from_curr.distance_m
         if driven_m > _LOOK_WITHIN_M:
             break
-        found = localiser.localise(frame, odometry)
+        localiser.move(motion)
+        found = localiser.localise(frame)
         attempts += found.attempts
         if found.status is not LocalisationStatus.LOCALISED:
             continue

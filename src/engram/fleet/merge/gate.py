@@ -193,7 +193,8 @@ def localise_drive(
     found: list[Localisation] = []
     with localiser, closing(live_frames(sequence, settings)) as frames:
         for live in frames:
-            found.append(localiser.localise(live.frame, live.odometry))
+            localiser.move(live.motion)
+            found.append(localiser.localise(live.frame))
             monitor.advance(found[-1].status.value)
             monitor.check()
     return measured(found)

@@ -41,7 +41,7 @@ from engram.localiser.attempts import Outcome
 from engram.mapper import match_edges
 from engram.maps import BulkWriter, StoredNode
 from engram.monitor import Monitor
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
 from engram.ranking import check_for_robot, policy_named
 from engram.robot import Settings
 
@@ -160,16 +160,17 @@ class Replay:
         with self._localiser(session, segment, self._relocaliser) as localiser:
             if seed is not None:
                 self._start_at(localiser, seed, segment.nodes[0])
-            for stored, odometry in self._stream(segment):
+            for stored, motion in self._stream(segment):
                 frame = self._robot.store.frames.decode(stored)
-                found, outcomes = self._localise(localiser, stored.node, frame, odometry)
+                localiser.move(motion)
+                found, outcomes = self._localise(localiser, stored.node, frame)
                 reason = self._reason(stored.node, frame, found)
                 if reason is None:
                     self._omit(stored, found)
                     report.omit()
                 else:
                     self._take(stored, frame, localiser, found)
-                    report.take(stored.node.stamp_ns, _moved_m(odometry), reason)
+                    report.take(stored.node.stamp_ns, _moved_m(motion), reason)
                 if found.status is LocalisationStatus.LOCALISED:
                     self._matched(stored.node, outcomes)
                     report.seed = Seed.PLACE if report.seed is Seed.NONE else report.seed
@@ -207,31 +208,29 @@ class Replay:
         localiser.replay_from(segment.nodes[0].driven_m, self._iterations[session.id])
         return localiser
 
-    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, OdometryStep]]:
+    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, Motion]]:
         """The nodes in the order of time, each with its motion since the one before."""
-        steps = [OdometryStep(OdometryStatus.FIRST)]
+        gaps, steps = GapFiller(), [OdometryStep(OdometryStatus.FIRST)]
         for (before, _), edge in zip(pairwise(segment.nodes), segment.steps, strict=True):
             _, prev_from_curr, covariance = seen_from(edge, before.id)
             steps.append(OdometryStep(OdometryStatus.OK, prev_from_curr, covariance))
-        yield from zip(self._robot.store.frames.stored(segment.nodes), steps, strict=True)
+        for stored, step in zip(self._robot.store.frames.stored(segment.nodes), steps, strict=True):
+            yield stored, gaps.motion(step, stored.node.stamp_ns)
 
     def _localise(
-        self, localiser: Localiser, node: Node, frame: Frame, odometry: OdometryStep
+        self, localiser: Localiser, node: Node, frame: Frame
     ) -> tuple[Localisation, list[Outcome]]:
         """One frame; where the robot itself measured how it lies to a known node, from there."""
         looked_up = self._looked_up.pop(node.id, None)
         if looked_up is not None:
-            localiser.carry_on(odometry, frame.stamp_ns)
             position = looked_up.localisation.position
             assert position is not None
             localiser.start_at(position)
             return looked_up.localisation, looked_up.outcomes
         known = self._known_neighbour(node.id, _MEASURED, self._run[0]) if self._run else None
         if known is not None:
-            localiser.carry_on(odometry, frame.stamp_ns)
             self._start_at(localiser, known, node)
-            odometry = OdometryStep(OdometryStatus.FIRST)
-        found = localiser.localise(frame, odometry)
+        found = localiser.localise(frame)
         return found, localiser.outcomes
 
     def _start_at(self, localiser: Localiser, position: Position, node: Node) -> None:
@@ -251,8 +250,8 @@ class Replay:
         if start is None:
             return False
         frames = (
-            (stored.node.id, self._robot.store.frames.decode(stored), odometry)
-            for stored, odometry in self._stream(segment)
+            (stored.node.id, self._robot.store.frames.decode(stored), motion)
+            for stored, motion in self._stream(segment)
         )
         with self._localiser(session, segment, relocaliser=None) as localiser:
             found, attempts = look_along(localiser, start, frames)
@@ -396,6 +395,7 @@ def _measured(found: Localisation) -> Position:
     return Position(found.node, found.node_from_live, found.covariance)
 
 
-def _moved_m(odometry: OdometryStep) -> float:
-    """How far a node is from the one before; 0 for a segment's first."""
-    return 0.0 if odometry.prev_from_curr is None else odometry.prev_from_curr.distance_m
+def _moved_m(motion: Motion) -> float:
+    """How far a node is from the one before by its edge; 0 for a segment's first."""
+    measured = motion.odometry.prev_from_curr
+    return 0.0 if measured is None else measured.distance_m
