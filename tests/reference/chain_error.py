@@ -2,7 +2,14 @@
 
 import numpy as np
 
-from engram.geometry import skew
+from engram.geometry import SE3, skew
+from engram.graph.chain_error import PivotedError, edge_error_rows
+
+
+def error_of(covariance) -> PivotedError:
+    """The kernel's model of a covariance, as edges get it."""
+    tau, v, *pivot = edge_error_rows([(SE3.identity(), covariance)])[0, :5].tolist()
+    return PivotedError(tau, v, np.array(pivot))
 
 
 def pivoted_error(covariance):

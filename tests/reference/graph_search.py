@@ -3,9 +3,9 @@
 import heapq
 
 import numpy as np
+from tests.reference.chain_error import error_of
 
 from engram.geometry import SE3
-from engram.graph.chain_error import PivotedError
 from engram.graph.graph import ExperienceGraph
 
 LEVER_M = 10.0
@@ -15,7 +15,7 @@ def chains(graph: ExperienceGraph, root: int, anchor=None, reach_m: float = np.i
     """node -> (root_from_node, [(tau, v, pivot in root)], cost), as Dijkstra settles them."""
     edges = [[] for _ in range(len(graph))]
     for edge in graph.edges:
-        error = PivotedError.from_covariance(edge.covariance)
+        error = error_of(edge.covariance)
         a, b = graph.index(edge.a), graph.index(edge.b)
         edges[a].append((b, edge.a_from_b, error, error.pivot_in_a))
         b_from_a = edge.a_from_b.inverse()
@@ -55,7 +55,7 @@ def neighbourhood(
     """node -> (node_from_live, sigma_m, sigma_yaw_rad) of the candidates, no slack."""
     live = reference_from_live.translation
     reach_m = max(radius_m, float(np.linalg.norm(live))) + margin_m
-    own = PivotedError.from_covariance(covariance)
+    own = error_of(covariance)
     own_term = (own.translation_var, own.rotation_var, own.pivot_in_a)
     wide = chains(graph, reference, live, reach_m + detour_m)
 

@@ -39,21 +39,6 @@ class PivotedError:
     rotation_var: float
     pivot_in_a: Array
 
-    @staticmethod
-    def from_covariance(covariance: Array) -> PivotedError:
-        """The model of a (6, 6) covariance, left perturbation, [translation, rotation].
-
-        The pivot is where the translational error is smallest; τ and v are the variances along
-        the worst axis there.
-
-        Raises:
-            InputError: the covariance has the wrong shape, is not finite or not positive
-                semi-definite.
-        """
-        _check([covariance])
-        tau, v, *pivot = _core.pivoted_error(np.ascontiguousarray(covariance))
-        return PivotedError(float(tau), float(v), np.array(pivot))
-
     def covariance(self) -> Array:
         """The (6, 6) covariance, left perturbation, [translation, rotation], of this model."""
         lever = skew(self.pivot_in_a)
@@ -68,11 +53,6 @@ class PivotedError:
     def seen_from(self, other_from_a: SE3) -> PivotedError:
         """The same error in another frame."""
         return PivotedError(self.translation_var, self.rotation_var, other_from_a @ self.pivot_in_a)
-
-    def variance_at(self, point_in_a: Array) -> float:
-        """Variance along the worst axis, m², of where a point (3,) carried by the transform is."""
-        lever = point_in_a - self.pivot_in_a
-        return self.translation_var + self.rotation_var * float(lever @ lever)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,11 +82,15 @@ class ChainError:
 def edge_error_rows(edges: Sequence[tuple[SE3, Array]]) -> Array:
     """(E, 8) τ, v, pivot in a, pivot in b: the rows of edges for the search kernels.
 
+    An edge's pivot is where its translational error is smallest; τ and v are the variances along
+    the worst axis there.
+
     Args:
-        edges: (E) ``a_from_b`` with its (6, 6) covariance, as for `PivotedError.from_covariance`.
+        edges: (E) ``a_from_b`` with its (6, 6) covariance, left perturbation,
+            [translation, rotation].
 
     Raises:
-        InputError: a covariance is none.
+        InputError: a covariance has the wrong shape, is not finite or not positive semi-definite.
     """
     _check([covariance for _, covariance in edges])
     rows = np.empty((len(edges), 8))
