@@ -32,7 +32,6 @@ from engram.ranking import (
     PastAttempts,
     RankingContext,
     RunAttempts,
-    SessionTimes,
 )
 
 CAMERA = CameraId("0" * 32)
@@ -208,7 +207,7 @@ def make_context(
         hour=hour,
         day=day,
         background=Background(
-            SessionTimes(records),
+            {record.id: record for record in records},
             lessons_of(graph, lessons),
             None if words is None else MadeUpWords(words),
         ),

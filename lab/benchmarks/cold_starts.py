@@ -209,7 +209,7 @@ def cold_start(
         opened.graph,
         opened.path_memory,
         opened.store.frames,
-        policy=POLICIES["path"](),
+        policy=POLICIES["path-near"](),
         budget=budget,
         relocaliser=relocaliser,
         basin=MatchBasin.of(drive.camera.fx, opened.attempts),

@@ -58,7 +58,7 @@ SEARCHED: dict[str, tuple[float, ...]] = {
 CHANCES = ("bias", "steepness")
 # Replays start from where the robot truly was: these say nothing there.
 WHEN_LOST = ("likeness", "vague_m")
-OTHERS = ("bandit", "path", "distance", "time-of-day")
+OTHERS = ("bandit", "path-near", "distance", "time-of-day")
 # A robot that has so many candidates does not know where it is; to match all takes long.
 MOST_CANDIDATES = 200
 

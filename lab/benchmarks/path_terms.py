@@ -5,8 +5,8 @@
 
 Localises all held-out sessions of a study that is done, in its maps and with its matches, at Np = 2
 and Nr = 1: with T = 0, which leaves the prior alone; with T = 10 and a uniform prior; and with
-T = 10 and both, as `path` is. Prints the route not localised, and differences from the last, with
-90 % intervals over sessions.
+T = 10 and both, as `path-near` is. Prints the route not localised, and differences from the last,
+with 90 % intervals over sessions.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
 from engram.measures import Drive, Resamples, SessionSums, difference, not_localised_sums
 from engram.ranking import POLICIES, RankingContext
-from engram.ranking.path import PathPolicy
+from engram.ranking.path_near import PathNearPolicy
 from engram.robot import Settings, open_map
 from engram_lab.cli.simulation import campaigns_folder
 from engram_lab.studies.configurations import Configuration
@@ -33,10 +33,10 @@ from engram_lab.studies.memo import MatchMemo
 from engram_lab.studies.running import Plan, RankingOptions, make_plan, read_built_map
 
 
-class LikelihoodAlone(PathPolicy):
-    """Γ(path) of a robot that was nowhere yet: π is uniform."""
+class LikelihoodAlone(PathNearPolicy):
+    """Γ(path-near) of a robot that was nowhere yet: π is uniform."""
 
-    name = "path, likelihood alone"
+    name = "path-near, likelihood alone"
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
@@ -45,9 +45,9 @@ class LikelihoodAlone(PathPolicy):
 
 POLICIES[LikelihoodAlone.name] = LikelihoodAlone
 TERMS = {
-    "prior alone (T = 0)": Configuration("path", T=0),
+    "prior alone (T = 0)": Configuration("path-near", T=0),
     "likelihood alone (T = 10, uniform prior)": Configuration(LikelihoodAlone.name),
-    "both (T = 10)": Configuration("path"),
+    "both (T = 10)": Configuration("path-near"),
 }
 
 

@@ -76,7 +76,7 @@ def test_budget_bounds_the_attempts(engram, street: Path, town: Path) -> None:
     assert all(frame["attempts"] <= 1 for frame in result["frames"])
 
 
-@pytest.mark.parametrize("policy", ["distance", "path", "path-literal", "random"])
+@pytest.mark.parametrize("policy", ["distance", "path", "path-near", "random"])
 def test_every_policy_localises(engram, street: Path, town: Path, policy: str) -> None:
     result = engram("localise", town, street, "--policy", policy, "--json").json
     assert result["summary"]["share_localised"] > 0.5

@@ -161,7 +161,7 @@ def hamlet(group: Group) -> None:
     other = group.map("map-other", group.folder / "other.engram", afternoon)
     centre = group.merge("merge", group.folder / "centre.engram", robot, other)
     group.merge("merge-other-way", group.folder / "way.engram", other, robot)
-    for policy in ("recall", "path", "path-literal", "distance"):
+    for policy in ("recall", "path-near", "path", "distance"):
         group.localise(f"localise-{policy}", centre, later, policy=policy, frames="::3")
     group.send("download-budget", centre, policy="budget", budget_bytes=BUDGET_BYTES)
     group.send("download-paths", centre, policy="paths", start_h=8.0, end_h=9.0)

@@ -13,7 +13,7 @@ from engram.frontend import DescriptorKind, Frame
 from engram.graph.model import NodeId
 from engram.places import default_vocabulary
 from engram.ranking import QuantisedWords
-from engram.ranking.likeness import Likeness, standard_likenesses
+from engram.ranking.likeness import likenesses, standard_likenesses
 from engram.ranking.recall import RECALL, RecallPolicy
 
 WORDS = st.lists(st.integers(0, 49), max_size=12, unique=True)
@@ -30,12 +30,10 @@ def cosine(idf: np.ndarray, a: list[int], b: list[int]) -> float:
 @given(WORDS, st.lists(WORDS, max_size=6))
 def test_it_is_the_cosine_with_each_node(live: list[int], shown: list[list[int]]) -> None:
     words = MadeUpWords({node: sorted(one) for node, one in enumerate(shown)})
-    alike = Likeness(words, np.array(sorted(live), np.int32))
     expected = [cosine(words.idf, live, one) for one in shown]
     nodes = np.arange(len(shown), dtype=np.int32)
-    np.testing.assert_allclose(alike.of_each(nodes), expected, atol=1e-12)
-    for node in range(len(shown)):
-        assert alike([node]) == pytest.approx(expected[node], abs=1e-12)
+    found = likenesses(words, np.array(sorted(live), np.int32), nodes)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
 def test_candidates_are_compared_with_each_other() -> None:

@@ -12,7 +12,7 @@ from tests.worlds import flat_graph, make_context, memory_of, neighbourhood_of, 
 from engram.graph.model import PathEntry, PathEntryKind
 from engram.graph.paths import PathMemory
 from engram.ranking.path import PathPolicy
-from engram.ranking.path_literal import PathLiteralPolicy
+from engram.ranking.path_near import PathNearPolicy
 
 
 def posterior_of(memory: PathMemory, candidates, observed, outcomes, reference, **options):
@@ -101,8 +101,8 @@ def test_candidates_stand_by_exact_posteriors_and_equal_ones_by_distance(situati
         outcomes=outcomes,
         reference=reference,
     )
-    assert PathLiteralPolicy().rank(context).tolist() == by_posterior
     assert PathPolicy().rank(context).tolist() == by_posterior
+    assert PathNearPolicy().rank(context).tolist() == by_posterior
 
 
 def test_equal_posteriors_whose_logarithms_differ_tie() -> None:
@@ -114,7 +114,7 @@ def test_equal_posteriors_whose_logarithms_differ_tie() -> None:
         observed=[4, 5, 6],
         outcomes=[True, True, False],
     )
-    for policy in (PathLiteralPolicy(), PathPolicy()):
+    for policy in (PathPolicy(), PathNearPolicy()):
         assert policy.rank(context).tolist() == [0, 1]
         nearer = dataclasses.replace(
             context, neighbourhood=neighbourhood_of([0, 1], np.array([0.2, 0.1]))
@@ -249,3 +249,11 @@ def _example():
         np.array(EXAMPLE_OUTCOMES, np.bool_),
         4,
     )
+
+
+def test_on_paths_tells_who_was_where() -> None:
+    memory = memory_of(flat_graph(10), [[n % 10, (3 * n) % 10] for n in range(130)])
+    held = memory.on_paths(
+        [path_uuid(0), path_uuid(129), path_uuid(999)], np.arange(10, dtype=np.int32)
+    )
+    assert [np.flatnonzero(row).tolist() for row in held] == [[0], [7, 9], []]

@@ -10,7 +10,7 @@ from tests.worlds import make_context, neighbourhood_of, path_uuid
 
 from engram.errors import ConfigError
 from engram.graph.basin import BASIN_LEVEL
-from engram.ranking import POLICIES, Foreseen, RankingContext, policy_named
+from engram.ranking import Foreseen, RankingContext, policy_named, policy_names
 from engram.ranking.context import order_by
 
 
@@ -71,7 +71,7 @@ def foreknown(context: RankingContext, seed: int = 0) -> RankingContext:
     return dataclasses.replace(context, foresee=tell)
 
 
-@pytest.mark.parametrize("name", sorted(POLICIES))
+@pytest.mark.parametrize("name", sorted(policy_names()))
 class TestContract:
     def test_name_is_the_one_in_the_table(self, name: str) -> None:
         assert policy_named(name).name == name
@@ -138,7 +138,7 @@ class TestContract:
             assert order.tolist() == [1, 2, 0]
 
 
-@pytest.mark.parametrize("name", sorted(POLICIES.keys() - {"random"}))
+@pytest.mark.parametrize("name", sorted({*policy_names()} - {"random"}))
 def test_equal_candidates_stand_by_distance_then_by_uuid(name: str) -> None:
     context = make_context(candidates=[0, 1, 2, 3, 4], along_m=[1.0, 0.5, -0.5, 0.5, -1.0])
     nothing = Foreseen(np.zeros(5, np.bool_), np.zeros(5, np.int64))
@@ -148,7 +148,7 @@ def test_equal_candidates_stand_by_distance_then_by_uuid(name: str) -> None:
     assert policy_named(name).rank(context).tolist() == expected
 
 
-@pytest.mark.parametrize("name", ["path", "path-literal"])
+@pytest.mark.parametrize("name", ["path", "path-near"])
 def test_path_policies_put_the_companion_of_recent_successes_first(name: str) -> None:
     context = make_context(
         paths=[[1, 2, 3, 4, 9], [6, 7, 8, 4, 5]],
@@ -175,10 +175,10 @@ def test_candidates_with_the_same_counts_in_another_order_tie() -> None:
         observed=observed,
         outcomes=[True] * len(observed),
     )
-    assert policy_named("path-literal").rank(context).tolist() == [1, 0]
+    assert policy_named("path").rank(context).tolist() == [1, 0]
 
 
-def test_path_ranks_beyond_the_basin_by_distance_where_the_literal_formula_does_not() -> None:
+def test_path_near_ranks_by_distance_beyond_the_basin_and_the_published_formula_does_not() -> None:
     situation = {
         "paths": [[0, 1, 2, 3]],
         "candidates": [3, 4, 5],
@@ -188,15 +188,15 @@ def test_path_ranks_beyond_the_basin_by_distance_where_the_literal_formula_does_
         "reference": 2,
     }
     context = make_context(**situation)
-    assert policy_named("path-literal").rank(context)[0] == 0
-    assert policy_named("path").rank(context).tolist() == [1, 2, 0]
+    assert policy_named("path").rank(context)[0] == 0
+    assert policy_named("path-near").rank(context).tolist() == [1, 2, 0]
     # A longer lens sees farther: the basin then holds the companion 6 m away.
-    assert policy_named("path").rank(make_context(**situation, focal_px=707.0))[0] == 0
+    assert policy_named("path-near").rank(make_context(**situation, focal_px=707.0))[0] == 0
 
 
 @given(context=contexts())
 @settings(max_examples=60, deadline=None)
-def test_path_is_the_formula_within_the_basin_and_distance_beyond(context) -> None:
+def test_path_near_is_the_formula_within_the_basin_and_distance_beyond(context) -> None:
     near, seen = context.neighbourhood, context.observations
     beyond = context.success_rates() < BASIN_LEVEL
     scores = context.path_memory.scores(
@@ -204,13 +204,13 @@ def test_path_is_the_formula_within_the_basin_and_distance_beyond(context) -> No
     )
     # The core adds up in another order: what differs in its last bits only may stand in either.
     scores = np.where(beyond, 0, scores.round(9))
-    order, expected = policy_named("path").rank(context), order_by(context, beyond, -scores)
+    order, expected = policy_named("path-near").rank(context), order_by(context, beyond, -scores)
     np.testing.assert_array_equal(np.sort(order), np.sort(expected))
     np.testing.assert_array_equal(scores[order], scores[expected])
     np.testing.assert_array_equal(order[beyond[order]], expected[beyond[expected]])
 
 
-def test_path_refuses_arrays_that_do_not_fit() -> None:
+def test_path_near_refuses_arrays_that_do_not_fit() -> None:
     context = make_context(paths=[[0, 1]], candidates=[0, 1])
     near = context.neighbourhood
     for broken in (
@@ -219,17 +219,9 @@ def test_path_refuses_arrays_that_do_not_fit() -> None:
         dataclasses.replace(near, along_m=near.along_m[:1]),
     ):
         with pytest.raises(ValueError, match=r"node 99|one offset and one distance"):
-            policy_named("path").rank(dataclasses.replace(context, neighbourhood=broken))
-
-
-def test_random_depends_on_seed_and_stamp() -> None:
-    orders = {
-        tuple(policy_named("random").rank(make_context(candidates=range(12), **varied)).tolist())
-        for varied in ({}, {"seed": 1}, {"stamp_ns": 1}, {"seed": 1, "stamp_ns": 1})
-    }
-    assert len(orders) == 4
+            policy_named("path-near").rank(dataclasses.replace(context, neighbourhood=broken))
 
 
 def test_unknown_policy_is_refused_with_the_known_ones_named() -> None:
-    with pytest.raises(ConfigError, match=r"'nearest'.*distance.*path, path-literal, random"):
+    with pytest.raises(ConfigError, match=r"'nearest'.*distance.*path, path-near, .*recall"):
         policy_named("nearest")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram.ranking import IterationUnit, Observations, RecentAttempts, RecentConfig
+from engram.ranking import IterationUnit, Observations, RecentAttempts, RecentConfig, RunLog
 
 
 def as_dict(observations: Observations) -> dict[int, bool]:
@@ -59,3 +59,16 @@ def test_t_zero_remembers_nothing() -> None:
 def test_senseless_settings_are_refused(settings) -> None:
     with pytest.raises(ConfigError):
         RecentConfig(**settings)
+
+
+def test_run_log_forgets_what_lies_two_hundred_metres_back() -> None:
+    log = RunLog()
+    for metre in range(500):
+        unknown = np.array([0.5, np.nan])
+        log.add(float(metre), [metre, 7], unknown, unknown, [True, False], [30, 0], 90)
+    run = log.attempts(499.0)
+    assert run.nodes[::2].tolist() == list(range(299, 500))
+    assert set(run.nodes[1::2].tolist()) == {7}
+    assert run.accepted[:2].tolist() == [True, False]
+    assert run.driven_m == 499.0
+    assert set(run.inliers.tolist()) == {30, 0}

@@ -88,7 +88,7 @@ def test_ranking_stages_are_of_the_size_they_say(stage: str, drive: BenchData) -
 
 def test_the_plain_formula_ranks_as_path_does() -> None:
     place = SyntheticPlace(150)
-    formula, path = PlainFormula(place), policy_named("path-literal")
+    formula, path = PlainFormula(place), policy_named("path")
     for _ in range(3):
         context = place.context(200, 300)
         scores = formula.scores(context)[path.rank(context)]

@@ -10,7 +10,7 @@ from engram_lab.demo import run_demo
 @pytest.mark.long
 def test_the_demo_shows_that_paths_find_more_with_fewer_attempts(tmp_path: Path) -> None:
     report = run_demo(tmp_path / "demo")
-    distance, path = report.localised["distance"], report.localised["path"]
+    distance, path = report.localised["distance"], report.localised["path-near"]
     # At one attempt a frame, 76 and 100 % of the frames are localised.
     assert path[1]["share_localised"] > distance[1]["share_localised"] + 0.1
     assert path[4]["share_localised"] >= distance[4]["share_localised"]

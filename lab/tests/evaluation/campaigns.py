@@ -52,13 +52,13 @@ def write_campaign(folder: Path, looks=LOOKS, *, truth: bool = True, road=ROAD) 
 def few_options(**changes) -> RankingOptions:
     """Two policies, two budgets, two folds."""
     values = {
-        "policies": ("distance", "path"),
+        "policies": ("distance", "path-near"),
         "lanes": (1, 2),
         "rounds": (1,),
         "folds": 2,
         "live_folds": 0,
         "map_sizes": False,
         # One core and a second are enough on so short a road.
-        "build": MapOptions(policy="path", lanes=2, rounds=4, relocaliser="exhaustive"),
+        "build": MapOptions(policy="path-near", lanes=2, rounds=4, relocaliser="exhaustive"),
     }
     return RankingOptions(**{**values, **changes})

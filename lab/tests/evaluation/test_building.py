@@ -58,6 +58,6 @@ def test_a_drive_starts_where_the_map_hangs_together(campaign: DriveSet, tmp_pat
 
 
 def test_every_candidate_is_attempted_only_where_something_asks_for_it() -> None:
-    assert EVERYTHING not in sweep(("distance", "path"), (1, 2), (1,))
+    assert EVERYTHING not in sweep(("distance", "path-near"), (1, 2), (1,))
     assert EVERYTHING in sweep(("distance", "oracle"), (1, 2), (1,))
-    assert EVERYTHING in sweep(("path",), (2, UNLIMITED), (1,))
+    assert EVERYTHING in sweep(("path-near",), (2, UNLIMITED), (1,))

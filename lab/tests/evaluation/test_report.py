@@ -14,8 +14,8 @@ from tests.synthetic_world import CAMERA
 from engram.errors import InputError
 from engram.frontend import DescriptorKind
 from engram.graph.model import Clock, Session, SessionId
-from engram.ranking import POLICIES
 from engram.robot import Settings
+from engram_lab.policies import STUDIED
 from engram_lab.studies import (
     UNLIMITED,
     Configuration,
@@ -35,7 +35,7 @@ from engram_lab.studies.summary import collect
 FRAMES = 400
 SESSIONS = 10
 # Share of steps that end without a match, at Np = 2 in the whole map.
-MISSES = {"oracle": 0.02, "recall": 0.03, "bandit": 0.06, "path": 0.05, "distance": 0.17}
+MISSES = {"oracle": 0.02, "recall": 0.03, "bandit": 0.06, "path-near": 0.05, "distance": 0.17}
 
 
 def made_up_drive(number: int) -> EvaluatedDrive:
@@ -70,16 +70,9 @@ def made_up_runs(session: int, configurations) -> Runs:
 
 @pytest.fixture(scope="module")
 def plan(tmp_path_factory, monkeypatch_module=None) -> Plan:
-    from engram_lab.studies import running
-
     work = tmp_path_factory.mktemp("work")
     drives = DriveSet("made-up", tuple(made_up_drive(k) for k in range(SESSIONS)))
-    known = running.POLICIES
-    running.POLICIES = {**known, **dict.fromkeys(MISSES)}
-    try:
-        options = RankingOptions(policies=tuple(MISSES), folds=5, live_folds=1)
-    finally:
-        running.POLICIES = known
+    options = RankingOptions(policies=tuple(MISSES), folds=5, live_folds=1)
     plan = Plan(drives, Settings(), options, work)
     for fold in plan.folds:
         sessions = [
@@ -96,7 +89,7 @@ def plan(tmp_path_factory, monkeypatch_module=None) -> Plan:
             if fold.number == 0:
                 live = [Configuration(one, 2) for one in MISSES if one != "oracle"]
                 guided = made_up_runs(session, live)
-                guided.matched[live.index(Configuration("path", 2))] = True
+                guided.matched[live.index(Configuration("path-near", 2))] = True
                 write_runs(plan.runs_path(session, "live"), guided)
     return plan
 
@@ -143,14 +136,14 @@ def test_shares_are_those_that_were_made_up(rows) -> None:
 
 
 def test_folds_have_rows_of_their_own(rows) -> None:
-    folds = [one_row(rows, policy="path", fold=str(k)) for k in range(5)]
+    folds = [one_row(rows, policy="path-near", fold=str(k)) for k in range(5)]
     assert sum(int(row["sessions"]) for row in folds) == SESSIONS
     assert {row["share_not_localised_low"] for row in folds} == {""}
 
 
 def test_only_unmemoised_runs_tell_milliseconds(rows) -> None:
-    assert one_row(rows, policy="path")["ms_per_frame"] == ""
-    live = one_row(rows, policy="path", mode="live")
+    assert one_row(rows, policy="path-near")["ms_per_frame"] == ""
+    live = one_row(rows, policy="path-near", mode="live")
     assert float(live["ms_per_frame"]) == pytest.approx(0.3)
     assert live["sessions"] == "2"
 
@@ -163,7 +156,7 @@ def test_false_successes_are_counted(rows) -> None:
         and row["rounds"] == "1" and row["paths"] == "matched+saved"
     }  # fmt: skip
     assert found["oracle"] == SESSIONS
-    assert found["path"] == 0
+    assert found["path-near"] == 0
 
 
 def test_every_figure_is_drawn(out: Path) -> None:
@@ -200,14 +193,14 @@ def test_a_policy_has_one_colour_in_all_figures(
     monkeypatch.setattr("engram.viewing.curves.save", keep)
     draw_figures(tmp_path, [collect(plan)])
     assert looks["recall"] == {("black", "-")}
-    assert looks["path, matched only"] == {(POLICY_COLOURS["path"], "--")}
+    assert looks["path-near, matched only"] == {(POLICY_COLOURS["path-near"], "--")}
     for policy in MISSES:
         assert looks[policy] == {(POLICY_COLOURS[policy], "-")}
 
 
 def test_every_policy_has_a_colour_of_its_own() -> None:
-    assert POLICY_COLOURS.keys() == POLICIES.keys()
-    assert len(set(POLICY_COLOURS.values())) == len(POLICIES)
+    assert POLICY_COLOURS.keys() == set(STUDIED)
+    assert len(set(POLICY_COLOURS.values())) == len(STUDIED)
 
 
 def test_claims_stand_beside_what_was_measured(out: Path) -> None:
@@ -262,18 +255,20 @@ def test_guided_runs_stand_beside_the_unguided_ones_of_the_same_sessions(out: Pa
     assert "oracle" not in rows
     share = "15.00 % (15.00 … 15.00)"
     assert rows["distance"].startswith(f"| distance | {share} | {share} | ")
-    assert rows["path"].startswith("| path | 0.00 % (0.00 … 0.00) | 5.00 % (5.00 … 5.00) | ")
+    assert rows["path-near"].startswith(
+        "| path-near | 0.00 % (0.00 … 0.00) | 5.00 % (5.00 … 5.00) | "
+    )
 
 
 def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / "work"
     work.mkdir()
-    bare = replace(plan, work=work, options=replace(plan.options, policies=("path",)))
+    bare = replace(plan, work=work, options=replace(plan.options, policies=("path-near",)))
     for fold in plan.folds:
         source = plan.map_path(fold).with_suffix(".json")
         (work / source.name).write_bytes(source.read_bytes())
         for session in fold.held_out:
-            only = [Configuration("path", 2), Configuration("path", UNLIMITED)]
+            only = [Configuration("path-near", 2), Configuration("path-near", UNLIMITED)]
             write_runs(bare.runs_path(session, "memo"), made_up_runs(session, only))
     files = {path.name for path in write_report(tmp_path / "out", [bare])}
     assert "fig11_lanes.png" in files
@@ -316,10 +311,10 @@ def with_runs(plan: Plan, work: Path, mode: str, run: dict[int, tuple[str, ...]]
 def test_policies_run_on_different_sessions_are_not_compared(plan: Plan, tmp_path: Path) -> None:
     first, second = plan.folds[0].held_out, plan.folds[1].held_out
     assert len(first) == len(second)
-    run = dict.fromkeys(first, ("path", "oracle", "bandit"))
+    run = dict.fromkeys(first, ("path-near", "oracle", "bandit"))
     run |= dict.fromkeys(second, ("distance", "recall"))
     found = collect(with_runs(plan, tmp_path / "work", "memo", run))
-    assert {one.policy for one in found.memo} == {"path", "oracle", "bandit"}
+    assert {one.policy for one in found.memo} == {"path-near", "oracle", "bandit"}
     assert {tuple(k.session for k in one.sessions) for one in found.memo.values()} == {first}
     assert {one.policy: count for one, count in found.left_out.items()} == {
         "distance": len(second),
@@ -329,14 +324,16 @@ def test_policies_run_on_different_sessions_are_not_compared(plan: Plan, tmp_pat
 
 def test_one_policy_guided_in_another_fold_hides_no_other(plan: Plan, tmp_path: Path) -> None:
     first, second = plan.folds[0].held_out, plan.folds[1].held_out
-    run = dict.fromkeys(first, ("path", "distance", "recall")) | dict.fromkeys(second, ("recall",))
+    run = dict.fromkeys(first, ("path-near", "distance", "recall")) | dict.fromkeys(
+        second, ("recall",)
+    )
     found = collect(with_runs(plan, tmp_path / "work", "live", run))
-    assert {one.policy for one in found.live} == {"path", "distance", "recall"}
+    assert {one.policy for one in found.live} == {"path-near", "distance", "recall"}
     assert {tuple(k.session for k in one.sessions) for one in found.live.values()} == {first}
 
 
 def test_what_stands_twice_in_a_file_counts_once(plan: Plan, tmp_path: Path) -> None:
-    run = dict.fromkeys(plan.folds[0].held_out, ("path", "path"))
+    run = dict.fromkeys(plan.folds[0].held_out, ("path-near", "path-near"))
     found = collect(with_runs(plan, tmp_path / "work", "memo", run))
     (result,) = found.memo.values()
     assert tuple(one.session for one in result.sessions) == plan.folds[0].held_out
@@ -388,7 +385,7 @@ def test_more_rounds_alone_are_reported_too(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / "work"
     work.mkdir()
     options = replace(
-        plan.options, policies=("distance", "path"), lanes=(1, 2), rounds=(2,), map_sizes=False
+        plan.options, policies=("distance", "path-near"), lanes=(1, 2), rounds=(2,), map_sizes=False
     )
     twice = replace(plan, work=work, options=options)
     for fold in plan.folds:

@@ -62,7 +62,7 @@ def test_every_session_is_localised_with_every_configuration(plan: Plan) -> None
     runs = read_runs(plan.runs_path(0, "memo"))
     assert runs.matched.shape == (len(runs.configurations), len(runs.step_m))
     # Look 0 is in every fold's training sessions: its drives are localised nearly everywhere.
-    assert runs.matched[runs.configurations.index(Configuration("path", 2))].mean() > 0.9
+    assert runs.matched[runs.configurations.index(Configuration("path-near", 2))].mean() > 0.9
     assert np.nanmax(runs.offset_m) < 0.5
 
 
@@ -163,21 +163,23 @@ def test_two_runs_do_not_work_in_one_folder(plan: Plan) -> None:
 
 
 def test_what_is_named_twice_is_run_once() -> None:
-    options = replace(few_options(), policies=("path", "distance", "path"), lanes=(2, 1, 2))
-    assert options.policies == ("path", "distance")
+    options = replace(
+        few_options(), policies=("path-near", "distance", "path-near"), lanes=(2, 1, 2)
+    )
+    assert options.policies == ("path-near", "distance")
     assert options.lanes == (2, 1)
 
 
 def test_more_policies_later_cost_only_what_is_new(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)
-    options = replace(plan.options, policies=("distance", "path", "random"))
+    options = replace(plan.options, policies=("distance", "path-near", "random"))
     more = replace(plan, options=options, work=work)
     before = {path: path.read_bytes() for path in work.glob("fold*.engram")}
     run(more)
     found = results(more)
     assert {key: found[key] for key in results(plan)} == results(plan)
-    assert {one.policy for _, one in found} == {"distance", "path", "random"}
+    assert {one.policy for _, one in found} == {"distance", "path-near", "random"}
     assert all(path.read_bytes() == bytes_ for path, bytes_ in before.items())
 
 
@@ -201,10 +203,10 @@ def test_policies_are_run_again_in_the_folds_that_are_run(plan: Plan, tmp_path: 
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)
     one_fold = replace(plan, options=replace(plan.options, only_folds=(1,)), work=work)
-    forget(one_fold, ["path"])
+    forget(one_fold, ["path-near"])
     left = results(one_fold)
     dropped = {(session, one.policy) for session, one in set(results(plan)) - set(left)}
-    assert dropped == {(session, "path") for session in plan.folds[1].held_out}
+    assert dropped == {(session, "path-near") for session in plan.folds[1].held_out}
     run(one_fold)
     assert results(one_fold) == results(plan)
 
@@ -225,7 +227,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)
     options = replace(
-        plan.options, policies=("distance", "path", "oracle"), map_sizes=True, live_folds=1
+        plan.options, policies=("distance", "path-near", "oracle"), map_sizes=True, live_folds=1
     )
     whole = replace(plan, options=options, work=work)
     run(whole)
@@ -251,7 +253,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
         if (row["fold"], row["mode"], row["lanes"], row["map_sessions"]) == ("all", "memo", "2", "")
         and (row["T"], row["radius"], row["paths"]) == ("10", "search", "matched+saved")
     }
-    assert set(pooled) == {"distance", "path", "oracle"}
+    assert set(pooled) == {"distance", "path-near", "oracle"}
     assert pooled["oracle"] <= min(pooled.values())
     # A fold's rows pool to the row of all folds, weighted by the way driven.
     by_fold = [

@@ -91,8 +91,7 @@ Policy: TypeAlias = Annotated[
     str,
     typer.Option(
         "--policy",
-        help="Ranking: recall, path, distance, bandit, bag-of-words, time-of-day, "
-        "collaborative, nearest-of-each, path-literal or random.",
+        help="Ranking: recall, path, path-near, distance, or one that an installed package brings.",
     ),
 ]
 Descriptor: TypeAlias = Annotated[

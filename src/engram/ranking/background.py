@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from engram.graph.model import Session, SessionId
 from engram.ranking.lessons import Lessons
-from engram.ranking.times import SessionTimes
 from engram.ranking.words import WordSource
 
 
@@ -14,11 +15,11 @@ class Background:
     """What some policies want to know of a map. All of it may be missing.
 
     Attributes:
-        times: when the sessions were driven.
+        sessions: the drives by id, with the times when they began.
         lessons: what past drives matched and failed to match.
         words: the visual words of nodes and frames; None without a vocabulary.
     """
 
-    times: SessionTimes = field(default_factory=SessionTimes)
+    sessions: Mapping[SessionId, Session] = field(default_factory=dict)
     lessons: Lessons = field(default_factory=Lessons.none)
     words: WordSource | None = None

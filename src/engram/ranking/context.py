@@ -103,8 +103,16 @@ class RankingPolicy(Protocol):
 
 
 def uses_words(policy: RankingPolicy) -> bool:
-    """Whether a policy looks at visual words: a localiser then has them read before it sets off."""
+    """Whether a policy looks at visual words: a localiser then has them read before it sets off.
+
+    It says so by an attribute of this name that is true.
+    """
     return bool(getattr(policy, "uses_words", False))
+
+
+def looks_ahead(policy: RankingPolicy) -> bool:
+    """Whether a policy asks `RankingContext.foresee`, as its attribute of this name says."""
+    return bool(getattr(policy, "looks_ahead", False))
 
 
 def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
@@ -113,22 +121,3 @@ def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.
     values = (np.ascontiguousarray(key, dtype=np.float64) for key in keys)
     uuid_words = context.graph.uuid_words
     return _core.order_rows(neighbourhood.nodes, uuid_words, *values, neighbourhood.distance_m)
-
-
-def round_robin(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
-    """The sessions of the candidates in turn, each with its nearest node first (SPEC §4).
-
-    In each round sessions stand by the keys, (Y,) each and equal for all nodes of one session;
-    ties by distance, then by UUID. A policy that knows which experience is best, but not which
-    node of it, would otherwise spend its budget on one experience's nodes from near to far.
-    """
-    nearest_first = order_by(context)
-    groups = context.sessions[nearest_first]
-    by_group = np.argsort(groups, kind="stable")
-    grouped = groups[by_group]
-    place = np.arange(len(groups))
-    is_first = np.diff(grouped, prepend=-1) != 0
-    first = np.maximum.accumulate(np.where(is_first, place, 0))
-    turn = np.empty(len(groups))
-    turn[nearest_first[by_group]] = place - first
-    return order_by(context, turn, *keys)

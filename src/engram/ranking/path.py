@@ -1,46 +1,68 @@
-"""Γ(path): path memory within the match basin, distance beyond it (SPEC §4)."""
+"""Γ(path) as published [L15 §V]: the formula ranks the whole neighbourhood."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.graph.basin import BASIN_LEVEL
-from engram.ranking.context import RankingContext
-from engram.ranking.path_literal import PathLiteralPolicy
+from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
+
+# Posteriors that are equal on paper tie, though their logarithms were added up from other numbers;
+# as in the core's `path_order`.
+_TIE_SCALE = 2.0**30
+_MEANING = {
+    "score": "log posterior of [L15 §V], up to a common constant",
+    "with successes": "paths shared with the nodes matched lately, summed over those",
+    "with failures": "paths shared with the nodes that failed lately, likewise",
+    "with k": "paths shared with the node in which the robot is localised, or was last",
+}
 
 
 class PathPolicy:
-    """By the formula of [L15 §V] among the candidates that are near enough to match; then the rest.
+    """By p(y = i | Z, θ, π) over path memory, for all of Y (SPEC §4).
 
-    The formula knows no distance: over the whole search radius it would put a node of the right
-    experience 8 m away before one of the same experience at 1 m. Our reading of the paper's "local
-    metric neighbourhood" is the match basin, where g(d) >= 0.6.
+    Args:
+        alpha: pseudo-count of the likelihood θ.
+        gamma: pseudo-count of the prior π.
     """
 
     name = "path"
 
     def __init__(self, alpha: float = 1.0, gamma: float = 1.0) -> None:
-        self._alpha, self._gamma = alpha, gamma
-
-    def reasons(self, context: RankingContext) -> Reasons:
-        """See `Explains`."""
-        literal = PathLiteralPolicy(self._alpha, self._gamma).reasons(context)
-        rule = (
-            f"highest score first where g is {BASIN_LEVEL:g} or more; behind them the others, "
-            "nearest first"
-        )
-        return replace(literal, rule=rule)
+        self._alpha = alpha
+        self._gamma = gamma
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
-        return context.path_memory.order(
-            context.neighbourhood,
-            context.basin,
-            BASIN_LEVEL,
+        scores = self.scores(context, context.neighbourhood.nodes)
+        return order_by(context, -np.rint(scores * _TIE_SCALE))
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        memory, seen = context.path_memory, context.observations
+        nodes = context.neighbourhood.nodes
+        shared = memory.co_occurrence(nodes, seen.nodes, excluded=context.own_path)
+        terms = {
+            "score": self.scores(context, nodes),
+            "with successes": shared[:, seen.succeeded].sum(axis=1).astype(np.float64),
+            "with failures": shared[:, ~seen.succeeded].sum(axis=1).astype(np.float64),
+        }
+        if context.reference is not None:
+            k = np.array([context.reference], np.int32)
+            here = memory.co_occurrence(nodes, k, excluded=context.own_path)
+            terms["with k"] = here[:, 0].astype(np.float64)
+        meaning = {name: _MEANING[name] for name in terms}
+        return Reasons(terms, meaning, rule="highest score first, of equals the nearest")
+
+    def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(N,) log posterior of nodes up to a common constant.
+
+        Nodes that share as many paths with as many of W have the same to the last bit; others
+        whose posterior is the same on paper may differ in that, and tie when they are ranked.
+        """
+        return context.path_memory.scores(
+            nodes,
             context.observations.nodes,
             context.observations.succeeded,
             context.reference,

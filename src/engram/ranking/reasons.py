@@ -31,12 +31,6 @@ class Reasons:
     rule: str = ""
 
 
-# What policies have in common that rank experiences.
-IN_TURNS = (
-    "the drives take turns, each with its nearest node, then with its second nearest, and so on"
-)
-
-
 @runtime_checkable
 class Explains(Protocol):
     """A policy that can say more than distance."""

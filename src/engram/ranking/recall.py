@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.graph.basin import prior_basin_m
-from engram.ranking.bandit import PRIOR_ATTEMPTS, PRIOR_RATE
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.likeness import standard_likenesses
 from engram.ranking.reasons import Reasons
@@ -33,6 +32,8 @@ class RecallConstants:
         tally: margin per log of how often this run matched the node's drive, over that of a drive
             not tried yet.
         tally_memory_m: metres driven over which an attempt comes to weigh e times less in that.
+        untried_rate, untried_attempts: success rate of a drive not tried yet, and how many attempts
+            that is worth. Source: SPEC §4, as Γ(bandit).
         likeness: margin per standard deviation that a node looks liker than the others do.
         vague_m: how vaguely even the surest candidate is known, σ, before likeness counts.
         steepness: log odds of a success per margin.
@@ -47,6 +48,8 @@ class RecallConstants:
     regret: float
     tally: float
     tally_memory_m: float
+    untried_rate: float
+    untried_attempts: float
     likeness: float
     vague_m: float
     steepness: float
@@ -65,6 +68,8 @@ RECALL = RecallConstants(
     regret=2.0,
     tally=0.5,
     tally_memory_m=8.0,
+    untried_rate=0.3,
+    untried_attempts=1.0,
     likeness=0.4,
     vague_m=0.5,
     steepness=1.8,
@@ -248,8 +253,8 @@ class RecallPolicy:
             regret=c.regret,
             tally=c.tally,
             tally_memory_m=c.tally_memory_m,
-            untried_rate=PRIOR_RATE,
-            untried_count=PRIOR_ATTEMPTS,
+            untried_rate=c.untried_rate,
+            untried_count=c.untried_attempts,
             needed=_NEEDED,
             attempts=_MOST_ATTEMPTS,
             picks=_PICKS,

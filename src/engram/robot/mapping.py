@@ -167,7 +167,7 @@ def map_drive(
             writer = store.resume_session(session.id)
             report.resumed = True
         opened = OpenMap(store)
-        opened.times.add(session)
+        opened.drives[session.id] = session
         words = _node_words(opened, store, settings, options)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             _map_frames(

@@ -40,7 +40,6 @@ from engram.ranking import (
     PastAttempts,
     QuantisedWords,
     RankingPolicy,
-    SessionTimes,
     check_for_robot,
     policy_named,
     uses_words,
@@ -57,7 +56,7 @@ class OpenMap:
         path_memory: its paths.
         remembered: its attempts; sessions are places in `sessions`, nodes are dense indices.
         attempts: counts of them, from which match basins are learnt.
-        times: when its sessions were driven.
+        drives: its sessions and those that are being added, by id: what policies may ask.
         sessions: its sessions, by id.
         last_iterations: number of the newest remembered iteration of each session that has any.
     """
@@ -72,7 +71,7 @@ class OpenMap:
         self.graph.add_edges(contents.edges)
         for entry in contents.path_entries:
             self.path_memory.add(entry)
-        self.times = SessionTimes(contents.sessions)
+        self.drives = {session.id: session for session in contents.sessions}
         self._words: dict[DescriptorKind, QuantisedWords] = {}
         self.remembered = contents.attempts
         self._lessons: dict[float, Lessons] = {}
@@ -226,7 +225,7 @@ class OpenMap:
                 lambda: self.vocabulary_or_default(descriptor),
                 lambda vocabulary: stored_words(self.store, vocabulary),
             )
-        return Background(self.times, self.lessons(focal_px), self._words[descriptor])
+        return Background(self.drives, self.lessons(focal_px), self._words[descriptor])
 
     def robot(
         self,

@@ -23,8 +23,8 @@ def prepare_ranking(
     """Order the candidates of 1,000 situations drawn at random, with `paths` paths in memory.
 
     A drive's situations are like each other, these are not: what a policy keeps from frame to
-    frame helps it only within the ten runs of one input. The reference of `path` works the formula
-    out in NumPy, over 150 paths only: over 10,000 it takes a hundred times as long.
+    frame helps it only within the ten runs of one input. The reference of `path-near` works the
+    formula out in NumPy, over 150 paths only: over 10,000 it takes a hundred times as long.
     """
     del data, plain
     place = SyntheticPlace(paths)
@@ -35,7 +35,7 @@ def prepare_ranking(
         order = ranking.rank(contexts[i % _INPUTS])
         return {"paths": paths, "candidates": len(order), "observed": _OBSERVED}
 
-    if policy != "path" or paths > 1000:
+    if policy != "path-near" or paths > 1000:
         return Prepared(ours, best_of=_BEST_OF)
     formula = PlainFormula(place)
 

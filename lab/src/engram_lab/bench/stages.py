@@ -108,8 +108,8 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "places_query_20000": partial(prepare_places_query, places=20_000, dense=True),
         "places_query_1000000": partial(prepare_places_query, places=1_000_000, dense=False),
         "vocabulary_train": prepare_vocabulary_train,
-        "rank_path_150": partial(prepare_ranking, policy="path", paths=150),
-        "rank_path_10000": partial(prepare_ranking, policy="path", paths=10_000),
+        "rank_path_150": partial(prepare_ranking, policy="path-near", paths=150),
+        "rank_path_10000": partial(prepare_ranking, policy="path-near", paths=10_000),
         "rank_recall_150": partial(prepare_ranking, policy="recall", paths=150),
         "rank_recall_10000": partial(prepare_ranking, policy="recall", paths=10_000),
     }

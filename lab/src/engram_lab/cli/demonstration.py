@@ -75,9 +75,9 @@ def _tell(report: DemoReport) -> None:
     console.print(grown)
     console.print(_found(report))
     console.print(
-        f"In {report.out}: one_place.png, the same place in six conditions; matches_path_4/, live "
-        "image and node side by side with their inliers joined; map_from_above.png, experiences "
-        "in colour; attempts.png, what each frame cost until it matched. `distance` tries the "
-        "nearest node first, `path` one that went together in earlier drives with those that "
-        "matched just now: the more experiences a place has, the more that saves."
+        f"In {report.out}: one_place.png, the same place in six conditions; matches_path-near_4/, "
+        "live image and node side by side with their inliers joined; map_from_above.png, "
+        "experiences in colour; attempts.png, what each frame cost until it matched. `distance` "
+        "tries the nearest node first, `path-near` one that went together in earlier drives with "
+        "those that matched just now: the more experiences a place has, the more that saves."
     )

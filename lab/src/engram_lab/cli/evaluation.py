@@ -113,8 +113,8 @@ def ranking(
       engram evaluate ranking monday.framelog tuesday.framelog … --out results/mine
     """
     from engram.cli.progress import progress
-    from engram.ranking import POLICIES
     from engram.robot import load_settings
+    from engram_lab.policies import STUDIED
     from engram_lab.studies import (
         DEFAULT_LANES,
         RankingOptions,
@@ -126,7 +126,7 @@ def ranking(
     )
 
     asked = RankingOptions(
-        policies=tuple(policies.split(",") if policies else POLICIES),
+        policies=tuple(policies.split(",") if policies else STUDIED),
         lanes=_lanes(lanes) if lanes else DEFAULT_LANES,
         rounds=_numbers(rounds, "--rounds"),
         folds=folds,

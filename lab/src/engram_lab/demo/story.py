@@ -33,7 +33,7 @@ from engram_lab.town import SimulatedDrive, campaign_named
 from engram_lab.town.simulating import simulate
 
 _CAMPAIGN = "hamlet"
-_POLICIES = ("distance", "path")
+_POLICIES = ("distance", "path-near")
 # One attempt, or one after another up to four: what counts is which experience is tried first.
 _ATTEMPTS = (1, 4)
 # The place that is shown in every condition, as a share of the drive.

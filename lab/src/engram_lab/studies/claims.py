@@ -45,7 +45,7 @@ def _pooled(campaigns: Sequence[CampaignResult]) -> list[str]:
     if len(campaigns) < 2:
         return []
     rows, ours = [], [one.get(_BEST_KNOWN) for one in campaigns]
-    for other in ("path", "distance", "bandit"):
+    for other in ("path-near", "distance", "bandit"):
         theirs = [one.get(other) for one in campaigns]
         pairs = [
             (a, b) for a, b in zip(ours, theirs, strict=True) if a is not None and b is not None
@@ -146,7 +146,7 @@ def _few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
     found = [campaign.get(policy) for policy in campaign.policies]
     found += [
         campaign.get(policy, **variant)
-        for policy in ("path", "path-literal")
+        for policy in ("path-near", "path")
         for variant in ({"radius": Radius.BASIN}, {"paths": PathKinds.MATCHED})
     ]
     return [one for one in found if one is not None]
@@ -165,13 +165,13 @@ def _path_claims(campaign: CampaignResult) -> Iterable[Row]:
         return
     few = campaign.few_lanes
     for result in _few_lanes_results(campaign):
-        if result.configuration.policy not in {"path", "path-literal"}:
+        if result.configuration.policy not in {"path-near", "path"}:
             continue
         label = result.configuration.label
         excess = excess_ratio(nearest.not_localised, result.not_localised, bound.not_localised)
         raw = ratio(nearest.not_localised, result.not_localised)
         far = ratio(nearest.failure(10.0), result.failure(10.0))
-        main = label == "path"
+        main = label == "path-near"
         yield (
             f"`distance` ÷ `{label}`, Np = {few}: excess over the oracle of route not localised",
             "5×" if main else "–",
@@ -184,10 +184,10 @@ def _path_claims(campaign: CampaignResult) -> Iterable[Row]:
 
 
 def _many_lanes(campaign: CampaignResult) -> Iterable[Row]:
-    path, nearest = campaign.get("path", 2), campaign.get("distance", 4)
+    path, nearest = campaign.get("path-near", 2), campaign.get("distance", 4)
     if path is not None and nearest is not None:
         yield (
-            "`path` at Np = 2 against `distance` at Np = 4, route not localised",
+            "`path-near` at Np = 2 against `distance` at Np = 4, route not localised",
             "equal",
             "equal or better",
             "",
@@ -195,7 +195,7 @@ def _many_lanes(campaign: CampaignResult) -> Iterable[Row]:
         )
     better, compared = [], []
     for lanes in sorted({one.lanes for one in campaign.memo}):
-        a, b = campaign.get("path", lanes), campaign.get("distance", lanes)
+        a, b = campaign.get("path-near", lanes), campaign.get("distance", lanes)
         if a is None or b is None:
             continue
         gap = campaign.resamples.interval(difference(a.not_localised, b.not_localised))
@@ -204,29 +204,29 @@ def _many_lanes(campaign: CampaignResult) -> Iterable[Row]:
             better.append(a.configuration.lanes_text)
     if compared:
         yield (
-            "`path` against `distance` at every Np",
+            "`path-near` against `distance` at every Np",
             "better",
             "better or within the interval",
             "",
             f"at {len(better)} of {len(compared)}: Np = {', '.join(better) or '–'}",
         )
-    a, b = campaign.get("path", UNLIMITED), campaign.get("distance", UNLIMITED)
+    a, b = campaign.get("path-near", UNLIMITED), campaign.get("distance", UNLIMITED)
     if a is not None and b is not None:
         yield ("both at unlimited Np", "equal", "equal", "", _against(campaign, a, b))
 
 
 def _memory(campaign: CampaignResult) -> Iterable[Row]:
-    usual, without = campaign.get("path"), campaign.get("path", T=0)
+    usual, without = campaign.get("path-near"), campaign.get("path-near", T=0)
     if usual is None or without is None:
         return
     yield (
-        "T = 0 against T = 10 for `path`, route not localised",
+        "T = 0 against T = 10 for `path-near`, route not localised",
         "clearly worse",
         "worse, interval clear of 0",
         "",
         _against(campaign, without, usual),
     )
-    some = [one for T in (5, 10, 20, 50, 100, 200) if (one := campaign.get("path", T=T))]
+    some = [one for T in (5, 10, 20, 50, 100, 200) if (one := campaign.get("path-near", T=T))]
     for name, values in (
         ("route not localised", [one.not_localised.value for one in some]),
         ("P(> 10 m)", [one.failure(10.0).value for one in some]),
@@ -247,7 +247,7 @@ def _recall(campaign: CampaignResult) -> Iterable[Row]:
         "≤ 1.2",
         times(campaign.resamples.interval(to_bound)),
     )
-    for other in ("path", "distance", "bandit"):
+    for other in ("path-near", "distance", "bandit"):
         result = campaign.get(other)
         if result is not None:
             must = "interval clear of 0 on the pooled sessions" if other == "bandit" else "better"
@@ -276,12 +276,12 @@ def _share(high: float, mean: float) -> str:
 
 
 def _growth(campaign: CampaignResult) -> Iterable[Row]:
-    for policy in ("distance", "path", _BEST_KNOWN):
+    for policy in ("distance", "path-near", _BEST_KNOWN):
         whole, first = campaign.get(policy), campaign.get(policy, sessions=1)
         if whole is None or first is None:
             continue
         fall = ratio(first.failure(10.0), whole.failure(10.0))
-        paper = {"distance": "rises", "path": "falls 4×"}.get(policy, "–")
+        paper = {"distance": "rises", "path-near": "falls 4×"}.get(policy, "–")
         must = "–" if policy == "distance" else "falls ≥ 2×"
         yield (
             f"`{policy}`: P(> 10 m) in the smallest map ÷ in the largest (Fig. 9)",

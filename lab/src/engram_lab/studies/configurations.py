@@ -21,8 +21,8 @@ DEFAULT_T = RecentConfig().T
 # The budget of [L15]'s Figs. 9, 12 and 13.
 FEW_LANES = 2
 # Policies whose second round is measured too.
-TWO_ROUNDS = ("distance", "path", "recall")
-PATH_POLICIES = ("path", "path-literal")
+TWO_ROUNDS = ("distance", "path-near", "recall")
+PATH_POLICIES = ("path-near", "path")
 
 
 class Radius(StrEnum):
@@ -49,7 +49,7 @@ class Configuration:
     """One way to localise the held-out sessions.
 
     Attributes:
-        policy: key of `POLICIES`.
+        policy: name of a ranking policy.
         lanes, rounds: Np and Nr.
         T: iterations remembered.
         radius: of the search for candidates.
@@ -109,10 +109,10 @@ def sweep(
     lanes: Sequence[int] = DEFAULT_LANES,
     rounds: Sequence[int] = (1, 2),
 ) -> tuple[Configuration, ...]:
-    """All that is run in the whole map: policy × Np, T, Nr = 2, and the variants of `path`.
+    """All that is run in the whole map: policy × Np, T, Nr = 2, and the variants of `path-near`.
 
     Args:
-        policies: keys of `POLICIES`.
+        policies: names of ranking policies.
         lanes: Np; `UNLIMITED` for as many attempts as there are candidates.
         rounds: Nr; rounds beyond the first are run for `TWO_ROUNDS` only.
     """
@@ -129,9 +129,9 @@ def sweep(
     for nr in rounds[1:]:
         limited = [np for np in lanes if np != UNLIMITED]
         add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)
-    if "path" in policies:
-        add(Configuration("path", few, rounds[0], T) for T in T_SWEEP)
-        add(Configuration("path", np, rounds[0], paths=PathKinds.MATCHED) for np in lanes)
+    if "path-near" in policies:
+        add(Configuration("path-near", few, rounds[0], T) for T in T_SWEEP)
+        add(Configuration("path-near", np, rounds[0], paths=PathKinds.MATCHED) for np in lanes)
     for policy in PATH_POLICIES:
         if policy in policies:
             add([Configuration(policy, few, rounds[0], radius=Radius.BASIN)])

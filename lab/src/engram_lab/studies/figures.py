@@ -28,8 +28,8 @@ _BEYOND = 20.0
 # A policy has one colour in all figures, whichever others are drawn beside it.
 POLICY_COLOURS = {
     "distance": "C0",
-    "path": "C1",
-    "path-literal": "C2",
+    "path-near": "C1",
+    "path": "C2",
     "random": "C3",
     "oracle": "C4",
     "time-of-day": "C5",
@@ -40,7 +40,7 @@ POLICY_COLOURS = {
     "recall": "black",
 }
 _LOOKS = {policy: (colour, "-") for policy, colour in POLICY_COLOURS.items()} | {
-    Configuration("path", paths=PathKinds.MATCHED).label: (POLICY_COLOURS["path"], "--")
+    Configuration("path-near", paths=PathKinds.MATCHED).label: (POLICY_COLOURS["path-near"], "--")
 }
 
 
@@ -132,7 +132,7 @@ def _lanes(
     """[L15] Fig. 11: failure against Np."""
     lines = []
     variants = [(policy, PathKinds.ALL) for policy in campaign.policies]
-    for policy, paths in [*variants, ("path", PathKinds.MATCHED)]:
+    for policy, paths in [*variants, ("path-near", PathKinds.MATCHED)]:
         results = by_lanes(campaign, policy, paths)
         if len(results) > 1:
             label = results[0].configuration.label
@@ -196,7 +196,7 @@ def _curves(
 
 def _sensitivity(campaign: CampaignResult) -> Panel | None:
     """[L15] Fig. 13: T."""
-    results = [campaign.get("path", T=T) for T in T_SWEEP]
+    results = [campaign.get("path-near", T=T) for T in T_SWEEP]
     found = [one for one in results if one is not None]
     if len(found) < 2:
         return None

@@ -15,9 +15,10 @@ from engram.errors import ConfigError
 from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
 from engram.monitor import ignore
-from engram.ranking import POLICIES
+from engram.ranking import policy_named
 from engram.robot import MapOptions, OpenMap, Settings, open_map
 from engram.sequences import LoggedFrame
+from engram_lab.policies import STUDIED
 from engram_lab.studies.building import (
     GENEROUS,
     BuiltMap,
@@ -53,7 +54,7 @@ class RankingOptions:
     """What an evaluation of ranking policies runs.
 
     Attributes:
-        policies: keys of `POLICIES`.
+        policies: names of ranking policies.
         lanes, rounds: Np and Nr.
         folds: of the cross-validation.
         seed: of the shuffle of sessions and of the bootstrap.
@@ -66,7 +67,7 @@ class RankingOptions:
             later joins it.
     """
 
-    policies: tuple[str, ...] = tuple(POLICIES)
+    policies: tuple[str, ...] = STUDIED
     lanes: tuple[int, ...] = DEFAULT_LANES
     rounds: tuple[int, ...] = (1, 2)
     folds: int = 5
@@ -82,10 +83,7 @@ class RankingOptions:
             once = tuple(dict.fromkeys(getattr(self, name)))
             object.__setattr__(self, name, once)  # what is named twice is run once
         for policy in self.policies:
-            if policy not in POLICIES:
-                raise ConfigError(
-                    f"no ranking policy '{policy}'; there are: {', '.join(sorted(POLICIES))}"
-                )
+            policy_named(policy)  # refuses what is none
         if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
             raise ConfigError(
                 f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"

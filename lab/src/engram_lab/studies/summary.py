@@ -22,8 +22,8 @@ from engram.measures import (
     not_localised_sums,
     product,
 )
-from engram.ranking import POLICIES
 from engram_lab.accuracy import PoseErrors
+from engram_lab.policies import STUDIED
 from engram_lab.studies.building import BuiltMap
 from engram_lab.studies.configurations import (
     EVERYTHING,
@@ -227,9 +227,9 @@ class CampaignResult:
 
     @property
     def policies(self) -> list[str]:
-        """Those run, in the order of `POLICIES`, whichever came first."""
+        """Those run, in the order of `STUDIED`, then others by name, whichever came first."""
         run = {one.policy for one in self.memo}
-        return [name for name in POLICIES if name in run]
+        return [name for name in STUDIED if name in run] + sorted(run - set(STUDIED))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

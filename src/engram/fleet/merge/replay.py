@@ -42,7 +42,7 @@ from engram.mapper import match_edges
 from engram.maps import BulkWriter, StoredNode
 from engram.monitor import Monitor
 from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
-from engram.ranking import check_for_robot, policy_named
+from engram.ranking import check_for_robot
 from engram.robot import Settings
 
 # A segment is seeded from a neighbour this far along it: farther, places are looked up instead.
@@ -78,7 +78,6 @@ class MergeOptions:
     sure_inliers: int = 40
 
     def __post_init__(self) -> None:
-        policy_named(self.policy)  # refuses what is none
         check_for_robot(self.policy)
         Budget(self.lanes, self.rounds)  # refuses what is no budget
         if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:

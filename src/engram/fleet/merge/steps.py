@@ -214,7 +214,7 @@ class _Merging:
             frontend=frontend,
             partial=path_id(session.id) in self._robot.partial_paths,
         )
-        self._centre.opened.times.add(session)
+        self._centre.opened.drives[session.id] = session
         self._report.sessions += is_new
 
     def _unite_path(self, session: Session, replay: Replay) -> list[PathEntry]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.ranking.context import RankingContext, round_robin
-from engram.ranking.reasons import IN_TURNS, Reasons
+from engram.ranking.context import RankingContext
+from engram.ranking.reasons import Reasons
+from engram_lab.policies.turns import IN_TURNS, round_robin
 
 
 class NearestOfEachPolicy:

@@ -13,6 +13,7 @@ class OraclePolicy:
     """By whether the attempt would succeed, then inliers, then distance (SPEC §4)."""
 
     name = "oracle"
+    looks_ahead = True
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`.

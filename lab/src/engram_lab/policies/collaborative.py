@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.graph.model import path_id
-from engram.ranking.context import RankingContext, round_robin
-from engram.ranking.reasons import IN_TURNS, Reasons
+from engram.ranking.context import RankingContext
+from engram.ranking.reasons import Reasons
+from engram_lab.policies.turns import IN_TURNS, round_robin
 
 # "Decayed with distance" (SPEC §4), by as much as the bandit's memory.
 _DECAY_M = 8.0

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.ranking.context import RankingContext, round_robin
-from engram.ranking.reasons import IN_TURNS, Reasons
-from engram.ranking.times import hour_difference
+from engram.graph.clock import day_of, hour_of_day
+from engram.ranking.context import RankingContext
+from engram.ranking.reasons import Reasons
+from engram_lab.policies.turns import IN_TURNS, round_robin
 
 
 class TimeOfDayPolicy:
@@ -37,10 +38,21 @@ class TimeOfDayPolicy:
     @staticmethod
     def _differences(context: RankingContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(Y,) hours, 0 to 12, and days."""
-        sessions, times = context.sessions, context.background.times
-        days = times.days(context.graph, sessions)
+        numbers, group = np.unique(context.sessions, return_inverse=True)
+        began = np.array([_began(context, number) for number in numbers.tolist()])
+        hours, days = began.reshape(-1, 2)[group].T
         today = np.fmax.reduce(days, initial=-np.inf) if context.day is None else context.day
         age_days = np.abs(today - days)
         if context.hour is None:
-            return np.zeros(len(sessions)), age_days
-        return hour_difference(times.hours(context.graph, sessions), context.hour), age_days
+            return np.zeros(len(group)), age_days
+        apart_h = np.abs(hours - context.hour) % 24
+        return np.minimum(apart_h, 24 - apart_h), age_days
+
+
+def _began(context: RankingContext, number: int) -> tuple[float, float]:
+    """Hour of day and days since 1970 at which a session began; NaN where it is not known."""
+    session = context.background.sessions.get(context.graph.session(number))
+    if session is None:
+        return np.nan, np.nan
+    hour, day = hour_of_day(session, session.start_ns), day_of(session, session.start_ns)
+    return np.nan if hour is None else hour, np.nan if day is None else day

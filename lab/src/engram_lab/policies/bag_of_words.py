@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.ranking.context import RankingContext, round_robin
-from engram.ranking.likeness import Likeness
-from engram.ranking.reasons import IN_TURNS, Reasons
+from engram.ranking.context import RankingContext
+from engram.ranking.reasons import Reasons
+from engram.ranking.words import WordSource
+from engram_lab.policies.turns import IN_TURNS, round_robin
 
 # An experience looks like its nodes within so many metres do (SPEC §4).
 _HERE_M = 2.0
@@ -30,7 +31,7 @@ class BagOfWordsPolicy:
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
         meaning = {"likeness": "cosine of the frame's words and those of the node's drive here"}
-        rule = f"{IN_TURNS}; likest first within a turn"
+        rule = f"{IN_TURNS}; most alike first within a turn"
         return Reasons({"likeness": experience_similarities(context)}, meaning, rule=rule)
 
 
@@ -44,7 +45,7 @@ def experience_similarities(context: RankingContext) -> NDArray[np.float64]:
     result = np.zeros(len(sessions))
     if words is None or context.live_words is None or len(sessions) == 0:
         return result
-    likeness_of = Likeness(words, context.live_words())
+    likeness_of = _Likeness(words, context.live_words())
     distance_m, nodes = context.neighbourhood.distance_m, context.neighbourhood.nodes
     nearest_first = np.lexsort((distance_m, sessions))
     bounds = np.flatnonzero(np.diff(sessions[nearest_first])) + 1
@@ -53,3 +54,30 @@ def experience_similarities(context: RankingContext) -> NDArray[np.float64]:
         within = int(np.searchsorted(away_m, max(_HERE_M, away_m[0]), side="right"))
         result[rows] = likeness_of(nodes[rows[:within]].tolist())
     return result
+
+
+class _Likeness:
+    """Cosine, 0…1, of idf-weighted sets of words with those of one frame."""
+
+    def __init__(self, words: WordSource, live: NDArray[np.int32]) -> None:
+        self._words = words
+        self._weights = words.idf**2
+        self._seen = np.zeros(len(self._weights))
+        self._seen[live] = self._weights[live]
+        self._norm = float(np.sqrt(self._seen.sum()))
+        # By word: whether a node before has it. A union by sorting takes several times as long.
+        self._met = np.zeros(len(self._weights), np.bool_)
+
+    def __call__(self, nodes: list[int]) -> float:
+        """Of all that some nodes show together."""
+        shared = whole = 0.0
+        sets = [self._words.of_node(node) for node in nodes]
+        for one in sets:
+            fresh = one if len(sets) == 1 else one[~self._met[one]]
+            self._met[fresh] = True
+            shared += float(self._seen[fresh].sum())
+            whole += float(self._weights[fresh].sum())
+        for one in sets:
+            self._met[one] = False
+        norm = self._norm * float(np.sqrt(whole))
+        return shared / norm if norm > 0 else 0.0

@@ -1,0 +1,51 @@
+"""Γ(path-near): path memory within the match basin, distance beyond it (SPEC §4)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.graph.basin import BASIN_LEVEL
+from engram.ranking.context import RankingContext
+from engram.ranking.path import PathPolicy
+from engram.ranking.reasons import Reasons
+
+
+class PathNearPolicy:
+    """By the formula of [L15 §V] among the candidates that are near enough to match; then the rest.
+
+    The formula knows no distance: over the whole search radius it would put a node of the right
+    experience 8 m away before one of the same experience at 1 m. Here it ranks what
+    lies within the match basin, where g(d) >= 0.6: another reading of the paper's "local metric
+    neighbourhood".
+    """
+
+    name = "path-near"
+
+    def __init__(self, alpha: float = 1.0, gamma: float = 1.0) -> None:
+        self._alpha, self._gamma = alpha, gamma
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        whole = PathPolicy(self._alpha, self._gamma).reasons(context)
+        rule = (
+            f"highest score first where g is {BASIN_LEVEL:g} or more; behind them the others, "
+            "nearest first"
+        )
+        return replace(whole, rule=rule)
+
+    def rank(self, context: RankingContext) -> NDArray[np.int64]:
+        """See `RankingPolicy`."""
+        return context.path_memory.order(
+            context.neighbourhood,
+            context.basin,
+            BASIN_LEVEL,
+            context.observations.nodes,
+            context.observations.succeeded,
+            context.reference,
+            excluded=context.own_path,
+            alpha=self._alpha,
+            gamma=self._gamma,
+        )
