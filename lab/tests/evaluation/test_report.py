@@ -207,7 +207,7 @@ def test_claims_stand_beside_what_was_measured(out: Path) -> None:
     text = (out / "claims.md").read_text()
     lines = {line.split(" | ")[0].lstrip("| "): line for line in text.splitlines()}
     # distance misses 3 blocks, path 1, the oracle none: 3 times the excess.
-    excess = lines["`distance` ÷ `path`, Np = 2: excess over the oracle of route not localised"]
+    excess = lines["`distance` ÷ `path-near`, Np = 2: excess over the oracle of route not localised"]
     assert "| 5× | 3×, low end > 1.5× | 5× | 3.00× (3.00 … 3.00)" in excess
     assert (
         "90.00 %"
@@ -240,7 +240,7 @@ def test_sweeps_are_told_as_tables(out: Path) -> None:
     rows = budgets[: budgets.index("", 3)]
     assert f"| distance {distance} 10.00 |" in rows
     assert f"| distance, Nr = 2 {distance} – |" in rows
-    assert any(row.startswith("| path, matched only |") for row in rows)
+    assert any(row.startswith("| path-near, matched only |") for row in rows)
     sizes = text[text.index("P(> 10 m) as the map grows, Np = 2") :].splitlines()
     assert sizes[2].startswith("| sessions in the map (nodes) | 1 (100) | 2 (200) | ")
     assert sizes[2].endswith(" | all (800) |")

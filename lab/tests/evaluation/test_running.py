@@ -271,7 +271,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
     assert missed / whole_way == pytest.approx(pooled["oracle"], abs=1e-5)
     assert all(row["ms_per_frame"] for row in rows if row["mode"] == "live")
     text = (tmp_path / "out" / "claims.md").read_text()
-    assert "`distance` ÷ `path`, Np = 2" in text
+    assert "`distance` ÷ `path-near`, Np = 2" in text
 
 
 @pytest.mark.long
