@@ -207,7 +207,9 @@ def test_claims_stand_beside_what_was_measured(out: Path) -> None:
     text = (out / "claims.md").read_text()
     lines = {line.split(" | ")[0].lstrip("| "): line for line in text.splitlines()}
     # distance misses 3 blocks, path 1, the oracle none: 3 times the excess.
-    excess = lines["`distance` ÷ `path-near`, Np = 2: excess over the oracle of route not localised"]
+    excess = lines[
+        "`distance` ÷ `path-near`, Np = 2: excess over the oracle of route not localised"
+    ]
     assert "| 5× | 3×, low end > 1.5× | 5× | 3.00× (3.00 … 3.00)" in excess
     assert (
         "90.00 %"
