@@ -39,7 +39,7 @@ from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_by
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeOptions, MergeReport, merge, silent
+from engram.fleet.merge import MergeOptions, MergeReport, merge
 from engram.fleet.merge.attempts import from_records
 from engram.geometry import SE3
 from engram.graph.model import (
@@ -296,7 +296,7 @@ def _downloads(centre: Path, seed: int, case: Case) -> Iterator[str]:
     copies = [centre.with_name(f"download-{number}.engram") for number in range(2)]
     try:
         for copy in copies:
-            download(centre, copy, options, progress=silent)
+            download(centre, copy, options)
     except InputError:
         return  # the centre has nothing for that hour, or the budget is too small for one node
     case.sent = options.policy

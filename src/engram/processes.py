@@ -1,11 +1,174 @@
-"""Processes that work for another one: none outlives it."""
+"""Work in processes of this machine: who dies is replaced, none outlives its parent."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
-from multiprocessing.connection import wait
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, TypeVar
+
+from engram.errors import EngramError, WorkerError
+from engram.monitor import Monitor
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+# A task that kills its worker this often will do so again.
+MAX_RETRIES = 3
+# How long Ctrl-C may wait.
+LISTEN_S = 0.5
+# Words on the way are put together so that the pipe is not the bottleneck.
+_WORDS_AT_ONCE = 10
+
+
+class WordsTogether(Monitor):
+    """In a worker: gathers the words of `advance` and sends several at a time."""
+
+    def __init__(self, send: Callable[[list[str]], object]) -> None:
+        self._send = send
+        self._words: list[str] = []
+
+    def advance(self, word: str = "") -> None:
+        """One more word."""
+        self._words.append(word)
+        if len(self._words) >= _WORDS_AT_ONCE:
+            self._send(self.take())
+
+    def take(self) -> list[str]:
+        """What was not sent yet."""
+        words, self._words = self._words, []
+        return words
+
+
+def run_in_processes(
+    work: Callable[[Task, Monitor], Result],
+    tasks: Mapping[str, Task],
+    workers: int,
+    monitor: Monitor,
+    done: Callable[[str, Result, int], None],
+) -> None:
+    """Runs tasks in processes, several at a time, each in a process of its own.
+
+    Args:
+        work: a function of a module; what it says to its monitor reaches `monitor`. It must be
+            sound wherever its process ends, and go on from there when it is run again.
+        tasks: by name.
+        workers: processes at a time.
+        monitor: hears the words of all tasks; its `check` may end the work.
+        done: hears of each task that is done: name, result, how often its worker died.
+
+    Raises:
+        WorkerError: a worker died again and again over the same task.
+        EngramError: what a task raised.
+    """
+    waiting = list(tasks)
+    retries = dict.fromkeys(tasks, 0)
+    with _team() as running:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                name = waiting.pop(0)
+                running.append(_start(work, name, tasks[name]))
+            _listen(running, monitor)
+            monitor.check()
+            for one in [one for one in running if not one.process.is_alive()]:
+                _hear(one, monitor)
+                running.remove(one)
+                one.pipe.close()
+                if one.outcome is None:
+                    _count_death(one, retries)
+                    waiting.insert(0, one.name)
+                elif isinstance(one.outcome, Exception):
+                    raise one.outcome
+                else:
+                    done(one.name, one.outcome[0], retries[one.name])
+
+
+@dataclass(slots=True)
+class _Running:
+    name: str
+    process: BaseProcess
+    pipe: Connection
+    outcome: tuple[Any] | Exception | None = None
+
+
+def _count_death(one: _Running, retries: dict[str, int]) -> None:
+    retries[one.name] += 1
+    if retries[one.name] > MAX_RETRIES:
+        raise WorkerError(
+            f"the worker of {one.name} died {MAX_RETRIES + 1} times, last with exit code "
+            f"{one.process.exitcode}; what is done is kept: give the same command again, with "
+            "fewer workers if memory was short"
+        )
+
+
+@contextmanager
+def _team() -> Iterator[list[_Running]]:
+    """The workers; whoever still runs at the end is ended."""
+    running: list[_Running] = []
+    try:
+        yield running
+    finally:
+        for one in running:
+            one.process.terminate()
+        for one in running:
+            one.process.join()
+
+
+def _start(work: Callable[[Task, Monitor], Result], name: str, task: Task) -> _Running:
+    # Started afresh: a forked child would share the parent's threads half way through.
+    context = multiprocessing.get_context("spawn")
+    pipe, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(work, task, theirs), daemon=True)
+    process.start()
+    theirs.close()
+    return _Running(name, process, pipe)
+
+
+def _work(work: Callable[[Task, Monitor], Result], task: Task, pipe: Connection) -> None:
+    """In the worker: Ctrl-C is for the parent, which ends its workers."""
+    import cv2
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_with_parent()
+    cv2.setNumThreads(1)  # the tasks run side by side
+    told = WordsTogether(pipe.send)
+    try:
+        outcome: tuple[Result] | EngramError = (work(task, told),)
+    except EngramError as error:
+        outcome = error
+    pipe.send(told.take())
+    pipe.send(outcome)
+    pipe.close()
+
+
+def _listen(running: Sequence[_Running], monitor: Monitor) -> None:
+    """Until something happens, but no longer than Ctrl-C should take."""
+    ready = wait(
+        [one.pipe for one in running] + [one.process.sentinel for one in running], LISTEN_S
+    )
+    for one in running:
+        if one.pipe in ready:
+            _hear(one, monitor)
+
+
+def _hear(one: _Running, monitor: Monitor) -> None:
+    """All that a worker has said."""
+    try:
+        while one.pipe.poll():
+            said = one.pipe.recv()
+            if isinstance(said, list):
+                for word in said:
+                    monitor.advance(word)
+            else:
+                one.outcome = said
+    except (EOFError, OSError):  # it is over: by itself, or killed in the midst of a word
+        one.process.join()
 
 
 def end_with_parent() -> None:

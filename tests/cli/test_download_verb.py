@@ -51,7 +51,7 @@ def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: P
         (("--policy", "tod", "--start", "21:00"), "widen the --window"),
         (("--policy", "paths", "--start", "3:00", "--end", "4:00"), "there is some from 9:00"),
         (("--policy", "budget", "--budget", "much"), "budget is 'much'"),
-        (("--policy", "budget", "--budget", "0%"), "budget is 0 per cent"),
+        (("--policy", "budget", "--budget", "0%"), "budget_percent is 0.0"),
         (("--policy", "budget", "--budget", "1e2%"), "budget is '1e2%'"),
         (("--policy", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
         (("--policy", "region", "--near", "xyz"), "no UUID"),

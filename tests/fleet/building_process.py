@@ -5,10 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import sys
 import threading
-from contextlib import contextmanager
 from pathlib import Path
 
 from engram.fleet.build import build_map
+from engram.monitor import Monitor
 from engram.processes import end_with_parent
 from engram.robot import Settings
 
@@ -24,14 +24,14 @@ def wait_long() -> None:
     threading.Event().wait(_LONG_S)
 
 
-@contextmanager
-def telling(what, total):
-    yield lambda word: print(word, flush=True)
+class Telling(Monitor):
+    def advance(self, word: str = "") -> None:
+        print(word, flush=True)
 
 
 def main(centre: str = "", *drives: str) -> None:
     if centre:
-        build_map(Path(centre), drives, Settings(), options(), progress=telling)
+        build_map(Path(centre), drives, Settings(), options(), monitor=Telling())
         return
     multiprocessing.get_context("spawn").Process(target=wait_long).start()
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import signal
-from contextlib import contextmanager
 
 from engram.fleet.build import BuildOptions, JudgeOptions, build_map
-from engram.fleet.build.group_mapping import map_group
 from engram.fleet.merge.gate import GateOptions
+from engram.monitor import QUIET, Monitor
 from engram.robot import MapOptions, Settings
 
 from .robots import OPTIONS
@@ -19,11 +18,10 @@ def options(**changes: object) -> BuildOptions:
     return BuildOptions(**values)
 
 
-def build(centre, logs, names="abc", progress=None, keep=False, **changes):
+def build(centre, logs, names="abc", monitor=QUIET, keep=False, **changes):
     """Builds a centre from drives of `logs`."""
-    shown = {} if progress is None else {"progress": progress}
     drives = [logs[name] for name in names]
-    return build_map(centre, drives, Settings(), options(**changes), keep=keep, **shown)
+    return build_map(centre, drives, Settings(), options(**changes), keep=keep, monitor=monitor)
 
 
 def judge(*drives: str, **changes: object) -> JudgeOptions:
@@ -31,28 +29,20 @@ def judge(*drives: str, **changes: object) -> JudgeOptions:
     return JudgeOptions(list(drives), **({"judge_at_m": 3.0, "localising": localising} | changes))
 
 
-def map_in_this_process(tasks, place, workers, advance, check, mapped):
-    """In place of `map_groups`, where workers are not what is tested."""
-    for task in tasks:
-        mapped(map_group(task, place(task.number), advance))
-        check()
+def in_this_process(work, tasks, workers, monitor, done):
+    """In place of `run_in_processes`, where workers are not what is tested."""
+    for name, task in tasks.items():
+        done(name, work(task, monitor), 0)
+        monitor.check()
 
 
-def interrupting(frames):
-    """A progress bar that presses Ctrl-C after so many steps."""
-    count = 0
+class Interrupting(Monitor):
+    """Presses Ctrl-C after so many frames."""
 
-    def progress(what, total):
-        @contextmanager
-        def shown():
-            def advance(word):
-                nonlocal count
-                count += 1
-                if count == frames:
-                    signal.raise_signal(signal.SIGINT)
+    def __init__(self, frames: int) -> None:
+        self.left = frames
 
-            yield advance
-
-        return shown()
-
-    return progress
+    def advance(self, word: str = "") -> None:
+        self.left -= 1
+        if self.left == 0:
+            signal.raise_signal(signal.SIGINT)

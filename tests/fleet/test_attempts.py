@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from tests.worlds import attempts_of
 
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import silent
 from engram.fleet.merge.attempts import lacking
 from engram.graph.model import SessionId
 from engram.maps import AttemptArrays, MapStore
@@ -95,7 +94,7 @@ def test_attempts_that_a_download_left_behind_are_carried_when_the_whole_map_com
         contents = store.load()
     drive = max(contents.sessions, key=lambda one: one.start_ns).id
     near = DownloadOptions("region", near=(str(contents.nodes[0].id),), radius_m=8.0)
-    download(robot, tmp_path / "part.engram", near, progress=silent)
+    download(robot, tmp_path / "part.engram", near)
     part, whole = remembered_in(tmp_path / "part.engram", drive), remembered_in(robot, drive)
     assert 0 < part.total() < whole.total()
     centre = tmp_path / "centre.engram"
@@ -125,7 +124,7 @@ def test_attempts_at_a_node_that_was_taken_back_come_again_with_it_and_once(tmp_
         _, second = (one.id for one in store.load().sessions)
     # The first drive is one revision, what the second tried at its nodes another one.
     only_first = tmp_path / "first.engram"
-    download(robot, only_first, DownloadOptions(), at=1, progress=silent)
+    download(robot, only_first, DownloadOptions(), at=1)
     merged(centre, only_first, robot)
     before = remembered_in(centre, second)
     with MapStore.open_for_writing(centre) as store:

@@ -10,12 +10,13 @@ from pathlib import Path
 import pytest
 
 from engram.errors import ConfigError, MapError
-from engram.fleet.build import BestOrder, Orders, best_order, building, find_best_order, judging
-from engram.fleet.merge import GateOptions, silent
+from engram.fleet.build import Orders, best_order, building, find_best_order, orders
+from engram.fleet.merge import GateOptions
 from engram.maps import MapStore
+from engram.monitor import QUIET
 from engram.robot import MapOptions, Settings, map_drive, open_drive
 
-from .builds import build, judge, map_in_this_process
+from .builds import build, in_this_process, judge
 from .robots import OPTIONS
 
 
@@ -29,7 +30,7 @@ def killed(*_: object, **__: object) -> None:
 
 @pytest.fixture(autouse=True)
 def one_process(monkeypatch):
-    monkeypatch.setattr(building, "map_groups", map_in_this_process)
+    monkeypatch.setattr(building, "run_in_processes", in_this_process)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def maps(tmp_path_factory, logs):
     """The maps of three groups of a drive each."""
     folder = tmp_path_factory.mktemp("groups")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "map_groups", map_in_this_process)
+        patch.setattr(building, "run_in_processes", in_this_process)
         build(folder / "centre.engram", logs, groups=3, keep=True)
     return [folder / "centre.engram.build" / f"group-{number}.engram" for number in range(3)]
 
@@ -50,7 +51,7 @@ def searched(tmp_path_factory, maps, logs):
 
 
 def search(folder, maps, by, **changes):
-    return find_best_order(maps, folder, Settings(), OPTIONS, by, silent, **changes)
+    return find_best_order(maps, folder, Settings(), OPTIONS, by, QUIET, **changes)
 
 
 def never(*_: object) -> None:
@@ -63,8 +64,8 @@ def test_a_search_that_is_done_is_not_done_again_and_says_what_it_took(
     shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
     again = search(tmp_path, maps[:2], judge(logs["held-out"], localise=never))
     assert again.to_dict() == searched[1].to_dict()
-    assert (again.merges, again.copies) == (2, 4)
-    assert min(again.merge_s, again.copy_s, again.judge_s) > 0
+    assert (again.spent.merges, again.spent.copies) == (2, 4)
+    assert min(again.spent.merge_s, again.spent.copy_s, again.spent.judge_s) > 0
 
 
 @pytest.mark.parametrize("what", ["drives", "distance", "localising", "reported", "groups"])
@@ -98,7 +99,7 @@ def test_a_search_that_was_killed_counts_what_it_had_done(tmp_path, maps, logs, 
         search(tmp_path, maps[:2], judge(logs["held-out"], localise=dies_over_the_second))
     (tmp_path / "order-0-1.engram").touch()  # a real kill leaves the map that it was at
     again = search(tmp_path, maps[:2], judge(logs["held-out"]))
-    assert (again.merges, again.copies) == (2, 4)
+    assert (again.spent.merges, again.spent.copies) == (2, 4)
     assert again.results == searched[1].results
     assert not list(tmp_path.glob("*.engram*"))
 
@@ -125,13 +126,12 @@ def test_a_step_that_cannot_be_read_is_made_again(tmp_path, maps, logs, searched
 def test_each_group_comes_first_once_and_the_others_follow_in_their_order(
     tmp_path, maps, logs, monkeypatch
 ):
-    monkeypatch.setattr(judging, "_MOST_GROUPS", 2)  # which is of all orders
+    monkeypatch.setattr(orders, "_MOST_GROUPS", 2)  # which is of all orders
     by = judge(logs["held-out"], orders=Orders.FIRST)
     found = search(tmp_path, maps, by)
     assert {one.order for one in found.results} == {(0, 1, 2), (1, 0, 2), (2, 0, 1)}
     assert found.order == min(found.results, key=lambda one: one.rank).order
-    assert (found.merges, found.copies) == (3 * 2, 3 * 3)
-    assert BestOrder.from_dict(found.to_dict()) == found
+    assert (found.spent.merges, found.spent.copies) == (3 * 2, 3 * 3)
 
 
 def test_what_a_search_of_firsts_judged_all_orders_need_not_judge_again(
@@ -181,7 +181,7 @@ def test_the_name_of_the_robot_does_not_let_a_drive_judge(tmp_path, maps, logs):
 def test_more_groups_than_can_be_tried_are_refused_before_they_are_mapped(
     tmp_path, logs, monkeypatch
 ):
-    monkeypatch.setattr(judging, "_MOST_GROUPS", 2)
+    monkeypatch.setattr(orders, "_MOST_GROUPS", 2)
     centre = tmp_path / "centre.engram"
     with pytest.raises(ConfigError, match="3 groups have 6 orders; at most 2"):
         build(centre, logs, "abc", groups=3, judge=judge(logs["held-out"]))
@@ -192,7 +192,7 @@ def test_orders_are_judged_with_the_centre_that_they_are_merged_into(tmp_path, m
     centre = tmp_path / "centre.engram"
     MapStore.copy(maps[2], centre)
     report = build(centre, logs, "ab", judge=judge(logs["held-out"]))
-    assert (report.best.merges, report.best.copies) == (4, 4)
+    assert (report.best.spent.merges, report.best.spent.copies) == (4, 4)
     assert report.content_hash == report.best.results[0].content_hash
     assert report.notes == []
     assert "are of centres that are new" in report.text()
@@ -226,13 +226,15 @@ def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch)
             build(centre, logs, "ab", judge=other)
     monkeypatch.setattr(best_order, "localise_drive", never)
     report = build(centre, logs, "ab", judge=judge(logs["held-out"]), keep=True)
-    assert report.best.judge_s > 0
+    assert report.best.spent.judge_s > 0
     assert report.content_hash == report.best.results[0].content_hash
     assert report.notes == []
     # Other drives choose anew where there is no centre yet; the groups' maps are used again.
     monkeypatch.undo()
     centre.unlink()
-    monkeypatch.setattr(building, "map_groups", lambda tasks, *_: None if not tasks else killed())
+    monkeypatch.setattr(
+        building, "run_in_processes", lambda _, tasks, *rest: killed() if tasks else None
+    )
     other = build(centre, logs, "ab", judge=judge(logs["other"]))
     assert other.best.results != report.best.results
 

@@ -18,9 +18,10 @@ from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
 from engram.fleet.build import JudgeOptions, build_map, order_costs
 from engram.fleet.merge.gate import GateOptions
 from engram.maps import MapStore
+from engram.monitor import Monitor
 from engram.robot import MapOptions, Settings
 
-from .builds import build, interrupting, options
+from .builds import Interrupting, build, options
 
 
 @pytest.fixture(scope="module")
@@ -48,19 +49,13 @@ def test_groups_are_mapped_and_merged_into_one_map(built, logs):
 def test_a_worker_that_dies_is_replaced_and_the_map_is_the_same(tmp_path, logs, built):
     killed = []
 
-    def killing(what, total):
-        @contextmanager
-        def shown():
-            def advance(word):
-                if not killed:  # the first word of any worker is its last
-                    killed.append(multiprocessing.active_children()[0].pid)
-                    os.kill(killed[0], signal.SIGKILL)
+    class Killing(Monitor):
+        def advance(self, word=""):
+            if not killed:  # the first word of any worker is its last
+                killed.append(multiprocessing.active_children()[0].pid)
+                os.kill(killed[0], signal.SIGKILL)
 
-            yield advance
-
-        return shown()
-
-    report = build(tmp_path / "centre.engram", logs, progress=killing)
+    report = build(tmp_path / "centre.engram", logs, monitor=Killing())
     assert len(killed) == 1
     assert sum(one.retries for one in report.mapped) == 1
     assert report.content_hash == built[1].content_hash
@@ -97,26 +92,20 @@ def test_a_build_that_is_killed_goes_on_at_once_and_comes_to_the_same_map(tmp_pa
 
 @pytest.mark.long
 def test_a_group_that_kills_every_worker_is_given_up(tmp_path, logs):
-    def killing(what, total):
-        @contextmanager
-        def shown():
-            def advance(word):
-                for child in multiprocessing.active_children():
-                    os.kill(child.pid, signal.SIGKILL)
-
-            yield advance
-
-        return shown()
+    class Killing(Monitor):
+        def advance(self, word=""):
+            for child in multiprocessing.active_children():
+                os.kill(child.pid, signal.SIGKILL)
 
     centre = tmp_path / "centre.engram"
     with pytest.raises(WorkerError, match="died 4 times"):
-        build(centre, logs, names="a", groups=1, workers=1, progress=killing)
+        build(centre, logs, names="a", groups=1, workers=1, monitor=Killing())
     assert not centre.exists()
 
 
 def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, built):
     centre = tmp_path / "centre.engram"
-    report = build(centre, logs, progress=interrupting(25))
+    report = build(centre, logs, monitor=Interrupting(25))
     assert report.interrupted
     assert "go on" in report.text()
     with pytest.raises(ConfigError, match="another build"):
@@ -153,7 +142,7 @@ def test_drives_that_the_centre_has_are_not_mapped_again(tmp_path, logs):
 def test_what_a_build_leaves_out_does_not_change_when_it_goes_on(tmp_path, logs):
     centre = tmp_path / "centre.engram"
     build(centre, logs, names="a", groups=1)
-    interrupted = build(centre, logs, names="abc", progress=interrupting(25))
+    interrupted = build(centre, logs, names="abc", monitor=Interrupting(25))
     assert interrupted.interrupted
     report = build(centre, logs, names="abc")
     assert report.left_out == ["a.framelog"]
@@ -178,7 +167,7 @@ def test_all_orders_are_tried_over_a_prefix_tree_and_the_best_is_kept(tmp_path, 
     best = report.best
     assert {one.order for one in best.results} == set(permutations(range(3)))
     # Σ 3!/(3−d)! over d = 2, 3 merges, and a copy for every node of the tree.
-    assert (best.merges, best.copies) == (6 + 6, 3 + 6 + 6)
+    assert (best.spent.merges, best.spent.copies) == (6 + 6, 3 + 6 + 6)
     assert [one.rank for one in best.results] == sorted(one.rank for one in best.results)
     # What was chosen was really built: the centre is the map that was judged.
     assert report.content_hash == best.results[0].content_hash

@@ -12,8 +12,9 @@ from engram.errors import SequenceError, WorkerError
 from engram.fleet.build import cluster
 from engram.fleet.build.cluster import map_groups_on_cluster
 from engram.fleet.build.group_mapping import GroupTask
-from engram.fleet.build.workers import WORDS_AT_ONCE
 from engram.maps import MapStore
+from engram.monitor import Monitor
+from engram.processes import _WORDS_AT_ONCE
 from engram.robot import Settings
 
 from .builds import build, options
@@ -39,19 +40,23 @@ def scheduler():
         yield started
 
 
-def run(started, tmp_path, sources, advance=lambda _: None, check=lambda: None):
+class Watching(Monitor):
+    """Passes words and questions on to functions."""
+
+    def __init__(self, advance=lambda _: None, check=lambda: None):
+        self.advance = advance
+        self.check = check
+
+
+def run(started, tmp_path, sources, *watching):
     """Maps groups of one drive each; returns what it was told of."""
     done = []
     mapping = options().mapping
-    tasks = [GroupTask(number, [one], Settings(), mapping) for number, one in enumerate(sources)]
-    map_groups_on_cluster(
-        tasks,
-        lambda number: tmp_path / f"group-{number}.engram",
-        started.scheduler_address,
-        advance,
-        check,
-        done.append,
-    )
+    tasks = [
+        GroupTask(number, tmp_path / f"group-{number}.engram", [one], Settings(), mapping)
+        for number, one in enumerate(sources)
+    ]
+    map_groups_on_cluster(tasks, started.scheduler_address, Watching(*watching), done.append)
     return done
 
 
@@ -79,15 +84,15 @@ def test_ctrl_c_is_heard_within_a_group_and_the_worker_stops(
     given_up, may_go_on = threading.Event(), threading.Event()
     really = cluster.map_group_far_away
 
-    def slow(task, advance):
+    def slow(task, monitor):
         def held(word):
             mapped.append(word)
-            if len(mapped) > WORDS_AT_ONCE:  # the client was told of those before
+            if len(mapped) > _WORDS_AT_ONCE:  # the client was told of those before
                 may_go_on.wait()  # until it is gone
-            advance(word)
+            monitor.advance(word)
 
         try:
-            return really(task, held)
+            return really(task, Watching(held))
         except cluster._GivenUpError:
             given_up.set()
             raise
@@ -112,9 +117,9 @@ def test_a_drive_that_cannot_be_read_is_tried_once(scheduler, tmp_path, monkeypa
     tried = []
     really = cluster.map_group_far_away
 
-    def counted(task, advance):
+    def counted(task, monitor):
         tried.append(task.number)
-        return really(task, advance)
+        return really(task, monitor)
 
     monkeypatch.setattr(cluster, "map_group_far_away", counted)
     with pytest.raises(SequenceError, match="nowhere"):

@@ -18,7 +18,6 @@ from engram.errors import ConfigError, InputError, MapError, NotAMapError, Revis
 from engram.fleet.download import DownloadOptions, DownloadReport, download
 from engram.fleet.download.downloading import most_that_fit
 from engram.fleet.download.selections import SELECTIONS, UNDERSTOOD
-from engram.fleet.merge import silent
 from engram.frontend import DescriptorKind
 from engram.graph.model import EdgeKind, path_id
 from engram.maps import MapStore
@@ -63,7 +62,7 @@ def centre(tmp_path_factory) -> Path:
 
 
 def sent(centre: Path, out: Path, policy: str, **options) -> DownloadReport:
-    return download(centre, out, DownloadOptions(policy, **options), progress=silent)
+    return download(centre, out, DownloadOptions(policy, **options))
 
 
 def robots_of(path: Path) -> dict[str, int]:
@@ -277,11 +276,11 @@ def test_as_of_an_older_revision_or_tag(centre, tmp_path):
     with MapStore.open_for_writing(mine) as store:
         store.tag("first", 1, author="me")
     options = DownloadOptions()
-    report = download(mine, tmp_path / "old.engram", options, at="first", progress=silent)
+    report = download(mine, tmp_path / "old.engram", options, at="first")
     assert report.revision == 1
     assert list(robots_of(tmp_path / "old.engram")) == ["r1"]
     with pytest.raises(RevisionError, match="'second'"):
-        download(mine, tmp_path / "none.engram", options, at="second", progress=silent)
+        download(mine, tmp_path / "none.engram", options, at="second")
 
 
 def test_what_was_taken_back_is_not_sent(centre, tmp_path):
@@ -346,17 +345,17 @@ class TestMistakes:
             ({"policy": "budget"}, "needs --budget"),
             ({"policy": "region"}, "needs --near"),
             ({"policy": "route"}, "needs --route"),
-            ({"policy": "tod", "start_h": 24.0}, "start is 24.0 h"),
-            ({"policy": "tod", "start_h": float("nan")}, "start is nan"),
-            ({"window_min": -1.0}, "window is -1.0 minutes"),
-            ({"epoch_min": 0.0}, "epoch is 0.0 minutes"),
-            ({"best_percent": 101.0}, "best is 101.0 per cent"),
-            ({"budget_bytes": 0}, "budget is 0 bytes"),
-            ({"budget_percent": 0.0}, "budget is 0 per cent"),
-            ({"budget_percent": 101.0}, "budget is 101 per cent"),
-            ({"budget_percent": float("nan")}, "budget is nan per cent"),
+            ({"policy": "tod", "start_h": 24.0}, "start_h is 24.0"),
+            ({"policy": "tod", "start_h": float("nan")}, "start_h is nan"),
+            ({"window_min": -1.0}, "window_min is -1.0, must be >= 0"),
+            ({"epoch_min": 0.0}, "epoch_min is 0.0"),
+            ({"best_percent": 101.0}, "best_percent is 101.0"),
+            ({"budget_bytes": 0}, "budget_bytes is 0"),
+            ({"budget_percent": 0.0}, "budget_percent is 0.0"),
+            ({"budget_percent": 101.0}, "budget_percent is 101.0"),
+            ({"budget_percent": float("nan")}, "budget_percent is nan"),
             ({"budget_percent": 10.0, "budget_bytes": 9}, "give one"),
-            ({"radius_m": float("inf")}, "radius is inf"),
+            ({"radius_m": float("inf")}, "radius_m is inf"),
         ],
     )
     def test_options_that_do_not_fit(self, centre, tmp_path, options, says):

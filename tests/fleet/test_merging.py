@@ -10,7 +10,7 @@ import pytest
 from tests.worlds import attempts_of
 
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import Reason, Seed, silent
+from engram.fleet.merge import Reason, Seed
 from engram.fleet.merge.handed_in import HandedIn
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
 from engram.maps import MapStore
@@ -271,7 +271,7 @@ def test_nodes_that_a_revert_had_hidden_bring_back_what_joins_them_to_others(tmp
     first, other = fleet["first"][0], fleet["other"][0]
     merged(centre, first, other)
     # A robot drives on in a download, so that its nodes hang on those of `first`.
-    download(centre, sent, DownloadOptions(), progress=silent)
+    download(centre, sent, DownloadOptions())
     drive = frame_log(tmp_path / "drive.framelog", np.arange(8, 40, 0.8), name="r5", day=5)
     map_drive(sent, open_drive(drive), Settings(), MapOptions(relocaliser="exhaustive"))
     (before,) = merged(centre, sent)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeReport, silent
+from engram.fleet.merge import MergeReport
 from engram.fleet.merge import merge as merge_maps
 from engram.graph.model import NodeId, Omission
 from engram.maps import MapStore
@@ -100,7 +100,7 @@ def test_what_another_rig_saw_of_the_same_street_is_omitted(street, tmp_path):
 def test_a_robot_works_from_a_download_of_real_maps(street, data_dir, tmp_path):
     centre, part = tmp_path / "centre.engram", tmp_path / "part.engram"
     merge(centre, street["grey"], street["colour"])
-    download(centre, part, DownloadOptions("copy"), progress=silent)
+    download(centre, part, DownloadOptions("copy"))
     red = open_drive(data_dir / DRIVE_0001, rig="colour", channel="red", robot="red")
     with LocaliseRun(part, red, Settings(), LocaliseOptions()) as run:
         results = [result for _, result in run]

@@ -16,7 +16,7 @@ from engram.fleet.build.scratch import BuildPlan, Scratch, build_folder, session
 from engram.maps import MapStore
 from engram.robot import Settings, map_drive, open_drive, session_of_drive
 
-from .builds import build, judge, map_in_this_process, options
+from .builds import build, in_this_process, judge, options
 from .robots import OPTIONS
 
 
@@ -30,7 +30,7 @@ def killed(*_: object, **__: object) -> None:
 
 @pytest.fixture(autouse=True)
 def one_process(monkeypatch):
-    monkeypatch.setattr(building, "map_groups", map_in_this_process)
+    monkeypatch.setattr(building, "run_in_processes", in_this_process)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def kept(tmp_path_factory, logs):
     """A centre of two groups, (a) and (b), whose maps were kept."""
     centre = tmp_path_factory.mktemp("kept") / "centre.engram"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(building, "map_groups", map_in_this_process)
+        patch.setattr(building, "run_in_processes", in_this_process)
         report = build(centre, logs, "ab", keep=True)
     return centre, report
 
@@ -189,13 +189,13 @@ def test_of_two_builds_into_one_centre_the_second_is_told_who_builds(tmp_path, l
     refused = []
 
     def meanwhile(*arguments):
-        monkeypatch.setattr(building, "map_groups", map_in_this_process)
+        monkeypatch.setattr(building, "run_in_processes", in_this_process)
         with pytest.raises(MapLockedError) as raised:
             build(centre, logs, "a", groups=1)
         refused.append(str(raised.value))
-        map_in_this_process(*arguments)
+        in_this_process(*arguments)
 
-    monkeypatch.setattr(building, "map_groups", meanwhile)
+    monkeypatch.setattr(building, "run_in_processes", meanwhile)
     build(centre, logs, "a", groups=1)
     assert f"centre.engram is being built by process {os.getpid()} on " in refused[0]
     assert "nothing new" in build(centre, logs, "a", groups=1).text()
@@ -225,7 +225,7 @@ def test_what_the_disk_refuses_is_an_error_of_maps(tmp_path, monkeypatch, number
     def refuse(path, *_, **__):
         raise OSError(number, "refused", str(path))
 
-    monkeypatch.setattr(Path, "write_text", refuse)
-    with pytest.raises(kind, match=r"build\.json\.part: (no space|refused)") as raised:
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(kind, match=r"build\.json\.\d+\.part: (no space|refused)") as raised:
         Scratch(tmp_path / "centre.engram").begin(BuildPlan([["a"]], [], "", {}, {}))
     assert type(raised.value) is kind

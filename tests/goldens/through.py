@@ -17,7 +17,6 @@ from engram import _core
 from engram.fleet.build.building import BuildOptions, build_map
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import merge as merge_maps
-from engram.fleet.merge import silent
 from engram.frontend import Frame, Frontend, StereoPair
 from engram.localiser import Budget, Localisation
 from engram.maps import MapStore
@@ -159,7 +158,7 @@ def send(centre: Path, out: Path, **options: Any) -> Values:
         "nodes", "of_nodes", "sessions", "partial_paths", "edges", "bridges", "components",
         "expected_missed", "copy_missed",
     )  # fmt: skip
-    report = download(centre, out, DownloadOptions(**options), progress=silent)
+    report = download(centre, out, DownloadOptions(**options))
     return {name: getattr(report, name) for name in names}
 
 

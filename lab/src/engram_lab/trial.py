@@ -19,12 +19,12 @@ from engram.errors import ConfigError, InputError
 from engram.fleet.download.downloading import DownloadReport, download
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.merge.gate import check_held_out
-from engram.fleet.merge.merging import Progress
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, Session
 from engram.localiser import Position
 from engram.maps import MapStore
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+from engram.monitor import QUIET, Monitor
 from engram.robot import (
     DriveSequence,
     FrameResult,
@@ -153,7 +153,7 @@ def check_not_sent(
     """
     if drives:
         with MapStore.open(centre, at=at) as store:
-            check_held_out(drives, store.sessions(), centre, "--check")
+            check_held_out(drives, store.sessions(), centre, "the drives")
 
 
 def try_downloads(
@@ -162,7 +162,7 @@ def try_downloads(
     drives: Sequence[OpenDrive],
     settings: Settings,
     localise: LocaliseOptions,
-    progress: Progress,
+    monitor: Monitor = QUIET,
     *,
     at: int | str | None = None,
     start: Callable[[OpenMap], Position | None] = lambda _: None,
@@ -176,7 +176,7 @@ def try_downloads(
         drives: open a held-out drive each.
         settings: of the localiser.
         localise: policy and budget.
-        progress: shows how it goes.
+        monitor: hears how it goes.
         at: revision of the centre; None for the newest.
         start: where a drive begins in a download; None if nobody knows: it begins lost.
         left_out: is told of a drive for which one of the options fits nothing; it is tried in
@@ -200,7 +200,7 @@ def try_downloads(
                 options = asked if hour is None else replace(asked, **_when(session, hour))
                 out = Path(folder) / f"{session.id}-{number}.engram"
                 try:
-                    report = download(centre, out, options, at=at, progress=progress)
+                    report = download(centre, out, options, at=at, monitor=monitor)
                 except ConfigError:
                     raise
                 except InputError as error:
@@ -213,7 +213,7 @@ def try_downloads(
                     position = start(run.opened)
                     if position is not None:
                         run.localiser.start_at(position)
-                    results = _localised(run, len(sequence), progress)
+                    results = _localised(run, len(sequence), monitor)
                     nodes = list(run.opened.graph.nodes)
                 own.append(_trial(name, session, hour, report, results, nodes))
                 out.unlink()
@@ -290,12 +290,12 @@ def trial_dict(trial: Trial) -> dict[str, Any]:
     }
 
 
-def _localised(run: LocaliseRun, frames: int, progress: Progress) -> list[FrameResult]:
-    with progress("localise", frames) as advance:
+def _localised(run: LocaliseRun, frames: int, monitor: Monitor) -> list[FrameResult]:
+    with monitor.stage("localise", frames) as part:
         results = []
         for _, result in run:
             results.append(result)
-            advance(result.localisation.status.value)
+            part.advance(result.localisation.status.value)
         return results
 
 

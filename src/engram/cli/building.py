@@ -98,7 +98,7 @@ def build(
       engram build town.engram logs/*.framelog --groups 3 --best-order --validate held-out.framelog
       engram build town.engram logs/*.framelog --groups 8 --best-first --validate held-out.framelog
     """
-    from engram.cli.progress import progress
+    from engram.cli.progress import Bars
     from engram.fleet.build import BuildOptions, build_map
     from engram.fleet.merge import MergeOptions
     from engram.robot import MapOptions, load_settings
@@ -118,7 +118,7 @@ def build(
         scheduler=scheduler,
         judge=_judge(validate or [], judge_at, _orders(best_order, best_first)),
     )
-    report = build_map(centre, drives, load_settings(config), asked, keep=keep, progress=progress)
+    report = build_map(centre, drives, load_settings(config), asked, keep=keep, monitor=Bars())
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

@@ -95,7 +95,7 @@ def download(
       engram download centre.engram r1.engram --policy budget --budget 200MB --start 17:00
       engram download centre.engram r1.engram --policy budget --budget 25% --start 17:00
     """
-    from engram.cli.progress import progress
+    from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
     from engram.fleet.download import download as send
 
@@ -117,7 +117,7 @@ def download(
         radius_m=radius,
         thumbnails=thumbnails,
     )
-    report = send(centre, out, asked, at=at, progress=progress)
+    report = send(centre, out, asked, at=at, monitor=Bars())
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

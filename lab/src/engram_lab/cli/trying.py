@@ -50,7 +50,7 @@ def try_(
       engram try centre.engram monday.framelog --policy tod --start 9:30
       engram try centre.engram monday.framelog tuesday.framelog --policy budget --budget 25%
     """
-    from engram.cli.progress import progress
+    from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
     from engram.robot import LocaliseOptions, load_settings, open_drive, session_of_drive
     from engram_lab.trial import LeftOut, check_not_sent, summarise_trials, try_downloads
@@ -74,7 +74,7 @@ def try_(
         [partial(open_drive, drive) for drive in drives],
         load_settings(config),
         LocaliseOptions(lanes=lanes, rounds=rounds),
-        progress,
+        Bars(),
         at=at,
         left_out=lambda one: left_out.append(replace(one, drive=str(named[one.drive]))),
     )

@@ -4,15 +4,13 @@ from engram.fleet.build.best_order import find_best_order
 from engram.fleet.build.building import BuildOptions, BuildReport, build_map
 from engram.fleet.build.group_mapping import GroupResult, GroupTask, map_group
 from engram.fleet.build.grouping import GROUPINGS, group_drives
-from engram.fleet.build.judging import JudgeOptions, Orders
-from engram.fleet.build.order_costs import order_costs
-from engram.fleet.build.order_results import BestOrder, OrderResult
+from engram.fleet.build.orders import BestOrder, JudgeOptions, OrderResult, Orders, order_costs
 
 __all__ = [
+    "GROUPINGS",
     "BestOrder",
     "BuildOptions",
     "BuildReport",
-    "GROUPINGS",
     "GroupResult",
     "GroupTask",
     "JudgeOptions",

@@ -5,27 +5,34 @@ Or only which of them comes first, on which most depends (docs/results-fleet.md)
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from engram.config import config_hash, to_dict
-from engram.errors import MapError
-from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
-from engram.fleet.build.keeping import keeping
-from engram.fleet.build.order_results import BestOrder, OrderResult, Spent
+from engram.errors import ConfigError, MapError
+from engram.fleet.build.orders import (
+    BestOrder,
+    JudgeOptions,
+    OrderResult,
+    Orders,
+    Spent,
+    check_countable,
+    check_held_out,
+)
+from engram.fleet.build.scratch import keeping, read_kept, write_kept
 from engram.fleet.merge.gate import localise_drive
-from engram.fleet.merge.merging import Progress, merge
+from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.graph.model import Session
 from engram.maps import MapStore
 from engram.maps.drafts import remove_left_drafts
 from engram.measures import failure_curve, failure_route, route_not_localised
+from engram.monitor import Monitor
 from engram.robot import OpenMap, Settings, open_drive
 
 # [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
@@ -41,7 +48,7 @@ def find_best_order(
     settings: Settings,
     merging: MergeOptions,
     judge: JudgeOptions,
-    progress: Progress,
+    monitor: Monitor,
     *,
     root: Path | None = None,
 ) -> BestOrder:
@@ -58,7 +65,7 @@ def find_best_order(
         settings: of the localiser.
         merging: policy and budget of the merges.
         judge: by what the best is told.
-        progress: shows how it goes.
+        monitor: hears of each order.
         root: the map that all orders begin with; None where each begins with its first group's.
 
     Raises:
@@ -72,8 +79,8 @@ def find_best_order(
     with keeping(folder):
         folder.mkdir(parents=True, exist_ok=True)
     search = _Search(maps, folder, settings, merging, judge, root)
-    with progress("try orders", judge.orders.of(len(maps))) as advance:
-        search.below((), root, advance)
+    with monitor.stage("try orders", judge.orders.of(len(maps))) as stage:
+        search.below((), root, stage)
     search.check_root()
     search.found.results.sort(key=lambda one: one.rank)
     return search.found
@@ -81,8 +88,13 @@ def find_best_order(
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """One node of the prefix tree: its map was made, and judged if it has all groups."""
+    """One node of the prefix tree: its map was made, and judged if it has all groups.
 
+    Attributes:
+        depends: hash of all that it was made and judged by.
+    """
+
+    depends: str
     order: tuple[int, ...]
     spent: Spent
     result: OrderResult | None
@@ -126,21 +138,19 @@ class _Search:
             for left in folder.glob("order-*.engram*"):
                 left.unlink()  # by a run that was killed
 
-    def below(
-        self, prefix: tuple[int, ...], merged: Path | None, advance: Callable[[str], None]
-    ) -> None:
+    def below(self, prefix: tuple[int, ...], merged: Path | None, monitor: Monitor) -> None:
         """All orders that begin so; `merged` is the map of the prefix."""
         for number in self._judge.orders.following(prefix, len(self._maps)):
             order = (*prefix, number)
             if (known := self._known_from(order)) is not None:
                 for step in known:
-                    self._count(step, advance)
+                    self._count(step, monitor)
                 continue
             with _Intermediate(self._folder, order) as place:
                 step = self._step(order, place, merged)
-                self._keep(step)
-                self._count(step, advance)
-                self.below(order, place, advance)
+                write_kept(self._path(step.order), step)
+                self._count(step, monitor)
+                self.below(order, place, monitor)
 
     def check_root(self) -> None:
         """The maps that were judged are those that merging would give now."""
@@ -166,7 +176,7 @@ class _Search:
             started = time.perf_counter()
             result = self._judged(order, place)
             costs["judge_s"] = time.perf_counter() - started
-        return _Step(order, Spent(**costs), result)
+        return _Step(self._depends, order, Spent(**costs), result)
 
     def _merge(self, place: Path, added: Path) -> dict[str, Any]:
         started = time.perf_counter()
@@ -205,18 +215,11 @@ class _Search:
             route_not_localised(reported),
         )
 
-    def _count(self, step: _Step, advance: Callable[[str], None]) -> None:
-        self.found.count(step.spent)
+    def _count(self, step: _Step, monitor: Monitor) -> None:
+        self.found.spent += step.spent
         if step.result is not None:
             self.found.results.append(step.result)
-            advance(" ".join(map(str, step.order)))
-
-    def _keep(self, step: _Step) -> None:
-        path = self._path(step.order)
-        draft = path.with_suffix(".part")
-        with keeping(self._folder):
-            draft.write_text(json.dumps({"depends": self._depends, **asdict(step)}))
-            draft.replace(path)
+            monitor.advance(" ".join(map(str, step.order)))
 
     def _known_from(self, prefix: tuple[int, ...]) -> list[_Step] | None:
         """All steps from a prefix on, if earlier runs made them by the same; else None."""
@@ -236,16 +239,11 @@ class _Search:
         path = self._path(order)
         if not path.exists():
             return None
-        with keeping(self._folder):
-            content = path.read_bytes()
         try:
-            values = json.loads(content)
-            if values["depends"] != self._depends:
-                return None
-            result = values["result"]
-            spent = Spent(**values["spent"])
-            step = _Step(order, spent, None if result is None else OrderResult.from_dict(result))
-        except (ValueError, TypeError, KeyError):
+            step = read_kept(path, _Step)
+        except ConfigError:
+            return None
+        if step.depends != self._depends:
             return None
         is_whole = (step.result is not None) == (len(order) == len(self._maps))
         return step if is_whole else None

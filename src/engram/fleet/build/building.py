@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 from uuid import UUID
 
-from engram.config import config_hash, to_dict
+from engram.config import config_hash, plain, to_dict
 from engram.errors import ConfigError
 from engram.fleet.build.best_order import find_best_order
 from engram.fleet.build.cluster import check_scheduler, map_groups_on_cluster
-from engram.fleet.build.group_mapping import GroupResult, GroupTask, fetched
+from engram.fleet.build.group_mapping import GroupResult, GroupTask, fetched, map_group
 from engram.fleet.build.grouping import Drive, group_drives, look_at_drive
-from engram.fleet.build.judging import JudgeOptions, Orders, check_countable, check_held_out
-from engram.fleet.build.order_costs import order_costs
-from engram.fleet.build.order_results import BestOrder
+from engram.fleet.build.orders import (
+    BestOrder,
+    JudgeOptions,
+    Orders,
+    check_countable,
+    check_held_out,
+    order_costs,
+)
 from engram.fleet.build.scratch import BuildPlan, MergingBegun, Scratch, sole_builder
-from engram.fleet.build.workers import map_groups
-from engram.fleet.merge.merging import Progress, Shown, merge, silent
+from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
 from engram.graph.model import SessionId, path_id
 from engram.maps import MapStore
 from engram.maps.drafts import check_parent
-from engram.monitor import deferred_interrupt
+from engram.monitor import QUIET, Monitor, interruptible
+from engram.processes import run_in_processes
 from engram.robot import MapOptions, Settings
 
 
@@ -94,18 +99,10 @@ class BuildReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``build --json`` prints."""
+        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "best"}
         return {
-            "centre": self.centre,
-            "left_out": self.left_out,
-            "groups": self.groups,
-            "mapped": [one.to_dict() for one in self.mapped],
-            "merges": [one.to_dict() for one in self.merges],
-            "merged_before_s": self.merged_before_s,
+            **plain({**values, "merges": [one.to_dict() for one in self.merges]}),
             "best_order": None if self.best is None else self.best.to_dict(),
-            "notes": self.notes,
-            "interrupted": self.interrupted,
-            "content_hash": self.content_hash,
-            "seconds": self.seconds,
             "parallel_s": self.parallel_s,
         }
 
@@ -151,9 +148,9 @@ class BuildReport:
         assert self.best is not None
         mapped_s = sum(one.seconds for one in self.mapped)
         group_s = mapped_s / len(self.mapped)
-        merge_s = self.best.merge_s / max(self.best.merges, 1)
-        copy_s = self.best.copy_s / max(self.best.copies, 1)
-        spent_s = mapped_s + self.best.merge_s + self.best.copy_s
+        merge_s = self.best.spent.merge_s / max(self.best.spent.merges, 1)
+        copy_s = self.best.spent.copy_s / max(self.best.spent.copies, 1)
+        spent_s = mapped_s + self.best.spent.merge_s + self.best.spent.copy_s
         took = (
             f"  mapping, and merging in {len(self.best.results)} orders, took {spent_s:.1f} s "
             f"(T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C {copy_s:.2f} s)"
@@ -178,7 +175,7 @@ def build_map(
     options: BuildOptions,
     *,
     keep: bool = False,
-    progress: Progress = silent,
+    monitor: Monitor = QUIET,
 ) -> BuildReport:
     """Maps groups of drives side by side and merges them into a centre.
 
@@ -193,7 +190,7 @@ def build_map(
         settings: the resolved configuration.
         options: how.
         keep: leave the groups' maps, until the next build into this centre.
-        progress: shows how it goes.
+        monitor: hears how it goes.
 
     Raises:
         ConfigError: the groups do not fit the drives, another build lies there unfinished, there
@@ -207,7 +204,7 @@ def build_map(
     check_parent(centre)
     looked_at = _look_at(drives)
     with sole_builder(centre):
-        report = _build(centre, looked_at, settings, options, progress, keep=keep)
+        report = _build(centre, looked_at, settings, options, monitor, keep=keep)
     report.seconds = time.perf_counter() - started
     return report
 
@@ -217,7 +214,7 @@ def _build(
     looked_at: Sequence[Drive],
     settings: Settings,
     options: BuildOptions,
-    progress: Progress,
+    monitor: Monitor,
     *,
     keep: bool,
 ) -> BuildReport:
@@ -237,7 +234,7 @@ def _build(
             check_scheduler(options.scheduler)
         scratch.begin(_plan(grouped, known, settings, options, keep=keep))
         try:
-            _map_and_merge(scratch, grouped, settings, options, progress, report)
+            _map_and_merge(scratch, grouped, settings, options, monitor, report)
         except KeyboardInterrupt:
             report.interrupted = True
     if not report.interrupted:
@@ -303,7 +300,7 @@ def _map_and_merge(
     grouped: Sequence[Sequence[Drive]],
     settings: Settings,
     options: BuildOptions,
-    progress: Progress,
+    monitor: Monitor,
     report: BuildReport,
 ) -> None:
     """What a build comes to, as far as this run takes it.
@@ -311,13 +308,13 @@ def _map_and_merge(
     Raises:
         KeyboardInterrupt: while groups were mapped or orders tried.
     """
-    mapped = _map(scratch, grouped, settings, options, progress)
-    begun = _settled_order(scratch, len(grouped), settings, options, progress)
-    report.best = begun.best_order()
+    mapped = _map(scratch, grouped, settings, options, monitor)
+    begun = _settled_order(scratch, len(grouped), settings, options, monitor)
+    report.best = begun.best
     report.groups = [[drive.name for drive in grouped[number]] for number in begun.order]
     report.mapped = [mapped[number] for number in begun.order]
     report.merged_before_s = sum(begun.seconds.values())
-    _merge(scratch, begun, settings, options, progress, report)
+    _merge(scratch, begun, settings, options, monitor, report)
 
 
 def _map(
@@ -325,30 +322,43 @@ def _map(
     grouped: Sequence[Sequence[Drive]],
     settings: Settings,
     options: BuildOptions,
-    progress: Progress,
+    monitor: Monitor,
 ) -> list[GroupResult]:
     """Maps the groups that are not mapped yet; remembers how long each took."""
     tasks = [
-        GroupTask(number, [drive.source for drive in group], settings, options.mapping)
+        GroupTask(
+            number, scratch.group(number), [one.source for one in group], settings, options.mapping
+        )
         for number, group in enumerate(grouped)
     ]
     missing = [task for task in tasks if scratch.result(task.number) is None]
     frames = sum(drive.frames for task in missing for drive in grouped[task.number])
-    words = f"map {len(missing)} groups"
-    with deferred_interrupt() as check, progress(words, frames) as advance:
+    with (
+        interruptible(monitor) as asked,
+        asked.stage(f"map {len(missing)} groups", frames) as stage,
+    ):
         if options.scheduler is not None:
-            map_groups_on_cluster(
-                missing, scratch.group, options.scheduler, advance, check, scratch.remember
-            )
+            map_groups_on_cluster(missing, options.scheduler, stage, scratch.remember)
         else:
-            map_groups(missing, scratch.group, options.workers, advance, check, scratch.remember)
-        check()  # also where the last groups were done as Ctrl-C was pressed
+            _map_here(missing, options.workers, stage, scratch)
+        asked.check()  # also where the last groups were done as Ctrl-C was pressed
     results = [scratch.result(task.number) for task in tasks]
     return [result for result in results if result is not None]
 
 
+def _map_here(tasks: Sequence[GroupTask], workers: int, monitor: Monitor, scratch: Scratch) -> None:
+    """Maps groups in processes of this machine."""
+
+    def done(name: str, result: GroupResult, retries: int) -> None:
+        del name
+        scratch.remember(replace(result, retries=retries))
+
+    named = {f"group {task.number}": task for task in tasks}
+    run_in_processes(map_group, named, workers, monitor, done)
+
+
 def _settled_order(
-    scratch: Scratch, groups: int, settings: Settings, options: BuildOptions, progress: Progress
+    scratch: Scratch, groups: int, settings: Settings, options: BuildOptions, monitor: Monitor
 ) -> MergingBegun:
     """The order of merging, written down before the first merge: it is not changed half way.
 
@@ -375,10 +385,10 @@ def _settled_order(
             settings,
             options.merging,
             judge,
-            progress,
+            monitor,
             root=scratch.centre if scratch.centre.exists() else None,
         )
-        begun = MergingBegun(list(best.order), judged_by, best.to_dict())
+        begun = MergingBegun(list(best.order), judged_by, best)
     scratch.remember_merging(begun)
     return begun
 
@@ -393,7 +403,7 @@ def _merge(
     begun: MergingBegun,
     settings: Settings,
     options: BuildOptions,
-    progress: Progress,
+    monitor: Monitor,
     report: BuildReport,
 ) -> None:
     """Merges the groups' maps into the centre, in their order.
@@ -410,7 +420,7 @@ def _merge(
             scratch.centre,
             [scratch.group(number)],
             options.merging,
-            Shown(progress),
+            monitor,
             settings=settings,
         )
         if report.merges[-1].interrupted:

@@ -12,8 +12,9 @@ from uuid import uuid4
 
 from engram.errors import EngramError, MissingExtraError, WorkerError
 from engram.fleet.build.group_mapping import GroupResult, GroupTask, map_group_far_away
-from engram.fleet.build.keeping import keeping
-from engram.fleet.build.workers import LISTEN_S, MAX_RETRIES, WORDS_AT_ONCE
+from engram.fleet.build.scratch import keeping
+from engram.monitor import Monitor, write_whole
+from engram.processes import LISTEN_S, MAX_RETRIES, WordsTogether
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -30,10 +31,8 @@ class _GivenUpError(Exception):
 
 def map_groups_on_cluster(
     tasks: Sequence[GroupTask],
-    place: Callable[[int], Path],
     scheduler: str,
-    advance: Callable[[str], None],
-    check: Callable[[], None],
+    monitor: Monitor,
     mapped: Callable[[GroupResult], None],
 ) -> None:
     """Maps groups on the workers of a cluster, which read the drives by themselves.
@@ -42,10 +41,8 @@ def map_groups_on_cluster(
 
     Args:
         tasks: the groups.
-        place: where the map of a group goes, by its number.
         scheduler: address of the Dask scheduler.
-        advance: called once per frame with a word on how it went.
-        check: called now and then; what it raises ends the work, on the workers too.
+        monitor: hears of each frame; what its `check` raises ends the work, on the workers too.
         mapped: told of each group that is done.
 
     Raises:
@@ -58,25 +55,26 @@ def map_groups_on_cluster(
     topic = f"engram-build-{uuid4().hex}"
     with _connected(scheduler) as client:  # whose end tells the workers that nobody waits for them
         client.subscribe_topic(topic, lambda event: heard.put(list(event[1])))
-        groups: dict[Future, int] = {}
+        groups: dict[Future, GroupTask] = {}
         for task in tasks:
             # A pure function of its task, but what it does is work: each is submitted once.
             future = client.submit(_map_on_worker, task, topic, pure=False, retries=MAX_RETRIES)
-            groups[future] = task.number
+            groups[future] = task
             future.add_done_callback(heard.put)
         while groups:
-            check()
+            monitor.check()
             try:
                 said = heard.get(timeout=LISTEN_S)
             except queue.Empty:
                 continue
             words = said
             if not isinstance(said, list):
-                result, content, words = _outcome(said, groups.pop(said), scheduler)
-                _keep(place(result.number), content)
+                task = groups.pop(said)
+                result, content, words = _outcome(said, task.number, scheduler)
+                _keep(task.path, content)
                 mapped(result)
             for word in words:
-                advance(word)
+                monitor.advance(word)
 
 
 def check_scheduler(scheduler: str) -> None:
@@ -131,7 +129,9 @@ def _connected(scheduler: str) -> Client:
 
 
 def _missing() -> MissingExtraError:
-    return MissingExtraError("building on a cluster needs Dask: pip install 'engram[cluster]'")
+    return MissingExtraError(
+        "building on a cluster needs Dask: pip install 'engram-localisation[cluster]'"
+    )
 
 
 def _silent(scheduler: str, error: Exception) -> WorkerError:
@@ -147,22 +147,19 @@ def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
 
     worker = get_worker()
     key = worker.get_current_task()
-    words: list[str] = []
 
-    def advance(word: str) -> None:
-        words.append(word)
-        if len(words) >= WORDS_AT_ONCE:
-            worker.log_event(topic, list(words))
-            words.clear()
-            known = worker.state.tasks.get(key)
-            if known is None or known.state == "cancelled":
-                raise _GivenUpError
+    def send(words: list[str]) -> None:
+        worker.log_event(topic, words)
+        known = worker.state.tasks.get(key)
+        if known is None or known.state == "cancelled":
+            raise _GivenUpError
 
+    told = WordsTogether(send)
     try:
-        result, content = map_group_far_away(task, advance)
+        result, content = map_group_far_away(task, told)
     except EngramError as error:
         return error
-    return result, content, words
+    return result, content, told.take()
 
 
 def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, bytes, list[str]]:
@@ -192,9 +189,8 @@ def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, b
 
 def _keep(path: Path, content: bytes) -> None:
     """The group's map, whole or not at all, in place of what another worker left half done."""
-    draft = path.with_name(f"{path.name}.part")
     with keeping(path.parent):
-        draft.write_bytes(content)
-        for suffix in ("", "-wal", "-shm"):  # another map's log would be taken for its own
+        for suffix in ("-wal", "-shm"):  # another map's log would be taken for its own
             path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
-        draft.replace(path)
+        with write_whole(path) as draft:
+            draft.write_bytes(content)

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from engram.robot import MapOptions, Settings, map_drive, open_drive
-from engram.monitor import ignore
-
 from engram.errors import MissingExtraError, SequenceError
 from engram.maps import MapStore, WritableMapStore
+from engram.monitor import QUIET, Monitor
+from engram.robot import MapOptions, Settings, map_drive, open_drive
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,12 +22,14 @@ class GroupTask:
 
     Attributes:
         number: of the group.
+        path: the group's map.
         sources: paths or fsspec URLs of the drives, in the order of mapping.
         settings: the resolved configuration.
         options: how each drive is mapped.
     """
 
     number: int
+    path: Path
     sources: Sequence[str]
     settings: Settings
     options: MapOptions
@@ -54,21 +55,16 @@ class GroupResult:
     nodes: int = 0
     retries: int = 0
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {name: getattr(self, name) for name in self.__slots__}
 
-
-def map_group(task: GroupTask, path: Path, advance: Callable[[str], None] = ignore) -> GroupResult:
+def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
     """Maps a group's sessions into a map, which is made if there is none.
 
     Sessions that the map holds are passed over; one that was interrupted is begun anew, so that a
     group whose worker died comes out as it would have otherwise.
 
     Args:
-        task: what to map.
-        path: the group's map.
-        advance: called once per frame with a word on how it went.
+        task: what to map, and where.
+        monitor: hears of each frame.
 
     Raises:
         MapError: the map cannot be written.
@@ -76,31 +72,31 @@ def map_group(task: GroupTask, path: Path, advance: Callable[[str], None] = igno
     """
     result = GroupResult(task.number)
     started, cpu_started = time.perf_counter(), time.process_time()
-    with WritableMapStore.opened_or_created(path) as store:
+    with WritableMapStore.opened_or_created(task.path) as store:
         for one in store.interrupted():
             store.resume_session(one.session.id).abandon()
     for source in task.sources:
         with fetched(source) as drive:
-            report = map_drive(path, open_drive(drive), task.settings, task.options, advance)
+            report = map_drive(
+                task.path, open_drive(drive), task.settings, task.options, monitor.advance
+            )
         if report.interrupted:
             raise KeyboardInterrupt
         result.sessions.append({"source": source, **report.to_dict()})
-    with MapStore.open(path) as made:
+    with MapStore.open(task.path) as made:
         result.nodes = made.node_count()
     result.seconds = time.perf_counter() - started
     result.cpu_s = time.process_time() - cpu_started
     return result
 
 
-def map_group_far_away(
-    task: GroupTask, advance: Callable[[str], None] = ignore
-) -> tuple[GroupResult, bytes]:
+def map_group_far_away(task: GroupTask, monitor: Monitor = QUIET) -> tuple[GroupResult, bytes]:
     """Maps a group on a machine that shares no disk with the caller; returns the map's bytes."""
     with tempfile.TemporaryDirectory(prefix="engram-group-") as folder:
-        path = Path(folder) / "group.engram"
-        result = map_group(task, path, advance)
+        here = replace(task, path=Path(folder) / "group.engram")
+        result = map_group(here, monitor)
         whole = Path(folder) / "whole.engram"
-        MapStore.copy(path, whole)  # without the write-ahead log beside it
+        MapStore.copy(here.path, whole)  # without the write-ahead log beside it
         return result, whole.read_bytes()
 
 
@@ -119,7 +115,7 @@ def fetched(source: str) -> Iterator[Path]:
         import fsspec
     except ImportError as error:
         raise MissingExtraError(
-            f"{source}: drives at URLs need fsspec: pip install 'engram[cluster]'"
+            f"{source}: drives at URLs need fsspec: pip install 'engram-localisation[cluster]'"
         ) from error
     with tempfile.TemporaryDirectory(prefix="engram-drive-") as folder:
         copy = Path(folder) / source.rstrip("/").rsplit("/", 1)[-1]

@@ -8,10 +8,10 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from random import Random
 
-from engram.robot import open_drive, session_of_drive
 from engram.errors import ConfigError
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Session, SessionId
+from engram.robot import open_drive, session_of_drive
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from engram.errors import ConfigError, MapError, MapLockedError
+import msgspec
+
+from engram.errors import ConfigError, MapError, MapLockedError, storage_full
 from engram.fleet.build.group_mapping import GroupResult
-from engram.fleet.build.keeping import keeping
-from engram.fleet.build.order_results import BestOrder
+from engram.fleet.build.orders import BestOrder
 from engram.maps import MapStore
 from engram.maps.lock import WriterLock, current_holder
+from engram.monitor import write_whole
+
+Kept = TypeVar("Kept")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +64,34 @@ class MergingBegun:
     Attributes:
         order: numbers of the groups.
         judge: what judged the orders, as `JudgeOptions.hash`; None where none were tried.
-        best: how the order was found, as `BestOrder.to_dict`.
+        best: how the order was found.
         seconds: of each group's merge that stands, by its number as text.
     """
 
     order: list[int]
     judge: str | None = None
-    best: dict[str, Any] | None = None
+    best: BestOrder | None = None
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def best_order(self) -> BestOrder | None:
-        """How the order was found."""
-        return None if self.best is None else BestOrder.from_dict(self.best)
+
+@contextmanager
+def keeping(folder: Path) -> Iterator[None]:
+    """Turns the file system's errors, in what reads and writes in a build's folder, into Engram's.
+
+    Raises:
+        StorageFullError: no space is left.
+        MapError: the folder or a file in it cannot be made, read, written or removed.
+    """
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or folder
+        if full := storage_full(error, where):
+            raise full from error
+        raise MapError(
+            f"{where}: {error.strerror or error}; a build keeps its maps in {folder}: it must be a "
+            "folder that can be written to, or one that can be made there"
+        ) from error
 
 
 def build_folder(centre: Path) -> Path:
@@ -186,14 +205,14 @@ class Scratch:
 
     def remember(self, result: GroupResult) -> None:
         """A group is mapped."""
-        _write_json(self._result_path(result.number), result.to_dict())
+        write_kept(self._result_path(result.number), result)
 
     def result(self, number: int) -> GroupResult | None:
         """What mapping a group came to; None if that is still to be done."""
         path = self._result_path(number)
         if not (path.exists() and self.group(number).exists()):
             return None
-        return GroupResult(**_read_json(path))
+        return read_kept(path, GroupResult)
 
     def merging_begun(self) -> MergingBegun | None:
         """The order that an earlier run merges by; None if it did not come so far.
@@ -202,11 +221,11 @@ class Scratch:
         """
         if not (self.centre.exists() and self._merging_path.exists()):
             return None
-        return MergingBegun(**_read_json(self._merging_path))
+        return read_kept(self._merging_path, MergingBegun)
 
     def remember_merging(self, begun: MergingBegun) -> None:
         """The order is settled, or one more merge stands."""
-        _write_json(self._merging_path, asdict(begun))
+        write_kept(self._merging_path, begun)
 
     @property
     def _plan_path(self) -> Path:
@@ -220,19 +239,10 @@ class Scratch:
         return self.folder / f"group-{number}.json"
 
     def _read_plan(self) -> BuildPlan | None:
-        if not self._plan_path.exists():
-            return None
-        values = _read_json(self._plan_path)
-        known = {name: values[name] for name in BuildPlan.__slots__ if name in values}
-        try:
-            return BuildPlan(**known)
-        except TypeError as error:
-            raise ConfigError(
-                f"{self._plan_path} is no plan ({error}); delete the folder"
-            ) from error
+        return read_kept(self._plan_path, BuildPlan) if self._plan_path.exists() else None
 
     def _write_plan(self, plan: BuildPlan) -> None:
-        _write_json(self._plan_path, asdict(plan))
+        write_kept(self._plan_path, plan)
         self.plan = plan
 
     def _check_left_out(self, plan: BuildPlan) -> None:
@@ -291,19 +301,19 @@ def _missing(centre: Path, plan: BuildPlan) -> list[str]:
     return sorted(wanted - sessions_of(centre))
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_kept(path: Path, kind: type[Kept]) -> Kept:
+    """What a build wrote down.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds something else.
+    """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except (OSError, msgspec.MsgspecError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); delete {path.parent}") from error
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path} is of another kind; delete {path.parent}")
-    return values
 
 
-def _write_json(path: Path, values: dict[str, Any]) -> None:
+def write_kept(path: Path, values: Any) -> None:
     """In one step: a killed build leaves no half file."""
-    draft = path.with_name(f"{path.name}.part")
-    with keeping(path.parent):
-        draft.write_text(json.dumps(values), encoding="utf-8")
-        draft.replace(path)
+    with keeping(path.parent), write_whole(path) as draft:
+        draft.write_bytes(msgspec.json.encode(values))

@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.config import to_dict
+from engram.config import plain, to_dict
 from engram.errors import InputError
 from engram.fleet.download.bridges import close_gaps, components
 from engram.fleet.download.coverage import Coverage, expected_missed
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.download.stock import Mask, Stock
-from engram.fleet.merge.merging import Progress
 from engram.graph.model import Edge, PathId, path_id
 from engram.maps import BulkWriter, MapStore, WritableMapStore
 from engram.maps.drafts import check_parent, draft_folder
+from engram.monitor import QUIET, Monitor
 
 # What a node takes beside its blobs: rows and indices of it, its edges and path entries; measured
 # on maps of `hamlet`. Only where the search for the budget begins: the file itself is measured.
@@ -77,11 +77,8 @@ class DownloadReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``download --json`` prints."""
-        return {
-            name: str(value) if name == "out" else value
-            for name in self.__slots__
-            for value in [getattr(self, name)]
-        }
+        values: dict[str, Any] = plain(self)
+        return values
 
     def text(self) -> str:
         """For people."""
@@ -119,7 +116,7 @@ def download(
     options: DownloadOptions,
     *,
     at: int | str | None = None,
-    progress: Progress,
+    monitor: Monitor = QUIET,
 ) -> DownloadReport:
     """Write a part of a centre as a map of its own.
 
@@ -128,7 +125,7 @@ def download(
         out: NAME.engram, which must not be there yet.
         options: which part.
         at: revision of the centre; None for the newest.
-        progress: shows how it goes.
+        monitor: hears of each node that is written.
 
     Raises:
         ConfigError: an option is missing, out of range, or means nothing to the policy.
@@ -148,7 +145,7 @@ def download(
         selection = SELECTIONS[options.policy](stock, options)
         coverage = selection.coverage or coverage_for(stock, options)
         with draft_folder(out) as folder:
-            sent = _fitting(stock, selection, options, folder, progress)
+            sent = _fitting(stock, selection, options, folder, monitor)
             compact = folder / _COMPACT
             MapStore.compact(folder / _DRAFT, compact)
             report = _report(stock, sent, coverage, compact, out, options)
@@ -166,11 +163,11 @@ class _Sent:
 
 
 def _fitting(
-    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, progress: Progress
+    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, monitor: Monitor
 ) -> _Sent:
     """Write the draft; for a budget as many nodes as fit, found by writing and measuring."""
     if selection.order is None:
-        return _write_draft(stock, selection, options, folder, progress)
+        return _write_draft(stock, selection, options, folder, monitor)
     landmarks, thumbnails = stock.sizes
     blobs = landmarks + thumbnails * options.with_thumbnails
     pages = np.ceil(blobs / _PAGE_BYTES) * _PAGE_BYTES + _ROWS_BYTES
@@ -179,7 +176,7 @@ def _fitting(
     def measure(count: int) -> int:
         newest.clear()
         part = _beginning(selection, count)
-        newest[count] = _write_draft(stock, part, options, folder, progress)
+        newest[count] = _write_draft(stock, part, options, folder, monitor)
         return _compacted_bytes(folder)
 
     budget_bytes, why = options.budget_bytes, dict(selection.why)
@@ -258,17 +255,17 @@ def _compacted_bytes(folder: Path) -> int:
 
 
 def _write_draft(
-    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, progress: Progress
+    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, monitor: Monitor
 ) -> _Sent:
     for old in folder.iterdir():
         old.unlink()
     bridges = close_gaps(stock.node_ids, stock.edges, selection.sent)
     with (
         MapStore.create(folder / _DRAFT) as draft,
-        progress("download", int(selection.sent.sum())) as advance,
+        monitor.stage("download", int(selection.sent.sum())) as part,
         _begin(draft, stock, options) as writer,
     ):
-        _write(writer, stock, selection.sent, bridges, options, advance)
+        _write(writer, stock, selection.sent, bridges, options, part)
         writer.commit()
         stock.words.give(draft, [stock.node_ids[at] for at in np.flatnonzero(selection.sent)])
     return _Sent(selection, bridges)
@@ -296,14 +293,14 @@ def _write(
     sent: Mask,
     bridges: list[Edge],
     options: DownloadOptions,
-    advance: Callable[[str], None],
+    monitor: Monitor,
 ) -> None:
     """All that belongs to the nodes that are sent, owners first."""
     _write_sessions(writer, stock, sent)
     nodes = [stock.nodes[at] for at in np.flatnonzero(sent)]
     for stored in stock.store.frames.stored(nodes):
         writer.add_node(stored if options.with_thumbnails else replace(stored, thumbnail=None))
-        advance("")
+        monitor.advance()
     for edge in stock.edges:
         if sent[stock.index[edge.a]] and sent[stock.index[edge.b]]:
             writer.add_edge(edge)

@@ -5,17 +5,21 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from datetime import date
+from typing import Annotated
 
-import numpy as np
+from msgspec import Meta
 
+from engram.config import check_bounds
 from engram.errors import ConfigError
 
-_HOURS = 24.0
 _CLOCK = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d{2}))?", re.ASCII)
 _SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kMGT]?i?B?)", re.ASCII)
 _PERCENT = re.compile(r"(?P<number>\d+(\.\d+)?)\s*%", re.ASCII)
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 _UNITS |= {f"{name}i": 2 ** (10 * power) for power, name in enumerate("kMGT", start=1)}
+
+
+_Minutes = Annotated[float, Meta(ge=0, le=720)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,18 +28,18 @@ class DownloadOptions:
 
     Attributes:
         policy: key of `SELECTIONS`.
-        start_h, end_h: the mission's hours of day, in [0, 24); None for not said.
+        start_h, end_h: the mission's hours of day; None if not given.
         day: the mission's date, "2026-11-17"; None for that of the centre's newest drive. It tells
             how high the sun stands at those hours.
-        latitude_deg: where the fleet drives, north positive; None to learn it from what got on with
-            what.
+        latitude_deg: where the fleet drives, north positive; None to learn it from which drives
+            matched which nodes.
         window_min: `tod`: how far a node's time of day may be from the mission's start, minutes.
             180: [G16] §VI-D.
         epoch_min: `paths`: length Δt of an epoch, minutes. 60: SPEC §7.
         best_percent: `paths`: share of the paths of each epoch that is sent. 50: [G16] §VI-D.
         buffer_min: widens the mission at both ends, minutes.
         budget_bytes: `budget`: what the file may take.
-        budget_percent: `budget`: the same as a share of what all nodes would take, sent alike.
+        budget_percent: `budget`: the same as a share of what all nodes would take.
         near: `region`: beginnings of UUIDs of nodes.
         route: `route`, and `budget` if it is to serve one: beginning of the UUID of a session
             that drove it.
@@ -44,38 +48,30 @@ class DownloadOptions:
     """
 
     policy: str = "copy"
-    start_h: float | None = None
-    end_h: float | None = None
+    start_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
+    end_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
     day: str | None = None
-    latitude_deg: float | None = None
-    window_min: float = 180.0
-    epoch_min: float = 60.0
-    best_percent: float = 50.0
-    buffer_min: float = 0.0
-    budget_bytes: int | None = None
-    budget_percent: float | None = None
+    latitude_deg: Annotated[float | None, Meta(ge=-90, le=90)] = None
+    window_min: _Minutes = 180.0
+    epoch_min: Annotated[float, Meta(ge=1, le=1440)] = 60.0
+    best_percent: Annotated[float, Meta(ge=0, le=100)] = 50.0
+    buffer_min: _Minutes = 0.0
+    budget_bytes: Annotated[int | None, Meta(gt=0)] = None
+    budget_percent: Annotated[float | None, Meta(gt=0, le=100)] = None
     near: tuple[str, ...] = ()
     route: str | None = None
-    radius_m: float = 20.0
+    radius_m: Annotated[float, Meta(ge=0, le=1e6)] = 20.0
     thumbnails: bool | None = None
 
     def __post_init__(self) -> None:
-        _check(self.window_min, "window", "minutes", 0.0, 720.0)
-        _check(self.epoch_min, "epoch", "minutes", 1.0, 1440.0)
-        _check(self.best_percent, "best", "per cent", 0.0, 100.0)
-        _check(self.buffer_min, "buffer", "minutes", 0.0, 720.0)
-        _check(self.radius_m, "radius", "metres", 0.0, 1e6)
-        for name, hour in (("start", self.start_h), ("end", self.end_h)):
-            if hour is not None and not 0 <= hour < _HOURS:
-                raise ConfigError(f"{name} is {hour} h, must be from 0:00 to 23:59")
+        check_bounds(self)
         if self.day is not None:
             _check_day(self.day)
-        if self.latitude_deg is not None:
-            _check(self.latitude_deg, "latitude", "degrees", -90.0, 90.0)
-        if self.budget_bytes is not None and self.budget_bytes <= 0:
-            raise ConfigError(f"budget is {self.budget_bytes} bytes, must be > 0")
-        if self.budget_percent is not None:
-            _check_share(self.budget_percent, self.budget_bytes)
+        if self.budget_bytes is not None and self.budget_percent is not None:
+            raise ConfigError(
+                f"budget is {self.budget_bytes} bytes and {self.budget_percent:g} per cent of "
+                "everything; give one"
+            )
 
     @property
     def with_thumbnails(self) -> bool:
@@ -117,22 +113,8 @@ def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
     return int(float(found["number"]) * _UNITS[unit]), None
 
 
-def _check_share(percent: float, budget_bytes: int | None) -> None:
-    if budget_bytes is not None:
-        raise ConfigError(
-            f"budget is {budget_bytes} bytes and {percent:g} per cent of everything; give one"
-        )
-    if not 0 < percent <= 100:
-        raise ConfigError(f"budget is {percent:g} per cent, must be > 0 and at most 100")
-
-
 def _check_day(text: str) -> None:
     try:
         date.fromisoformat(text)
     except ValueError:
         raise ConfigError(f"date is {text!r}, must be a day such as 2026-11-17") from None
-
-
-def _check(value: float, name: str, unit: str, least: float, most: float) -> None:
-    if not (np.isfinite(value) and least <= value <= most):
-        raise ConfigError(f"{name} is {value} {unit}, must be from {least:g} to {most:g}")

@@ -2,7 +2,7 @@
 
 from engram.fleet.merge.gate import Gate, GateOptions, what_is_worse
 from engram.fleet.merge.handed_in import HandedIn
-from engram.fleet.merge.merging import Progress, merge, silent
+from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment, string_segments
@@ -13,14 +13,12 @@ __all__ = [
     "HandedIn",
     "MergeOptions",
     "MergeReport",
-    "Progress",
     "Reason",
     "RunReport",
     "Seed",
     "Segment",
     "SegmentReport",
     "merge",
-    "silent",
     "string_segments",
     "what_is_worse",
 ]

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeAlias
 
 from engram.errors import InputError
 from engram.fleet.merge.centre import Centre
@@ -20,36 +19,9 @@ from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.steps import merge_one
 from engram.maps import FORMAT_VERSION, MapStore
 from engram.maps.drafts import draft_folder
-from engram.monitor import QUIET, Monitor, ignore, interruptible
+from engram.monitor import QUIET, Monitor, interruptible
 from engram.robot import Settings
 from engram.viewing import check_picture
-
-Progress: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
-
-
-@contextmanager
-def silent(what: str, total: int) -> Iterator[Callable[[str], None]]:
-    """A `Progress` that shows nothing."""
-    del what, total
-    yield ignore
-
-
-class Shown(Monitor):
-    """A monitor that shows its stages by a `Progress`."""
-
-    def __init__(self, progress: Progress, advance: Callable[[str], None] = ignore) -> None:
-        self._progress = progress
-        self._advance = advance
-
-    @contextmanager
-    def stage(self, what: str, total: int) -> Iterator[Monitor]:
-        """See `Monitor`."""
-        with self._progress(what, total) as advance:
-            yield Shown(self._progress, advance)
-
-    def advance(self, word: str = "") -> None:
-        """See `Monitor`."""
-        self._advance(word)
 
 
 def merge(

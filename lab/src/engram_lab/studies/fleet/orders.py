@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from engram.fleet.build import JudgeOptions, find_best_order
-from engram.fleet.merge import GateOptions, silent
+from engram.fleet.merge import GateOptions
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
 from engram.measures import Drive
+from engram.monitor import QUIET
 from engram.robot import DriveSequence, OpenMap, Settings, session_of_drive
 from engram_lab.studies.configurations import Configuration
 from engram_lab.studies.drives import EvaluatedDrive
@@ -79,6 +80,6 @@ def try_orders(plan: FleetPlan, arm: Arm, fold: Fold, names: Sequence[str]) -> N
         plan.settings,
         arm.merging(relocaliser),
         judge,
-        silent,
+        QUIET,
     )
     write_record(path, found.to_dict())

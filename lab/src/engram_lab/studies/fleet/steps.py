@@ -12,7 +12,6 @@ from pathlib import Path
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, DownloadReport, download
 from engram.fleet.merge import merge as merge_maps
-from engram.fleet.merge import silent
 from engram.frontend.matching import matcher_hash
 from engram.graph.clock import hour_of_day
 from engram.graph.model import path_id
@@ -179,7 +178,7 @@ def _downloaded(whole: Path, draft: Path, policy: str, hour: float | None) -> Do
     """What a robot gets: where nothing was driven at such an hour it asks for more."""
     try:
         options = DownloadOptions(policy, start_h=hour, end_h=hour)
-        return download(whole, draft, options, progress=silent)
+        return download(whole, draft, options)
     except InputError:
         if policy not in _ASKS_FOR_MORE:
             raise

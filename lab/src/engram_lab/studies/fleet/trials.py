@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions
-from engram.fleet.merge import silent
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, SessionId
 from engram.localiser import Position
 from engram.maps import MapStore
 from engram.measures import Drive
+from engram.monitor import QUIET
 from engram.places import (
     DenseTable,
     FabMap,
@@ -108,7 +108,7 @@ def try_downloads_for(
         drives=[lambda: FrameLog(drive.path)],
         settings=plan.settings,
         localise=arm.localising(plan.options.relocaliser),
-        progress=silent,
+        monitor=QUIET,
         start=partial(_start, plan, fold, drive),
     )
     found, refused = trials({COPY: _wanted(COPY)}), {}

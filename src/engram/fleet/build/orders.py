@@ -1,0 +1,289 @@
+"""Orders of merging: which are tried, by what they are judged, how they fare, what trying costs.
+
+Source: [G16] §VI-E, eq. (8); SPEC §7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from engram.config import config_hash, plain, to_dict
+from engram.errors import ConfigError
+from engram.fleet.merge.gate import GateOptions, held_as
+from engram.graph.model import Session
+from engram.measures import Drive
+from engram.robot import DriveSequence, OpenMap, Settings, open_drive, session_of_drive
+
+# 5,040 orders of 7 groups are a matter of days.
+_MOST_GROUPS = 6
+
+
+class Orders(StrEnum):
+    """Which orders of k groups are tried."""
+
+    ALL = "all"  # k! of them
+    FIRST = "first"  # k: each group comes first once, the others follow in their order
+
+    def following(self, prefix: tuple[int, ...], groups: int) -> list[int]:
+        """The groups that may come after a prefix."""
+        left = [number for number in range(groups) if number not in prefix]
+        return left if self is Orders.ALL or not prefix else left[:1]
+
+    def of(self, groups: int) -> int:
+        """How many orders there are."""
+        return math.factorial(groups) if self is Orders.ALL else groups
+
+
+Localise: TypeAlias = Callable[[OpenMap, DriveSequence, Settings, GateOptions], Drive]
+
+
+@dataclass(frozen=True, slots=True)
+class JudgeOptions:
+    """By what an order is judged.
+
+    Attributes:
+        drives: validation sessions; no part of the groups, and of no report of quality.
+        judge_at_m: distance x that the operator can bear on dead reckoning: the order with the
+            lowest P(X ≥ x) is best.
+        localising: policy and budget of the validation.
+        reported: further sessions, which choose nothing: how they fare tells how good the chosen
+            order is.
+        localise: how a drive is localised in a map; None for `localise_drive`. Results that a
+            search finds from earlier are taken to be by the same.
+        orders: which are tried.
+    """
+
+    drives: Sequence[Path]
+    judge_at_m: float = 10.0
+    localising: GateOptions = field(default_factory=GateOptions)
+    reported: Sequence[Path] = ()
+    localise: Localise | None = None
+    orders: Orders = Orders.ALL
+
+    def __post_init__(self) -> None:
+        if not self.drives:
+            raise ConfigError(
+                "the best order is judged by validation drives: name some (--validate)"
+            )
+        if not 0 <= self.judge_at_m < math.inf:
+            raise ConfigError(f"judge_at_m is {self.judge_at_m}, must be finite and >= 0")
+
+    def hash(self) -> str:
+        """Changes when any order could be judged otherwise: by drives, distance or localising.
+
+        Not by which orders are tried: those that were judged need not be again.
+
+        Raises:
+            SequenceError: a drive cannot be read.
+        """
+        sessions = [
+            [str(session_of_drive(open_drive(path)).id) for path in paths]
+            for paths in (self.drives, self.reported)
+        ]
+        return config_hash([*sessions, self.judge_at_m, to_dict(self.localising)])
+
+
+def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -> None:
+    """Refuses to judge a map by what it was made of, or by one drive twice.
+
+    Args:
+        judge: the drives that must be held out.
+        mapped: the sessions that none of them must be, and where each is, in words.
+
+    Raises:
+        ConfigError: a drive is not held out; names it.
+        SequenceError: a drive cannot be read.
+    """
+    where = {one.id: words for one, words in mapped}
+    known = [one for one, _ in mapped]
+    for path in (*judge.drives, *judge.reported):
+        sequence = open_drive(path)
+        held = held_as(sequence, known)
+        if held is not None:
+            raise ConfigError(
+                f"{path} judges the orders of merging, but is {where[held.id]} (session {held.id} "
+                f"of {held.robot}); judge by drives that are in no map, and name each once"
+            )
+        known.append(session_of_drive(sequence))
+        where[known[-1].id] = f"the same drive as {path}"
+
+
+def check_countable(groups: int, orders: Orders) -> None:
+    """Refuses more groups than all orders of them could be tried.
+
+    Raises:
+        ConfigError: there are too many, or none.
+    """
+    if groups < 1:
+        raise ConfigError("there are no groups to be merged in any order")
+    if orders is Orders.ALL and groups > _MOST_GROUPS:
+        raise ConfigError(
+            f"{groups} groups have {math.factorial(groups):,} orders; at most {_MOST_GROUPS} "
+            f"groups can be tried in all orders; --best-first tries {groups}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class OrderResult:
+    """One order and how the validation drives fare in its map.
+
+    Attributes:
+        order: numbers of the groups.
+        judged: P(X ≥ x) at the distance judged by.
+        area_m: area under the failure curve to 50 m.
+        at_m: P(X ≥ x) at 5, 10 and 20 m, by distance.
+        nodes: of the map.
+        content_hash: of the map.
+        reported: P(X ≥ x) of the sessions that choose nothing, every half metre from 0 to 50;
+            empty where there are none.
+        reported_missed: share of their way without a match.
+    """
+
+    order: tuple[int, ...]
+    judged: float
+    area_m: float
+    at_m: dict[str, float]
+    nodes: int
+    content_hash: str
+    reported: list[float] = field(default_factory=list)
+    reported_missed: float = 0.0
+
+    @property
+    def rank(self) -> tuple[float, float, tuple[int, ...]]:
+        """Best first; the order itself where two are alike."""
+        return self.judged, self.area_m, self.order
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """What steps of the search took; those of earlier runs count like those of this one.
+
+    Attributes:
+        merges, copies: made.
+        merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
+        replayed, attempts, proposed, lookups: nodes that were replayed in merging, match attempts,
+            those of them at proposed nodes, and nodes for which the relocaliser was asked.
+    """
+
+    merges: int = 0
+    copies: int = 0
+    merge_s: float = 0.0
+    copy_s: float = 0.0
+    judge_s: float = 0.0
+    replayed: int = 0
+    attempts: int = 0
+    proposed: int = 0
+    lookups: int = 0
+
+    def __add__(self, other: Spent) -> Spent:
+        return Spent(*(getattr(self, n) + getattr(other, n) for n in self.__slots__))
+
+
+@dataclass(slots=True)
+class BestOrder:
+    """Orders of some groups, and how they fare.
+
+    Attributes:
+        results: one per order, best first.
+        judge_at_m: what they were judged by.
+        tried: which orders of the groups.
+        rooted: whether every order began with a centre that was there, not with its first group.
+        spent: in this search, in all its runs; what an interruption undid is counted once.
+    """
+
+    results: list[OrderResult] = field(default_factory=list)
+    judge_at_m: float = 10.0
+    tried: Orders = Orders.ALL
+    rooted: bool = False
+    spent: Spent = field(default_factory=Spent)
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """The best."""
+        return self.results[0].order
+
+    def spread(self) -> dict[str, dict[str, float]]:
+        """P(X ≥ x) at 5, 10 and 20 m over the orders: least, median, most, and of the best."""
+        found = {}
+        for at in self.results[0].at_m:
+            values = [one.at_m[at] for one in self.results]
+            found[at] = {
+                "least": min(values),
+                "median": float(np.median(values)),
+                "most": max(values),
+                "best": self.results[0].at_m[at],
+            }
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``build --json`` prints."""
+        return {
+            "order": list(self.order),
+            "judge_at_m": self.judge_at_m,
+            "tried": self.tried.value,
+            "rooted": self.rooted,
+            "orders": plain(self.results),
+            "spread": self.spread(),
+            **plain(self.spent),
+        }
+
+    def text(self) -> str:
+        """For people."""
+        told = " ".join(map(str, self.order))
+        lines = [
+            f"best of {len(self.results)} orders: {told}, P(no match within "
+            f"{self.judge_at_m:g} m) {self.results[0].judged:.2%}; {self.spent.merges} "
+            f"merges in {self.spent.merge_s:.1f} s, {self.spent.copies} copies in "
+            f"{self.spent.copy_s:.1f} s, judging {self.spent.judge_s:.1f} s"
+        ]
+        lines += [
+            f"  P(X >= {at} m): least {one['least']:.2%}, median {one['median']:.2%}, most "
+            f"{one['most']:.2%}, best order {one['best']:.2%}"
+            for at, one in self.spread().items()
+        ]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, slots=True)
+class OrderCosts:
+    """What trying all orders costs, seconds.
+
+    Attributes:
+        model_s: numerator of (8): every order's merges made afresh.
+        sequential_s: its denominator: every order built by mapping sequentially, but for the copy
+            of the first group.
+        tree_s: merges of a common prefix made once.
+        sequential_tree_s: sequential building that shares its prefixes likewise.
+    """
+
+    model_s: float
+    sequential_s: float
+    tree_s: float
+    sequential_tree_s: float
+
+
+def order_costs(groups: int, group_s: float, merge_s: float, copy_s: float) -> OrderCosts:
+    """The cost model of trying all orders ([G16] eq. (8), SPEC §7).
+
+    Args:
+        groups: k.
+        group_s: T_G, mapping one group.
+        merge_s: T_M, merging one group's map.
+        copy_s: T_C, copying an intermediate map.
+    """
+    k, orders = groups, math.factorial(groups)
+    inner = sum(orders // math.factorial(k - depth) for depth in range(2, k + 1))
+    copies_s = (inner + k) * copy_s
+    return OrderCosts(
+        model_s=k * group_s + orders * (k - 1) * merge_s + k * (orders - 1) * copy_s,
+        sequential_s=(orders * (k - 1) + 1) * group_s + (orders - 1) * copy_s,
+        tree_s=k * group_s + inner * merge_s + copies_s,
+        sequential_tree_s=(inner + k) * group_s + copies_s,
+    )
