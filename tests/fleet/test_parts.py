@@ -1,35 +1,39 @@
 """What hangs together with the centre while a merge goes on, against counting components."""
 
 import random
+from unittest.mock import Mock
 from uuid import UUID
 
 import numpy as np
 import pytest
 
-from engram.fleet.merge.parts import Parts
+from engram.fleet.merge.handed_in import HandedIn
+from engram.fleet.merge.state import Merge
 from engram.geometry import SE3
-from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
+from engram.maps import MapStore
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_node_is_apart_while_no_edges_lead_from_it_to_what_was_there(seed: int) -> None:
+def test_a_node_is_apart_while_no_edges_lead_from_it_to_what_was_there(seed: int, tmp_path) -> None:
     rng = random.Random(seed)
-    graph, parts = ExperienceGraph(), Parts()
+    MapStore.create(tmp_path / "empty.engram").close()
+    with MapStore.open(tmp_path / "empty.engram") as store:
+        merge = Merge(store, HandedIn(store, "robot"))
+    merge.writer = Mock()
     session = SessionId(UUID(int=1))
-    nodes = [NodeId(UUID(int=number)) for number in range(2, 22)]
-    known = nodes[:5]
-    for number, node in enumerate(nodes):
-        graph.add_node(Node(node, session, number, "camera", float(number)))
-        if node not in known:
-            parts.take(node)
+    ids = [NodeId(UUID(int=number)) for number in range(2, 22)]
+    nodes = [Node(one, session, at, "camera", float(at)) for at, one in enumerate(ids)]
+    known = ids[:5]
+    for node in nodes[:5]:
+        merge.graph.add_node(node)
+    for node in nodes[5:]:
+        merge.take(Mock(node=node), Mock())
     for _ in range(15):
-        a, b = rng.sample(nodes, 2)
-        edge = Edge(a, b, EdgeKind.MATCH, SE3.identity(), np.eye(6))
-        graph.add_edge(edge)
-        parts.join(edge)
-        labels = graph.components()
+        a, b = rng.sample(ids, 2)
+        merge.add_edge(Edge(a, b, EdgeKind.MATCH, SE3.identity(), np.eye(6)))
+        labels = merge.graph.components()
         there = set(labels[: len(known)].tolist())
-        for number, node in enumerate(nodes):
+        for number, node in enumerate(ids):
             expected = node not in known and int(labels[number]) not in there
-            assert parts.is_apart(node) == expected
+            assert merge.is_apart(node) == expected

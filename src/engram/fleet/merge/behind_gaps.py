@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 
-from engram.fleet.merge.positions import seen_from
 from engram.fleet.merge.segments import Segment
 from engram.frontend import Frame
 from engram.graph.model import NodeId
 from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
 from engram.localiser.attempts import Outcome
+from engram.maps import StoredNode
 from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
 
 # A guess over a longer way is none. Source: SPEC §3.4, after which a robot counts as lost.
@@ -57,9 +56,8 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
     """
     gaps = GapFiller()
     gaps.motion(OdometryStep(OdometryStatus.FIRST), before.nodes[0].stamp_ns)
-    for (one, other), edge in zip(pairwise(before.nodes), before.steps, strict=True):
-        _, motion, covariance = seen_from(edge, one.id)
-        gaps.motion(OdometryStep(OdometryStatus.OK, motion, covariance), other.stamp_ns)
+    for node, motion in zip(before.nodes[1:], before.motions, strict=True):
+        gaps.motion(OdometryStep(OdometryStatus.OK, *motion), node.stamp_ns)
     lost = OdometryStep(OdometryStatus.NO_CONSENSUS)
     guess = gaps.motion(lost, segment.nodes[0].stamp_ns)
     assert guess.prev_from_curr is not None
@@ -72,7 +70,7 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
 def look_along(
     localiser: Localiser,
     start: Position,
-    frames: Iterable[tuple[NodeId, Frame, Motion]],
+    frames: Iterable[tuple[StoredNode, Frame, Motion]],
 ) -> tuple[FoundNode | None, int]:
     """Looks for the first frames of a segment from a guess of where it begins.
 
@@ -89,7 +87,7 @@ def look_along(
     driven_m = first_at_m = 0.0
     attempts = 0
     localiser.start_at(start)
-    for node, frame, motion in frames:
+    for stored, frame, motion in frames:
         if motion.odometry.prev_from_curr is not None:
             driven_m += motion.odometry.prev_from_curr.distance_m
         if driven_m > _LOOK_WITHIN_M:
@@ -100,7 +98,7 @@ def look_along(
         if found.status is not LocalisationStatus.LOCALISED:
             continue
         if first is None:
-            first, first_at_m = FoundNode(node, found, localiser.outcomes), driven_m
+            first, first_at_m = FoundNode(stored.node.id, found, localiser.outcomes), driven_m
         elif driven_m - first_at_m >= _BASE_LINE_M:
             return first, attempts
     return None, attempts

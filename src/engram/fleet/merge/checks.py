@@ -7,50 +7,65 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from engram.errors import IncompatibleError
-from engram.fleet.merge.centre import Centre
 from engram.fleet.merge.handed_in import HandedIn
+from engram.fleet.merge.state import Merge
 from engram.graph.model import Clock, Node, NodeId, Session, SessionId
 
 _NS_PER_S = 1_000_000_000
 # Stamps count as running backwards only where odometry says that the robot drove on by as much.
 _DRIVEN_SLACK_M = 0.5
 # Pairs of drives at the same time that are named for each robot: a name shared by two makes many.
-_TOLD_OVERLAPS = 5
+_NAMED_OVERLAPS = 5
 
 
-def check_fits(centre: Centre, robot: HandedIn) -> None:
+def check_fits(merge: Merge) -> None:
     """Refuse a map that would spoil the centre.
 
     Raises:
         IncompatibleError: it has another kind of descriptors; or it has a node or a session under
             the UUID of one of the centre's, and another content.
     """
-    kind, theirs = centre.opened.descriptor, robot.store.descriptor()
+    robot, known = merge.robot, merge.centre.sessions
+    kind, theirs = merge.centre.descriptor, robot.store.descriptor()
     if None not in {kind, theirs} and kind is not theirs:
         raise IncompatibleError(
             f"{robot.name} holds {theirs} descriptors, the centre {kind}; the two cannot be "
             "matched: extract and map the drives again"
         )
     for session in robot.sessions:
-        ours = centre.opened.sessions.get(session.id)
+        ours = known.get(session.id)
         if ours is not None and _drive(ours) != _drive(session):
             raise IncompatibleError(
                 f"session {session.id} is a drive of {session.robot} in {robot.name} and another "
                 f"one, of {ours.robot}, in the centre: one of the two maps is not what it says"
             )
-    _check_nodes(centre, robot)
-
-
-def _check_nodes(centre: Centre, robot: HandedIn) -> None:
-    """Refuse nodes that the centre has, or once omitted, with another content."""
-    for node, theirs in robot.landmark_hashes.items():
-        ours = centre.landmark_hashes.get(node, theirs)
-        if ours != theirs or not _same_record(centre, robot, node):
+    landmarks = merge.landmark_hashes
+    for node, brought in robot.landmark_hashes.items():
+        held = landmarks.get(node, brought)
+        if held != brought or not _same_record(merge, node):
+            record = robot.nodes.get(node)
+            which = f" (session {record.session}, stamp {record.stamp_ns})" if record else ""
             raise IncompatibleError(
-                f"node {node}{_told(robot, node)} has one content in {robot.name} and another in "
-                f"the centre, landmarks {theirs.hex()} and {ours.hex()}: a node never changes, so "
-                "one of the two maps is not what it says"
+                f"node {node}{which} has one content in {robot.name} and another in the centre, "
+                f"landmarks {brought.hex()} and {held.hex()}: a node never changes, so one of the "
+                "two maps is not what it says"
             )
+
+
+def _drive(session: Session) -> tuple[str, str, int]:
+    """What a session's UUID is made of; clock, longitude and zone may be told later (SPEC §2.8)."""
+    return session.robot, session.camera, session.start_ns
+
+
+def _same_record(merge: Merge, node: NodeId) -> bool:
+    """Whether a node that both have is of the same drive, moment and camera."""
+    if node not in merge.graph or node not in merge.robot.nodes:
+        return True
+    ours, theirs = (
+        (one.session, one.stamp_ns, one.camera)
+        for one in (merge.graph.node(merge.graph.index(node)), merge.robot.nodes[node])
+    )
+    return ours == theirs
 
 
 def check_readable(robot: HandedIn, nodes: Sequence[Node]) -> None:
@@ -63,55 +78,31 @@ def check_readable(robot: HandedIn, nodes: Sequence[Node]) -> None:
         pass
 
 
-def notes(centre: Centre, robot: HandedIn, now_ns: int) -> list[str]:
+def notes(merge: Merge, now_ns: int) -> list[str]:
     """What is odd about a map and does not stand in the way of a merge.
 
-    Drives that the centre has are left out: what is odd about them was told when they came.
+    Drives that the centre has are left out: what is odd about them was reported when they came.
 
     Args:
-        centre: before the merge.
-        robot: the map.
+        merge: before anything is added.
         now_ns: the time, UTC.
     """
-    told = [
+    robot = merge.robot
+    found = [
         f"session {one.session.id} of {one.session.robot} was interrupted in {robot.name}: it is "
         "not handed in before it is resumed or sealed there"
         for one in robot.store.interrupted()
     ]
-    new = [one for one in robot.sessions if one.id not in centre.opened.sessions]
+    new = [one for one in robot.sessions if one.id not in merge.centre.sessions]
     for session in new:
-        told += _backwards(session, robot.nodes_of[session])
+        found += _backwards(session, robot.nodes_of[session])
         if session.clock is Clock.UTC and session.start_ns > now_ns:
-            told.append(
+            found.append(
                 f"session {session.id} of {session.robot} begins "
                 f"{(session.start_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
                 "was wrong"
             )
-    return told + list(_overlaps(centre, robot, new))
-
-
-def _drive(session: Session) -> tuple[str, str, int]:
-    """What a session's UUID is made of; clock, longitude and zone may be told later (SPEC §2.8)."""
-    return session.robot, session.camera, session.start_ns
-
-
-def _same_record(centre: Centre, robot: HandedIn, node: NodeId) -> bool:
-    """Whether a node that both have is of the same drive, moment and camera."""
-    if node not in centre.graph or node not in robot.nodes:
-        return True
-    ours, theirs = centre.graph.node(centre.graph.index(node)), robot.nodes[node]
-    return (ours.session, ours.stamp_ns, ours.camera) == (
-        theirs.session,
-        theirs.stamp_ns,
-        theirs.camera,
-    )
-
-
-def _told(robot: HandedIn, node: NodeId) -> str:
-    """Where a node comes from; nothing of one that the robot's map has omitted itself."""
-    if node not in robot.nodes:
-        return ""
-    return f" (session {robot.nodes[node].session}, stamp {robot.nodes[node].stamp_ns})"
+    return found + list(_overlaps(merge, new))
 
 
 def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
@@ -131,19 +122,19 @@ def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
         )
 
 
-def _overlaps(centre: Centre, robot: HandedIn, new: Sequence[Session]) -> Iterator[str]:
+def _overlaps(merge: Merge, new: Sequence[Session]) -> Iterator[str]:
     """Drives of one robot at the same time: two robots of one name, or a clock that was wrong."""
-    spans = _spans(centre, robot)
+    spans = _spans(merge)
     ids = {session.id for session in new}
     for name in sorted({session.robot for session in new}):
         pairs = list(overlapping([one for one in spans if one.session.robot == name], ids))
-        for one, other in pairs[:_TOLD_OVERLAPS]:
+        for one, other in pairs[:_NAMED_OVERLAPS]:
             yield (
                 f"sessions {one.id} and {other.id} are both of a robot named {name!r} and overlap "
                 "in time: two robots have the same name, or a clock was wrong"
             )
-        if len(pairs) > _TOLD_OVERLAPS:
-            yield f"… and {len(pairs) - _TOLD_OVERLAPS} more pairs of drives of {name!r}"
+        if len(pairs) > _NAMED_OVERLAPS:
+            yield f"… and {len(pairs) - _NAMED_OVERLAPS} more pairs of drives of {name!r}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +162,11 @@ def overlapping(
         running.append(span)
 
 
-def _spans(centre: Centre, robot: HandedIn) -> list[Span]:
+def _spans(merge: Merge) -> list[Span]:
     """Of every session whose clock is UTC."""
-    sessions = {**centre.opened.sessions, **{one.id: one for one in robot.sessions}}
+    sessions = {**merge.centre.sessions, **{one.id: one for one in merge.robot.sessions}}
     last = {one.id: one.start_ns for one in sessions.values()}
-    for node in (*centre.graph.nodes, *robot.contents.nodes):
+    for node in (*merge.graph.nodes, *merge.robot.contents.nodes):
         last[node.session] = max(last[node.session], node.stamp_ns)
     return [
         Span(one, one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC

@@ -9,13 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from engram.errors import InputError
-from engram.fleet.merge.centre import Centre
 from engram.fleet.merge.checks import check_fits, check_readable
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.pictures import picture_before_and_after
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
+from engram.fleet.merge.state import Merge
 from engram.fleet.merge.steps import merge_one
 from engram.maps import FORMAT_VERSION, MapStore
 from engram.maps.drafts import draft_folder
@@ -144,7 +144,7 @@ def _check_before_raising(place: Path, robot: HandedIn) -> None:
     """
     with MapStore.open(place) as store:
         if store.format_version < FORMAT_VERSION:
-            check_fits(Centre(store), robot)
+            check_fits(Merge(store, robot))
             check_readable(robot, robot.contents.nodes)
 
 

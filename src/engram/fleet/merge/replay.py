@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 from engram.errors import ConfigError
 from engram.fleet.merge.behind_gaps import FoundNode, look_along, position_behind_gap
-from engram.fleet.merge.centre import Centre
-from engram.fleet.merge.handed_in import HandedIn
-from engram.fleet.merge.parts import Parts
-from engram.fleet.merge.positions import beyond, recomposed, seen_from, uncertainty_m2
+from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
 from engram.fleet.merge.report import Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
+from engram.fleet.merge.state import Merge
 from engram.frontend import Frame, FrameStatus
+from engram.geometry import SE3
 from engram.graph.model import (
     Attempt,
     Edge,
@@ -39,7 +38,7 @@ from engram.localiser import (
 )
 from engram.localiser.attempts import Outcome
 from engram.mapper import match_edges
-from engram.maps import BulkWriter, StoredNode
+from engram.maps import StoredNode
 from engram.monitor import Monitor
 from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
 from engram.ranking import check_for_robot
@@ -89,51 +88,32 @@ class MergeOptions:
 
 
 class Replay:
-    """Replays segments one after another and writes what the centre takes.
+    """Replays segments one after another and adds what the centre lacks.
 
     Args:
-        centre: grows.
-        robot: whose segments they are.
-        writer: the open revision.
+        merge: what is known and added.
         settings: of localiser and mapper.
         options: policy and budget.
-        relocaliser: shared by all segments.
         monitor: hears of each node what became of it, and is asked behind each whether to go on.
 
     Attributes:
-        edges: how many were written.
-        match_attempts: how many were made.
-        proposed_attempts: how many of them at nodes that the relocaliser proposed.
-        lookups: for how many frames the relocaliser was asked.
         attempts: those to be remembered, by session, in the order of iterations.
         entries: what the replay matched, by session, in the order of time; not yet numbered.
     """
 
     def __init__(
-        self,
-        centre: Centre,
-        robot: HandedIn,
-        writer: BulkWriter,
-        settings: Settings,
-        options: MergeOptions,
-        relocaliser: Relocaliser | None,
-        monitor: Monitor,
+        self, merge: Merge, settings: Settings, options: MergeOptions, monitor: Monitor
     ) -> None:
-        self.edges = 0
-        self.match_attempts = 0
-        self.proposed_attempts = 0
-        self.lookups = 0
-        self.attempts: dict[SessionId, list[Attempt]] = {}
-        self.entries: dict[SessionId, list[PathEntry]] = {}
-        self._centre = centre
-        self._robot = robot
-        self._writer = writer
+        self.attempts: dict[SessionId, list[Attempt]] = defaultdict(list)
+        self.entries: dict[SessionId, list[PathEntry]] = defaultdict(list)
+        self._merge = merge
         self._settings = settings
         self._options = options
-        self._relocaliser = relocaliser
         self._monitor = monitor
+        self._relocaliser = (
+            None if (name := options.relocaliser) is None else self._lazy_relocaliser(name)
+        )
         self._taken: set[NodeId] = set()
-        self._parts = Parts()
         self._run: list[int] = []  # nodes taken one after another, by their dense indices
         self._iterations: dict[SessionId, int] = {}
         # How far each drive had come when the centre last knew it.
@@ -159,37 +139,30 @@ class Replay:
         with self._localiser(session, segment, self._relocaliser) as localiser:
             if seed is not None:
                 self._start_at(localiser, seed, segment.nodes[0])
-            for stored, motion in self._stream(segment):
-                frame = self._robot.store.frames.decode(stored)
+            for stored, frame, motion in self._stream(segment):
                 localiser.move(motion)
                 found, outcomes = self._localise(localiser, stored.node, frame)
-                reason = self._reason(stored.node, frame, found)
-                if reason is None:
-                    self._omit(stored, found)
-                    report.omit()
-                else:
-                    self._take(stored, frame, localiser, found)
-                    report.take(stored.node.stamp_ns, _moved_m(motion), reason)
-                if found.status is LocalisationStatus.LOCALISED:
-                    self._matched(stored.node, outcomes)
-                    report.seed = Seed.PLACE if report.seed is Seed.NONE else report.seed
-                self.match_attempts += found.attempts
-                self.proposed_attempts += found.proposed
-                self.lookups += "places" in found.stage_ms
-                self._monitor.advance("added" if reason else "covered")
-                self._monitor.check()
+                reason = self._keep(localiser, stored, frame, found, outcomes)
+                report.add(stored.node.stamp_ns, motion.odometry.prev_from_curr, reason)
+                if found.status is LocalisationStatus.LOCALISED and report.seed is Seed.NONE:
+                    report.seed = Seed.PLACE
             self._end_run()
             self._remember(session, localiser)
         return report
 
     # -- the stream
 
+    def _lazy_relocaliser(self, name: str) -> LazyRelocaliser:
+        """One for all segments."""
+        centre, descriptor = self._merge.centre, self._settings.frontend.descriptor
+        return LazyRelocaliser(name, lambda: centre.relocaliser(name, descriptor))
+
     def _localiser(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None
     ) -> Localiser:
-        centre, options = self._centre.opened, self._options
+        robot, centre, options = self._merge.robot, self._merge.centre, self._options
         localiser = centre.localiser(
-            self._robot.contents.cameras[segment.nodes[0].camera],
+            robot.contents.cameras[segment.nodes[0].camera],
             self._settings,
             policy=options.policy,
             # The lost get no more, for the next node asks again, from a step on: four times as
@@ -201,20 +174,20 @@ class Replay:
             clock=session,
         )
         if session.id not in self._iterations:
-            made = self._robot.last_iterations.get(session.id, -1)
-            made = max(made, centre.last_iterations.get(session.id, -1))
-            self._iterations[session.id] = made + _ITERATION_GAP
+            made = (one.last_iterations.get(session.id, -1) for one in (robot, centre))
+            self._iterations[session.id] = max(made) + _ITERATION_GAP
         localiser.replay_from(segment.nodes[0].driven_m, self._iterations[session.id])
         return localiser
 
-    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, Motion]]:
+    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, Frame, Motion]]:
         """The nodes in the order of time, each with its motion since the one before."""
-        gaps, steps = GapFiller(), [OdometryStep(OdometryStatus.FIRST)]
-        for (before, _), edge in zip(pairwise(segment.nodes), segment.steps, strict=True):
-            _, prev_from_curr, covariance = seen_from(edge, before.id)
-            steps.append(OdometryStep(OdometryStatus.OK, prev_from_curr, covariance))
-        for stored, step in zip(self._robot.store.frames.stored(segment.nodes), steps, strict=True):
-            yield stored, gaps.motion(step, stored.node.stamp_ns)
+        gaps, frames = GapFiller(), self._merge.robot.store.frames
+        steps = [
+            OdometryStep(OdometryStatus.FIRST),
+            *(OdometryStep(OdometryStatus.OK, *motion) for motion in segment.motions),
+        ]
+        for stored, step in zip(frames.stored(segment.nodes), steps, strict=True):
+            yield stored, frames.decode(stored), gaps.motion(step, stored.node.stamp_ns)
 
     def _localise(
         self, localiser: Localiser, node: Node, frame: Frame
@@ -235,7 +208,7 @@ class Replay:
     def _start_at(self, localiser: Localiser, position: Position, node: Node) -> None:
         """A robot that only its own nodes vouch for is as lost as it was when it saved them."""
         open_loop_m = 0.0
-        if self._parts.is_apart(position.node):
+        if self._merge.is_apart(position.node):
             open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
         localiser.start_at(position, open_loop_m)
 
@@ -244,17 +217,13 @@ class Replay:
         before = self._last
         if before is None or before.nodes[0].session != session.id:
             return False
-        end = self._centre.equivalent(before.nodes[-1].id)
+        end = self._merge.equivalent(before.nodes[-1].id)
         start = None if end is None else position_behind_gap(end, before, segment)
         if start is None:
             return False
-        frames = (
-            (stored.node.id, self._robot.store.frames.decode(stored), motion)
-            for stored, motion in self._stream(segment)
-        )
         with self._localiser(session, segment, relocaliser=None) as localiser:
-            found, attempts = look_along(localiser, start, frames)
-        self.match_attempts += attempts
+            found, attempts = look_along(localiser, start, self._stream(segment))
+        self._merge.report.match_attempts += attempts
         if found is not None:
             self._looked_up[found.node] = found
         return found is not None
@@ -262,12 +231,9 @@ class Replay:
     def _seed(self, segment: Segment) -> Position | None:
         """Where the first frame is, by the nearest node of the segment with a known neighbour."""
         from_first = Position.at(segment.nodes[0].id)
-        for number, node in enumerate(segment.nodes):
-            if number:
-                _, motion, covariance = seen_from(
-                    segment.steps[number - 1], segment.nodes[number - 1].id
-                )
-                from_first = from_first.carried_on(motion, covariance)
+        for node, motion in zip(segment.nodes, (None, *segment.motions), strict=True):
+            if motion is not None:
+                from_first = from_first.carried_on(*motion)
                 if from_first.node_from_live.distance_m > _SEED_WITHIN_M:
                     return None
             known = self._known_neighbour(node.id, frozenset(EdgeKind))
@@ -291,50 +257,67 @@ class Replay:
                 which say no more than odometry does.
         """
         found = []
-        for edge in self._robot.edges_of.get(node, ()):
-            other = self._centre.equivalent(edge.b if edge.a == node else edge.a)
+        for edge in self._merge.robot.edges_of.get(node, ()):
+            other = self._merge.equivalent(edge.b if edge.a == node else edge.a)
             if other is None or edge.kind not in kinds:
                 continue
-            if before is None or self._centre.graph.index(other.node) < before:
+            if before is None or self._merge.graph.index(other.node) < before:
                 found.append(beyond(other, edge, node))
         return min(found, key=lambda one: uncertainty_m2(one.covariance), default=None)
 
     # -- what becomes of a frame
 
+    def _keep(
+        self,
+        localiser: Localiser,
+        stored: StoredNode,
+        frame: Frame,
+        found: Localisation,
+        outcomes: list[Outcome],
+    ) -> Reason | None:
+        """Omits or takes a node; returns why it was taken."""
+        reason = self._reason(stored.node, frame, found)
+        if reason is None:
+            # The centre shows this place alike already.
+            self._merge.omit(stored.node.id, _measured(found), stored.landmark_hash)
+            self._link(stored.node.id)
+        else:
+            self._take(stored, frame, localiser, found)
+        if found.status is LocalisationStatus.LOCALISED:
+            self._matched(stored.node, outcomes)
+        report = self._merge.report
+        report.match_attempts += found.attempts
+        report.proposed_attempts += found.proposed
+        self._monitor.advance("added" if reason else "covered")
+        self._monitor.check()
+        return reason
+
     def _reason(self, node: Node, frame: Frame, found: Localisation) -> Reason | None:
         """Why a node is taken; None where what it matched will do for all that localised by it."""
         if found.status is LocalisationStatus.LOCALISED:
             is_sure = found.inliers >= self._options.sure_inliers
-            return None if is_sure or node.id not in self._robot.relied_on else Reason.WEAK_MATCH
+            relied_on = node.id in self._merge.robot.relied_on
+            return Reason.WEAK_MATCH if relied_on and not is_sure else None
         if frame.status is not FrameStatus.OK:
             return Reason.UNUSABLE_FRAME
         if found.candidates:
             return Reason.NO_MATCH
         return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
-    def _omit(self, stored: StoredNode, found: Localisation) -> None:
-        """The centre shows this place alike already."""
-        node = stored.node.id
-        position = _measured(found)
-        self._writer.add_omission(self._centre.omit(node, position, stored.landmark_hash))
-        self._link(node)
-
     def _take(
         self, stored: StoredNode, frame: Frame, localiser: Localiser, found: Localisation
     ) -> None:
         """A node that the centre is lacking, with its own edges and that to what it matched."""
         node = stored.node
-        index = self._centre.graph.add_node(node)
-        self._writer.add_node(stored, frame)
+        index = self._merge.take(stored, frame)
         self._taken.add(node.id)
-        self._parts.take(node.id)
         self._run.append(index)
         self._link(node.id)
         if found.node is not None:
             at = _measured(found)
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
-            self._add_edge(match)
-        self._write(lay_proximity_edges(self._centre.graph, index))
+            self._merge.add_edge(match)
+        self._merge.write_edges(lay_proximity_edges(self._merge.graph, index))
         localiser.settle_in(node.id, node.stamp_ns)
 
     def _matched(self, node: Node, outcomes: list[Outcome]) -> None:
@@ -342,48 +325,76 @@ class Replay:
         self._matched_at_m[node.session] = node.driven_m
         self._end_run()
         acceptance = self._settings.localiser.acceptance
-        for edge in match_edges(self._centre.graph, outcomes, acceptance):
-            self._add_edge(edge)
+        for edge in match_edges(self._merge.graph, outcomes, acceptance):
+            self._merge.add_edge(edge)
 
     def _link(self, node: NodeId) -> None:
         """The robot's edges from a node to what is resolved already, to the equivalents of both."""
-        for edge in self._robot.edges_of.get(node, ()):
-            a, b = self._centre.equivalent(edge.a), self._centre.equivalent(edge.b)
+        for edge in self._merge.robot.edges_of.get(node, ()):
+            a, b = self._merge.equivalent(edge.a), self._merge.equivalent(edge.b)
             if a is None or b is None or not {edge.a, edge.b} & self._taken:
                 continue
             moved = recomposed(edge, a, b)
             if moved is not None:
-                self._add_edge(moved)
+                self._merge.add_edge(moved)
 
     def _end_run(self) -> None:
         """Nodes were taken one after another up to here: their far end is tied now, or never."""
         run, self._run = self._run, []
         if run:
-            self._write(tighten_chain(self._centre.graph, run))
-
-    def _add_edge(self, edge: Edge) -> None:
-        """Adds an edge; of two with one key, moved from different nodes, the surer one stays."""
-        known = self._centre.graph.find_edge(edge.a, edge.b, edge.kind)
-        if known is None or uncertainty_m2(edge.covariance) < uncertainty_m2(known.covariance):
-            self._centre.graph.add_edge(edge)
-            self._write([edge])
-
-    def _write(self, edges: list[Edge]) -> None:
-        """Edges that are in the graph already."""
-        for edge in edges:
-            self._writer.add_edge(edge)
-            self._parts.join(edge)
-        self.edges += len(edges)
+            self._merge.write_edges(tighten_chain(self._merge.graph, run))
 
     def _remember(self, session: Session, localiser: Localiser) -> None:
         """Attempts and matches of a segment, for the session's attempts and its path."""
         self._iterations[session.id] = localiser.iteration + _ITERATION_GAP
-        self.attempts.setdefault(session.id, []).extend(localiser.take_attempts())
-        self.entries.setdefault(session.id, []).extend(
+        self.attempts[session.id] += localiser.take_attempts()
+        self.entries[session.id] += (
             replace(entry, kind=PathEntryKind.REPLAYED)
             for entry in localiser.walk.take_new()
             if entry.kind is PathEntryKind.MATCHED
         )
+        if self._relocaliser is not None:
+            self._merge.report.lookups = self._relocaliser.asked
+
+
+class LazyRelocaliser:
+    """A relocaliser that is made when it is first asked: learning all nodes takes a while.
+
+    Attributes:
+        asked: how often it was, once for a frame.
+    """
+
+    new_place: float | None = None
+
+    def __init__(self, name: str, make: Callable[[], Relocaliser]) -> None:
+        self.name = name
+        self.asked = 0
+        self._make = make
+        self._made: Relocaliser | None = None
+
+    def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
+        """See `Relocaliser`."""
+        self.asked += 1
+        if self._made is None:
+            self._made = self._make()
+        proposed = self._made.propose(live, count, allowed)
+        self.new_place = self._made.new_place
+        return proposed
+
+    def carry_on(self, motion: SE3 | None) -> None:
+        """See `Relocaliser`; one that was never asked believes nothing yet."""
+        if self._made is not None:
+            self._made.carry_on(motion)
+
+    def failed(self, nodes: Sequence[int]) -> None:
+        """See `Relocaliser`."""
+        if self._made is not None:
+            self._made.failed(nodes)
+
+    def forget(self) -> None:
+        """See `Relocaliser`."""
+        if self._made is not None:
+            self._made.forget()
 
 
 def _measured(found: Localisation) -> Position:
@@ -392,9 +403,3 @@ def _measured(found: Localisation) -> Position:
     assert found.node_from_live is not None
     assert found.covariance is not None
     return Position(found.node, found.node_from_live, found.covariance)
-
-
-def _moved_m(motion: Motion) -> float:
-    """How far a node is from the one before by its edge; 0 for a segment's first."""
-    measured = motion.odometry.prev_from_curr
-    return 0.0 if measured is None else measured.distance_m

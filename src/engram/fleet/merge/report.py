@@ -9,6 +9,7 @@ from enum import StrEnum
 from typing import Any
 
 from engram.config import to_dict
+from engram.geometry import SE3
 
 # Lines of drives that people are shown; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
@@ -95,27 +96,25 @@ class SegmentReport:
     runs: list[RunReport] = field(default_factory=list)
     _in_run: bool = field(default=False, repr=False)
 
-    def omit(self) -> None:
-        """Counts a node omitted, which ends a run."""
-        self.omitted += 1
-        self._in_run = False
-
-    def take(self, stamp_ns: int, moved_m: float, reason: Reason) -> None:
-        """Counts a node taken, in a run of its own if what came before it was omitted.
+    def add(self, stamp_ns: int, prev_from_curr: SE3 | None, reason: Reason | None) -> None:
+        """Counts a node; one that is taken in a run of its own if the one before was omitted.
 
         Args:
             stamp_ns: of the node.
-            moved_m: odometry distance since the node before.
-            reason: why it was taken.
+            prev_from_curr: by odometry, since the node before; None for the first.
+            reason: why it was taken; None if it was omitted.
         """
-        if self._in_run:
-            self.runs[-1].length_m += moved_m
+        if reason is None:
+            self.omitted += 1
+        elif self._in_run and prev_from_curr is not None:
+            self.runs[-1].length_m += prev_from_curr.distance_m
         else:
             self.runs.append(RunReport(stamp_ns))
-        self._in_run = True
-        self.runs[-1].nodes += 1
-        self.runs[-1].reasons[reason] += 1
-        self.taken += 1
+        self._in_run = reason is not None
+        if reason is not None:
+            self.runs[-1].nodes += 1
+            self.runs[-1].reasons[reason] += 1
+            self.taken += 1
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""

@@ -7,6 +7,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.fleet.merge.positions import seen_from
+from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, NodeId
 
 
@@ -27,6 +32,14 @@ class Segment:
     def key(self) -> tuple[int, NodeId]:
         """Stamp and UUID of the first node: segments of one session are replayed in this order."""
         return self.nodes[0].stamp_ns, self.nodes[0].id
+
+    @property
+    def motions(self) -> list[tuple[SE3, NDArray[np.float64]]]:
+        """``prev_from_curr`` of each node but the first, and its (6, 6) covariance."""
+        return [
+            seen_from(edge, before.id)[1:]
+            for edge, before in zip(self.steps, self.nodes[:-1], strict=True)
+        ]
 
 
 def string_segments(nodes: Sequence[Node], edges: Iterable[Edge]) -> list[Segment]:

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.fleet.merge.centre import Centre
-from engram.fleet.merge.handed_in import HandedIn
+from engram.fleet.merge.state import Merge
 from engram.frontend import DescriptorKind
 from engram.graph.model import NodeId
 from engram.maps import MapStore, WritableMapStore
@@ -16,21 +15,17 @@ from engram.places import decode_vocabulary, default_vocabulary, hash_of
 from engram.places.stored_words import keep_missing_words, stored_words, worked_out_words
 
 
-def keep_words(
-    store: WritableMapStore, centre: Centre, robot: HandedIn, descriptor: DescriptorKind
-) -> None:
+def keep_words(store: WritableMapStore, merge: Merge, descriptor: DescriptorKind) -> None:
     """Copies the words that the robot's map has by the centre's vocabulary, and works out the rest.
 
     Words are no part of any revision: where this is interrupted, they are worked out later.
     """
-    vocabulary = centre.opened.vocabulary_or_default(descriptor)
-    theirs = stored_words(robot.store, vocabulary)
-    brought = {
-        node: theirs[node] for node in robot.nodes if node in centre.graph and node in theirs
-    }
+    vocabulary, graph = merge.centre.vocabulary_or_default(descriptor), merge.graph
+    theirs = stored_words(merge.robot.store, vocabulary)
+    brought = {node: theirs[node] for node in merge.robot.nodes if node in graph and node in theirs}
     if brought:
         store.put_words(hash_of(vocabulary), brought)
-    keep_missing_words(store, vocabulary, [node.id for node in centre.graph.nodes])
+    keep_missing_words(store, vocabulary, [node.id for node in graph.nodes])
 
 
 class CentreWords:
