@@ -35,7 +35,7 @@ from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, Segm
 from engram.frontend import DescriptorKind
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
-from engram.maps import MapStore
+from engram.maps import BulkWriter, MapStore
 from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
 from engram.robot import MapOptions, Settings, map_drive, open_drive, session_of_drive
@@ -332,7 +332,7 @@ class TestReported:
         merge(mixed, [fleet["other"][0], fleet["longer"][0]], apart)
         (report,) = merged(centre, mixed)
         (note,) = [note for note in report.notes if "not connected to the existing map" in note]
-        assert note.startswith(f"{nodes_in(fleet['other'][0])} of")
+        assert note.startswith(f"{nodes_in(fleet['other'][0])} added nodes")
 
     def test_two_robots_of_one_name(self, tmp_path, fleet):
         maps = []
@@ -379,7 +379,7 @@ class TestReported:
 
     def test_the_report_says_all_of_it_in_text_and_json(self, centre, fleet):
         (report,) = merged(centre, fleet["longer"][0])
-        assert "nodes taken" in report.text()
+        assert "nodes added" in report.text()
         assert "no place of the map looks like it" in report.text()
         values = report.to_dict()
         assert values["revision"] == 2
@@ -388,16 +388,14 @@ class TestReported:
         assert segment["runs"][-1]["reason"] == "no_place"
 
     def test_a_drive_in_many_segments_takes_one_line(self):
+        run = RunReport(0, 1, 0.0, Reason.NOTHING_NEAR)
         segments = [
-            SegmentReport("5621beba-1", "r1", stamp, Seed.NONE, 1, 0, [RunReport(stamp, 1)])
-            for stamp in range(50)
+            SegmentReport("5621beba-1", "r1", stamp, Seed.NONE, 1, 0, [run]) for stamp in range(50)
         ]
         segments.append(SegmentReport("5621beba-1", "r1", 60, Seed.NEIGHBOUR, omitted=4))
-        for one in segments[:-1]:
-            one.runs[0].reasons[Reason.NOTHING_NEAR] += 1
         report = MergeReport("r1.engram", "", ["r1"], revision=2, taken=50, segments=segments)
         (line,) = [line for line in report.text().splitlines() if "5621beba" in line]
-        assert "50 taken, 4 omitted, in 51 segments, 50 not found" in line
+        assert "50 added, 4 already covered, in 51 segments, 50 not found" in line
         assert "nothing known is near (50)" in line
 
 
@@ -591,7 +589,7 @@ class TestInterrupted:
 
     def test_when_all_nodes_were_looked_at(self, centre, fleet, pressed):
         before = hash_of(centre)
-        pressed(steps._Merging, "_carry_attempts")
+        pressed(steps, "_carry_attempts")
         (report,) = merged(centre, fleet["longer"][0])
         assert report.interrupted
         assert hash_of(centre) == before
@@ -602,7 +600,7 @@ class TestInterrupted:
         assert report.interrupted
 
     def test_when_a_merge_was_done_the_next_one_is_not_begun(self, centre, fleet, pressed):
-        pressed(steps.BulkWriter, "commit")
+        pressed(BulkWriter, "commit")
         maps = [fleet[name][0] for name in ("other", "longer")]
         done, stopped = merged(centre, *maps)
         assert (done.interrupted, done.revision) == (False, 2)
@@ -612,7 +610,7 @@ class TestInterrupted:
 
     def test_when_the_last_merge_was_done_whoever_called_hears_of_it(self, centre, fleet, pressed):
         told = []
-        pressed(steps.BulkWriter, "commit")
+        pressed(BulkWriter, "commit")
         with pytest.raises(KeyboardInterrupt):
             merged(centre, fleet["longer"][0], monitor=Told(told))
         assert [report.revision for report in told] == [2]

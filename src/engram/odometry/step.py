@@ -43,3 +43,8 @@ class OdometryStep:
     prev_from_curr: SE3 | None = None
     covariance: NDArray[np.float64] | None = None
     inliers: int = 0
+
+    @property
+    def moved_m(self) -> float:
+        """Distance of `prev_from_curr`, metres; 0 without one."""
+        return 0.0 if self.prev_from_curr is None else self.prev_from_curr.distance_m

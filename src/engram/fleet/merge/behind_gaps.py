@@ -88,8 +88,7 @@ def look_along(
     attempts = 0
     localiser.start_at(start)
     for stored, frame, motion in frames:
-        if motion.odometry.prev_from_curr is not None:
-            driven_m += motion.odometry.prev_from_curr.distance_m
+        driven_m += motion.odometry.moved_m
         if driven_m > _LOOK_WITHIN_M:
             break
         localiser.move(motion)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from engram.errors import ConfigError
 from engram.fleet.merge.behind_gaps import FoundNode, look_along, position_behind_gap
 from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
-from engram.fleet.merge.report import Reason, Seed, SegmentReport
+from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
 from engram.fleet.merge.state import Merge
 from engram.frontend import Frame, FrameStatus
@@ -127,28 +127,28 @@ class Replay:
 
         Taken is, too, what others rely on and the centre barely shows; see `MergeOptions`.
         """
-        report = SegmentReport(str(session.id), session.robot, segment.nodes[0].stamp_ns)
-        seed = self._seed(segment)
-        if seed is not None:
-            report.seed = Seed.NEIGHBOUR
+        seed = Seed.NONE
+        if (start := self._seed(segment)) is not None:
+            seed = Seed.NEIGHBOUR
         elif self._look_behind_gap(session, segment):
-            report.seed = Seed.GAP
+            seed = Seed.GAP
         self._last = segment
         if self._relocaliser is not None:
             self._relocaliser.forget()
+        kept: list[KeptNode] = []
         with self._localiser(session, segment, self._relocaliser) as localiser:
-            if seed is not None:
-                self._start_at(localiser, seed, segment.nodes[0])
+            if start is not None:
+                self._start_at(localiser, start, segment.nodes[0])
             for stored, frame, motion in self._stream(segment):
                 localiser.move(motion)
                 found, outcomes = self._localise(localiser, stored.node, frame)
                 reason = self._keep(localiser, stored, frame, found, outcomes)
-                report.add(stored.node.stamp_ns, motion.odometry.prev_from_curr, reason)
-                if found.status is LocalisationStatus.LOCALISED and report.seed is Seed.NONE:
-                    report.seed = Seed.PLACE
+                kept.append(KeptNode(stored.node.stamp_ns, motion.odometry.moved_m, reason))
+                if found.status is LocalisationStatus.LOCALISED and seed is Seed.NONE:
+                    seed = Seed.PLACE
             self._end_run()
             self._remember(session, localiser)
-        return report
+        return SegmentReport.of(session, seed, kept)
 
     # -- the stream
 

@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import groupby
 from typing import Any
 
-from engram.config import to_dict
-from engram.geometry import SE3
+from engram.config import plain
+from engram.graph.model import Session
 
 # Lines of drives that people are shown; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
@@ -43,7 +44,7 @@ _WORDS = {
 }
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class RunReport:
     """Nodes of a segment, one after another, that were taken.
 
@@ -51,30 +52,31 @@ class RunReport:
         first_stamp_ns: of the first of them.
         nodes: how many.
         length_m: odometry distance from first to last.
-        reasons: why each was.
+        reason: the most frequent; of equals the first in `Reason`.
     """
 
     first_stamp_ns: int
-    nodes: int = 0
-    length_m: float = 0.0
-    reasons: Counter[Reason] = field(default_factory=Counter)
-
-    @property
-    def reason(self) -> Reason:
-        """The most frequent reason; of equals the first in `Reason`."""
-        return max(Reason, key=lambda reason: self.reasons[reason])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "first_stamp_ns": self.first_stamp_ns,
-            "nodes": self.nodes,
-            "length_m": self.length_m,
-            "reason": self.reason.value,
-        }
+    nodes: int
+    length_m: float
+    reason: Reason
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
+class KeptNode:
+    """What became of one node in a replay.
+
+    Attributes:
+        stamp_ns: of the node.
+        moved_m: odometry distance since the node before it.
+        reason: why it was taken; None if it was omitted.
+    """
+
+    stamp_ns: int
+    moved_m: float
+    reason: Reason | None
+
+
+@dataclass(frozen=True, slots=True)
 class SegmentReport:
     """What became of one segment.
 
@@ -93,40 +95,29 @@ class SegmentReport:
     seed: Seed = Seed.NONE
     taken: int = 0
     omitted: int = 0
-    runs: list[RunReport] = field(default_factory=list)
-    _in_run: bool = field(default=False, repr=False)
+    runs: Sequence[RunReport] = ()
 
-    def add(self, stamp_ns: int, prev_from_curr: SE3 | None, reason: Reason | None) -> None:
-        """Counts a node; one that is taken in a run of its own if the one before was omitted.
-
-        Args:
-            stamp_ns: of the node.
-            prev_from_curr: by odometry, since the node before; None for the first.
-            reason: why it was taken; None if it was omitted.
-        """
-        if reason is None:
-            self.omitted += 1
-        elif self._in_run and prev_from_curr is not None:
-            self.runs[-1].length_m += prev_from_curr.distance_m
-        else:
-            self.runs.append(RunReport(stamp_ns))
-        self._in_run = reason is not None
-        if reason is not None:
-            self.runs[-1].nodes += 1
-            self.runs[-1].reasons[reason] += 1
-            self.taken += 1
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "session": self.session,
-            "robot": self.robot,
-            "first_stamp_ns": self.first_stamp_ns,
-            "seed": self.seed.value,
-            "taken": self.taken,
-            "omitted": self.omitted,
-            "runs": [run.to_dict() for run in self.runs],
-        }
+    @staticmethod
+    def of(session: Session, seed: Seed, nodes: Sequence[KeptNode]) -> SegmentReport:
+        """Counts the nodes of a segment, in the order of time."""
+        runs = []
+        for _, some in groupby(nodes, key=lambda one: one.reason is None):
+            run = list(some)
+            reasons = Counter(one.reason for one in run if one.reason is not None)
+            if reasons:
+                length_m = sum(one.moved_m for one in run[1:])
+                reason = max(Reason, key=reasons.__getitem__)
+                runs.append(RunReport(run[0].stamp_ns, len(run), length_m, reason))
+        taken = sum(run.nodes for run in runs)
+        return SegmentReport(
+            str(session.id),
+            session.robot,
+            nodes[0].stamp_ns,
+            seed,
+            taken,
+            len(nodes) - taken,
+            runs,
+        )
 
 
 _SEED_WORDS = {
@@ -140,7 +131,7 @@ def _drive_text(segments: Sequence[SegmentReport]) -> str:
     """One line for all segments of a drive: lost odometry leaves hundreds of a node each."""
     first = segments[0]
     taken, omitted = sum(one.taken for one in segments), sum(one.omitted for one in segments)
-    line = f"  {first.robot} {first.session[:8]}: {taken} taken, {omitted} omitted"
+    line = f"  {first.robot} {first.session[:8]}: {taken} added, {omitted} already covered"
     if len(segments) > 1:
         line += f", in {len(segments)} segments"
     seeds = Counter(one.seed for one in segments)
@@ -169,14 +160,6 @@ class HeldOutFigures:
     longest_gap_m: float
     p_no_match: Mapping[int, float]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values; the distances become text, as JSON wants its keys."""
-        return {
-            "route_not_localised": self.route_not_localised,
-            "longest_gap_m": self.longest_gap_m,
-            "p_no_match": {str(within_m): p for within_m, p in self.p_no_match.items()},
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class HeldOutReport:
@@ -190,14 +173,6 @@ class HeldOutReport:
     drives: Sequence[str]
     before: HeldOutFigures
     after: HeldOutFigures
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return {
-            "drives": list(self.drives),
-            "before": self.before.to_dict(),
-            "after": self.after.to_dict(),
-        }
 
     def text(self) -> str:
         """One line for people."""
@@ -279,27 +254,17 @@ class MergeReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``merge --json`` prints for this map."""
-        values: dict[str, Any] = {
-            name: to_dict(getattr(self, name))
-            for name in self.__slots__
-            if name not in {"segments", "robots", "held_out"}
-        }
-        return {
-            **values,
-            "robots": list(self.robots),
-            "changed": self.changed,
-            "held_out": None if self.held_out is None else self.held_out.to_dict(),
-            "segments": [segment.to_dict() for segment in self.segments],
-        }
+        return {**plain(self), "changed": self.changed}
 
     def text(self) -> str:
         """For people."""
         lines = [f"{self.source} ({', '.join(self.robots) or 'no drives'}): {self._outcome()}"]
         if self.changed and not self.interrupted:
             lines.append(
-                f"  {self.taken} nodes taken, {self.omitted} omitted, {self.known} known already, "
-                f"{self.known_omissions} omitted before; {self.sessions} new sessions, "
-                f"{self.path_entries} path entries, {self.attempts} attempts carried over"
+                f"  {self.taken} nodes added, {self.omitted} already covered; from earlier merges "
+                f"{self.known} known, {self.known_omissions} covered; "
+                f"{self.sessions} new sessions, {self.path_entries} path entries, "
+                f"{self.attempts} attempts carried over"
             )
             drives = self._drives()
             lines += [_drive_text(one) for one in drives[:_SHOWN_DRIVES]]
@@ -319,7 +284,7 @@ class MergeReport:
 
     def _outcome(self) -> str:
         if self.interrupted:
-            return "interrupted: nothing of it is in the centre; give the same command again"
+            return "interrupted: nothing of it is in the fleet map; give the same command again"
         if not self.changed:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"
