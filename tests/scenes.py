@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import DescriptorKind, Frame, FrameStatus, Landmarks
+from engram.frontend import BRIEF, Frame, FrameStatus, Landmarks
 from engram.geometry import SE3, StereoCamera
 
 CAMERA = StereoCamera(fx=300.0, fy=300.0, cx=255.0, cy=190.0, baseline_m=0.3, width=512, height=384)
@@ -77,7 +77,7 @@ class Scene:
                     descriptors=descriptors,
                     octaves=np.zeros(len(rows), np.uint8),
                 ),
-                descriptor=DescriptorKind.BRIEF,
+                descriptor=BRIEF,
                 frontend="test",
                 status=FrameStatus.OK,
             ),

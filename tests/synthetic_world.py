@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from engram.frontend import DescriptorKind, Frame, FrameStatus
+from engram.frontend import BRIEF, Frame, FrameStatus
 from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
 from engram.geometry import SE3, StereoCamera
 from engram.odometry import OdometryStatus, OdometryStep
@@ -98,7 +98,7 @@ def see(
         camera,
     )
     status = FrameStatus.OK if len(rows) >= 30 else FrameStatus.TOO_FEW_LANDMARKS
-    return Frame(stamp_ns, camera, landmarks, DescriptorKind.BRIEF, "synthetic", status)
+    return Frame(stamp_ns, camera, landmarks, BRIEF, "synthetic", status)
 
 
 @dataclass(frozen=True)

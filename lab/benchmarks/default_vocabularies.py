@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import DescriptorKind, Frontend, FrontendConfig
+from engram.frontend import BRIEF, TEBLID, DescriptorKind, Frontend, FrontendConfig
 from engram.places import TrainingConfig, encode_vocabulary, train_vocabulary
 from engram_lab.town import SimulatedDrive, campaign_named
 
@@ -29,10 +29,7 @@ CONFIG = TrainingConfig(words=5000, samples=80)
 
 def render(folder: Path) -> list[Path]:
     """One file per session, with the descriptors of both kinds."""
-    frontends = {
-        kind: Frontend(FrontendConfig(descriptor=kind))
-        for kind in (DescriptorKind.BRIEF, DescriptorKind.TEBLID)
-    }
+    frontends = {kind: Frontend(FrontendConfig(descriptor=kind)) for kind in (BRIEF, TEBLID)}
     files = []
     for name, seed, sessions, spacing_m in DRIVES:
         campaign = dataclasses.replace(campaign_named(name, seed), spacing_m=spacing_m)
@@ -65,7 +62,7 @@ def main() -> None:
     files = render(Path(sys.argv[1]))
     data = Path(__file__).parents[1] / "src/engram/places/data"
     data.mkdir(exist_ok=True)
-    for kind in (DescriptorKind.BRIEF, DescriptorKind.TEBLID):
+    for kind in (BRIEF, TEBLID):
         vocabulary = train_vocabulary(frames_of(files, kind), kind, CONFIG, trained_on=TRAINED_ON)
         body = encode_vocabulary(vocabulary)
         (data / f"{kind}.safetensors").write_bytes(body)

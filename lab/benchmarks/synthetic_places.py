@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import DescriptorKind, FrameStatus
+from engram.frontend import BRIEF, FrameStatus
 from engram.frontend.blobs import encode_landmarks
 from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
 from engram.geometry import StereoCamera
@@ -12,7 +12,7 @@ from engram.graph.model import Clock, Node, Session, node_id, session_id
 from engram.maps import StoredNode
 
 CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
-DESCRIPTOR, FRONTEND = DescriptorKind.BRIEF, "synthetic"
+DESCRIPTOR, FRONTEND = BRIEF, "synthetic"
 
 
 def landmark_bytes(

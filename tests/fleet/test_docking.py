@@ -32,7 +32,7 @@ from engram.errors import (
 from engram.fleet.merge import MergeOptions, gate, merge, merging, steps
 from engram.fleet.merge.gate import check_held_out, what_is_worse
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
-from engram.frontend import DescriptorKind
+from engram.frontend import TEBLID
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
 from engram.maps import BulkWriter, MapStore
@@ -161,9 +161,7 @@ class TestRefused:
         assert MapStore.check(centre).problems == ()
 
     def test_maps_of_other_descriptors(self, tmp_path, centre, fleet):
-        robot = rewritten(
-            fleet["other"][0], tmp_path / "t.engram", descriptor=DescriptorKind.TEBLID
-        )
+        robot = rewritten(fleet["other"][0], tmp_path / "t.engram", descriptor=TEBLID)
         self.refuses(centre, robot, IncompatibleError, "teblid", "brief")
 
     def test_a_node_with_the_uuid_of_another(self, tmp_path, centre, fleet):
@@ -249,9 +247,7 @@ class TestRefused:
     def test_a_map_that_does_not_fit_a_centre_of_an_older_format(self, tmp_path, fleet):
         centre = tmp_path / "centre.engram"
         shutil.copy(OLDER_FORMAT, centre)
-        robot = rewritten(
-            fleet["other"][0], tmp_path / "t.engram", descriptor=DescriptorKind.TEBLID
-        )
+        robot = rewritten(fleet["other"][0], tmp_path / "t.engram", descriptor=TEBLID)
         self.refuses(centre, robot, IncompatibleError, "teblid", "brief")
         self.refuses(centre, damaged(fleet["other"][0], tmp_path / "d.engram"), MapError)
 

@@ -18,7 +18,7 @@ from engram.errors import ConfigError, InputError, MapError, NotAMapError, Revis
 from engram.fleet.download import DownloadOptions, DownloadReport, download
 from engram.fleet.download.downloading import most_that_fit
 from engram.fleet.download.selections import SELECTIONS, UNDERSTOOD
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.graph.model import EdgeKind, path_id
 from engram.maps import MapStore
 from engram.places import default_vocabulary
@@ -136,7 +136,7 @@ def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
 
 
 def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
-    vocabulary = default_vocabulary(DescriptorKind.BRIEF)
+    vocabulary = default_vocabulary(BRIEF)
     sent(centre, tmp_path / "before.engram", "tod", start_h=9.0)
     keeping = tmp_path / "keeping.engram"
     MapStore.copy(centre, keeping)

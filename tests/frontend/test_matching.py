@@ -13,7 +13,7 @@ from tests.scenes import CAMERA, Scene, normalised_error
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError, InputError
-from engram.frontend import DescriptorKind
+from engram.frontend import TEBLID
 from engram.frontend.matching import (
     MatcherConfig,
     _settings,
@@ -290,7 +290,7 @@ print(digest.hexdigest())
 
 def test_two_kinds_of_descriptor_are_a_clear_error() -> None:
     frame, _ = Scene(50, 1).seen_from(SE3.identity())
-    other = dataclasses.replace(frame, descriptor=DescriptorKind.TEBLID)
+    other = dataclasses.replace(frame, descriptor=TEBLID)
     with pytest.raises(IncompatibleError, match="teblid"):
         match_frames(frame, other, CONFIG, 0)
 
@@ -302,7 +302,7 @@ def test_a_prediction_needs_its_covariance() -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", [{"ratio": 1.5}, {"min_consensus": 3}, {"chi2": 0.0}, {"max_distance": 300}]
+    "setting", [{"ratio": 1.5}, {"min_consensus": 3}, {"chi2": 0.0}, {"max_distance": -1}]
 )
 def test_senseless_settings_are_refused(setting: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(setting))):

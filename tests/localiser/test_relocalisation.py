@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.synthetic_world import World, see
 
 from engram.errors import IncompatibleError
-from engram.frontend import DescriptorKind, Frame, Landmarks
+from engram.frontend import BRIEF, TEBLID, Frame, Landmarks
 from engram.localiser.relocalisation import (
     RELOCALISERS,
     Exhaustive,
@@ -77,7 +77,7 @@ def anywhere(index: int) -> bool:
 class _Drive:
     """Frames along a road of a synthetic world, as a graph and as a source of landmarks."""
 
-    def __init__(self, places_m: np.ndarray, descriptor=DescriptorKind.BRIEF) -> None:
+    def __init__(self, places_m: np.ndarray, descriptor=BRIEF) -> None:
         world = World(length_m=float(places_m.max()) + 20, seed=3)
         self.frames = [
             replace(see(world, world.pose_at(s), 1000 + i, count=1500), descriptor=descriptor)
@@ -168,7 +168,7 @@ def test_a_frame_without_landmarks_is_no_error() -> None:
 
 def test_a_frame_with_another_kind_of_descriptor_is_refused() -> None:
     relocaliser = RELOCALISERS["fabmap"](searched(MAPPED))
-    other = _Drive(np.array([0.0]), DescriptorKind.TEBLID).frames[0]
+    other = _Drive(np.array([0.0]), TEBLID).frames[0]
     with pytest.raises(IncompatibleError, match="teblid"):
         relocaliser.propose(other, 4, anywhere)
 
@@ -178,4 +178,4 @@ def searched(drive: _Drive) -> Searched:
 
 
 def brief() -> Vocabulary:
-    return default_vocabulary(DescriptorKind.BRIEF)
+    return default_vocabulary(BRIEF)

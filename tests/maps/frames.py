@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import DescriptorKind, Frame, FrameStatus, Landmarks
+from engram.frontend import BRIEF, Frame, FrameStatus, Landmarks
 from engram.frontend.quantisation import LandmarkCodes, landmarks_from_codes
 from engram.geometry import StereoCamera
 
@@ -33,7 +33,7 @@ def frame(stamp_ns: int, *, count: int = 40, seed: int = 0, camera: StereoCamera
         stamp_ns,
         camera,
         landmarks(count, seed, camera),
-        DescriptorKind.BRIEF,
+        BRIEF,
         FRONTEND,
         FrameStatus.OK,
         smooth.astype(np.uint8),

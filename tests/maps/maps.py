@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from engram.frontend import DescriptorKind, Frame
+from engram.frontend import BRIEF, Frame
 from engram.geometry import SE3
 from engram.graph.model import (
     Attempt,
@@ -40,7 +40,7 @@ def session(name: str = "robot-1", start_ns: int = 1_000) -> Session:
 
 def begin(store: WritableMapStore, drive: Session, **changes: object) -> SessionWriter:
     arguments = {
-        "descriptor": DescriptorKind.BRIEF,
+        "descriptor": BRIEF,
         "frontend": FRONTEND,
         "author": "tests",
         "configuration": {"mapper": {"distance_m": 1.0}},

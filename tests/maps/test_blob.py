@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import InputError, MapCorruptError
+from engram.frontend import BRIEF
 from engram.frontend.blobs import (
     blob_hash,
     content_digest,
@@ -53,7 +54,7 @@ def body_with(**changes: object) -> bytes:
 def test_landmarks_come_back_bit_for_bit(count, seed, camera):
     written = landmarks(count, seed, camera)
     blob = encode_landmarks(written, camera)
-    assert_same_landmarks(decode_landmarks(blob, camera), written)
+    assert_same_landmarks(decode_landmarks(blob, camera, BRIEF), written)
     assert encode_landmarks(written, camera) == blob
     assert blob_hash(blob) == content_digest(blob[16:])
 
@@ -94,21 +95,21 @@ def test_any_flipped_bit_is_found(at, bit):
     broken = bytearray(BLOB)
     broken[at] ^= 1 << bit
     with pytest.raises(MapCorruptError, match="hash"):
-        decode_landmarks(bytes(broken), CAMERA)
+        decode_landmarks(bytes(broken), CAMERA, BRIEF)
 
 
 @given(length=st.integers(0, len(BLOB) - 1))
 @settings(max_examples=50)
 def test_a_cut_blob_is_found(length):
     with pytest.raises(MapCorruptError, match="hash"):
-        decode_landmarks(BLOB[:length], CAMERA)
+        decode_landmarks(BLOB[:length], CAMERA, BRIEF)
 
 
 @given(body=st.binary(max_size=400))
 @settings(max_examples=200)
 def test_random_bytes_with_a_right_hash_are_refused(body):
     with pytest.raises(MapCorruptError):
-        decode_landmarks(sealed(body), CAMERA)
+        decode_landmarks(sealed(body), CAMERA, BRIEF)
 
 
 @given(at=st.integers(0, len(BLOB) - 17), value=st.integers(0, 255))
@@ -117,7 +118,7 @@ def test_hostile_bytes_with_a_right_hash_give_landmarks_or_a_clear_error(at, val
     body = bytearray(BLOB[16:])
     body[at] = value
     try:
-        read = decode_landmarks(sealed(bytes(body)), CAMERA)
+        read = decode_landmarks(sealed(bytes(body)), CAMERA, BRIEF)
     except MapCorruptError:
         return
     assert len(read) == 7
@@ -141,14 +142,14 @@ def test_hostile_bytes_with_a_right_hash_give_landmarks_or_a_clear_error(at, val
 )
 def test_wrong_arrays_are_refused(changes):
     with pytest.raises(MapCorruptError):
-        decode_landmarks(sealed(body_with(**changes)), CAMERA)
+        decode_landmarks(sealed(body_with(**changes)), CAMERA, BRIEF)
 
 
 @pytest.mark.parametrize("length", [2**62, 100_000_001, 2**64 - 1])
 def test_a_huge_header_is_refused_without_memory(length):
     body = length.to_bytes(8, "little") + b"{}"
     with pytest.raises(MapCorruptError, match="safetensors"):
-        decode_landmarks(sealed(body), CAMERA)
+        decode_landmarks(sealed(body), CAMERA, BRIEF)
 
 
 def test_a_huge_shape_is_refused_without_memory():
@@ -156,18 +157,18 @@ def test_a_huge_shape_is_refused_without_memory():
         {"pixels": {"dtype": "U16", "shape": [2**60, 2], "data_offsets": [0, 2**62]}}
     ).encode()
     with pytest.raises(MapCorruptError, match="safetensors"):
-        decode_landmarks(sealed(len(header).to_bytes(8, "little") + header), CAMERA)
+        decode_landmarks(sealed(len(header).to_bytes(8, "little") + header), CAMERA, BRIEF)
 
 
 def test_the_camera_of_another_image_size_is_refused():
     with pytest.raises(MapCorruptError, match="quantum"):
-        decode_landmarks(BLOB, WIDE)
+        decode_landmarks(BLOB, WIDE, BRIEF)
 
 
 def test_a_newer_version_is_refused():
     newer = BLOB[16:].replace(b"version=1", b"version=2")
     with pytest.raises(MapCorruptError, match="version 1"):
-        decode_landmarks(sealed(newer), CAMERA)
+        decode_landmarks(sealed(newer), CAMERA, BRIEF)
 
 
 def test_a_thumbnail_is_recognisable():

@@ -12,7 +12,7 @@ from sqlalchemy import insert
 from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, RevisionError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF, TEBLID
 from engram.graph.model import (
     NodeId,
     Omission,
@@ -125,9 +125,7 @@ def test_readers_see_nothing_before_the_commit_and_the_writer_everything(target,
 def test_a_decoded_frame_is_read_from_memory_until_it_is_written(target, source):
     stored = next(source.frames.stored(source.load().nodes))
     with begin_bulk(target) as writer:
-        writer.add_session(
-            session("robot-1"), CAMERA, descriptor=DescriptorKind.BRIEF, frontend=FRONTEND
-        )
+        writer.add_session(session("robot-1"), CAMERA, descriptor=BRIEF, frontend=FRONTEND)
         writer.add_node(stored, source.frames.decode(stored))
         found = target.frames.frame(stored.node.id)
     assert_same_landmarks(found.landmarks, source.frames.frame(stored.node.id).landmarks)
@@ -232,9 +230,7 @@ def test_what_does_not_fit_is_refused_by_name(target, source):
         with pytest.raises(InputError, match=f"edge: node {strange}"):
             writer.add_edge(edge(stored.node.id, strange))
         with pytest.raises(IncompatibleError, match="brief"):
-            writer.add_session(
-                session("robot-5"), CAMERA, descriptor=DescriptorKind.TEBLID, frontend=FRONTEND
-            )
+            writer.add_session(session("robot-5"), CAMERA, descriptor=TEBLID, frontend=FRONTEND)
         with pytest.raises(RevisionError, match="being written"):
             begin_bulk(target)
 

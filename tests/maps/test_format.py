@@ -11,7 +11,7 @@ import pytest
 from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF, TEBLID
 from engram.geometry import SE3
 from engram.graph.model import EdgeKind, NodeId, Omission
 from engram.maps import MapStore, SessionState
@@ -45,7 +45,7 @@ def test_format_1_reads_as_it_was_written(old):
         for one in contents.nodes:
             frame = store.frames.frame(one.id)
             assert len(frame.landmarks) == 20
-            assert frame.descriptor is DescriptorKind.BRIEF
+            assert frame.descriptor == BRIEF
             assert store.frames.thumbnail(one.id).shape == (30, 40)
         assert store.statistics() == {"basin": {"g": [0.94, 0.7, 0.4]}}
         assert [revision.message for revision in store.log()] == ["the first", "the second"]
@@ -73,7 +73,7 @@ def test_format_1_is_sound_and_can_be_written_on(old):
     assert MapStore.check(old).problems == ()
     with MapStore.open_for_writing(old) as store:
         with pytest.raises(IncompatibleError):
-            begin(store, session("robot-4"), descriptor=DescriptorKind.TEBLID)
+            begin(store, session("robot-4"), descriptor=TEBLID)
         assert store.session_state(session("robot-1").id) is SessionState.COMMITTED
         assert store.seal(session("robot-3").id).contents["nodes"] == 2
         begin(store, session("robot-4")).commit()

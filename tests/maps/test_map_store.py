@@ -11,7 +11,7 @@ from sqlalchemy import insert
 from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, MapLockedError, RevisionError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF, TEBLID
 from engram.geometry import StereoCamera
 from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind
 from engram.maps import MapStore, SessionState
@@ -130,8 +130,8 @@ class TestSessions:
         write_drive(writer)
         writer.commit()
         with pytest.raises(IncompatibleError, match=r"brief.*teblid"):
-            begin(store, session("robot-2"), descriptor=DescriptorKind.TEBLID)
-        assert store.info().descriptor is DescriptorKind.BRIEF
+            begin(store, session("robot-2"), descriptor=TEBLID)
+        assert store.info().descriptor == BRIEF
 
 
 class TestInterruption:
@@ -217,7 +217,7 @@ class TestRecords:
             (dataclasses.replace(good, driven_m=np.nan), frame, InputError),
             (dataclasses.replace(good, camera=other.camera.id), other, InputError),
             (good, dataclasses.replace(frame, frontend="other"), IncompatibleError),
-            (good, dataclasses.replace(frame, descriptor=DescriptorKind.TEBLID), IncompatibleError),
+            (good, dataclasses.replace(frame, descriptor=TEBLID), IncompatibleError),
         ):
             with pytest.raises(error):
                 writer.add_node(wrong, its_frame)

@@ -7,7 +7,7 @@ import pytest
 from tests.scenes import CAMERA, Scene, normalised_error
 
 from engram.errors import ConfigError, IncompatibleError
-from engram.frontend import DescriptorKind, Frame, FrameStatus, MatcherConfig
+from engram.frontend import TEBLID, Frame, FrameStatus, MatcherConfig
 from engram.geometry import SE3, StereoCamera
 from engram.odometry import Odometry, OdometryConfig, OdometryStatus, WindowConfig
 
@@ -169,7 +169,7 @@ def test_another_camera_or_descriptor_is_a_clear_error() -> None:
     with pytest.raises(IncompatibleError, match="camera changed"):
         odometry.step(dataclasses.replace(frames[1], camera=other))
     with pytest.raises(IncompatibleError, match="descriptors"):
-        odometry.step(dataclasses.replace(frames[1], descriptor=DescriptorKind.TEBLID))
+        odometry.step(dataclasses.replace(frames[1], descriptor=TEBLID))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from engram import _core
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.places import FabMap, default_vocabulary
 
 pytestmark = pytest.mark.data
@@ -70,15 +70,15 @@ def corridor(data_dir: Path) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[
 
 def test_the_second_lap_is_recognised_and_no_wrong_door_is_believed(corridor) -> None:
     images, rows = corridor
-    vocabulary = default_vocabulary(DescriptorKind.BRIEF)
+    vocabulary = default_vocabulary(BRIEF)
     recogniser = FabMap(vocabulary)
     for _, descriptors in images[: SECOND_LAP - 1]:
-        recogniser.add(vocabulary.words_of(descriptors, DescriptorKind.BRIEF))
+        recogniser.add(vocabulary.words_of(descriptors, BRIEF))
     along = sorted(rows)
     right, first, wrong, answers = 0, 0, [], 0
     for number in range(SECOND_LAP, len(images) + 1):
         live = images[number - 1]
-        words = vocabulary.words_of(live[1], DescriptorKind.BRIEF)
+        words = vocabulary.words_of(live[1], BRIEF)
         places = recogniser.recognise(words, 10).places
         support = [inliers(live, images[place]) for place in places]
         best = int(places[int(np.argmax(support))]) + 1

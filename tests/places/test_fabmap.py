@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.fabmap import log_likelihood
 
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.places import DetectorModel, FabMap, FabMapConfig
 from places.worlds import look, places, small_vocabulary
 
@@ -14,7 +14,7 @@ VOCABULARY = small_vocabulary()
 
 
 def words_of(things: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return VOCABULARY.words_of(look(things, rng), DescriptorKind.BRIEF)
+    return VOCABULARY.words_of(look(things, rng), BRIEF)
 
 
 def by_the_book(config: FabMapConfig, query: np.ndarray, place: np.ndarray) -> float:

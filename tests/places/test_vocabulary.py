@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError, IncompatibleError, InputError, MapCorruptError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF, TEBLID
 from engram.places import (
     TrainingConfig,
     decode_vocabulary,
@@ -30,18 +30,18 @@ def test_each_thing_becomes_a_word() -> None:
 
 def test_an_image_shows_each_word_once_and_in_order() -> None:
     rng = np.random.default_rng(1)
-    words = VOCABULARY.words_of(look(np.array([3, 3, 3, 9]), rng), DescriptorKind.BRIEF)
+    words = VOCABULARY.words_of(look(np.array([3, 3, 3, 9]), rng), BRIEF)
     assert np.array_equal(words, np.unique(words))
     assert len(words) <= 4
 
 
 def test_an_image_without_features_shows_no_words() -> None:
-    assert len(VOCABULARY.words_of(np.zeros((0, 32), np.uint8), DescriptorKind.BRIEF)) == 0
+    assert len(VOCABULARY.words_of(np.zeros((0, 32), np.uint8), BRIEF)) == 0
 
 
 def test_words_of_another_descriptor_are_refused() -> None:
     with pytest.raises(IncompatibleError, match="teblid"):
-        VOCABULARY.words_of(np.zeros((1, 32), np.uint8), DescriptorKind.TEBLID)
+        VOCABULARY.words_of(np.zeros((1, 32), np.uint8), TEBLID)
 
 
 def test_training_twice_gives_the_same_bytes() -> None:
@@ -51,7 +51,7 @@ def test_training_twice_gives_the_same_bytes() -> None:
 def test_reading_gives_back_what_was_written() -> None:
     read = decode_vocabulary(BODY)
     assert encode_vocabulary(read) == BODY
-    assert read.descriptor is DescriptorKind.BRIEF
+    assert read.descriptor == BRIEF
     rng = np.random.default_rng(2)
     image = look(np.arange(20), rng)
     assert np.array_equal(read.quantise(image), VOCABULARY.quantise(image))
@@ -97,7 +97,7 @@ def test_a_ring_of_parents_is_refused() -> None:
 
 def test_too_few_descriptors_are_refused() -> None:
     with pytest.raises(InputError, match="too few for 50 words"):
-        train_vocabulary([appearances()[:20]], DescriptorKind.BRIEF, TrainingConfig(words=50))
+        train_vocabulary([appearances()[:20]], BRIEF, TrainingConfig(words=50))
 
 
 def test_settings_out_of_range_are_refused() -> None:

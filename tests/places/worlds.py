@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.places import TrainingConfig, Vocabulary, train_vocabulary
 
 THINGS = 60
@@ -32,4 +32,4 @@ def small_vocabulary(seed: int = 0) -> Vocabulary:
     rng = np.random.default_rng(seed)
     frames = [look(things, rng) for things in places(150, rng)]
     config = TrainingConfig(words=THINGS, depth=2, samples=20, seed=seed)
-    return train_vocabulary(frames, DescriptorKind.BRIEF, config)
+    return train_vocabulary(frames, BRIEF, config)

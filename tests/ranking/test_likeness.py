@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.worlds import MadeUpWords, flat_graph, make_context
 
 from engram.errors import MapCorruptError
-from engram.frontend import DescriptorKind, Frame
+from engram.frontend import BRIEF, Frame
 from engram.graph.model import NodeId
 from engram.places import default_vocabulary
 from engram.ranking import QuantisedWords
@@ -81,8 +81,6 @@ class _Unreadable:
 
 
 def test_a_node_that_cannot_be_read_shows_nothing() -> None:
-    words = QuantisedWords(
-        flat_graph(2), _Unreadable(), lambda: default_vocabulary(DescriptorKind.BRIEF)
-    )
+    words = QuantisedWords(flat_graph(2), _Unreadable(), lambda: default_vocabulary(BRIEF))
     words.prepare()
     assert len(words.of_node(1)) == 0

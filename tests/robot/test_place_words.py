@@ -10,7 +10,7 @@ from tests.mapping_rig import localise_simulated, map_simulated
 from tests.synthetic_world import World, drive
 
 from engram.errors import IncompatibleError, InputError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF, TEBLID
 from engram.maps import MapStore
 from engram.places import TrainingConfig, default_vocabulary, encode_vocabulary
 from engram.places.stored_words import keep_missing_words, stored_words
@@ -18,7 +18,7 @@ from engram.robot import MapOptions, OpenMap, Settings, map_drive, open_drive, o
 from engram.robot.vocabularies import train_map_vocabulary, use_vocabulary
 
 ROAD = World(length_m=60.0, seed=11)
-VOCABULARY = default_vocabulary(DescriptorKind.BRIEF)
+VOCABULARY = default_vocabulary(BRIEF)
 LIVE = drive(ROAD, 20 + np.arange(0, 3, 0.5), start_ns=2_000_000_000_000, seed=1)
 
 
@@ -48,7 +48,7 @@ def landmarks_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
         monkeypatch.setattr(
             opened.store.frames, "frame", lambda node: read.append(node) or reader(node)
         )
-        opened.relocaliser("fabmap", DescriptorKind.BRIEF)
+        opened.relocaliser("fabmap", BRIEF)
     return len(read)
 
 
@@ -124,7 +124,7 @@ def test_training_and_taking_a_vocabulary_fill_in_words(path: Path, tmp_path: Pa
 
 def test_a_vocabulary_that_cannot_be_used_is_refused(path: Path, tmp_path: Path) -> None:
     teblid = tmp_path / "teblid.safetensors"
-    teblid.write_bytes(encode_vocabulary(default_vocabulary(DescriptorKind.TEBLID)))
+    teblid.write_bytes(encode_vocabulary(default_vocabulary(TEBLID)))
     with pytest.raises(IncompatibleError, match="teblid"):
         use_vocabulary(path, teblid, author="a", advance=lambda *_: None)
     with pytest.raises(InputError, match="no vocabulary of its own"):

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from engram.errors import EngramError
-from engram.frontend import DescriptorKind, Frame, FrameStatus, Landmarks, StereoPair
+from engram.frontend import BRIEF, Frame, FrameStatus, Landmarks, StereoPair
 from engram.frontend.quantisation import LandmarkCodes, landmarks_from_codes
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
@@ -250,7 +250,7 @@ def logged(index: int, status: OdometryStatus | None = None) -> LoggedFrame:
         stamp_ns(index),
         camera(),
         landmarks(index),
-        DescriptorKind.BRIEF,
+        BRIEF,
         "frontend-hash",
         FrameStatus.OK,
         picture(index, 0),
@@ -269,7 +269,7 @@ def log_header(**changes) -> FrameLogHeader:
     values = {
         "info": info,
         "camera": camera(),
-        "descriptor": DescriptorKind.BRIEF,
+        "descriptor": BRIEF,
         "frontend": "frontend-hash",
         "odometry": "odometry-hash",
     }

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId
 from engram.places import BagOfWords
@@ -66,7 +66,7 @@ def find_lookalikes(
     """
     with open_map(map_path, at) as opened:
         words = _words(opened)
-        recogniser = BagOfWords(opened.vocabulary_or_default(DescriptorKind.BRIEF))
+        recogniser = BagOfWords(opened.vocabulary_or_default(BRIEF))
         for one in words:
             recogniser.add(one)
         ids = [node.id for node in opened.graph.nodes]
@@ -107,7 +107,7 @@ def write_confusion_picture(file: Path, confusion: Confusion) -> None:
 
 def _words(opened: OpenMap) -> list[NDArray[np.int32]]:
     """Of each node, kept in the map or worked out from its landmarks."""
-    vocabulary = opened.vocabulary_or_default(DescriptorKind.BRIEF)
+    vocabulary = opened.vocabulary_or_default(BRIEF)
     kept = stored_words(opened.store, vocabulary)
     found = []
     for node in opened.graph.nodes:

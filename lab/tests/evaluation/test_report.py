@@ -12,7 +12,7 @@ import pytest
 from tests.synthetic_world import CAMERA
 
 from engram.errors import InputError
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.graph.model import Clock, Session, SessionId
 from engram.robot import Settings
 from engram_lab.policies import STUDIED
@@ -41,7 +41,7 @@ MISSES = {"oracle": 0.02, "recall": 0.03, "bandit": 0.06, "path-near": 0.05, "di
 def made_up_drive(number: int) -> EvaluatedDrive:
     session = Session(SessionId(UUID(int=number)), "robot", CAMERA.id, number, Clock.UTC)
     path = Path(f"{number:03d}.framelog")
-    return EvaluatedDrive(path, session, CAMERA, DescriptorKind.BRIEF, "made up", "", "known")
+    return EvaluatedDrive(path, session, CAMERA, BRIEF, "made up", "", "known")
 
 
 def miss_share(one: Configuration) -> float:

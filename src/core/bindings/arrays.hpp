@@ -10,16 +10,31 @@
 #include <utility>
 #include <vector>
 
+#include "kernels/types.hpp"
+
 namespace engram {
 
 template <class T, int dimensions>
 using Input = nanobind::ndarray<const T, nanobind::ndim<dimensions>, nanobind::c_contig,
                                 nanobind::device::cpu>;
 
-// Binary descriptors: (N, 32) uint8 in Python, four 64-bit words per row here.
-using Descriptors =
-    nanobind::ndarray<const uint8_t, nanobind::shape<-1, 32>, nanobind::c_contig,
-                      nanobind::device::cpu>;
+// Binary descriptors: (N, B) uint8 in Python, B / 8 64-bit words per row here.
+using Descriptors = Input<uint8_t, 2>;
+
+// 64-bit words of a descriptor.
+inline int width_of(const Descriptors &descriptors) {
+  const size_t bytes = descriptors.shape(1);
+  if (bytes == 0 || bytes % 8 != 0 || bytes / 8 > kMostWords)
+    throw nanobind::value_error("descriptors must have 8, 16, 24 … up to 2048 bytes");
+  return static_cast<int>(bytes / 8);
+}
+
+// The width that both have.
+inline int common_width(const Descriptors &a, const Descriptors &b) {
+  if (a.shape(1) != b.shape(1))
+    throw nanobind::value_error("descriptors of different widths cannot be compared");
+  return width_of(a);
+}
 
 inline const uint64_t *words(const Descriptors &descriptors) {
   return reinterpret_cast<const uint64_t *>(descriptors.data());

@@ -37,12 +37,14 @@ struct Features {
                                points_in_cam.shape(0), descriptors.shape(0), octaves.shape(0)})
       if (other != count)
         throw nb::value_error("the arrays of a frame's landmarks must have one row each");
+    width_of(descriptors);
     if (count > kMostLandmarks)
       throw nb::value_error("a frame may have at most 32767 landmarks");
   }
 
   FrameView view() const {
     return {static_cast<int64_t>(pixels.shape(0)),
+            width_of(descriptors),
             pixels.data(),
             disparity_px.data(),
             disparity_sigma_px.data(),
@@ -100,9 +102,14 @@ std::optional<Prediction> prediction_of(const std::optional<Matrix> &predicted,
   return prediction;
 }
 
+void check_comparable(const Features &reference, const Features &live) {
+  common_width(reference.descriptors, live.descriptors);
+}
+
 nb::object match_rows(const Features &reference, const Features &live,
                       const MatchSettings &settings, std::optional<Matrix> predicted,
                       std::optional<Matrix> covariance) {
+  check_comparable(reference, live);
   const auto prediction = prediction_of(predicted, covariance);
   const FrameView a = reference.view(), b = live.view();
   std::vector<RowPair> pairs;
@@ -141,6 +148,7 @@ nb::object estimate_pose(const Features &reference, const Features &live,
 nb::object attempt(const Features &reference, const Features &live, const MatchSettings &settings,
                    uint64_t seed, std::optional<Matrix> predicted,
                    std::optional<Matrix> covariance) {
+  check_comparable(reference, live);
   const auto prediction = prediction_of(predicted, covariance);
   const FrameView a = reference.view(), b = live.view();
   PoseEstimate estimate;

@@ -35,14 +35,9 @@ void make_tree(WordTree *place, const engram::Descriptors &centres,
                const Input<int32_t, 1> &bounds) {
   const auto nodes = static_cast<int64_t>(centres.shape(0));
   check_bounds(bounds, nodes);
-  auto *tree = new (place) WordTree;
+  auto *tree = new (place) WordTree{{engram::width_of(centres), nodes}, {}, {}};
   tree->bounds.assign(bounds.data(), bounds.data() + nodes + 1);
-  for (size_t word = 0; word < 4; ++word) {
-    tree->centres[word].assign(static_cast<size_t>(nodes + engram::kWordPadding), 0);
-    for (int64_t n = 0; n < nodes; ++n)
-      tree->centres[word][static_cast<size_t>(n)] =
-          engram::words(centres)[4 * n + static_cast<int64_t>(word)];
-  }
+  tree->centres.assign(engram::words(centres), nodes);
   int32_t leaves = 0;
   for (size_t n = 0; n < static_cast<size_t>(nodes); ++n)
     tree->words.push_back(tree->bounds[n] == tree->bounds[n + 1] ? leaves++ : -1);
@@ -52,6 +47,8 @@ auto quantise(const WordTree &tree, const engram::Descriptors &descriptors, int 
   if (beam < 1 || beam > engram::kMaxBeam)
     throw std::invalid_argument("beam is " + std::to_string(beam) + ", must be 1 to " +
                                 std::to_string(engram::kMaxBeam));
+  if (engram::width_of(descriptors) != tree.centres.width)
+    throw std::invalid_argument("word tree: its words and these descriptors differ in width");
   const size_t count = descriptors.shape(0);
   std::vector<int32_t> words(count);
   {
@@ -67,17 +64,19 @@ auto k_majority(const engram::Descriptors &descriptors, int64_t k, int iteration
   if (count == 0 || k < 1 || iterations < 0)
     throw std::invalid_argument("k_majority: needs descriptors, k >= 1 and iterations >= 0");
   const size_t most = std::min(count, static_cast<size_t>(k));
-  std::vector<uint64_t> centres(4 * most);
+  const int width = engram::width_of(descriptors);
+  const auto columns = static_cast<size_t>(width);
+  std::vector<uint64_t> centres(columns * most);
   std::vector<int32_t> assignment(count);
   int64_t found = 0;
   {
     nb::gil_scoped_release unlocked;
     found = ENGRAM_CALL(k_majority, engram::words(descriptors), static_cast<int64_t>(count),
-                        static_cast<int64_t>(most), iterations, seed, centres.data(),
+                        width, static_cast<int64_t>(most), iterations, seed, centres.data(),
                         assignment.data());
   }
-  centres.resize(4 * static_cast<size_t>(found));
-  return nb::make_tuple(engram::to_numpy(std::move(centres), {static_cast<size_t>(found), 4}),
+  centres.resize(columns * static_cast<size_t>(found));
+  return nb::make_tuple(engram::to_numpy(std::move(centres), {static_cast<size_t>(found), columns}),
                         engram::to_numpy(std::move(assignment), {count}));
 }
 
@@ -125,9 +124,9 @@ void bind_places(nb::module_ &module) {
   nb::class_<WordTree>(module, "WordTree", "A tree of binary words, ready to be searched.")
       .def("__init__", &make_tree, "centres"_a, "bounds"_a)
       .def("quantise", &quantise, "descriptors"_a, "beam"_a,
-           "Word (N,) int32 of each descriptor (N, 32) uint8.");
+           "Word (N,) int32 of each descriptor (N, B) uint8.");
   module.def("k_majority", &k_majority, "descriptors"_a, "k"_a, "iterations"_a, "seed"_a,
-             "Centres (K, 4) uint64, K <= k, and the cluster (N,) int32 of each descriptor.");
+             "Centres (K, B / 8) uint64, K <= k, and the cluster (N,) int32 of each descriptor.");
   module.def("best_scores", &best_scores, "scores"_a, "most"_a,
              "Numbers (K,) int64 of the greatest scores, greatest first, ties by number.");
   nb::class_<PlaceIndex>(module, "PlaceIndex", "For each word the places that show it.")

@@ -1,4 +1,4 @@
-// Distances between 256-bit binary descriptors, four 64-bit words each.
+// Distances between binary descriptors of `width` 64-bit words each.
 #pragma once
 
 #include <cstdint>
@@ -8,4 +8,4 @@
 ENGRAM_DECLARE_KERNELS(
     // distances[i * b_count + j] = number of bits in which a[i] and b[j] differ.
     void hamming_matrix(const uint64_t *a, int64_t a_count, const uint64_t *b, int64_t b_count,
-                        uint16_t *distances);)
+                        int width, uint16_t *distances);)

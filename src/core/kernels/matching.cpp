@@ -13,6 +13,7 @@
 #include "kernels/float_lanes.hpp"
 #include "kernels/projection.hpp"
 #include "kernels/rigid.hpp"
+#include "kernels/width.hpp"
 
 namespace engram::ENGRAM_ISA {
 namespace {
@@ -35,9 +36,23 @@ inline int popcount(uint64_t word) {
 #endif
 }
 
-inline int hamming(const uint64_t *a, const uint64_t *b) {
-  return popcount(a[0] ^ b[0]) + popcount(a[1] ^ b[1]) + popcount(a[2] ^ b[2]) +
-         popcount(a[3] ^ b[3]);
+// A descriptor, wherever it stands in memory, as words that may be loaded.
+template <class Width> struct Descriptor {
+  uint64_t words[most_words(Width{})];
+
+  Descriptor(const uint64_t *from, Width width) {
+    std::memcpy(words, from, sizeof(uint64_t) * width);
+  }
+};
+
+template <class Width> int hamming(const uint64_t *a, const uint64_t *b, Width width) {
+  int bits = 0;
+  for (int word = 0; word < width; ++word) {
+    uint64_t other;
+    std::memcpy(&other, b + word, sizeof other);
+    bits += popcount(a[word] ^ other);
+  }
+  return bits;
 }
 
 double power(double base, int exponent) {
@@ -62,19 +77,16 @@ Patch patch_of(const FrameView &frame, int64_t row, const MatchSettings &setting
 
 // The live landmarks in blocks of 32, those of like patch size together.
 struct Blocks {
-  // A block's descriptors: word w of landmark 4 i + g of the block stands at 32 w + 8 g + i, so
-  // that four vectors of counts in 64 bits shift into one of 16 bits.
-  struct Words {
-    uint64_t values[4 * kColumns];
-  };
-
   std::vector<int32_t> rows; // of the live frame, by column
   std::vector<float> u, v;
-  std::vector<Words> words;
+  // Descriptors, block by block: word w of landmark 4 i + g of a block stands at 32 w + 8 g + i, so
+  // that four vectors of counts in 64 bits shift into one of 16 bits.
+  std::vector<uint64_t> words;
+  int width; // words of a descriptor
   std::vector<double> least_m, most_m; // patch sizes in a block
   Shorts beyond{};                     // in the last block: far where there is no landmark
 
-  int64_t count() const { return static_cast<int64_t>(words.size()); }
+  int64_t count() const { return static_cast<int64_t>(least_m.size()); }
 };
 
 // In the order of their size, but for 3 %: blocks are compared by their true bounds.
@@ -97,14 +109,16 @@ std::vector<int32_t> rows_by_size(const std::vector<double> &sizes) {
   return rows;
 }
 
-Blocks blocks_of(const FrameView &frame, const MatchSettings &settings) {
+template <class Width>
+Blocks blocks_of(const FrameView &frame, const MatchSettings &settings, Width width) {
   Blocks blocks;
+  blocks.width = width;
   std::vector<double> sizes(frame.count);
   for (int64_t row = 0; row < frame.count; ++row)
     sizes[row] = patch_of(frame, row, settings).size_m;
   blocks.rows = rows_by_size(sizes);
   const int64_t count = (frame.count + kColumns - 1) / kColumns;
-  blocks.words.resize(count);
+  blocks.words.resize(count * width * kColumns);
   blocks.least_m.assign(count, std::numeric_limits<double>::max());
   blocks.most_m.assign(count, 0);
   blocks.u.resize(frame.count), blocks.v.resize(frame.count);
@@ -115,9 +129,10 @@ Blocks blocks_of(const FrameView &frame, const MatchSettings &settings) {
     blocks.v[column] = frame.pixels[2 * row + 1];
     blocks.least_m[block] = std::min(blocks.least_m[block], sizes[row]);
     blocks.most_m[block] = std::max(blocks.most_m[block], sizes[row]);
-    for (int64_t word = 0; word < 4; ++word)
-      std::memcpy(&blocks.words[block].values[kColumns * word + 8 * (within % 4) + within / 4],
-                  frame.descriptors + 4 * row + word, sizeof(uint64_t));
+    uint64_t *words = &blocks.words[block * width * kColumns + 8 * (within % 4) + within / 4];
+    for (int64_t word = 0; word < width; ++word)
+      std::memcpy(words + kColumns * word, frame.descriptors + width * row + word,
+                  sizeof(uint64_t));
   }
   for (int64_t lane = frame.count - kColumns * (count - 1); lane < kColumns; ++lane)
     blocks.beyond[lane] = kFar;
@@ -125,25 +140,24 @@ Blocks blocks_of(const FrameView &frame, const MatchSettings &settings) {
 }
 
 // Bits in which the descriptor differs from each of a block.
-Shorts distances_to(const uint64_t *descriptor, const Blocks::Words &block) {
+template <class Width>
+Shorts distances_to(const uint64_t *descriptor, const uint64_t *block, Width width) {
 #ifdef __AVX512VPOPCNTDQ__
   typedef uint64_t Counts __attribute__((vector_size(64)));
   Counts totals[4] = {};
   for (int group = 0; group < 4; ++group)
-    for (int word = 0; word < 4; ++word) {
+    for (int word = 0; word < width; ++word) {
       Counts other;
-      std::memcpy(&other, block.values + kColumns * word + 8 * group, sizeof other);
+      std::memcpy(&other, block + kColumns * word + 8 * group, sizeof other);
       totals[group] += (Counts)_mm512_popcnt_epi64((__m512i)(descriptor[word] ^ other));
     }
   return (Shorts)((totals[0] | totals[1] << 16) | (totals[2] | totals[3] << 16) << 32);
 #else
   int32_t totals[kColumns];
   for (int64_t column = 0; column < kColumns; ++column) {
-    const uint64_t *other = block.values + column;
-    totals[column] = popcount(descriptor[0] ^ other[0]) +
-                     popcount(descriptor[1] ^ other[kColumns]) +
-                     popcount(descriptor[2] ^ other[2 * kColumns]) +
-                     popcount(descriptor[3] ^ other[3 * kColumns]);
+    totals[column] = 0;
+    for (int word = 0; word < width; ++word)
+      totals[column] += popcount(descriptor[word] ^ block[kColumns * word + column]);
   }
   int16_t distances[kColumns];
   for (int i = 0; i < 8; ++i)
@@ -176,14 +190,16 @@ public:
       : blocks_(blocks), here_(blocks.count()), nearest_(blocks.count(), Shorts{} + kFar),
         nearest_row_(blocks.count(), Shorts{} - int16_t{1}) {}
 
-  // Returns the least.
-  int16_t measure(const uint64_t *descriptor, int16_t row, double least_m, double most_m) {
+  // Returns the least. Out of line, so that the descriptor stays in registers over all blocks.
+  template <class Width>
+  [[gnu::noinline]] int16_t measure(const uint64_t *descriptor, int16_t row, double least_m, double most_m,
+                  Width width) {
     touched_.clear();
     Shorts smallest = Shorts{} + kFar;
     for (int64_t block = 0; block < blocks_.count(); ++block) {
       if (blocks_.most_m[block] < least_m || blocks_.least_m[block] > most_m)
         continue;
-      Shorts here = distances_to(descriptor, blocks_.words[block]);
+      Shorts here = distances_to(descriptor, &blocks_.words[block * width * kColumns], width);
       if (block == blocks_.count() - 1)
         here |= blocks_.beyond;
       const Shorts before = nearest_[block], closer = here < before;
@@ -225,7 +241,7 @@ bool apart(const Blocks &blocks, int32_t a, int32_t b, double limit_px) {
 // same corner found in a second octave is no rival.
 int32_t distinct_column(const Distances &distances, int16_t least, const MatchSettings &settings,
                         const Blocks &blocks, std::vector<int32_t> &close) {
-  const auto limit = static_cast<int16_t>(std::min(least / settings.ratio, 256.0));
+  const auto limit = static_cast<int16_t>(std::min(least / settings.ratio, 64.0 * blocks.width));
   close.clear();
   int32_t best = -1;
   distances.within(limit, [&](int32_t column, int16_t distance) {
@@ -415,24 +431,22 @@ private:
   std::vector<double> pixel_variances_; // by octave
 };
 
-} // namespace
-
+template <class Width>
 void match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
-               std::vector<RowPair> &pairs) {
+               std::vector<RowPair> &pairs, Width width) {
   pairs.clear();
   if (reference.count == 0 || live.count == 0)
     return;
-  const Blocks blocks = blocks_of(live, settings);
+  const Blocks blocks = blocks_of(live, settings, width);
   Distances distances(blocks);
   std::vector<RowPair> forward; // `live` is still a column
   std::vector<int32_t> close;
   for (int64_t i = 0; i < reference.count; ++i) {
     const Patch patch = patch_of(reference, i, settings);
     const double reach = settings.patch_ratio * patch.doubt * patch.doubt;
-    uint64_t descriptor[4];
-    std::memcpy(descriptor, reference.descriptors + 4 * i, sizeof descriptor);
-    const int16_t least = distances.measure(descriptor, static_cast<int16_t>(i),
-                                            patch.size_m / reach, patch.size_m * reach);
+    const Descriptor<Width> descriptor(reference.descriptors + width * i, width);
+    const int16_t least = distances.measure(descriptor.words, static_cast<int16_t>(i),
+                                            patch.size_m / reach, patch.size_m * reach, width);
     if (least > settings.max_distance)
       continue;
     const int32_t column = distinct_column(distances, least, settings, blocks, close);
@@ -444,8 +458,9 @@ void match_all(const FrameView &reference, const FrameView &live, const MatchSet
       pairs.push_back({pair.reference, blocks.rows[pair.live], pair.distance});
 }
 
+template <class Width>
 void match_near(const FrameView &reference, const FrameView &live, const Prediction &prediction,
-                const MatchSettings &settings, std::vector<RowPair> &pairs) {
+                const MatchSettings &settings, std::vector<RowPair> &pairs, Width width) {
   pairs.clear();
   if (reference.count == 0 || live.count == 0)
     return;
@@ -462,8 +477,7 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
     const double u = windows.stereo[0][lane], v = windows.stereo[1][lane];
     if (!windows.worth[lane] || !strips.within(u, v, settings.max_radius_px))
       continue;
-    uint64_t descriptor[4];
-    std::memcpy(descriptor, reference.descriptors + 4 * i, sizeof descriptor);
+    const Descriptor<Width> descriptor(reference.descriptors + width * i, width);
     std::array<float, 3> centre, radius;
     for (int k = 0; k < 3; ++k) {
       centre[k] = static_cast<float>(windows.stereo[k][lane]);
@@ -472,9 +486,7 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
     candidates.clear();
     std::pair<int32_t, int32_t> best{kFar, -1};
     strips.visit(centre, radius, [&](int32_t j) {
-      uint64_t other[4];
-      std::memcpy(other, live.descriptors + 4 * j, sizeof other);
-      const int32_t distance = hamming(descriptor, other);
+      const int32_t distance = hamming(descriptor.words, live.descriptors + width * j, width);
       candidates.emplace_back(distance, j);
       best = std::min(best, candidates.back());
       const bool closer = distance < nearest_distance[j];
@@ -493,6 +505,20 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
       pairs.push_back({static_cast<int32_t>(i), best.second, best.first});
   }
   std::erase_if(pairs, [&](const RowPair &p) { return nearest_row[p.live] != p.reference; });
+}
+
+} // namespace
+
+void match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
+               std::vector<RowPair> &pairs) {
+  with_width(live.width, [&](auto width) { match_all(reference, live, settings, pairs, width); });
+}
+
+void match_near(const FrameView &reference, const FrameView &live, const Prediction &prediction,
+                const MatchSettings &settings, std::vector<RowPair> &pairs) {
+  with_width(live.width, [&](auto width) {
+    match_near(reference, live, prediction, settings, pairs, width);
+  });
 }
 
 } // namespace engram::ENGRAM_ISA

@@ -18,14 +18,18 @@ struct Camera {
   double fx, fy, cx, cy, baseline_m;
 };
 
+// Descriptors have at most so many 64-bit words: distances are counted in 16 bits.
+constexpr int kMostWords = 256;
+
 // The landmarks of a frame, as `engram.frontend.Landmarks` has them.
 struct FrameView {
   int64_t count;
+  int width; // of a descriptor, 64-bit words
   const float *pixels;             // (count, 2)
   const float *disparity_px;       // (count,)
   const float *disparity_sigma_px; // (count,)
   const float *points_in_cam;      // (count, 3)
-  const uint64_t *descriptors;     // (count, 4)
+  const uint64_t *descriptors;     // (count, width)
   const uint8_t *octaves;          // (count,)
   Camera camera;
 };

@@ -1,11 +1,24 @@
 """Stereo pair → frame; frame ↔ frame matching and relative pose. Knows nothing of maps."""
 
-from engram.frontend.frame import DescriptorKind, Frame, FrameStatus, Landmarks, StereoPair
+from engram.frontend.features import FEATURES, FeatureKind, feature_kind
+from engram.frontend.frame import (
+    BRIEF,
+    TEBLID,
+    DescriptorKind,
+    Frame,
+    FrameStatus,
+    Landmarks,
+    StereoPair,
+)
 from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.frontend.matching import Match, MatcherConfig, match_frames, matcher_hash, pair_seed
 
 __all__ = [
+    "BRIEF",
+    "FEATURES",
+    "TEBLID",
     "DescriptorKind",
+    "FeatureKind",
     "Frame",
     "FrameStatus",
     "Frontend",
@@ -14,6 +27,7 @@ __all__ = [
     "Match",
     "MatcherConfig",
     "StereoPair",
+    "feature_kind",
     "match_frames",
     "matcher_hash",
     "pair_seed",

@@ -17,7 +17,7 @@ import safetensors.numpy
 from numpy.typing import NDArray
 
 from engram.errors import InputError, MapCorruptError
-from engram.frontend import Landmarks
+from engram.frontend import DescriptorKind, Landmarks, feature_kind
 from engram.frontend.quantisation import (
     LandmarkCodes,
     landmarks_from_codes,
@@ -35,7 +35,7 @@ _METADATA_KEY = "engram.landmarks"
 _ROW_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pixels": ("U16", (2,)),
     "disparity": ("U16", ()),
-    "descriptors": ("U8", (32,)),
+    "descriptors": ("U8", ()),  # and as many columns as the kind has bytes
     "octaves": ("U8", ()),
     "sigma": ("U8", ()),
 }
@@ -82,14 +82,16 @@ def encode_landmarks(landmarks: Landmarks, camera: StereoCamera) -> bytes:
     return content_digest(body) + body
 
 
-def decode_landmarks(blob: bytes, camera: StereoCamera) -> Landmarks:
+def decode_landmarks(blob: bytes, camera: StereoCamera, kind: DescriptorKind) -> Landmarks:
     """The landmarks of a blob, bit for bit those that were encoded.
 
     Args:
         blob: what `encode_landmarks` made; may come from anywhere.
         camera: the camera of the frame.
+        kind: of its descriptors.
 
     Raises:
+        IncompatibleError: the kind is unknown here.
         MapCorruptError: the bytes do not match their hash, are no landmark blob of a known
             version, or hold impossible values.
     """
@@ -101,7 +103,7 @@ def decode_landmarks(blob: bytes, camera: StereoCamera) -> Landmarks:
     except safetensors.SafetensorError as error:
         raise MapCorruptError(f"landmark blob is no safetensors file: {error}") from error
     _check_metadata(body, pixel_quantum(camera.width, camera.height))
-    arrays = _checked_arrays(tensors)
+    arrays = _checked_arrays(tensors, feature_kind(kind).descriptor_bytes)
     if not arrays["disparity"].all():
         raise MapCorruptError("landmark blob holds a disparity of zero, a point at infinity")
     codes = LandmarkCodes(arrays["pixels"], arrays["disparity"], arrays["sigma"])
@@ -167,7 +169,7 @@ def _check_exact(given: Landmarks, stored: Landmarks) -> None:
             )
     count = len(given.pixels)
     for name, dtype, shape in (
-        ("descriptors", np.uint8, (count, 32)),
+        ("descriptors", np.uint8, (count, *given.descriptors.shape[1:2])),
         ("octaves", np.uint8, (count,)),
     ):
         array = getattr(given, name)
@@ -190,7 +192,9 @@ def _check_metadata(body: bytes, quantum_px: float) -> None:
         )
 
 
-def _checked_arrays(tensors: list[tuple[str, dict[str, Any]]]) -> dict[str, NDArray[Any]]:
+def _checked_arrays(
+    tensors: list[tuple[str, dict[str, Any]]], descriptor_bytes: int
+) -> dict[str, NDArray[Any]]:
     """Arrays by name, after their names, types and shapes have been found right."""
     found = dict(tensors)
     if found.keys() != _ROW_SHAPES.keys():
@@ -200,12 +204,12 @@ def _checked_arrays(tensors: list[tuple[str, dict[str, Any]]]) -> dict[str, NDAr
     arrays = {}
     for name, (dtype, row_shape) in _ROW_SHAPES.items():
         tensor = found[name]
-        if tensor["dtype"] != dtype or tensor["shape"] != [count, *row_shape]:
+        shape = [count, descriptor_bytes] if name == "descriptors" else [count, *row_shape]
+        if tensor["dtype"] != dtype or tensor["shape"] != shape:
             raise MapCorruptError(
-                f"landmark blob: {name} is {tensor['dtype']} {tensor['shape']}, "
-                f"not {dtype} {[count, *row_shape]}"
+                f"landmark blob: {name} is {tensor['dtype']} {tensor['shape']}, not {dtype} {shape}"
             )
-        arrays[name] = np.frombuffer(tensor["data"], _DTYPES[dtype]).reshape(count, *row_shape)
+        arrays[name] = np.frombuffer(tensor["data"], _DTYPES[dtype]).reshape(shape)
     return arrays
 
 

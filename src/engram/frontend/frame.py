@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NewType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.geometry import StereoCamera
+
+# Key in `FEATURES`. Two kinds are never matched with each other.
+DescriptorKind = NewType("DescriptorKind", str)
+
+BRIEF = DescriptorKind("brief")
+TEBLID = DescriptorKind("teblid")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,13 +32,6 @@ class StereoPair:
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
     camera: StereoCamera
-
-
-class DescriptorKind(StrEnum):
-    """Binary descriptors of 256 bits. Two kinds are never matched with each other."""
-
-    BRIEF = "brief"
-    TEBLID = "teblid"
 
 
 class FrameStatus(StrEnum):
@@ -55,7 +55,7 @@ class Landmarks:
         disparity_px: (N,) float32, > 0.
         disparity_sigma_px: (N,) float32, standard deviation of the disparity.
         points_in_cam: (N, 3) float32, metres, in the left camera.
-        descriptors: (N, 32) uint8, 256 bits.
+        descriptors: (N, B) uint8, as wide as their kind has them.
         octaves: (N,) uint8, pyramid level of detection, 0 is full resolution.
     """
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.config import config_hash
-from engram.errors import ConfigError, SequenceError
-from engram.frontend.descriptors import DESCRIPTORS
-from engram.frontend.frame import DescriptorKind, Frame, FrameStatus, StereoPair
+from engram.config import check_bounds, config_hash
+from engram.errors import ConfigError, IncompatibleError, SequenceError
+from engram.frontend.features import feature_kind
+from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
 from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
 
 # Goes up whenever the same settings give other landmarks than before.
@@ -50,42 +52,28 @@ class FrontendConfig:
         thumbnails: whether frames carry a small picture for people.
     """
 
-    descriptor: DescriptorKind = DescriptorKind.BRIEF
-    landmarks: int = 600
-    octaves: int = 2
-    fast_threshold: int = 7
-    cell_px: int = 32
-    max_disparity_px: int = 124
-    min_disparity_px: float = 0.5
-    uniqueness: float = 0.85
-    max_residual: float = 0.7
-    max_sigma_px: float = 1.0
-    sigma_floor_px: float = 0.05
-    sigma_scale: float = 1.0
-    min_landmarks: int = 40
-    dark_mean: float = 16.0
+    descriptor: DescriptorKind = BRIEF
+    landmarks: Annotated[int, Meta(ge=1, le=100_000)] = 600
+    octaves: Annotated[int, Meta(ge=1, le=4)] = 2
+    fast_threshold: Annotated[int, Meta(ge=1, le=254)] = 7
+    cell_px: Annotated[int, Meta(ge=4, le=4096)] = 32
+    max_disparity_px: Annotated[int, Meta(ge=1, le=500)] = 124
+    min_disparity_px: Annotated[float, Meta(ge=1 / 64, le=500)] = 0.5
+    uniqueness: Annotated[float, Meta(ge=0.01, le=1)] = 0.85
+    max_residual: Annotated[float, Meta(ge=0, le=2)] = 0.7
+    max_sigma_px: Annotated[float, Meta(ge=1 / 64, le=4)] = 1.0
+    sigma_floor_px: Annotated[float, Meta(ge=0, le=4)] = 0.05
+    sigma_scale: Annotated[float, Meta(ge=0, le=100)] = 1.0
+    min_landmarks: Annotated[int, Meta(ge=0, le=100_000)] = 40
+    dark_mean: Annotated[float, Meta(ge=0, le=255)] = 16.0
     thumbnails: bool = True
 
     def __post_init__(self) -> None:
-        limits = {
-            "landmarks": (1, 100_000),
-            "octaves": (1, 4),
-            "fast_threshold": (1, 254),
-            "cell_px": (4, 4096),
-            "max_disparity_px": (1, 500),
-            "min_disparity_px": (1 / 64, 500),
-            "uniqueness": (0.01, 1),
-            "max_residual": (0, 2),
-            "max_sigma_px": (1 / 64, 4),
-            "sigma_floor_px": (0, 4),
-            "sigma_scale": (0, 100),
-            "min_landmarks": (0, 100_000),
-            "dark_mean": (0, 255),
-        }
-        for name, (least, most) in limits.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise ConfigError(f"frontend.{name} is {value}, must lie in {least} to {most}")
+        check_bounds(self)
+        try:
+            feature_kind(self.descriptor)
+        except IncompatibleError as error:
+            raise ConfigError(f"frontend: {error}") from error
 
 
 class Frontend:
@@ -110,34 +98,20 @@ class Frontend:
         """
         _check_images(pair)
         config = self.config
-        fused = config.descriptor is DescriptorKind.BRIEF
-        pixels, disparity_px, sigma_px, descriptors, octaves, corners = _core.extract(
-            pair.left,
-            pair.right,
-            landmarks=_landmarks_for(pair.left, config.landmarks),
-            octaves=config.octaves,
-            fast_threshold=config.fast_threshold,
-            cell_px=config.cell_px,
-            with_descriptors=fused,
-            max_disparity_px=config.max_disparity_px,
-            min_disparity_px=config.min_disparity_px,
-            uniqueness=config.uniqueness,
-            max_residual=config.max_residual,
-            max_sigma_px=config.max_sigma_px,
-            sigma_floor_px=config.sigma_floor_px,
-            sigma_scale=config.sigma_scale,
-        )
-        if not fused:
-            descriptors = DESCRIPTORS[config.descriptor](pair.left, pixels, octaves)
+        kind = feature_kind(config.descriptor)
+        found = kind.detect(pair, config, _landmarks_for(pair.left, config.landmarks))
+        descriptors = found.descriptors
+        if descriptors is None:
+            descriptors = kind.describe(pair.left, found.pixels, found.octaves)
         quantum_px = pixel_quantum(pair.camera.width, pair.camera.height)
-        codes = quantise(pixels, disparity_px, sigma_px, quantum_px)
+        codes = quantise(found.pixels, found.disparity_px, found.sigma_px, quantum_px)
         return Frame(
             stamp_ns=pair.stamp_ns,
             camera=pair.camera,
-            landmarks=landmarks_from_codes(codes, descriptors, octaves, pair.camera),
+            landmarks=landmarks_from_codes(codes, descriptors, found.octaves, pair.camera),
             descriptor=config.descriptor,
             frontend=self.hash,
-            status=self._status(pair, len(pixels), corners),
+            status=self._status(pair, len(codes), found.candidates),
             thumbnail=make_thumbnail(pair.left) if config.thumbnails else None,
         )
 

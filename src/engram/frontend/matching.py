@@ -10,14 +10,16 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 from uuid import UUID
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.config import config_hash
-from engram.errors import ConfigError, IncompatibleError, InputError
+from engram.config import check_bounds, config_hash
+from engram.errors import IncompatibleError, InputError
 from engram.frontend.frame import Frame
 from engram.geometry import SE3
 
@@ -31,7 +33,7 @@ class MatcherConfig:
 
     Attributes:
         max_distance: bits in which descriptors may differ, searching the whole frame. Two random
-            descriptors differ in 128 ± 8 bits; the least of 500 differs in about 100.
+            descriptors of 256 bits differ in 128 ± 8; the least of 500 differs in about 100.
         max_guided_distance: the same near a predicted place, where few candidates compete.
         ratio: the best distance must be less than this times the next best (Lowe 2004).
         guided_ratio: the same near a predicted place.
@@ -57,7 +59,8 @@ class MatcherConfig:
         independent_landmarks: landmarks beyond this many share their errors (residual distortion,
             rectification, the scene's geometry), so that the covariance of a pose does not fall
             below what this many alone would give. Measured against motion capture on EuRoC.
-        min_consensus: fewest landmarks that make a pose at all. What is accepted as a
+        min_consensus: fewest landmarks that make a pose at all; three agree on some pose whatever
+            they are. What is accepted as a
             localisation is decided by the localiser, with a higher threshold.
         max_samples: bound on the triples drawn from the matches.
         max_hypotheses: bound on the triples that are scored.
@@ -68,57 +71,30 @@ class MatcherConfig:
         second_pass: search once more, guided by the pose found.
     """
 
-    max_distance: int = 80
-    max_guided_distance: int = 90
-    ratio: float = 0.85
-    guided_ratio: float = 0.9
+    max_distance: Annotated[int, Meta(ge=0)] = 80
+    max_guided_distance: Annotated[int, Meta(ge=0)] = 90
+    ratio: Annotated[float, Meta(gt=0, lt=1)] = 0.85
+    guided_ratio: Annotated[float, Meta(gt=0, lt=1)] = 0.9
     same_corner_px: float = 3.0
-    octave_scale: float = 2.0
-    patch_ratio: float = 2.0
-    pixel_sigma_px: float = 0.65
-    disparity_sigma_px: float = 0.08
-    offset_sigma_px: float = 0.3
-    offset_drift_px: float = 0.02
-    gate_sigmas: float = 3.0
-    max_radius_px: float = 128.0
-    chi2: float = 11.34
-    independent_landmarks: float = 10.0
-    min_consensus: int = 6
+    octave_scale: Annotated[float, Meta(ge=1, le=100)] = 2.0
+    patch_ratio: Annotated[float, Meta(ge=1, le=100)] = 2.0
+    pixel_sigma_px: Annotated[float, Meta(gt=0)] = 0.65
+    disparity_sigma_px: Annotated[float, Meta(gt=0)] = 0.08
+    offset_sigma_px: Annotated[float, Meta(gt=0)] = 0.3
+    offset_drift_px: Annotated[float, Meta(gt=0)] = 0.02
+    gate_sigmas: Annotated[float, Meta(gt=0)] = 3.0
+    max_radius_px: Annotated[float, Meta(gt=0)] = 128.0
+    chi2: Annotated[float, Meta(gt=0)] = 11.34
+    independent_landmarks: Annotated[float, Meta(gt=0)] = 10.0
+    min_consensus: Annotated[int, Meta(ge=4)] = 6
     max_samples: int = 3000
     max_hypotheses: int = 600
-    confidence: float = 0.999
+    confidence: Annotated[float, Meta(gt=0, lt=1)] = 0.999
     max_view_angle_rad: float = 1.2
     second_pass: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("ratio", "guided_ratio", "confidence"):
-            if not 0 < getattr(self, name) < 1:
-                raise ConfigError(
-                    f"matcher: {name} is {getattr(self, name)}, must be within (0, 1)"
-                )
-        for name in ("octave_scale", "patch_ratio"):
-            if not 1 <= getattr(self, name) <= 100:
-                raise ConfigError(f"matcher: {name} is {getattr(self, name)}, must be ≥ 1")
-        for name in (
-            "pixel_sigma_px",
-            "disparity_sigma_px",
-            "offset_sigma_px",
-            "offset_drift_px",
-            "gate_sigmas",
-            "max_radius_px",
-            "chi2",
-            "independent_landmarks",
-        ):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"matcher: {name} is {getattr(self, name)}, must be > 0")
-        if self.min_consensus < 4:
-            raise ConfigError(
-                f"matcher: min_consensus is {self.min_consensus}, must be ≥ 4: "
-                "three landmarks agree on some pose whatever they are"
-            )
-        for name in ("max_distance", "max_guided_distance"):
-            if not 0 <= getattr(self, name) <= 256:
-                raise ConfigError(f"matcher: {name} is {getattr(self, name)}, must be 0 … 256")
+        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -115,7 +115,7 @@ def landmarks_from_codes(
 
     Args:
         codes: positions of N landmarks, in quanta of the camera's image.
-        descriptors: (N, 32) uint8.
+        descriptors: (N, B) uint8.
         octaves: (N,) uint8.
         camera: the camera that saw them; gives the quantum and the points.
     """

@@ -12,7 +12,7 @@ import numpy as np
 from sqlalchemy import Table, select
 
 from engram.errors import EngramError, MapCorruptError
-from engram.frontend import DescriptorKind, FrameStatus
+from engram.frontend import DescriptorKind, FrameStatus, feature_kind
 from engram.frontend.blobs import (
     HASH_BYTES,
     blob_hash,
@@ -103,7 +103,9 @@ class _Checking:
     revision_of: dict[Table, dict[int, int]] = field(default_factory=dict)
     revision_rows: dict[int, Row] = field(default_factory=dict)
     cameras: dict[int, StereoCamera] = field(default_factory=dict)
-    landmark_hashes: dict[int, tuple[bytes, int]] = field(default_factory=dict)
+    kinds: dict[int, DescriptorKind] = field(default_factory=dict)
+    # Of every node: hash of its landmarks, keys of its camera and front-end.
+    landmark_hashes: dict[int, tuple[bytes, int, int]] = field(default_factory=dict)
     uuids: dict[tuple[Table, int], str] = field(default_factory=dict)
     brought: Counter[tuple[int, str]] = field(default_factory=Counter)
     session_ids: dict[int, SessionId] = field(default_factory=dict)
@@ -273,8 +275,8 @@ def _check_camera(checking: _Checking, row: Row) -> None:
     checking.cameras[row["key"]] = camera_from_row(row)
 
 
-def _check_frontend(_: _Checking, row: Row) -> None:
-    DescriptorKind(row["descriptor"])
+def _check_frontend(checking: _Checking, row: Row) -> None:
+    checking.kinds[row["key"]] = feature_kind(row["descriptor"]).name
 
 
 def _check_session(checking: _Checking, row: Row) -> None:
@@ -285,21 +287,25 @@ def _check_session(checking: _Checking, row: Row) -> None:
 
 def _check_node(checking: _Checking, row: Row) -> None:
     uuid_from_bytes(row["uuid"], "the row")
-    checking.landmark_hashes[row["key"]] = (row["landmark_hash"], row["camera"])
+    checking.landmark_hashes[row["key"]] = (
+        row["landmark_hash"],
+        row["camera"],
+        row["frontend"],
+    )
     FrameStatus(row["status"])
     if not np.isfinite(row["driven_m"]):
         raise MapCorruptError(f"driven_m is {row['driven_m']}")
 
 
 def _check_frame(checking: _Checking, row: Row) -> None:
-    expected, camera_key = checking.landmark_hashes.get(row["node"], (b"", -1))
-    camera = checking.cameras.get(camera_key)
+    expected, camera_key, frontend = checking.landmark_hashes.get(row["node"], (b"", -1, -1))
+    camera, kind = checking.cameras.get(camera_key), checking.kinds.get(frontend)
     name = checking.uuids.get((nodes, row["node"]), "?")
     if blob_hash(row["landmarks"]) != expected:
         raise MapCorruptError(f"the landmarks are not those of node {name}")
-    if camera is not None:
+    if camera is not None and kind is not None:
         checking.blobs += 1
-        decode_landmarks(row["landmarks"], camera)
+        decode_landmarks(row["landmarks"], camera, kind)
     if row["thumbnail"] is not None:
         checking.blobs += 1
         decode_thumbnail(row["thumbnail"])

@@ -26,7 +26,7 @@ from engram.maps.view import View
 
 DEFAULT_CACHE_BYTES = 256 * 2**20
 # Of a landmark in memory: 2 + 1 + 1 + 3 floats, descriptor, octave.
-_BYTES_PER_LANDMARK = 61
+_BYTES_PER_LANDMARK = 29  # its descriptor not counted
 _BYTES_PER_FRAME = 1500
 # Stored nodes read at a time: about 2 MB.
 _STORED_BATCH = 64
@@ -125,7 +125,7 @@ class FrameReader:
         if camera is None:
             raise MapCorruptError(f"node {stored.node.id}: its camera is missing")
         try:
-            landmarks = decode_landmarks(stored.landmarks, camera)
+            landmarks = decode_landmarks(stored.landmarks, camera, stored.descriptor)
         except MapCorruptError as error:
             raise MapCorruptError(f"node {stored.node.id}: {error}") from error
         return Frame(
@@ -202,7 +202,7 @@ class FrameReader:
         if blob_hash(blob) != row["landmark_hash"]:
             raise MapCorruptError(f"node {node}: its landmarks are not those that were saved")
         try:
-            landmarks = decode_landmarks(blob, camera)
+            landmarks = decode_landmarks(blob, camera, frontend[0])
             status = FrameStatus(row["status"])
         except (MapCorruptError, ValueError) as error:
             raise MapCorruptError(f"node {node}: {error}") from error
@@ -279,4 +279,5 @@ _NODE_UUID = nodes.columns.keys().index("uuid")
 
 
 def _size_bytes(frame: Frame) -> int:
-    return _BYTES_PER_FRAME + _BYTES_PER_LANDMARK * len(frame.landmarks)
+    landmarks = frame.landmarks
+    return _BYTES_PER_FRAME + _BYTES_PER_LANDMARK * len(landmarks) + landmarks.descriptors.nbytes

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Select, func, select, union
 
 from engram.errors import MapCorruptError
-from engram.frontend import DescriptorKind
+from engram.frontend import DescriptorKind, feature_kind
 from engram.frontend.blobs import content_digest
 from engram.geometry import CameraId, StereoCamera
 from engram.graph.model import (
@@ -104,13 +104,10 @@ def load_cameras(connection: Connection) -> dict[int, StereoCamera]:
 def load_frontends(connection: Connection) -> dict[int, tuple[DescriptorKind, str]]:
     """Descriptor kind and hash of all front-ends by key."""
     rows = connection.execute(select(frontends).order_by(frontends.c.key))
-    try:
-        return {
-            row["key"]: (DescriptorKind(row["descriptor"]), row["hash"])
-            for row in verified(frontends, rows)
-        }
-    except ValueError as error:
-        raise MapCorruptError(f"table frontends: {error}") from error
+    return {
+        row["key"]: (feature_kind(row["descriptor"]).name, row["hash"])
+        for row in verified(frontends, rows)
+    }
 
 
 def descriptor_of(connection: Connection, view: View) -> DescriptorKind | None:

@@ -70,7 +70,7 @@ def train_vocabulary(
     Equal input and configuration give an equal vocabulary on every machine.
 
     Args:
-        frames: the descriptors (N, 32) uint8 of each frame. Frames should show places apart from
+        frames: the descriptors (N, B) uint8 of each frame. Frames should show places apart from
             each other, as if drawn at random from where robots drive: words are counted per frame.
         kind: their kind.
         config: settings.

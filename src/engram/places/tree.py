@@ -22,7 +22,7 @@ class TreeArrays:
     """A tree as it is stored.
 
     Attributes:
-        centres: (M, 32) uint8, one per node in breadth-first order; the root's means nothing.
+        centres: (M, B) uint8, one per node in breadth-first order; the root's means nothing.
         bounds: (M + 1,) int32, the children of node n are nodes bounds[n] up to bounds[n + 1];
             a node without children is a leaf, and leaves are the words, in this order.
     """
@@ -37,7 +37,7 @@ class TreeArrays:
 
     @property
     def leaf_centres(self) -> NDArray[np.uint8]:
-        """(W, 32) uint8, the words themselves."""
+        """(W, B) uint8, the words themselves."""
         return self.centres[np.flatnonzero(np.diff(self.bounds) == 0)]
 
     def searchable(self) -> _core.WordTree:
@@ -68,7 +68,7 @@ def grow_tree(
     descriptors whatever the clusters above came to.
 
     Args:
-        descriptors: (N, 32) uint8, N > 0.
+        descriptors: (N, B) uint8, N > 0.
         words: how many leaves are wanted; there are fewer where descriptors are equal or few.
         depth: levels below the root.
         iterations: at most so many of Lloyd's iterations for each cluster.
@@ -78,7 +78,7 @@ def grow_tree(
     branching = round(words ** (1 / depth))
     # Clusters of the level above, each the rows of its members, in the order of its siblings.
     clusters = [np.arange(len(descriptors))]
-    levels: list[NDArray[np.uint8]] = [np.zeros((1, 32), np.uint8)]
+    levels: list[NDArray[np.uint8]] = [np.zeros((1, descriptors.shape[1]), np.uint8)]
     children: list[NDArray[np.int64]] = []
     for level in range(depth):
         sizes = np.array([len(cluster) for cluster in clusters])
@@ -110,7 +110,7 @@ def _split(
     iterations: int,
     seed: int,
 ) -> tuple[NDArray[np.uint8], list[NDArray[np.int64]]]:
-    """Centres (K, 32) uint8 of a cluster's parts, and the rows of the members of each.
+    """Centres (K, B) uint8 of a cluster's parts, and the rows of the members of each.
 
     A cluster that is not to be parted goes on as its own only child, so that leaves are all of
     one depth.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.errors import IncompatibleError, InputError, MapCorruptError
-from engram.frontend import DescriptorKind
+from engram.frontend import DescriptorKind, feature_kind
 from engram.places.chow_liu import WordStatistics
 from engram.places.tree import TreeArrays
 
@@ -68,20 +68,20 @@ class Vocabulary:
         return len(self.statistics)
 
     def quantise(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """The word (N,) int32 of each descriptor (N, 32) uint8."""
+        """The word (N,) int32 of each descriptor (N, B) uint8."""
         return self._search.quantise(descriptors, self.beam)
 
     def words_of(self, descriptors: NDArray[np.uint8], kind: DescriptorKind) -> NDArray[np.int32]:
         """The distinct words that an image shows, rising.
 
         Args:
-            descriptors: (N, 32) uint8, possibly none.
+            descriptors: (N, B) uint8, possibly none.
             kind: of which kind they are.
 
         Raises:
             IncompatibleError: the vocabulary is of another kind.
         """
-        if kind is not self.descriptor:
+        if kind != self.descriptor:
             raise IncompatibleError(
                 f"the descriptors are {kind}, the vocabulary's words {self.descriptor}; train one "
                 f"for {kind} with engram vocabulary train, or use the default one"
@@ -145,9 +145,21 @@ def decode_vocabulary(body: bytes) -> Vocabulary:
 
 @cache
 def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
-    """The vocabulary that ships with the package: small, trained on simulated drives only."""
+    """The vocabulary of a map that has none of its own.
+
+    For the kinds of this package a small one, trained on simulated drives only; for others one of
+    a single word, by which all places look alike.
+
+    Raises:
+        IncompatibleError: the kind is unknown here.
+    """
     file = resources.files("engram.places") / "data" / f"{descriptor}.safetensors"
-    return decode_vocabulary(file.read_bytes())
+    if file.is_file():
+        return decode_vocabulary(file.read_bytes())
+    root_and_word = np.zeros((2, feature_kind(descriptor).descriptor_bytes), np.uint8)
+    tree = TreeArrays(root_and_word, np.array([1, 2, 2], np.int32))
+    one, none = np.ones(1, np.int32), np.zeros(1, np.int32)
+    return Vocabulary(descriptor, tree, WordStatistics(2, one, none - 1, none), (), trained_on="–")
 
 
 def _metadata(body: bytes) -> dict[str, Any]:
@@ -186,8 +198,14 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
             raise ValueError("a sample shows a word that there is not")
         if (np.diff(sample) <= 0).any():
             raise ValueError("the words of a sample do not rise")
+    kind = feature_kind(about["descriptor"])
+    if arrays["centres"].shape[1] != kind.descriptor_bytes:
+        raise ValueError(
+            f"its words have {arrays['centres'].shape[1]} bytes, descriptors of kind {kind.name} "
+            f"{kind.descriptor_bytes}"
+        )
     vocabulary = Vocabulary(
-        DescriptorKind(about["descriptor"]),
+        kind.name,
         TreeArrays(arrays["centres"], arrays["bounds"]),
         statistics,
         samples,
@@ -196,7 +214,7 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
     )
     if vocabulary.tree.words != len(statistics):
         raise ValueError("its tree has another number of words than its statistics")
-    vocabulary.quantise(np.zeros((1, 32), np.uint8))  # refuses a beam that is out of range
+    vocabulary.quantise(arrays["centres"][:1])  # refuses a beam that is out of range
     return vocabulary
 
 

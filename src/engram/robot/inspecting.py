@@ -24,7 +24,7 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
             "format_version": info.format_version,
             "revision": info.revision,
             "content_hash": store.content_hash(),
-            "descriptor": None if info.descriptor is None else info.descriptor.value,
+            "descriptor": info.descriptor,
             "sessions": info.sessions,
             "robots": sorted({session.robot for session in opened.sessions.values()}),
             "cameras": info.cameras,

@@ -8,6 +8,7 @@ from pathlib import Path
 from engram.config import load_toml
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, FrontendConfig
+from engram.frontend.features import fitted_matcher
 from engram.localiser import LocaliserConfig
 from engram.mapper import MapperConfig
 from engram.odometry import OdometryConfig
@@ -23,10 +24,26 @@ class Settings:
     mapper: MapperConfig = field(default_factory=MapperConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
-        """These settings with a map's kind of descriptor; None leaves them as they are."""
-        if descriptor is None or descriptor is self.frontend.descriptor:
-            return self
-        return replace(self, frontend=replace(self.frontend, descriptor=descriptor))
+        """These settings for a map's kind of descriptor; None for the one they have.
+
+        What is not set of matching becomes what suits the kind.
+
+        Raises:
+            ConfigError: the kind is unknown here.
+        """
+        before = self.frontend.descriptor
+        frontend = self.frontend
+        if descriptor not in {None, before}:
+            frontend = replace(frontend, descriptor=descriptor)
+        kind = frontend.descriptor
+        odometry = fitted_matcher(self.odometry.matcher, before, kind)
+        localiser = fitted_matcher(self.localiser.matcher, before, kind)
+        return replace(
+            self,
+            frontend=frontend,
+            odometry=replace(self.odometry, matcher=odometry),
+            localiser=replace(self.localiser, matcher=localiser),
+        )
 
 
 def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:
@@ -40,13 +57,7 @@ def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:
         ConfigError: the file cannot be read, or a setting is unknown or out of range.
     """
     settings = Settings() if path is None else _read_settings(path)
-    if descriptor is None:
-        return settings
-    try:
-        return settings.for_descriptor(DescriptorKind(descriptor))
-    except ValueError:
-        known = ", ".join(DescriptorKind)
-        raise ConfigError(f"descriptor {descriptor!r} is unknown; known: {known}") from None
+    return settings.for_descriptor(None if descriptor is None else DescriptorKind(descriptor))
 
 
 def _read_settings(path: Path) -> Settings:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engram.config import to_dict
 from engram.errors import IncompatibleError, InputError, MapCorruptError
-from engram.frontend import DescriptorKind, Frame, FrameStatus
+from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus
 from engram.graph.model import NodeId
 from engram.maps import MapStore
 from engram.places import (
@@ -83,7 +83,7 @@ def describe_vocabulary(map_path: Path, at: int | str | None = None) -> Vocabula
     """
     with OpenMap(MapStore.open(map_path, at=at)) as opened:
         own = opened.vocabulary
-        kind = opened.descriptor or DescriptorKind.BRIEF
+        kind = opened.descriptor or BRIEF
         return _report(own or default_vocabulary(kind), default=own is None)
 
 
@@ -115,7 +115,7 @@ def train_map_vocabulary(
     for at, source in enumerate(sources or [map_path]):
         for frame in _frames(source, kind):
             kind = kind or frame.descriptor
-            if frame.descriptor is not kind:
+            if frame.descriptor != kind:
                 raise IncompatibleError(
                     f"{source} has {frame.descriptor} descriptors, the map {kind}; a vocabulary "
                     "has words of one kind"

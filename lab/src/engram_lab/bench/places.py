@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import DescriptorKind
+from engram.frontend import BRIEF
 from engram.places import (
     DenseTable,
     FabMap,
@@ -52,7 +52,7 @@ def prepare_places_query(
     queries = [leaves[rng.choice(_drawn(frequency, rng), _LANDMARKS)] for _ in range(_QUERIES)]
 
     def words_of(i: int) -> NDArray[np.int32]:
-        return vocabulary.words_of(queries[i % _QUERIES], DescriptorKind.BRIEF)
+        return vocabulary.words_of(queries[i % _QUERIES], BRIEF)
 
     def ours(i: int) -> dict[str, int]:
         words = words_of(i)
@@ -87,7 +87,7 @@ def prepare_vocabulary_train(data: BenchData, plain: PlainPipeline | None) -> Pr
     config = TrainingConfig(words=_TRAINING_WORDS)
 
     def ours(_: int) -> dict[str, int]:
-        vocabulary = train_vocabulary(frames, DescriptorKind.BRIEF, config)
+        vocabulary = train_vocabulary(frames, BRIEF, config)
         return {"words": len(vocabulary), "descriptors": _TRAINING_FRAMES * _LANDMARKS}
 
     return Prepared(ours)
@@ -104,7 +104,7 @@ def made_up_vocabulary(rng: np.random.Generator) -> Vocabulary:
     both = np.where(parents >= 0, np.minimum(seen, seen[parents]) // 2, 0).astype(np.int32)
     statistics = WordStatistics(images, seen, parents, both)
     samples = tuple(_drawn(frequency, rng) for _ in range(100))
-    return Vocabulary(DescriptorKind.BRIEF, _made_up_tree(rng), statistics, samples)
+    return Vocabulary(BRIEF, _made_up_tree(rng), statistics, samples)
 
 
 def _made_up_tree(rng: np.random.Generator) -> TreeArrays:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from engram.errors import EngramError, MapCorruptError
-from engram.frontend import DescriptorKind
+from engram.errors import EngramError, IncompatibleError, MapCorruptError
+from engram.frontend import DescriptorKind, feature_kind
 from engram.geometry import SE3, StereoCamera
 from engram.graph.clock import check_longitude, check_zone
 from engram.graph.model import Clock
@@ -49,7 +49,7 @@ class FrameLogHeader:
             "robot": self.info.robot,
             "longitude_deg": self.info.longitude_deg,
             "zone": self.info.zone,
-            "descriptor": self.descriptor.value,
+            "descriptor": self.descriptor,
             "frontend": self.frontend,
             "odometry": self.odometry,
             "frames": self.frames,
@@ -73,6 +73,7 @@ class FrameLogHeader:
 
         Raises:
             MapCorruptError: the text is no such header.
+            IncompatibleError: its kind of descriptor is unknown here.
         """
         try:
             values = json.loads(text)
@@ -90,11 +91,13 @@ class FrameLogHeader:
             return FrameLogHeader(
                 info,
                 camera,
-                DescriptorKind(values["descriptor"]),
+                feature_kind(values["descriptor"]).name,
                 _text(values["frontend"]),
                 _text(values["odometry"]),
                 _text(values["frames"]),
             )
+        except IncompatibleError:
+            raise
         except (ValueError, KeyError, TypeError, RecursionError, EngramError) as error:
             raise MapCorruptError(f"the frame log's header cannot be read: {error}") from error
 

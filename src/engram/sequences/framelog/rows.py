@@ -132,7 +132,7 @@ def decode_frame(
         return Frame(
             stamp_ns=step.stamp_ns,
             camera=header.camera,
-            landmarks=decode_landmarks(landmarks, header.camera),
+            landmarks=decode_landmarks(landmarks, header.camera, header.descriptor),
             descriptor=header.descriptor,
             frontend=header.frontend,
             status=step.status,

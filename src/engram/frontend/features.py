@@ -1,0 +1,235 @@
+"""The kinds of features: how landmarks are detected and described, in one table.
+
+Everything above asks this table for the width of a descriptor and never assumes one. Another
+package adds a kind by an entry point of the group `engram.features` that names a `FeatureKind`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.errors import IncompatibleError
+from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, StereoPair
+from engram.frontend.matching import MatcherConfig
+
+if TYPE_CHECKING:
+    from engram.frontend.frontend import FrontendConfig
+
+ENTRY_POINTS = "engram.features"
+
+# OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 were measured best for
+# corners that have no size of their own.
+_TEBLID_SCALE_FACTOR = 5.0
+_TEBLID_KEYPOINT_SIZE_PX = 7.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keypoints:
+    """Where a stereo pair has landmarks, before they are rounded to what is stored.
+
+    Attributes:
+        pixels: (N, 2) float32, left u, v, px.
+        disparity_px: (N,) float32, > 0.
+        sigma_px: (N,) float32, standard deviation of the disparity.
+        octaves: (N,) uint8, pyramid level of detection, 0 is full resolution.
+        candidates: points of the left image for which a disparity was sought.
+        descriptors: (N, B) uint8 where the detector describes in passing, else None.
+    """
+
+    pixels: NDArray[np.float32]
+    disparity_px: NDArray[np.float32]
+    sigma_px: NDArray[np.float32]
+    octaves: NDArray[np.uint8]
+    candidates: int
+    descriptors: NDArray[np.uint8] | None = None
+
+
+class Detect(Protocol):
+    """Finds landmarks in a stereo pair."""
+
+    def __call__(self, pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
+        """At most `landmarks` keypoints of a pair whose images have been checked."""
+        ...
+
+
+class Describe(Protocol):
+    """Describes points of an image."""
+
+    def __call__(
+        self, image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]:
+        """Descriptors (N, B) uint8, B as the kind's `descriptor_bytes`.
+
+        Args:
+            image: (h, w) uint8 grey.
+            pixels: (N, 2) float32 u, v, px of the full-size image.
+            octaves: (N,) uint8, the pyramid level at which each point was found; each level is
+                half the size of the one before.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureKind:
+    """One kind of feature: binary descriptors, compared by the number of bits that differ.
+
+    Attributes:
+        name: what settings, maps and frame logs call it.
+        descriptor_bytes: width of a descriptor, a multiple of 8 up to 2048.
+        detect: finds the landmarks.
+        describe: describes them, where `detect` does not do so in passing.
+        matcher: settings of matching that suit it; they take the place of those left at their
+            defaults.
+    """
+
+    name: DescriptorKind
+    descriptor_bytes: int
+    detect: Detect
+    describe: Describe
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+
+    def __post_init__(self) -> None:
+        if not (0 < self.descriptor_bytes <= 2048 and self.descriptor_bytes % 8 == 0):
+            raise IncompatibleError(
+                f"feature kind {self.name!r} has descriptors of {self.descriptor_bytes} bytes, "
+                "must be a multiple of 8 up to 2048"
+            )
+
+
+def detect_corners(pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
+    """FAST corners with a disparity, the best of each cell of a grid first (SPEC §2.1–2.3)."""
+    return _corners(pair, config, landmarks, with_brief=False)
+
+
+def detect_corners_with_brief(
+    pair: StereoPair, config: FrontendConfig, landmarks: int
+) -> Keypoints:
+    """`detect_corners`, with what `describe_brief` gives for them, in one pass."""
+    return _corners(pair, config, landmarks, with_brief=True)
+
+
+def _corners(
+    pair: StereoPair, config: FrontendConfig, landmarks: int, *, with_brief: bool
+) -> Keypoints:
+    pixels, disparity_px, sigma_px, descriptors, octaves, corners = _core.extract(
+        pair.left,
+        pair.right,
+        landmarks=landmarks,
+        octaves=config.octaves,
+        fast_threshold=config.fast_threshold,
+        cell_px=config.cell_px,
+        with_descriptors=with_brief,
+        max_disparity_px=config.max_disparity_px,
+        min_disparity_px=config.min_disparity_px,
+        uniqueness=config.uniqueness,
+        max_residual=config.max_residual,
+        max_sigma_px=config.max_sigma_px,
+        sigma_floor_px=config.sigma_floor_px,
+        sigma_scale=config.sigma_scale,
+    )
+    described = descriptors if with_brief else None
+    return Keypoints(pixels, disparity_px, sigma_px, octaves, corners, described)
+
+
+def describe_brief(
+    image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """BRIEF-256, upright: descriptors (N, 32) uint8.
+
+    Source: Calonder et al., ECCV 2010. Pattern: `src/core/kernels/brief_pattern.inc`.
+    """
+    descriptors = np.empty((len(pixels), 32), dtype=np.uint8)
+    level = image
+    for octave in range(int(octaves.max(initial=0)) + 1):
+        if octave:
+            level = _core.halve(level)
+        here = octaves == octave
+        positions = np.rint((pixels[here] + 0.5) / 2**octave - 0.5).astype(np.int16)
+        descriptors[here] = _core.describe(_core.smooth(level), positions)
+    return descriptors
+
+
+def describe_teblid(
+    image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """TEBLID-256, upright, by OpenCV: descriptors (N, 32) uint8.
+
+    Source: Suárez et al., Revisiting Binary Local Image Description for Resource Limited Devices,
+    RA-L 2021.
+    """
+    import cv2
+
+    if not len(pixels):
+        return np.empty((0, 32), dtype=np.uint8)
+    extra: Any = cv2.xfeatures2d  # OpenCV's stubs leave TEBLID out
+    engine = extra.TEBLID_create(_TEBLID_SCALE_FACTOR, extra.TEBLID_SIZE_256_BITS)
+    keypoints = [
+        cv2.KeyPoint(float(u), float(v), _TEBLID_KEYPOINT_SIZE_PX * 2 ** int(octave), 0)
+        for (u, v), octave in zip(pixels, octaves, strict=True)
+    ]
+    kept, descriptors = engine.compute(image, keypoints)
+    assert len(kept) == len(keypoints), "TEBLID keeps all points inside the image"
+    return np.asarray(descriptors, dtype=np.uint8)
+
+
+FEATURES: dict[DescriptorKind, FeatureKind] = {
+    kind.name: kind
+    for kind in (
+        FeatureKind(BRIEF, 32, detect_corners_with_brief, describe_brief),
+        FeatureKind(TEBLID, 32, detect_corners, describe_teblid),
+    )
+}
+
+
+def feature_kind(name: str) -> FeatureKind:
+    """The kind of that name, from the table or from an installed package that brings it.
+
+    Raises:
+        IncompatibleError: there is no such kind here.
+    """
+    known = FEATURES.get(DescriptorKind(name))
+    if known is not None:
+        return known
+    brought = _brought()
+    if name not in brought:
+        raise IncompatibleError(
+            f"descriptors of kind {name!r} are unknown here; known: "
+            f"{', '.join(sorted(FEATURES.keys() | brought))}; install the package that adds them"
+        )
+    return FEATURES.setdefault(DescriptorKind(name), brought[name].load())
+
+
+@lru_cache(maxsize=1)
+def _brought() -> dict[str, Any]:
+    """What installed packages add, by name, not yet loaded."""
+    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+
+
+def fitted_matcher(
+    matcher: MatcherConfig, before: DescriptorKind, kind: DescriptorKind
+) -> MatcherConfig:
+    """Settings of matching for another kind; what was set on purpose stays.
+
+    Args:
+        matcher: settings made for features of the kind `before`.
+        before: that kind.
+        kind: the kind that they are to suit.
+
+    Raises:
+        IncompatibleError: there is no such kind here.
+    """
+    untouched = (MatcherConfig(), feature_kind(before).matcher)
+    suited = feature_kind(kind).matcher
+    changes = {
+        name: getattr(suited, name)
+        for name in (one.name for one in fields(matcher))
+        if any(getattr(matcher, name) == getattr(one, name) for one in untouched)
+    }
+    return replace(matcher, **changes)
