@@ -161,6 +161,18 @@ def test_a_robot_goes_out_with_the_centre_and_hands_back_what_it_added(tmp_path,
     assert_sound(centre)
 
 
+def test_the_author_is_whoever_added_something(tmp_path, fleet):
+    centre, robot = tmp_path / "centre.engram", tmp_path / "robot.engram"
+    merged(centre, fleet["first"][0])
+    shutil.copy(centre, robot)
+    robot_map(robot, np.arange(6, 40, 0.8), 0, name="r9", day=9)
+    merged(centre, robot)
+    with MapStore.open(centre) as store:
+        first, second = store.log()
+    assert (first.author, second.author) == ("r1", "r9")
+    assert second.message == "merge r9"
+
+
 def test_later_robots_localise_in_what_earlier_ones_of_the_merge_brought(tmp_path, fleet):
     robot = tmp_path / "two-days.engram"
     shutil.copy(fleet["other"][0], robot)

@@ -6,7 +6,11 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
+import msgspec
+
+from engram.config import check_bounds
 from engram.errors import ConfigError
 from engram.fleet.merge.behind_gaps import FoundNode, look_along, position_behind_gap
 from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
@@ -62,11 +66,8 @@ class MergeOptions:
         lanes, rounds: the budget of each replayed frame, lost or not; a count, never a deadline,
             so that the same input gives the same map.
         relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
-        author: who merges; None for the robots whose drives are handed in.
-        sure_inliers: a node that other drives of the robot's map matched is omitted only for a
-            match of so many inliers: what localised by the node need not localise by another that
-            the node itself barely matches. 0 omits for every match, as [G16] does. What it
-            costs and brings is in docs/results-fleet.md.
+        author: who merges; None for the robots whose drives are added to.
+        sure_inliers: see its description.
     """
 
     policy: str = "recall"
@@ -74,17 +75,24 @@ class MergeOptions:
     rounds: int = 4
     relocaliser: str | None = "fabmap"
     author: str | None = None
-    sure_inliers: int = 40
+    sure_inliers: Annotated[
+        int,
+        msgspec.Meta(
+            ge=0,
+            description="a node that other drives of the robot's map matched is omitted only for a "
+            "match of so many inliers: what localised by the node need not localise by another "
+            "that the node itself barely matches. 0 omits for every match, as [G16] does",
+        ),
+    ] = 40
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         check_for_robot(self.policy)
         Budget(self.lanes, self.rounds)  # refuses what is no budget
         if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
             raise ConfigError(
                 f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
             )
-        if self.sure_inliers < 0:
-            raise ConfigError(f"sure_inliers is {self.sure_inliers}, must be 0 or more")
 
 
 class Replay:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,17 +56,26 @@ def string_segments(nodes: Sequence[Node], edges: Iterable[Edge]) -> list[Segmen
     Source: SPEC §7 MERGE 2; [G16] §V-A, Algorithm 1.
     """
     known = {node.id: node for node in nodes}
-    steps = _steps(known, edges)
-    chains = _Chains()
-    for a, b in steps:
-        chains.link(a, b)
-    strung = [_segment(chain, known, steps) for chain in chains.all()]
-    strung += [Segment((node,), ()) for node in known.values() if node.id not in chains]
+    following = _steps(known, edges)
+    entered = {after for after, _ in following.values()}
+    strung = [_from(node, known, following) for node in nodes if node.id not in entered]
     return sorted(strung, key=lambda segment: segment.key)
 
 
-def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[tuple[NodeId, NodeId], Edge]:
-    """The odometry edges that go on, by (earlier, later) node.
+def _from(
+    first: Node, known: dict[NodeId, Node], following: dict[NodeId, tuple[NodeId, Edge]]
+) -> Segment:
+    """The chain that begins in a node; steps lead on in time, so that it ends."""
+    nodes, steps = [first], []
+    while (step := following.get(nodes[-1].id)) is not None:
+        after, edge = step
+        nodes.append(known[after])
+        steps.append(edge)
+    return Segment(tuple(nodes), tuple(steps))
+
+
+def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[NodeId, tuple[NodeId, Edge]]:
+    """The odometry edges that go on: from each node the later one, and the edge between them.
 
     Where edges branch, the one with the smaller time step goes on, then the smaller UUIDs: so each
     node has one edge at most to an earlier node and one to a later.
@@ -83,70 +90,10 @@ def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[tuple[NodeI
         oriented.append((b.stamp_ns - a.stamp_ns, a.id, b.id, edge))
     # An edge laid both ways between the same nodes: the key of the edge decides which is taken.
     oriented.sort(key=lambda one: (one[0], one[1], one[2], one[3].a))
-    chosen: dict[tuple[NodeId, NodeId], Edge] = {}
-    left: set[NodeId] = set()
+    chosen: dict[NodeId, tuple[NodeId, Edge]] = {}
     entered: set[NodeId] = set()
     for _, a_id, b_id, edge in oriented:
-        if a_id not in left and b_id not in entered:
-            chosen[a_id, b_id] = edge
-            left.add(a_id)
+        if a_id not in chosen and b_id not in entered:
+            chosen[a_id] = b_id, edge
             entered.add(b_id)
     return chosen
-
-
-class _Chains:
-    """[G16] Algorithm 1 by cases; the comments of its lines 6 and 8 are swapped in the paper.
-
-    Edges come in any order, as they do from a map; each node has one edge to an earlier node and
-    one to a later at most.
-    """
-
-    def __init__(self) -> None:
-        self._ending: dict[NodeId, deque[NodeId]] = {}
-        self._beginning: dict[NodeId, deque[NodeId]] = {}
-        self._held: set[NodeId] = set()
-
-    def __contains__(self, node: NodeId) -> bool:
-        return node in self._held
-
-    def link(self, a: NodeId, b: NodeId) -> None:
-        """An edge from a to b."""
-        before, after = self._ending.pop(a, None), self._beginning.pop(b, None)
-        if before is not None and after is not None:
-            self._fuse(before, after)
-        elif before is not None:
-            before.append(b)
-            self._ending[b] = before
-        elif after is not None:
-            after.appendleft(a)
-            self._beginning[a] = after
-        else:
-            self._beginning[a] = self._ending[b] = deque((a, b))
-        self._held |= {a, b}
-
-    def _fuse(self, before: deque[NodeId], after: deque[NodeId]) -> None:
-        """The shorter chain moves: fusing costs n log n altogether."""
-        first, last = before[0], after[-1]
-        if len(before) >= len(after):
-            before.extend(after)
-            fused = before
-        else:
-            after.extendleft(reversed(before))
-            fused = after
-        self._beginning[first] = self._ending[last] = fused
-
-    def all(self) -> Iterable[deque[NodeId]]:
-        """The chains."""
-        return self._beginning.values()
-
-
-def _segment(
-    chain: deque[NodeId],
-    known: dict[NodeId, Node],
-    steps: dict[tuple[NodeId, NodeId], Edge],
-) -> Segment:
-    ids = list(chain)
-    return Segment(
-        tuple(known[one] for one in ids),
-        tuple(steps[pair] for pair in pairwise(ids)),
-    )

@@ -61,7 +61,7 @@ def merge_one(
     report.known = len(robot.nodes) - len(new) - report.known_omissions
     if new or merge.has_more():
         check_readable(robot, new)
-        with store.begin_revision(**_about(robot, settings, options)) as merge.writer:
+        with store.begin_revision(**_about(merge, new, settings, options)) as merge.writer:
             with monitor.stage(f"merge {robot.name}", len(new)) as stage:
                 _take_over(merge, new, Replay(merge, settings, options, stage))
             monitor.check()
@@ -77,18 +77,37 @@ def merge_one(
     return report
 
 
-def _about(robot: HandedIn, settings: Settings, options: MergeOptions) -> dict[str, Any]:
+def _about(
+    merge: Merge, new: Sequence[Node], settings: Settings, options: MergeOptions
+) -> dict[str, Any]:
     """Who merged what and how: kept with the revision, and free of where it happened."""
-    names = ", ".join(robot.robots)
+    names = ", ".join(_contributors(merge, new))
     return {
         "author": options.author or names or "nobody",
         "message": f"merge {names or 'a map without drives'}",
         "configuration": {
-            "merge": {"source": robot.content_hash, **to_dict(options)},
+            "merge": {"source": merge.robot.content_hash, **to_dict(options)},
             "settings": to_dict(settings),
             "engram": __version__,
         },
     }
+
+
+def _contributors(merge: Merge, new: Sequence[Node]) -> list[str]:
+    """Whose drives bring nodes or ways that the centre lacks; all robots where none does."""
+    robot = merge.robot
+    saved = {node.session for node in new}
+    driven = {
+        entry.path
+        for entry in robot.contents.path_entries
+        if merge.new_entry(entry) is not None or not merge.knows(entry.node)
+    }
+    found = {
+        one.robot
+        for one in robot.sessions
+        if one.id not in merge.centre.sessions or one.id in saved or path_id(one.id) in driven
+    }
+    return sorted(found) or robot.robots
 
 
 def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
