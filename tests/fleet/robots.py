@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,10 @@ from tests.mapping_rig import Mapped, map_simulated
 from tests.synthetic_world import World, drive
 
 from engram.fleet.merge import MergeOptions, MergeReport, merge
+from engram.frontend import DescriptorKind
 from engram.geometry import SE3
-from engram.graph.model import Clock, NodeId
+from engram.graph.model import Clock, NodeId, Session
+from engram.maps import MapStore, StoredNode
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
 
 DAY_NS = 86_400_000_000_000
@@ -40,6 +44,37 @@ def merged(
     centre: Path, *robots: Path, asked: MergeOptions = OPTIONS, **options: object
 ) -> list[MergeReport]:
     return merge(centre, robots, asked, **options)
+
+
+def rewritten(
+    source: Path,
+    target: Path,
+    *,
+    session: Callable[[Session], Session] = lambda one: one,
+    node: Callable[[StoredNode], StoredNode] = lambda one: one,
+    descriptor: DescriptorKind | None = None,
+) -> Path:
+    """A copy of a map that remembers no attempt, with records changed on the way."""
+    with MapStore.open(source) as given, MapStore.create(target) as store:
+        contents, frontends = given.load(), given.frontends()
+        with store.begin_revision(author="tests", message="", configuration={}) as writer:
+            for one in contents.sessions:
+                kind, frontend = frontends[one.id]
+                writer.add_session(
+                    session(one),
+                    contents.cameras[one.camera],
+                    descriptor=descriptor or kind,
+                    frontend=frontend,
+                )
+            for stored in given.frames.stored(contents.nodes):
+                kept = replace(stored, descriptor=descriptor or stored.descriptor)
+                writer.add_node(node(kept))
+            for edge in contents.edges:
+                writer.add_edge(edge)
+            for entry in contents.path_entries:
+                writer.add_path_entry(entry)
+            writer.commit()
+    return target
 
 
 def truth_of(*maps: Mapped) -> dict[NodeId, SE3]:

@@ -17,7 +17,7 @@ from engram.fleet.merge.attempts import lacking
 from engram.graph.model import SessionId
 from engram.maps import AttemptArrays, MapStore
 
-from .robots import merged, robot_map
+from .robots import merged, rewritten, robot_map
 
 # Few values of each, so that attempts are often equal, or differ in one thing only.
 IDENTITIES = st.tuples(
@@ -107,8 +107,7 @@ def test_attempts_that_a_download_left_behind_are_carried_when_the_whole_map_com
 
 def test_attempts_alone_are_worth_a_revision(tmp_path, robot):
     centre, forgetful = tmp_path / "centre.engram", tmp_path / "forgetful.engram"
-    without_attempts(robot, forgetful)
-    merged(centre, forgetful)
+    merged(centre, rewritten(robot, forgetful))
     (report,) = merged(centre, robot)
     with MapStore.open(robot) as store:
         assert report.attempts == len(store.load().attempts) > 0
@@ -133,21 +132,3 @@ def test_attempts_at_a_node_that_was_taken_back_come_again_with_it_and_once(tmp_
     (report,) = merged(centre, robot)
     assert report.taken > 0
     assert remembered_in(centre, second) == before
-
-
-def without_attempts(source, target) -> None:
-    """A copy of a map that remembers no attempt."""
-    with MapStore.open(source) as given, MapStore.create(target) as store:
-        contents, frontends = given.load(), given.frontends()
-        with store.begin_revision(author="tests", message="", configuration={}) as writer:
-            for one in contents.sessions:
-                kind, frontend = frontends[one.id]
-                camera = contents.cameras[one.camera]
-                writer.add_session(one, camera, descriptor=kind, frontend=frontend)
-            for stored in given.frames.stored(contents.nodes):
-                writer.add_node(stored)
-            for edge in contents.edges:
-                writer.add_edge(edge)
-            for entry in contents.path_entries:
-                writer.add_path_entry(entry)
-            writer.commit()

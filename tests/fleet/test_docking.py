@@ -40,7 +40,7 @@ from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
 from engram.robot import MapOptions, Settings, map_drive, open_drive, session_of_drive
 
-from .robots import frame_log, merged, robot_map
+from .robots import frame_log, merged, rewritten, robot_map
 
 HOUR_NS = 3_600_000_000_000
 OLDER_FORMAT = Path(__file__).parents[1] / "maps" / "data" / "format-2.engram"
@@ -64,31 +64,6 @@ def hash_of(path: Path) -> str:
 def nodes_in(path: Path) -> int:
     with MapStore.open(path) as store:
         return store.info().nodes
-
-
-def rewritten(source: Path, target: Path, *, session=None, node=None, descriptor=None) -> Path:
-    """A copy of a map in which records were changed on the way."""
-    with MapStore.open(source) as given, MapStore.create(target) as store:
-        contents, frontends = given.load(), given.frontends()
-        with store.begin_revision(author="tests", message="", configuration={}) as writer:
-            for one in contents.sessions:
-                changed = one if session is None else session(one)
-                kind, frontend = frontends[one.id]
-                writer.add_session(
-                    changed,
-                    contents.cameras[one.camera],
-                    descriptor=descriptor or kind,
-                    frontend=frontend,
-                )
-            for stored in given.frames.stored(contents.nodes):
-                kept = replace(stored, descriptor=descriptor or stored.descriptor)
-                writer.add_node(kept if node is None else node(kept))
-            for edge in contents.edges:
-                writer.add_edge(edge)
-            for entry in contents.path_entries:
-                writer.add_path_entry(entry)
-            writer.commit()
-    return target
 
 
 def swapped(source: Path, target: Path, node: NodeId | None = None) -> tuple[Path, NodeId]:
