@@ -15,9 +15,10 @@ from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Session, session_id
 from engram.localiser import Budget, Localisation, Localiser
 from engram.mapper import Mapper, MappingStep, Saver
-from engram.maps import MapStore
+from engram.maps import Map, open_map
 from engram.odometry import GapFiller, Motion
-from engram.robot import OpenMap, Settings
+from engram.robot import Settings
+from engram.robot.localisers import localiser_in
 from engram.robot.mapping import loop_search
 
 
@@ -66,10 +67,9 @@ def map_simulated(
     **budget: int,
 ) -> Mapped:
     first = drive[0].frame
-    opening = MapStore.open_for_writing if path.exists() else MapStore.create
-    with opening(path) as store:
+    with open_map(path, create=True) as opened, opened.writing():
         session = session_for(drive, name, longitude_deg)
-        writer = store.begin_session(
+        writer = opened.begin_session(
             session,
             first.camera,
             descriptor=first.descriptor,
@@ -77,9 +77,9 @@ def map_simulated(
             author=name,
             configuration={},
         )
-        opened = OpenMap(store)
-        saver = Saver(writer, store.frames)
-        localiser = opened.localiser(
+        saver = Saver(writer, opened.frames)
+        localiser = localiser_in(
+            opened,
             first.camera,
             Settings(),
             policy=policy,
@@ -122,8 +122,9 @@ def localise_simulated(
     relocaliser: str | None = "exhaustive",
     budget: Budget | None = None,
 ) -> list[Localisation]:
-    with OpenMap(MapStore.open(path)) as opened:
-        localiser = opened.localiser(
+    with Map.open(path) as opened:
+        localiser = localiser_in(
+            opened,
             drive[0].frame.camera,
             Settings(),
             policy=policy,

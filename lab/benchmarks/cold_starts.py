@@ -38,9 +38,11 @@ from engram.localiser import (
     LocaliserConfig,
     Relocaliser,
 )
+from engram.maps import Map, open_map
 from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
-from engram.robot import MapOptions, OpenMap, Settings, map_drive, open_drive, open_map
+from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot.localisers import relocaliser_in
 from engram.robot.session import session_of_drive
 from engram.sequences import LoggedFrame
 from engram.sequences.trajectories import read_truth
@@ -101,13 +103,13 @@ class Town:
         axes: (N, 3) float64, viewing directions in the world.
     """
 
-    opened: OpenMap
+    opened: Map
     world_from_node: Sequence[SE3]
     centres: NDArray[np.float64]
     axes: NDArray[np.float64]
 
     @staticmethod
-    def of(opened: OpenMap, logs: Sequence[Path]) -> Town:
+    def of(opened: Map, logs: Sequence[Path]) -> Town:
         """The truth of a map that was made from these logs."""
         truths = {session_of_drive(open_drive(log)).id: read_truth(log) for log in logs}
         poses = []
@@ -146,7 +148,7 @@ class LiveDrive:
         self.frames = [entry for entry in sequence if isinstance(entry, LoggedFrame)]
         self.truth = [truth.at(entry.frame.stamp_ns) for entry in self.frames]
         self._town = town
-        self._matcher = FrameMatcher(town.opened.store.frames, config.matcher)
+        self._matcher = FrameMatcher(town.opened.frames, config.matcher)
         self._findable: dict[int, bool] = {}
 
     def findable(self, at: int) -> bool:
@@ -208,11 +210,11 @@ def cold_start(
     with Localiser(
         opened.graph,
         opened.path_memory,
-        opened.store.frames,
+        opened.frames,
         policy=POLICIES["path-near"](),
         budget=budget,
         relocaliser=relocaliser,
-        basin=MatchBasin.of(drive.camera.fx, opened.attempts),
+        basin=MatchBasin.of(drive.camera.fx, opened.basin_counts),
         live=drive.session,
     ) as localiser:
         gaps = GapFiller()
@@ -378,7 +380,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         def drives() -> Iterator[LiveDrive]:
             return (LiveDrive(logs[number], town, settings.localiser) for number in held_out)
 
-        relocaliser = opened.relocaliser(asked.relocaliser, settings.frontend.descriptor)
+        relocaliser = relocaliser_in(opened, asked.relocaliser, settings.frontend.descriptor)
         file = asked.out / f"{name}-{asked.relocaliser}.csv"
         budget = Budget(asked.lanes, lost_rounds=asked.rounds)
         starts = run_starts(town, drives(), file, asked.starts, relocaliser, budget)

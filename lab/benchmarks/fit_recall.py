@@ -28,6 +28,7 @@ from scipy.optimize import minimize
 
 from engram.frontend.matching import matcher_hash
 from engram.localiser import Budget, FrameMatcher
+from engram.maps import Map, open_map
 from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.ranking import (
     Foreseen,
@@ -38,7 +39,8 @@ from engram.ranking import (
     policy_named,
 )
 from engram.ranking.recall import RECALL, RecallConstants, RecallPolicy
-from engram.robot import OpenMap, Settings, open_map
+from engram.robot import Settings
+from engram.robot.localisers import localiser_in
 from engram_lab.cli.simulation import campaigns_folder
 from engram_lab.studies.building import GENEROUS, build_map, true_nodes
 from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
@@ -101,7 +103,7 @@ class Recording:
 
 
 def record(
-    opened: OpenMap, drive: EvaluatedDrive, known: Sequence[EvaluatedDrive], work: Path
+    opened: Map, drive: EvaluatedDrive, known: Sequence[EvaluatedDrive], work: Path
 ) -> Recorded:
     """Localises a drive that the map does not hold, attempting everything."""
     settings = Settings()
@@ -110,7 +112,7 @@ def record(
     )
     matcher = settings.localiser.matcher
     memo = MatchMemo(
-        FrameMatcher(opened.store.frames, matcher),
+        FrameMatcher(opened.frames, matcher),
         work / f"memo-{drive.name}.npz",
         matcher_hash(matcher),
     )
@@ -120,7 +122,8 @@ def record(
     frames, length_m = [], 0.0
     if start is None:
         return Recorded(drive.name, (), 0.0)
-    with opened.localiser(
+    with localiser_in(
+        opened,
         drive.camera,
         settings,
         policy=recording,

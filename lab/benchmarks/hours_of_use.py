@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from engram.graph.model import PathEntryKind
-from engram.maps import MapContents, MapStore
+from engram.maps import Map, MapContents
 
 _MINUTE_NS = 60 * 10**9
 _DAY_MIN = 24 * 60
@@ -41,7 +41,7 @@ def main() -> None:
     asked = parser.parse_args()
     matches = near = 0
     for path in asked.maps:
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             apart_min = minutes_apart(store.load())
         within = int((apart_min <= asked.window).sum())
         print(f"{path}: {within} of {len(apart_min)} matches")

@@ -21,7 +21,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from engram.maps import MapStore
+from engram.maps import Map, check_file
 
 # The child tells when a checkpoint is about to be committed and when it is done.
 _CHILD = """
@@ -87,13 +87,13 @@ def kill_once(
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.engram"
         seen = _run_and_kill(path, drive, frames, rng, within_commit)
-        sound = MapStore.check(path).sound
-        with MapStore.open(path) as store:
+        sound = check_file(path).sound
+        with Map.open(path) as store:
             interrupted = store.interrupted()
         nodes = interrupted[0].nodes if interrupted else 0
         ended = "not begun"
         if interrupted and seal:
-            with MapStore.open_for_writing(path) as store:
+            with Map.open(path, writes=True) as store:
                 store.seal(interrupted[0].session.id)
             ended = "sealed"
         elif interrupted:
@@ -108,7 +108,7 @@ def kill_once(
             sound,
             bool(interrupted),
             ended,
-            MapStore.check(path).sound,
+            check_file(path).sound,
         )
 
 

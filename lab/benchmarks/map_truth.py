@@ -25,8 +25,8 @@ from engram.geometry import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import EdgeKind
 from engram.localiser import Position
-from engram.maps import MapStore
-from engram.robot import MapOptions, OpenMap, Settings, map_drive, open_drive
+from engram.maps import Map
+from engram.robot import MapOptions, Settings, map_drive, open_drive
 from engram_lab.cli.simulation import campaigns_folder
 from engram_lab.studies.drives import EvaluatedDrive, drives_of
 from engram_lab.studies.starting import TrueNodes
@@ -49,7 +49,7 @@ def judge(drives: list[EvaluatedDrive], path: Path) -> int:
     truths = {drive.session.id: drive.truth() for drive in drives}
     errors: dict[EdgeKind, list[float]] = {}
     joined: Counter[EdgeKind] = Counter()
-    with OpenMap(MapStore.open(path)) as opened:
+    with Map.open(path) as opened:
         true = TrueNodes(opened, truths)
         for edge in opened.graph.edges:
             a, b = true.pose(edge.a), true.pose(edge.b)
@@ -70,7 +70,7 @@ def judge(drives: list[EvaluatedDrive], path: Path) -> int:
     return joined.total() - joined[EdgeKind.ODOMETRY]
 
 
-def what_is_near(opened: OpenMap, true: TrueNodes) -> str:
+def what_is_near(opened: Map, true: TrueNodes) -> str:
     """One line about the candidates of a robot that stands at nodes of the map."""
     graph = opened.graph
     stands = np.random.default_rng(0).permutation(len(graph))[:STANDS]

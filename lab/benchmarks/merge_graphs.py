@@ -55,8 +55,7 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
-from engram.maps import MapStore
-from engram.robot import OpenMap
+from engram.maps import Map, check_file
 
 OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")
 # Turn about: every match omits; as by default; what other drives rely on is never omitted.
@@ -183,7 +182,7 @@ def random_fleet(seed: int) -> list[RandomMap]:
 def write(made: RandomMap, path: Path, order: int) -> None:
     """The map's file; `order` decides in which order the rows come."""
     rng = random.Random(order)
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         about = {"author": "robot", "message": "", "configuration": {}}
         with store.begin_revision(**about) as writer:
             for one in shuffled(made.sessions, rng):
@@ -213,17 +212,17 @@ def merged(centre: Path, robot: Path, seed: int) -> MergeReport:
 
 def parts(path: Path) -> tuple[dict[NodeId, int], int]:
     """The part in which each node handed in lies, itself or its equivalent; and how many."""
-    with OpenMap(MapStore.open(path)) as opened:
+    with Map.open(path) as opened:
         labels = opened.graph.components()
         found = {node.id: int(labels[at]) for at, node in enumerate(opened.graph.nodes)}
-        for omission in opened.store.omissions().values():
+        for omission in opened.omissions.values():
             found[omission.omitted] = found[omission.node]
     return found, int(labels.max(initial=-1)) + 1
 
 
 def remembered(path: Path) -> Counter[tuple[SessionId, int, int, bool, int]]:
     """The remembered attempts of a map, by what carrying them over leaves alone."""
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         contents = store.load()
     made = contents.attempts
     sessions = [contents.sessions[at].id for at in made.session]
@@ -269,7 +268,7 @@ def violations(seed: int, case: Case) -> Iterator[str]:
             if after > before + of_robot or after != report.components:
                 yield f"merge {number}: {after} parts of {before} and {of_robot}"
             before = after
-        if problems := MapStore.check(centre).problems:
+        if problems := check_file(centre).problems:
             yield f"the centre is not sound: {problems}"
         yield from _again(centre, robots, seed)
         yield from _downloads(centre, seed, case)
@@ -302,9 +301,9 @@ def _downloads(centre: Path, seed: int, case: Case) -> Iterator[str]:
     case.sent = options.policy
     if copies[0].read_bytes() != copies[1].read_bytes():
         yield f"{options}: made again it has other bytes"
-    if problems := MapStore.check(copies[0]).problems:
+    if problems := check_file(copies[0]).problems:
         yield f"{options}: not sound: {problems}"
-    with OpenMap(MapStore.open(copies[0])) as opened:
+    with Map.open(copies[0]) as opened:
         sent = [node.id for node in opened.graph.nodes]
         apart = int(opened.graph.components().max(initial=-1)) + 1
     if apart > len({ours[node] for node in sent}):
@@ -331,7 +330,7 @@ def _mission(rng: random.Random, centre: Path, nodes: list[NodeId]) -> DownloadO
 
 
 def content_hash(path: Path) -> str:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         return store.content_hash()
 
 

@@ -26,7 +26,7 @@ from synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of, landmark_by
 from engram.fleet.merge import merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
-from engram.maps import BulkWriter, MapStore
+from engram.maps import BulkWriter, Map, copy_map
 
 SESSION_NODES = 500
 LANDMARKS = 100
@@ -57,7 +57,7 @@ def write_session(
 
 def write_map(path: Path, robot: str, places: list[range], seed: int | None) -> None:
     rng = None if seed is None else np.random.default_rng(seed)
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         about = {"author": robot, "message": "synthetic", "configuration": {}}
         with store.begin_revision(**about) as writer:
             for number, some in enumerate(places):
@@ -126,7 +126,7 @@ def measure(folder: Path, centre: Path, nodes: int, size: int) -> None:
     if not robot.exists():
         write_map(robot, f"robot-{nodes}", robot_places(nodes, size) if nodes else [], seed=nodes)
     copy.unlink(missing_ok=True)
-    MapStore.copy(centre, copy)
+    copy_map(centre, copy)
     command = [sys.executable, __file__, "--merge", str(copy), str(robot)]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     copy.unlink()

@@ -60,7 +60,7 @@ def held_out_drives(plan: Plan) -> list[list[Drive]]:
             for session in fold.held_out:
                 drive = plan.drives.drives[session]
                 memo = MatchMemo(
-                    FrameMatcher(opened.store.frames, config),
+                    FrameMatcher(opened.frames, config),
                     plan.work / f"memo-{drive.key}.matches.npz",
                     matcher_hash(config),
                 )

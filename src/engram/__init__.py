@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from engram.frontend import StereoPair
     from engram.geometry import SE3, StereoCamera
     from engram.localiser import Budget, Localisation, LocalisationStatus, Position
-    from engram.robot import LiveRobot, OpenMap, Settings, map_drive, open_drive, open_map
+    from engram.maps import Map, open_map
+    from engram.robot import LiveRobot, Settings, map_drive, open_drive
 
 __version__ = "0.1.0"
 
@@ -25,7 +26,7 @@ __all__ = [
     "LiveRobot",
     "Localisation",
     "LocalisationStatus",
-    "OpenMap",
+    "Map",
     "Position",
     "Settings",
     "StereoCamera",
@@ -43,14 +44,14 @@ _HOMES = {
     "LiveRobot": "engram.robot",
     "Localisation": "engram.localiser",
     "LocalisationStatus": "engram.localiser",
-    "OpenMap": "engram.robot",
+    "Map": "engram.maps",
     "Position": "engram.localiser",
     "Settings": "engram.robot",
     "StereoCamera": "engram.geometry",
     "StereoPair": "engram.frontend",
     "map_drive": "engram.robot",
     "open_drive": "engram.robot",
-    "open_map": "engram.robot",
+    "open_map": "engram.maps",
 }
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.robot import MapOptions, Settings, map_drive, open_drive
 
 
@@ -92,7 +92,7 @@ def test_revert_and_its_undoing(engram, town: Path) -> None:
 
 def test_blame_names_robot_session_and_revision(engram, town: Path) -> None:
     session = engram("show", town, 1, "--json").json["sessions"][0]
-    with MapStore.open(town) as store:
+    with Map.open(town) as store:
         node = store.load().nodes[0]
     (found,) = engram("blame", town, str(node.id)[:10], "--json").json
     assert (found["robot"], found["session"]) == ("r1", session["session"])

@@ -29,18 +29,18 @@ def test_every_frame_of_the_mapped_drive_is_found_at_once(engram, street: Path, 
 
 
 def test_an_empty_map_is_a_new_place_everywhere(engram, street: Path, tmp_path: Path) -> None:
-    from engram.maps import MapStore
+    from engram.maps import Map
 
-    MapStore.create(tmp_path / "empty.engram").close()
+    Map.create(tmp_path / "empty.engram").close()
     summary = engram("relocalise", tmp_path / "empty.engram", street, "--json").json["summary"]
     assert summary["new_place"] == summary["frames"] == 12
     assert summary["attempts"] == 0
 
 
 def test_an_empty_map_has_no_places_that_look_alike(engram, tmp_path: Path) -> None:
-    from engram.maps import MapStore
+    from engram.maps import Map
 
-    MapStore.create(tmp_path / "empty.engram").close()
+    Map.create(tmp_path / "empty.engram").close()
     ran = engram("places", tmp_path / "empty.engram")
     assert ran.status == 0
     assert "no two places" in ran.out

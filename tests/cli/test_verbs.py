@@ -255,8 +255,8 @@ def test_a_second_writer_is_told_who_writes(engram, street: Path, town: Path) ->
         [
             sys.executable,
             "-c",
-            "import sys; from engram.maps import MapStore\n"
-            f"with MapStore.open_for_writing({str(town)!r}):\n"
+            "import sys; from engram.maps import Map\n"
+            f"with Map.open({str(town)!r}, writes=True):\n"
             "    print('open', flush=True); sys.stdin.read()",
         ],
         stdin=subprocess.PIPE,

@@ -15,7 +15,7 @@ from engram.fleet.merge import MergeOptions, MergeReport, merge
 from engram.frontend import DescriptorKind
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Session
-from engram.maps import MapStore, StoredNode
+from engram.maps import Map, StoredNode
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
 
 DAY_NS = 86_400_000_000_000
@@ -55,8 +55,8 @@ def rewritten(
     descriptor: DescriptorKind | None = None,
 ) -> Path:
     """A copy of a map that remembers no attempt, with records changed on the way."""
-    with MapStore.open(source) as given, MapStore.create(target) as store:
-        contents, frontends = given.load(), given.frontends()
+    with Map.open(source) as given, Map.create(target) as store:
+        contents, frontends = given.load(), given.frontends
         with store.begin_revision(author="tests", message="", configuration={}) as writer:
             for one in contents.sessions:
                 kind, frontend = frontends[one.id]

@@ -15,7 +15,7 @@ from tests.worlds import attempts_of
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge.attempts import lacking
 from engram.graph.model import SessionId
-from engram.maps import AttemptArrays, MapStore
+from engram.maps import AttemptArrays, Map
 
 from .robots import merged, rewritten, robot_map
 
@@ -76,7 +76,7 @@ def test_what_is_lacking_makes_the_union_of_both(made, remembered):
 
 def remembered_in(path, session: SessionId) -> Counter:
     """Remembered attempts of a session between the nodes that they were made on."""
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         return Counter(attempts_of(store.load(), session))
 
 
@@ -90,7 +90,7 @@ def robot(tmp_path, fleet):
 
 
 def test_attempts_that_a_download_left_behind_are_carried_when_the_whole_map_comes(tmp_path, robot):
-    with MapStore.open(robot) as store:
+    with Map.open(robot) as store:
         contents = store.load()
     drive = max(contents.sessions, key=lambda one: one.start_ns).id
     near = DownloadOptions("region", near=(str(contents.nodes[0].id),), radius_m=8.0)
@@ -109,7 +109,7 @@ def test_attempts_alone_are_worth_a_revision(tmp_path, robot):
     centre, forgetful = tmp_path / "centre.engram", tmp_path / "forgetful.engram"
     merged(centre, rewritten(robot, forgetful))
     (report,) = merged(centre, robot)
-    with MapStore.open(robot) as store:
+    with Map.open(robot) as store:
         assert report.attempts == len(store.load().attempts) > 0
     assert (report.changed, report.revision, report.taken) == (True, 2, 0)
     assert f"{report.attempts} attempts carried over" in report.text()
@@ -119,14 +119,14 @@ def test_attempts_alone_are_worth_a_revision(tmp_path, robot):
 
 def test_attempts_at_a_node_that_was_taken_back_come_again_with_it_and_once(tmp_path, robot):
     centre = tmp_path / "centre.engram"
-    with MapStore.open(robot) as store:
+    with Map.open(robot) as store:
         _, second = (one.id for one in store.load().sessions)
     # The first drive is one revision, what the second tried at its nodes another one.
     only_first = tmp_path / "first.engram"
     download(robot, only_first, DownloadOptions(), at=1)
     merged(centre, only_first, robot)
     before = remembered_in(centre, second)
-    with MapStore.open_for_writing(centre) as store:
+    with Map.open(centre, writes=True) as store:
         store.revert(1, author="me")
     assert remembered_in(centre, second).total() < before.total()
     (report,) = merged(centre, robot)

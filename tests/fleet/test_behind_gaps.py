@@ -17,8 +17,8 @@ from engram.fleet.merge.segments import Segment
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, SessionId, node_id
 from engram.localiser import Position
+from engram.maps import open_map
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.robot import open_map
 
 from .robots import DAY_NS, WORLD, merged, robot_map, truth_of
 
@@ -42,7 +42,7 @@ def test_a_segment_behind_a_gap_is_found_from_where_the_one_before_ended(tmp_pat
     assert report.components == 1
     truth = truth_of(first, second)
     with open_map(centre) as opened:
-        omissions = opened.store.omissions().values()
+        omissions = opened.omissions.values()
         assert len(omissions) == report.omitted
         for one in omissions:
             true = truth[one.node].inverse() @ truth[one.omitted]

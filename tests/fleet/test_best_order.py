@@ -12,7 +12,7 @@ import pytest
 from engram.errors import ConfigError, MapError
 from engram.fleet.build import Orders, best_order, building, find_best_order, orders
 from engram.fleet.merge import GateOptions
-from engram.maps import MapStore
+from engram.maps import copy_map
 from engram.monitor import QUIET
 from engram.robot import MapOptions, Settings, map_drive, open_drive
 
@@ -165,7 +165,7 @@ def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
     centre = tmp_path / "centre.engram"
     with pytest.raises(ConfigError, match=r"b\.framelog judges .* to be built from"):
         build(centre, logs, "ab", judge=judge(logs["b"]))
-    MapStore.copy(maps[2], centre)
+    copy_map(maps[2], centre)
     with pytest.raises(ConfigError, match=r"c\.framelog judges .* in .*centre\.engram already"):
         build(centre, logs, "ab", judge=judge(logs["c"]))
     assert not centre.with_name("centre.engram.build").exists()
@@ -190,7 +190,7 @@ def test_more_groups_than_can_be_tried_are_refused_before_they_are_mapped(
 
 def test_orders_are_judged_with_the_centre_that_they_are_merged_into(tmp_path, maps, logs):
     centre = tmp_path / "centre.engram"
-    MapStore.copy(maps[2], centre)
+    copy_map(maps[2], centre)
     report = build(centre, logs, "ab", judge=judge(logs["held-out"]))
     assert (report.best.spent.merges, report.best.spent.copies) == (4, 4)
     assert report.content_hash == report.best.results[0].content_hash
@@ -202,7 +202,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
     tmp_path, maps, logs, monkeypatch
 ):
     centre = tmp_path / "centre.engram"
-    MapStore.copy(maps[2], centre)
+    copy_map(maps[2], centre)
 
     def meanwhile(*arguments):
         found = best_order.localise_drive(*arguments)
@@ -242,7 +242,7 @@ def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch)
 def test_a_map_that_is_not_the_one_that_was_judged_is_told(tmp_path, maps, logs, monkeypatch):
     centre = tmp_path / "centre.engram"
     with monkeypatch.context() as patch:
-        patch.setattr(MapStore, "copy", lambda source, target: copied(source, target, centre))
+        patch.setattr(best_order, "copy_map", lambda source, target: copied(source, target, centre))
         with pytest.raises(KilledError):
             build(centre, logs, "ab", judge=judge(logs["held-out"]))
     copied_really(maps[2], centre)
@@ -251,7 +251,7 @@ def test_a_map_that_is_not_the_one_that_was_judged_is_told(tmp_path, maps, logs,
     assert report.notes[0] in report.text()
 
 
-copied_really = MapStore.copy
+copied_really = copy_map
 
 
 def copied(source: Path, target: Path, centre: Path) -> None:

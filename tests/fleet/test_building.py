@@ -17,7 +17,7 @@ import pytest
 from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
 from engram.fleet.build import JudgeOptions, build_map, order_costs
 from engram.fleet.merge.gate import GateOptions
-from engram.maps import MapStore
+from engram.maps import Map, check_file
 from engram.monitor import Monitor
 from engram.robot import MapOptions, Settings
 
@@ -37,9 +37,9 @@ def test_groups_are_mapped_and_merged_into_one_map(built, logs):
     assert [len(one.sessions) for one in report.mapped] == [2, 1]
     assert all(one.seconds > 0 and one.retries == 0 for one in report.mapped)
     assert len(report.merges) == 1
-    assert MapStore.check(centre).problems == ()
+    assert check_file(centre).problems == ()
     assert not centre.with_name("centre.engram.build").exists()
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         assert len(store.load().sessions) == 3
         assert store.content_hash() == report.content_hash
     assert "2 drives" in report.text()
@@ -135,7 +135,7 @@ def test_drives_that_the_centre_has_are_not_mapped_again(tmp_path, logs):
     assert more.left_out == ["a.framelog", "b.framelog"]
     assert more.groups == [["c.framelog"]]
     assert "left out" in more.text()
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         assert len(store.load().sessions) == 3
 
 

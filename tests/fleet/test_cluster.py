@@ -12,7 +12,7 @@ from engram.errors import SequenceError, WorkerError
 from engram.fleet.build import cluster
 from engram.fleet.build.cluster import map_groups_on_cluster
 from engram.fleet.build.group_mapping import GroupTask
-from engram.maps import MapStore
+from engram.maps import check_file
 from engram.monitor import Monitor
 from engram.processes import _WORDS_AT_ONCE
 from engram.robot import Settings
@@ -74,7 +74,7 @@ def test_frames_are_told_while_a_group_is_mapped(scheduler, tmp_path, logs):
     (result,) = run(scheduler, tmp_path, [logs["a"]], advance)
     assert len(words) == result.sessions[0]["frames"] == 20
     assert [there for _, there in words[:10]] == [False] * 10  # before the group was done
-    assert MapStore.check(tmp_path / "group-0.engram").problems == ()
+    assert check_file(tmp_path / "group-0.engram").problems == ()
 
 
 def test_ctrl_c_is_heard_within_a_group_and_the_worker_stops(

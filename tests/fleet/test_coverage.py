@@ -16,7 +16,7 @@ from engram.fleet.download.coverage import Coverage, Demand, expected_missed, gr
 from engram.fleet.download.selections import coverage_for
 from engram.fleet.download.stock import Stock
 from engram.graph.basin import MatchBasin
-from engram.maps import MapStore
+from engram.maps import Map
 
 from .robots import DAY_NS, WORLD
 
@@ -129,7 +129,7 @@ def centre(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def stock(centre):
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         yield Stock(store)
 
 

@@ -35,7 +35,7 @@ from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, Segm
 from engram.frontend import TEBLID
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
-from engram.maps import BulkWriter, MapStore
+from engram.maps import BulkWriter, Map, check_file, copy_map
 from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
 from engram.robot import MapOptions, Settings, map_drive, open_drive, session_of_drive
@@ -57,18 +57,18 @@ def centre(tmp_path, fleet):
 
 
 def hash_of(path: Path) -> str:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         return store.content_hash()
 
 
 def nodes_in(path: Path) -> int:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         return store.info().nodes
 
 
 def swapped(source: Path, target: Path, node: NodeId | None = None) -> tuple[Path, NodeId]:
     """A copy of a map in which a node has the landmarks of another; and its UUID."""
-    with MapStore.open(source) as store:
+    with Map.open(source) as store:
         nodes = store.load().nodes
         node = node or nodes[3].id
         others = [one for one in nodes if one.id != node]
@@ -85,14 +85,14 @@ def swapped(source: Path, target: Path, node: NodeId | None = None) -> tuple[Pat
 def omitted_from(centre: Path, robot: Path) -> NodeId:
     """Merges a map, and names a node that was not taken."""
     merged(centre, robot)
-    with MapStore.open(centre) as store:
-        return next(iter(store.omissions()))
+    with Map.open(centre) as store:
+        return next(iter(store.omissions))
 
 
 def damaged(source: Path, target: Path) -> Path:
     """A copy of a map in which a bit of the last node's landmarks was lost."""
     shutil.copy(source, target)
-    with MapStore.open(target) as store:
+    with Map.open(target) as store:
         stored = list(store.frames.stored(store.load().nodes))[-1]
     content = bytearray(target.read_bytes())
     at = content.find(stored.landmarks[300:400])
@@ -133,7 +133,7 @@ class TestRefused:
         assert all(word in str(raised.value) for word in words), raised.value
         assert centre.read_bytes() == content
         assert hash_of(centre) == before
-        assert MapStore.check(centre).problems == ()
+        assert check_file(centre).problems == ()
 
     def test_maps_of_other_descriptors(self, tmp_path, centre, fleet):
         robot = rewritten(fleet["other"][0], tmp_path / "t.engram", descriptor=TEBLID)
@@ -153,9 +153,9 @@ class TestRefused:
         other, node = swapped(fleet["same"][0], tmp_path / "other.engram")
         theirs = tmp_path / "theirs.engram"
         merged(theirs, fleet["first"][0])
-        with MapStore.open_for_writing(theirs) as store, MapStore.open(other) as given:
+        with Map.open(theirs, writes=True) as store, Map.open(other) as given:
             known = store.load().nodes[0].id
-            omission = Omission(node, known, SE3.identity(), given.landmark_hashes()[node])
+            omission = Omission(node, known, SE3.identity(), given.landmark_hashes[node])
             with store.begin_revision(author="tests", message="", configuration={}) as writer:
                 writer.add_omission(omission)
                 writer.commit()
@@ -165,8 +165,8 @@ class TestRefused:
     def test_maps_of_format_2_did_not_keep_what_they_omitted(self, tmp_path, centre, fleet):
         """Nothing can be said of such nodes, so nothing is refused."""
         node = omitted_from(centre, fleet["same"][0])
-        with MapStore.open(centre) as store:
-            assert store.omissions()[node].landmark_hash is not None
+        with Map.open(centre) as store:
+            assert store.omissions[node].landmark_hash is not None
         connection = sqlite3.connect(centre)
         with connection:
             connection.execute("DELETE FROM omitted_landmarks")
@@ -177,13 +177,13 @@ class TestRefused:
 
     def test_what_a_revert_took_back_binds_nobody(self, tmp_path, centre, fleet):
         node = omitted_from(centre, fleet["same"][0])
-        with MapStore.open_for_writing(centre) as store:
+        with Map.open(centre, writes=True) as store:
             store.revert("head", author="tests", message="")
-            assert node not in store.landmark_hashes()
+            assert node not in store.landmark_hashes
         robot, _ = swapped(fleet["same"][0], tmp_path / "r.engram", node)
         merged(centre, robot)
-        with MapStore.open(centre) as store, MapStore.open(robot) as given:
-            assert store.landmark_hashes()[node] == given.landmark_hashes()[node]
+        with Map.open(centre) as store, Map.open(robot) as given:
+            assert store.landmark_hashes[node] == given.landmark_hashes[node]
 
     def test_a_drive_with_the_uuid_of_another(self, tmp_path, centre, fleet):
         robot = rewritten(
@@ -213,7 +213,7 @@ class TestRefused:
 
     def test_a_row_that_was_damaged_on_the_way(self, tmp_path, centre, fleet):
         robot = tmp_path / "damaged.engram"
-        MapStore.copy(fleet["longer"][0], robot)
+        copy_map(fleet["longer"][0], robot)
         with sqlite3.connect(robot) as connection:
             connection.execute("UPDATE edges SET a_from_b = zeroblob(96) WHERE key = 2")
         connection.close()
@@ -332,7 +332,7 @@ class TestReported:
         assert any("hours from now" in note for note in report.notes)
 
     def test_a_clock_that_runs_backwards(self, tmp_path, fleet):
-        with MapStore.open(fleet["other"][0]) as store:
+        with Map.open(fleet["other"][0]) as store:
             nodes = store.load().nodes
         middle = nodes[len(nodes) // 2].stamp_ns
 
@@ -346,7 +346,7 @@ class TestReported:
         (report,) = merged(tmp_path / "centre.engram", robot)
         assert any("runs backwards" in note for note in report.notes)
         assert report.taken == len(nodes)
-        assert MapStore.check(tmp_path / "centre.engram").problems == ()
+        assert check_file(tmp_path / "centre.engram").problems == ()
 
     def test_the_report_says_all_of_it_in_text_and_json(self, centre, fleet):
         (report,) = merged(centre, fleet["longer"][0])
@@ -415,7 +415,7 @@ class TestGate:
         # What passed stands.
         assert [report.revision for report in told] == [2]
         assert hash_of(centre) == told[0].content_hash
-        assert MapStore.check(centre).problems == ()
+        assert check_file(centre).problems == ()
 
     def test_a_drive_that_a_map_holds_is_not_held_out(self, tmp_path, centre, fleet):
         drive = frame_log(tmp_path / "drive.framelog", np.arange(0, 8, 0.8), 1, day=8)
@@ -490,7 +490,7 @@ def test_ctrl_c_ends_a_merge_between_two_nodes_and_the_next_one_completes_it(
     whole = tmp_path / "whole.engram"
     expected = merged(whole, fleet["first"][0], fleet["longer"][0])[-1].content_hash
     assert merged(centre, fleet["longer"][0])[0].content_hash == expected
-    assert MapStore.check(centre).abandoned_rows == 0
+    assert check_file(centre).abandoned_rows == 0
 
 
 class TestInterrupted:
@@ -541,7 +541,7 @@ class TestInterrupted:
         assert report.interrupted
         assert impatient.frames == impatient.at
         assert hash_of(centre) == report.content_hash == before
-        assert MapStore.check(centre).problems == ()
+        assert check_file(centre).problems == ()
 
     def test_when_the_gate_has_said_yes(self, centre, fleet, held_out, pressed):
         before = hash_of(centre)
@@ -609,7 +609,7 @@ def kill_and_look(tmp_path: Path, fleet: dict, kills: int, seed: int) -> None:
         done, _, _ = select.select([merging.stdout], [], [], rng.uniform(0, seconds))
         merging.kill()
         said = merging.communicate()[0]
-        report = MapStore.check(centre)
+        report = check_file(centre)
         assert report.problems == ()
         assert report.interrupted == ()
         assert hash_of(centre) in ({after} if said else {before, after})
@@ -622,7 +622,7 @@ def kill_and_look(tmp_path: Path, fleet: dict, kills: int, seed: int) -> None:
         else:
             seconds *= 1.05
     assert merged(centre, fleet["longer"][0])[0].content_hash == after
-    assert MapStore.check(centre).problems == ()
+    assert check_file(centre).problems == ()
 
 
 def test_killed_at_any_moment_the_centre_is_as_before_or_complete(tmp_path, fleet):
@@ -637,10 +637,10 @@ def test_killed_many_times_the_centre_is_as_before_or_complete(tmp_path, fleet):
 def test_a_centre_with_an_interrupted_session_of_that_robot_says_so(tmp_path, fleet):
     robot, centre = tmp_path / "robot.engram", tmp_path / "centre.engram"
     robot_map(robot, np.arange(0, 10, 0.5), 0, name="r1", day=1)
-    with MapStore.open(robot) as given, MapStore.create(centre) as store:
+    with Map.open(robot) as given, Map.create(centre) as store:
         (session,) = given.load().sessions
         (camera,) = given.load().cameras.values()
-        kind, frontend = given.frontends()[session.id]
+        kind, frontend = given.frontends[session.id]
         store.begin_session(
             session, camera, descriptor=kind, frontend=frontend, author="r1", configuration={}
         )

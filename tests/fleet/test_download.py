@@ -20,7 +20,7 @@ from engram.fleet.download.downloading import most_that_fit
 from engram.fleet.download.selections import SELECTIONS, UNDERSTOOD
 from engram.frontend import BRIEF
 from engram.graph.model import EdgeKind, path_id
-from engram.maps import MapStore
+from engram.maps import Map, check_file, copy_map
 from engram.places import default_vocabulary
 from engram.places.stored_words import keep_missing_words, stored_words
 
@@ -67,7 +67,7 @@ def sent(centre: Path, out: Path, policy: str, **options) -> DownloadReport:
 
 def robots_of(path: Path) -> dict[str, int]:
     """How many nodes of each robot a map holds."""
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         contents = store.load()
     names = {session.id: session.robot for session in contents.sessions}
     found = [names[node.session] for node in contents.nodes]
@@ -75,7 +75,7 @@ def robots_of(path: Path) -> dict[str, int]:
 
 
 def node_ids(path: Path) -> set:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         return {node.id for node in store.load().nodes}
 
 
@@ -93,13 +93,13 @@ POLICIES = {
 def test_every_download_is_sound_and_the_same_every_time(centre, tmp_path, policy):
     options = dict(POLICIES[policy])
     if policy == "route":
-        with MapStore.open(centre) as store:
+        with Map.open(centre) as store:
             options["route"] = str(store.load().sessions[0].id)
     one = sent(centre, tmp_path / "one.engram", policy, **options)
     again = sent(centre, tmp_path / "again.engram", policy, **options)
     assert (tmp_path / "one.engram").read_bytes() == (tmp_path / "again.engram").read_bytes()
     assert one.content_hash == again.content_hash
-    assert MapStore.check(tmp_path / "one.engram").problems == ()
+    assert check_file(tmp_path / "one.engram").problems == ()
     assert 0 < one.nodes <= one.of_nodes
     assert [file.name for file in sorted(tmp_path.iterdir())] == ["again.engram", "one.engram"]
 
@@ -108,17 +108,17 @@ def test_every_download_is_sound_and_the_same_every_time(centre, tmp_path, polic
 def test_merging_an_unchanged_download_changes_nothing(centre, tmp_path, policy):
     mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
     sent(mine, tmp_path / "robot.engram", policy, **POLICIES[policy])
-    with MapStore.open(mine) as store:
+    with Map.open(mine) as store:
         before = store.revision, store.content_hash()
     (report,) = merged(mine, tmp_path / "robot.engram")
     assert report.revision is None
-    with MapStore.open(mine) as store:
+    with Map.open(mine) as store:
         assert (store.revision, store.content_hash()) == before
 
 
 def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
     report = sent(centre, tmp_path / "robot.engram", "copy")
-    with MapStore.open(centre) as ours, MapStore.open(tmp_path / "robot.engram") as theirs:
+    with Map.open(centre) as ours, Map.open(tmp_path / "robot.engram") as theirs:
         mine, given = ours.load(), theirs.load()
         assert set(mine.nodes) == set(given.nodes)
         assert set(mine.sessions) == set(given.sessions)
@@ -128,8 +128,8 @@ def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
             assert attempts_of(mine, session.id) == attempts_of(given, session.id)
         keys = [{(e.a, e.b, e.kind) for e in one.edges} for one in (mine, given)]
         assert keys[0] == keys[1]
-        assert ours.landmark_hashes() == theirs.landmark_hashes()
-        assert theirs.partial_paths() == frozenset()
+        assert ours.landmark_hashes == theirs.landmark_hashes
+        assert theirs.partial_paths == frozenset()
         assert theirs.log()[0].committed_ns == ours.log()[-1].committed_ns
         assert theirs.log()[0].configuration["download"]["source"] == ours.content_hash()
     assert (report.bridges, report.expected_missed) == (0, report.copy_missed)
@@ -139,14 +139,14 @@ def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
     vocabulary = default_vocabulary(BRIEF)
     sent(centre, tmp_path / "before.engram", "tod", start_h=9.0)
     keeping = tmp_path / "keeping.engram"
-    MapStore.copy(centre, keeping)
-    with MapStore.open_for_writing(keeping) as store:
+    copy_map(centre, keeping)
+    with Map.open(keeping, writes=True) as store:
         nodes = [node.id for node in store.load().nodes]
         assert not stored_words(store, vocabulary)
         keep_missing_words(store, vocabulary, nodes)
         kept = stored_words(store, vocabulary)
     sent(keeping, tmp_path / "after.engram", "tod", start_h=9.0)
-    with MapStore.open(tmp_path / "after.engram") as store:
+    with Map.open(tmp_path / "after.engram") as store:
         went = stored_words(store, vocabulary)
     assert set(went) == node_ids(tmp_path / "after.engram")
     assert all(np.array_equal(words, kept[node]) for node, words in went.items())
@@ -166,7 +166,7 @@ def test_tod_sends_what_was_saved_near_that_hour_over_midnight_too(centre, tmp_p
 
 def test_paths_send_every_node_of_the_chosen_drives(centre, tmp_path):
     report = sent(centre, tmp_path / "out.engram", "paths", start_h=18.0, end_h=18.0)
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         contents = store.load()
     r2 = next(session for session in contents.sessions if session.robot == "r2")
     assert report.why["epochs"] == [18]
@@ -184,13 +184,13 @@ def test_tod_and_paths_send_what_passes_both(centre, tmp_path):
 
 
 def test_entries_left_behind_make_a_path_partial(centre, tmp_path):
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         first = store.load().nodes[0]
     report = sent(centre, tmp_path / "out.engram", "region", near=(str(first.id),), radius_m=5.0)
     assert 3 <= report.nodes < report.of_nodes / 2
-    with MapStore.open(tmp_path / "out.engram") as store:
+    with Map.open(tmp_path / "out.engram") as store:
         contents = store.load()
-        partial = store.partial_paths()
+        partial = store.partial_paths
         assert {entry.path for entry in contents.path_entries} == partial
         for node in contents.nodes:
             assert len(store.frames.frame(node.id).landmarks) > 0
@@ -199,7 +199,7 @@ def test_entries_left_behind_make_a_path_partial(centre, tmp_path):
 def test_gaps_are_closed_by_bridges_and_no_more_pieces_come(centre, tmp_path):
     # The evenings hang together through the mornings only.
     report = sent(centre, tmp_path / "out.engram", "tod", start_h=21.0, window_min=180.0)
-    with MapStore.open(tmp_path / "out.engram") as store:
+    with Map.open(tmp_path / "out.engram") as store:
         kinds = store.info().edges_of_kind
     assert set(robots_of(tmp_path / "out.engram")) == {"r2", "r4"}
     assert kinds["bridge"] == report.bridges >= 1
@@ -261,8 +261,8 @@ def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(cent
     (report,) = merged(mine, robot)
     assert (report.revision, report.taken) == (5, len(added))
     assert report.components == 1
-    assert MapStore.check(mine).problems == ()
-    with MapStore.open(mine) as store:
+    assert check_file(mine).problems == ()
+    with Map.open(mine) as store:
         contents = store.load()
     assert {node.id for node in contents.nodes} >= set(added)
     assert not any(edge.kind is EdgeKind.BRIDGE for edge in contents.edges)
@@ -273,7 +273,7 @@ def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(cent
 
 def test_as_of_an_older_revision_or_tag(centre, tmp_path):
     mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
-    with MapStore.open_for_writing(mine) as store:
+    with Map.open(mine, writes=True) as store:
         store.tag("first", 1, author="me")
     options = DownloadOptions()
     report = download(mine, tmp_path / "old.engram", options, at="first")
@@ -285,11 +285,11 @@ def test_as_of_an_older_revision_or_tag(centre, tmp_path):
 
 def test_what_was_taken_back_is_not_sent(centre, tmp_path):
     mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
-    with MapStore.open_for_writing(mine) as store:
+    with Map.open(mine, writes=True) as store:
         store.revert(2, author="me")
     sent(mine, tmp_path / "out.engram", "copy")
     assert "r2" not in robots_of(tmp_path / "out.engram")
-    assert MapStore.check(tmp_path / "out.engram").problems == ()
+    assert check_file(tmp_path / "out.engram").problems == ()
 
 
 class TestMostThatFit:
@@ -430,7 +430,7 @@ class TestMistakes:
                 sent(centre, tmp_path / out, "copy")
         with pytest.raises(NotAMapError):
             sent(tmp_path / "there.engram", tmp_path / "out.engram", "copy")
-        MapStore.create(tmp_path / "empty.engram").close()
+        Map.create(tmp_path / "empty.engram").close()
         with pytest.raises(InputError, match="holds no nodes"):
             sent(tmp_path / "empty.engram", tmp_path / "out.engram", "copy")
 

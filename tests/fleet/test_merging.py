@@ -13,26 +13,26 @@ from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import Reason, Seed
 from engram.fleet.merge.handed_in import HandedIn
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
-from engram.maps import MapStore
-from engram.robot import MapOptions, Settings, map_drive, open_drive, open_map
+from engram.maps import Map, check_file, open_map
+from engram.robot import MapOptions, Settings, map_drive, open_drive
 
 from .robots import OPTIONS, frame_log, merged, robot_map, truth_of
 
 
 def assert_sound(path) -> None:
-    assert MapStore.check(path).problems == ()
+    assert check_file(path).problems == ()
 
 
 def test_an_empty_centre_takes_everything_to_the_byte(tmp_path, fleet):
     centre, (robot, _) = tmp_path / "centre.engram", fleet["first"]
     (report,) = merged(centre, robot)
-    with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
+    with Map.open(centre) as ours, Map.open(robot) as theirs:
         mine, given = ours.load(), theirs.load()
         assert mine.nodes == given.nodes
         assert mine.sessions == given.sessions
         assert mine.path_entries == given.path_entries
-        assert ours.landmark_hashes() == theirs.landmark_hashes()
-        assert ours.omissions() == {}
+        assert ours.landmark_hashes == theirs.landmark_hashes
+        assert ours.omissions == {}
         for session in given.sessions:
             kept = attempts_of(mine, session.id)[: len(attempts_of(given, session.id))]
             assert kept == attempts_of(given, session.id)
@@ -48,8 +48,8 @@ def test_what_localises_is_omitted_and_remembered_where_it_lies(tmp_path, fleet)
     assert report.omitted >= 0.9 * len(mapped_same.saved)
     assert report.components == 1
     truth = truth_of(mapped_first, mapped_same)
-    with MapStore.open(centre) as store:
-        omissions = store.omissions()
+    with Map.open(centre) as store:
+        omissions = store.omissions
         sessions = {session.robot: session for session in store.load().sessions}
         entries = store.load().path_entries
     assert len(omissions) == report.omitted
@@ -60,7 +60,7 @@ def test_what_localises_is_omitted_and_remembered_where_it_lies(tmp_path, fleet)
     # The robot's own entries keep their numbers and stand at the equivalents; then what the
     # replay matched.
     own = [entry for entry in entries if entry.path == path_id(sessions["r2"].id)]
-    with MapStore.open(same) as store:
+    with Map.open(same) as store:
         given = store.load().path_entries
     assert [entry.sequence for entry in own[: len(given)]] == [one.sequence for one in given]
     for entry, one in zip(own, given, strict=False):
@@ -127,9 +127,9 @@ def test_handing_in_the_same_again_changes_nothing(tmp_path, fleet, names):
     assert [report.revision for report in again] == [None] * len(names)
     assert not any(report.changed for report in again)
     assert again[-1].content_hash == before.content_hash
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         assert store.revision == len(names)
-    assert MapStore.check(centre).abandoned_rows == 0
+    assert check_file(centre).abandoned_rows == 0
 
 
 def test_the_same_in_the_same_order_gives_the_same_map(tmp_path, fleet):
@@ -152,7 +152,7 @@ def test_a_robot_goes_out_with_the_centre_and_hands_back_what_it_added(tmp_path,
     assert {segment.seed for segment in report.segments} == {Seed.NEIGHBOUR}
     # What the robot could not localise the centre cannot either: it holds nothing else.
     assert report.taken == len(back.saved)
-    with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
+    with Map.open(centre) as ours, Map.open(robot) as theirs:
         mine, given = ours.load(), theirs.load()
         assert set(mine.path_entries) >= set(given.path_entries)
         edges = {(edge.a, edge.b, edge.kind) for edge in mine.edges}
@@ -167,7 +167,7 @@ def test_the_author_is_whoever_added_something(tmp_path, fleet):
     shutil.copy(centre, robot)
     robot_map(robot, np.arange(6, 40, 0.8), 0, name="r9", day=9)
     merged(centre, robot)
-    with MapStore.open(centre) as store:
+    with Map.open(centre) as store:
         first, second = store.log()
     assert (first.author, second.author) == ("r1", "r9")
     assert second.message == "merge r9"
@@ -186,10 +186,10 @@ def test_later_robots_localise_in_what_earlier_ones_of_the_merge_brought(tmp_pat
     (report,) = merged(centre, both)
     assert report.components == 2
     assert report.known_omissions == 0
-    with MapStore.open(both) as store, MapStore.open(centre) as ours:
+    with Map.open(both) as store, Map.open(centre) as ours:
         # The omissions of the map handed in go along.
-        assert set(ours.omissions()) >= set(store.omissions())
-        assert report.omitted >= len(store.omissions())
+        assert set(ours.omissions) >= set(store.omissions)
+        assert report.omitted >= len(store.omissions)
 
 
 def test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match(tmp_path, fleet):
@@ -198,7 +198,7 @@ def test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match(tmp_path, fl
     robot_map(path, np.arange(0, 24, 0.8), name="r5", day=5, aside_m=0.1)
     again = robot_map(path, np.arange(0, 12, 0.8), name="r5", day=6)
     assert not again.saved
-    with MapStore.open(path) as store, HandedIn(store, "r5") as handed_in:
+    with Map.open(path) as store, HandedIn(store, "r5") as handed_in:
         relied_on, all_nodes = handed_in.relied_on, set(handed_in.nodes)
     assert 5 <= len(relied_on) <= len(all_nodes) / 2 + 1
 
@@ -206,8 +206,8 @@ def test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match(tmp_path, fl
         _, report = merged(
             centre, fleet["first"][0], path, asked=replace(OPTIONS, sure_inliers=sure_inliers)
         )
-        with MapStore.open(centre) as store:
-            contents, omitted = store.load(), set(store.omissions())
+        with Map.open(centre) as store:
+            contents, omitted = store.load(), set(store.omissions)
         taken = all_nodes - omitted
         assert taken <= {node.id for node in contents.nodes}
         assert report.taken == len(taken)
@@ -253,9 +253,9 @@ def test_attempts_go_along_to_the_equivalents(tmp_path, fleet):
     again = robot_map(robot, np.arange(0, 24, 0.8), 0, name="r2", day=7, aside_m=-0.4)
     assert len(again.saved) < 5
     _, report = merged(centre, first, robot)
-    with MapStore.open(centre) as ours, MapStore.open(robot) as theirs:
+    with Map.open(centre) as ours, Map.open(robot) as theirs:
         mine, given = ours.load(), theirs.load()
-        omissions = ours.omissions()
+        omissions = ours.omissions
     (drive,) = [
         one for one in given.sessions if one.start_ns == max(s.start_ns for s in given.sessions)
     ]
@@ -287,7 +287,7 @@ def test_nodes_that_a_revert_had_hidden_bring_back_what_joins_them_to_others(tmp
     drive = frame_log(tmp_path / "drive.framelog", np.arange(8, 40, 0.8), name="r5", day=5)
     map_drive(sent, open_drive(drive), Settings(), MapOptions(relocaliser="exhaustive"))
     (before,) = merged(centre, sent)
-    with MapStore.open_for_writing(centre) as store:
+    with Map.open(centre, writes=True) as store:
         store.revert(1, author="tests")
     (report,) = merged(centre, first)
     with open_map(centre, None) as opened:

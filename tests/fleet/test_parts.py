@@ -11,14 +11,14 @@ from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.state import Merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.maps import MapStore
+from engram.maps import Map
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_node_is_apart_while_no_edges_lead_from_it_to_what_was_there(seed: int, tmp_path) -> None:
     rng = random.Random(seed)
-    MapStore.create(tmp_path / "empty.engram").close()
-    with MapStore.open(tmp_path / "empty.engram") as store:
+    Map.create(tmp_path / "empty.engram").close()
+    with Map.open(tmp_path / "empty.engram") as store:
         merge = Merge(store, HandedIn(store, "robot"))
     merge.writer = Mock()
     session = SessionId(UUID(int=1))

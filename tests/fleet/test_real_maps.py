@@ -11,7 +11,7 @@ from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import MergeReport
 from engram.fleet.merge import merge as merge_maps
 from engram.graph.model import NodeId, Omission
-from engram.maps import MapStore
+from engram.maps import Map, check_file
 from engram.robot import (
     LocaliseOptions,
     LocaliseRun,
@@ -46,14 +46,14 @@ def stamps_of(*maps: Path) -> dict[NodeId, int]:
     """When each node of some maps was saved, nanoseconds."""
     found: dict[NodeId, int] = {}
     for path in maps:
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             found |= {node.id: node.stamp_ns for node in store.load().nodes}
     return found
 
 
 def omissions_of(centre: Path) -> list[Omission]:
-    with MapStore.open(centre) as store:
-        return list(store.omissions().values())
+    with Map.open(centre) as store:
+        return list(store.omissions.values())
 
 
 def errors_m(centre: Path, robot: Path, truth: Trajectory) -> list[float]:
@@ -84,7 +84,7 @@ def test_what_another_rig_saw_of_the_same_street_is_omitted(street, tmp_path):
     assert colour.taken <= 0.05 * len(stamps_of(street["colour"]))
     assert blue.taken <= 0.2 * len(stamps_of(street["blue"]))
     assert blue.components == 1
-    assert MapStore.check(centre).sound
+    assert check_file(centre).sound
     stamps_ns = stamps_of(centre, *street.values())
     # The rigs trigger within 6 ms of each other; frames come every 100 ms.
     apart = [
@@ -108,7 +108,7 @@ def test_a_robot_works_from_a_download_of_real_maps(street, data_dir, tmp_path):
     map_drive(part, red, Settings(), MapOptions())
     (report,) = merge(centre, part)
     assert (report.sessions, report.known) == (1, len(stamps_of(street["grey"])))
-    assert MapStore.check(centre).sound
+    assert check_file(centre).sound
 
 
 def test_two_robots_that_share_a_road_agree_with_the_truth(data_dir, tmp_path):
@@ -132,7 +132,7 @@ def test_halves_of_a_room_are_joined_where_they_overlap(data_dir, tmp_path):
     _, report = merge(centre, first, second)
     assert report.omitted >= 3
     assert report.components == 1
-    assert MapStore.check(centre).sound
+    assert check_file(centre).sound
     truth = read_matrix_truth(drive / "poses_world_from_rectified_cam0.txt")
     assert max(errors_m(centre, second, truth)) <= 0.25
 

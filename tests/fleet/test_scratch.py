@@ -13,7 +13,7 @@ import pytest
 from engram.errors import ConfigError, InputError, MapError, MapLockedError, StorageFullError
 from engram.fleet.build import building, find_best_order
 from engram.fleet.build.scratch import BuildPlan, Scratch, build_folder, sessions_of
-from engram.maps import MapStore
+from engram.maps import copy_map
 from engram.robot import Settings, map_drive, open_drive, session_of_drive
 
 from .builds import build, in_this_process, judge, options
@@ -48,7 +48,7 @@ def begun(tmp_path, kept):
     """The same, free to be changed."""
     centre = tmp_path / "centre.engram"
     shutil.copytree(build_folder(kept[0]), build_folder(centre))
-    MapStore.copy(kept[0], centre)
+    copy_map(kept[0], centre)
     return centre
 
 

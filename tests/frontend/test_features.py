@@ -32,15 +32,15 @@ from engram.frontend import (
     match_frames,
 )
 from engram.frontend.blobs import decode_landmarks, encode_landmarks
-from engram.frontend.features import (
-    describe_brief,
-    describe_teblid,
-    detect_corners,
-    fitted_matcher,
-)
+from engram.frontend.features import describe_brief, describe_teblid, detect_corners, fitted_matcher
 from engram.geometry import StereoCamera
-from engram.maps import MapStore
-from engram.places import TrainingConfig, decode_vocabulary, encode_vocabulary, train_vocabulary
+from engram.maps import Map
+from engram.places import (
+    TrainingConfig,
+    decode_vocabulary,
+    encode_vocabulary,
+    train_vocabulary,
+)
 from engram.places.vocabulary import default_vocabulary
 from engram.robot import Settings
 from engram.robot.recording import extract_log
@@ -147,8 +147,8 @@ def test_a_drive_is_mapped_and_another_is_localised_in_it(
     city = tmp_path / "city.engram"
     mapped = run("map", city, write_drive(tmp_path / "a", 1), "--descriptor", kind)
     assert mapped["nodes_saved"] >= 2
-    with MapStore.open(city) as store:
-        assert store.descriptor() == kind
+    with Map.open(city) as store:
+        assert store.descriptor == kind
     assert run("check", city)["problems"] == []
     found = run("localise", city, write_drive(tmp_path / "b", 2))
     assert found["summary"]["share_localised"] == 1.0

@@ -13,13 +13,13 @@ import numpy as np
 from platformdirs import user_cache_path
 
 import engram
-from engram import _core
+from engram import _core, maps
 from engram.fleet.build.building import BuildOptions, build_map
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import merge as merge_maps
 from engram.frontend import Frame, Frontend, StereoPair
 from engram.localiser import Budget, Localisation
-from engram.maps import MapStore
+from engram.maps import Map, open_map
 from engram.maps.history import revert_revision
 from engram.odometry import Odometry
 from engram.robot import (
@@ -30,9 +30,9 @@ from engram.robot import (
     Settings,
     map_drive,
     open_drive,
-    open_map,
     session_of_drive,
 )
+from engram.robot.localisers import localiser_in
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.there_and_back import ThereAndBack
 from engram_lab.town.campaigns import campaign_named
@@ -124,7 +124,8 @@ def localise(path: Path, sequence: DriveSequence, *, policy: str, threads: bool)
     with LocaliseRun(path, sequence, settings, LocaliseOptions(policy=policy)) as run:
         if not threads:
             run.localiser.close()
-            run.localiser = run.opened.localiser(
+            run.localiser = localiser_in(
+                run.opened,
                 sequence.camera,
                 settings,
                 policy=policy,
@@ -178,7 +179,7 @@ def revert(path: Path, revision: int) -> Values:
 
 def contents(path: Path) -> Values:
     """A map: counts, and hashes of its records by table."""
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         info = store.info()
         names = ("revision", "sessions", "nodes", "edges", "path_entries", "attempts")
         return {
@@ -189,7 +190,7 @@ def contents(path: Path) -> Values:
 
 
 def copy_map(source: Path, target: Path) -> None:
-    MapStore.copy(source, target)
+    maps.copy_map(source, target)
 
 
 def robot_over(path: Path, sequence: DriveSequence) -> Iterator[object]:

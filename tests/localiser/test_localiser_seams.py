@@ -9,10 +9,11 @@ from tests.synthetic_world import World, drive
 
 from engram.errors import MapCorruptError
 from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
-from engram.robot import OpenMap, Settings
+from engram.robot import Settings
+from engram.robot.localisers import localiser_in
 
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)
@@ -49,15 +50,16 @@ def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candida
     path = tmp_path / "town.engram"
     map_simulated(path, drive(WORLD, ROAD))
     live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
-    with OpenMap(MapStore.open(path)) as opened:
-        matcher = _Counting(opened.store.frames, Settings().localiser.matcher)
+    with Map.open(path) as opened:
+        matcher = _Counting(opened.frames, Settings().localiser.matcher)
         searched = []
 
         def search(*args, **options):
             searched.append(args)
             return opened.graph.neighbourhood(*args, **options)
 
-        with opened.localiser(
+        with localiser_in(
+            opened,
             live[0].frame.camera,
             Settings(),
             policy="distance",
@@ -82,15 +84,20 @@ def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_
     elsewhere = drive(World(30.0, seed=9), ROAD, seed=2, start_ns=10**15)
     blind = OdometryStep(OdometryStatus.TOO_FEW_MATCHES)
     radii_m = []
-    with OpenMap(MapStore.open(path)) as opened:
+    with Map.open(path) as opened:
 
         def search(*args, **options):
             radii_m.append(options["radius_m"])
             return opened.graph.neighbourhood(*args, **options)
 
         settings = Settings()
-        with opened.localiser(
-            live[0].frame.camera, settings, policy="distance", relocaliser=None, search=search
+        with localiser_in(
+            opened,
+            live[0].frame.camera,
+            settings,
+            policy="distance",
+            relocaliser=None,
+            search=search,
         ) as localiser:
             localiser.start_at(Position.at(opened.graph.node(0).id))
             gone = [replace(seen, odometry=blind) for seen in elsewhere[10:16] * 20]
@@ -113,8 +120,9 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
     policy = _Foreseeing()
     monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
     with (
-        OpenMap(MapStore.open(path)) as opened,
-        opened.localiser(
+        Map.open(path) as opened,
+        localiser_in(
+            opened,
             live[0].frame.camera,
             Settings(),
             policy=policy.name,
@@ -139,8 +147,8 @@ class _Damaged(FrameMatcher):
 
     threads = False
 
-    def __init__(self, opened: OpenMap) -> None:
-        super().__init__(opened.store.frames, Settings().localiser.matcher)
+    def __init__(self, opened: Map) -> None:
+        super().__init__(opened.frames, Settings().localiser.matcher)
         self.first = opened.graph.node(0).id
 
     def match(self, live, live_id, node, guide):
@@ -156,8 +164,9 @@ def test_what_is_damaged_is_foreseen_to_fail(tmp_path: Path, monkeypatch) -> Non
     policy = _Foreseeing()
     monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
     with (
-        OpenMap(MapStore.open(path)) as opened,
-        opened.localiser(
+        Map.open(path) as opened,
+        localiser_in(
+            opened,
             live[0].frame.camera,
             Settings(),
             policy=policy.name,
@@ -199,8 +208,9 @@ def test_a_lost_robot_has_a_budget_of_its_own_and_a_matcher_that_gives_up_sooner
     live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
     relocaliser = _All()
     with (
-        OpenMap(MapStore.open(path)) as opened,
-        opened.localiser(
+        Map.open(path) as opened,
+        localiser_in(
+            opened,
             live[0].frame.camera,
             Settings(),
             budget=Budget(2, 1, lost_rounds=5),
@@ -227,8 +237,9 @@ def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
     map_simulated(path, drive(world, road))
     live = drive(world, road, seed=1, start_ns=10**15)[:40]
     with (
-        OpenMap(MapStore.open(path)) as opened,
-        opened.localiser(
+        Map.open(path) as opened,
+        localiser_in(
+            opened,
             live[0].frame.camera,
             Settings(),
             policy="distance",

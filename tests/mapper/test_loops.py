@@ -13,8 +13,7 @@ from engram.errors import MapCorruptError
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind
 from engram.localiser import FrameMatcher
-from engram.maps import MapStore
-from engram.robot import OpenMap
+from engram.maps import Map
 
 # A lap of 151 m with a step every 0.7 m: 0.17° a step too much is 37° and 17 m at its end.
 LAP_M = 2 * np.pi * 24.0
@@ -31,8 +30,8 @@ def path(tmp_path: Path) -> Path:
 
 def loop_edges(path: Path, mapped: Mapped) -> list[tuple[Edge, SE3]]:
     """Measured edges between own nodes, each with its truth."""
-    with MapStore.open(path) as store:
-        edges = OpenMap(store).graph.edges
+    with Map.open(path) as store:
+        edges = store.graph.edges
     truth = mapped.saved
     return [
         (edge, truth[edge.a].inverse() @ truth[edge.b])
@@ -78,7 +77,7 @@ def test_the_same_drive_gives_the_same_map(tmp_path: Path) -> None:
     for name in ("one", "two"):
         path = tmp_path / f"{name}.engram"
         map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             hashes.add(store.content_hash())
     assert len(hashes) == 1
 
@@ -137,8 +136,8 @@ def test_a_road_that_looks_like_the_metres_before_carries_no_mapping_robot_back(
     ]
     second = map_simulated(path, seen, name="r2", closes_loops=True)
     truth = first.saved | second.saved
-    with MapStore.open(path) as store:
-        edges = OpenMap(store).graph.edges
+    with Map.open(path) as store:
+        edges = store.graph.edges
     assert any(edge.kind is EdgeKind.PROXIMITY for edge in edges)
     for edge in edges:
         true = truth[edge.a].inverse() @ truth[edge.b]

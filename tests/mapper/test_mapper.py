@@ -13,9 +13,8 @@ from engram.frontend import FrameStatus
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntryKind
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.robot import OpenMap
 
 WORLD = World(60.0)
 ROAD = np.arange(0.0, 55.0, 0.7)
@@ -28,8 +27,8 @@ def path(tmp_path: Path) -> Path:
 
 
 def graph_of(path: Path) -> ExperienceGraph:
-    with MapStore.open(path) as store:
-        return OpenMap(store).graph
+    with Map.open(path) as store:
+        return store.graph
 
 
 def looks(first: int, last: int) -> np.ndarray:
@@ -103,8 +102,8 @@ def test_paths_hold_what_was_matched_and_what_was_saved(path: Path) -> None:
     map_simulated(path, drive(WORLD, ROAD))
     seen = drive(WORLD, ROAD, looks(40, 99), seed=1, start_ns=LATER_NS)
     mapped = map_simulated(path, seen, "r2")
-    with MapStore.open(path) as store:
-        memory = OpenMap(store).path_memory
+    with Map.open(path) as store:
+        memory = store.path_memory
     assert len(memory.paths) == 2
     entries = memory.entries(memory.paths[1])
     saved = [entry.node for entry in entries if entry.kind is PathEntryKind.SAVED]
@@ -175,7 +174,7 @@ def test_the_same_input_gives_the_same_map(tmp_path: Path) -> None:
         map_simulated(path, drive(WORLD, ROAD))
         seen = drive(WORLD, ROAD, looks(30, 50), seed=1, start_ns=LATER_NS)
         map_simulated(path, seen, "r2")
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             hashes.append(store.content_hash())
     assert hashes[0] == hashes[1]
 

@@ -7,21 +7,21 @@ import signal
 from pathlib import Path
 
 from engram.graph.model import PathId, SessionId, path_id
-from engram.maps import BulkWriter, MapStore, WritableMapStore
+from engram.maps import BulkWriter, Map
 
 
-def begin_bulk(store: WritableMapStore) -> BulkWriter:
+def begin_bulk(store: Map) -> BulkWriter:
     return store.begin_revision(author="tests", message="copy", configuration={"policy": "copy"})
 
 
 def copy_into(
     writer: BulkWriter,
-    source: MapStore,
+    source: Map,
     partial: set[PathId] | frozenset[PathId] = frozenset(),
     only: set[SessionId] | None = None,
 ) -> None:
     contents = source.load()
-    frontends = source.frontends()
+    frontends = source.frontends
     taken = {one.id for one in contents.sessions if only is None or one.id in only}
     for one in contents.sessions:
         if one.id in taken:
@@ -49,13 +49,13 @@ def copy_into(
             writer.add_attempts(one.id, made, node_ids)
     for name, values in source.statistics().items():
         writer.put_statistics(name, values)
-    vocabulary = source.vocabulary()
+    vocabulary = source.vocabulary
     if vocabulary is not None:
         writer.put_vocabulary(vocabulary)
 
 
 def copy_and_die(target: str, source: str) -> None:
-    with MapStore.open_for_writing(Path(target)) as store, MapStore.open(Path(source)) as other:
+    with Map.open(Path(target), writes=True) as store, Map.open(Path(source)) as other:
         writer = begin_bulk(store)
         copy_into(writer, other)
         writer.flush()

@@ -6,7 +6,7 @@ import sys
 
 from tests.maps.maps import Drive, begin, session
 
-from engram.maps import MapStore
+from engram.maps import Map
 
 
 def say(*words: object) -> None:
@@ -15,7 +15,7 @@ def say(*words: object) -> None:
 
 
 def main(path: str, sessions: int, nodes: int) -> None:
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         for number in range(sessions):
             drive = session(f"robot-{number}")
             state = store.session_state(drive.id)

@@ -21,7 +21,7 @@ from engram.graph.model import (
     node_id,
     session_id,
 )
-from engram.maps import SessionWriter, WritableMapStore
+from engram.maps import Map, SessionWriter
 
 from .frames import CAMERA, FRONTEND, frame
 
@@ -38,7 +38,7 @@ def session(name: str = "robot-1", start_ns: int = 1_000) -> Session:
     )
 
 
-def begin(store: WritableMapStore, drive: Session, **changes: object) -> SessionWriter:
+def begin(store: Map, drive: Session, **changes: object) -> SessionWriter:
     arguments = {
         "descriptor": BRIEF,
         "frontend": FRONTEND,

@@ -13,15 +13,8 @@ from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.frontend import BRIEF, TEBLID
-from engram.graph.model import (
-    NodeId,
-    Omission,
-    PathEntry,
-    PathEntryKind,
-    node_id,
-    path_id,
-)
-from engram.maps import BulkWriter, MapStore, SessionState, bulk_writer
+from engram.graph.model import NodeId, Omission, PathEntry, PathEntryKind, node_id, path_id
+from engram.maps import BulkWriter, Map, SessionState, bulk_writer, check_file
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
 
@@ -34,7 +27,7 @@ from .maps import assert_same_edges, begin, edge, session, write_drive
 def source(tmp_path):
     """Two drives, statistics, and an interrupted session that nobody should copy."""
     path = tmp_path / "source.engram"
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         for name in ("robot-1", "robot-2"):
             writer = begin(store, session(name))
             write_drive(writer, 12)
@@ -42,17 +35,17 @@ def source(tmp_path):
             writer.commit()
         store.put_vocabulary(b"words", author="tests", message="", configuration={})
         write_drive(begin(store, session("robot-3")), 2)
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         yield store
 
 
 @pytest.fixture
 def target(location):
-    with MapStore.create(location) as store:
+    with Map.create(location) as store:
         yield store
 
 
-def assert_same_contents(copy: MapStore, source: MapStore) -> None:
+def assert_same_contents(copy: Map, source: Map) -> None:
     read, written = copy.load(), source.load()
     assert read.sessions == written.sessions
     assert read.nodes == written.nodes
@@ -60,10 +53,10 @@ def assert_same_contents(copy: MapStore, source: MapStore) -> None:
     assert_same_edges(read.edges, list(written.edges))
     for one in written.sessions:
         assert attempts_of(read, one.id) == attempts_of(written, one.id)
-    assert copy.frontends() == source.frontends()
-    assert copy.landmark_hashes() == source.landmark_hashes()
+    assert copy.frontends == source.frontends
+    assert copy.landmark_hashes == source.landmark_hashes
     assert copy.statistics() == source.statistics()
-    assert copy.vocabulary() == source.vocabulary()
+    assert copy.vocabulary == source.vocabulary
     for mine, theirs in zip(
         copy.frames.stored(read.nodes), source.frames.stored(written.nodes), strict=True
     ):
@@ -76,9 +69,9 @@ def test_a_copy_is_equal_to_the_byte(target, location, source):
         revision = writer.commit()
     assert (revision.number, revision.contents["nodes"]) == (1, 24)
     assert_same_contents(target, source)
-    with MapStore.open(location) as reader:
+    with Map.open(location) as reader:
         assert_same_contents(reader, source)
-    assert MapStore.check(location).problems == ()
+    assert check_file(location).problems == ()
 
 
 def test_the_content_hash_does_not_tell_in_how_many_batches_it_was_written(
@@ -87,7 +80,7 @@ def test_the_content_hash_does_not_tell_in_how_many_batches_it_was_written(
     hashes = set()
     for number, batch_bytes in enumerate((1, 10_000, 2**30)):
         monkeypatch.setattr(bulk_writer, "_BATCH_BYTES", batch_bytes)
-        with MapStore.create(tmp_path / f"{number}.engram") as store:
+        with Map.create(tmp_path / f"{number}.engram") as store:
             with begin_bulk(store) as writer:
                 copy_into(writer, source)
                 writer.commit()
@@ -112,7 +105,7 @@ def test_readers_see_nothing_before_the_commit_and_the_writer_everything(target,
         copy_into(writer, source)
         writer.flush()
         wanted = source.load().nodes[3].id
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             assert reader.load().nodes == ()
             assert reader.content_hash() == before
             assert reader.interrupted() == []
@@ -135,21 +128,21 @@ def test_what_was_abandoned_is_collected_and_can_be_written_again(target, locati
     with begin_bulk(target) as writer:
         copy_into(writer, source)
         writer.flush()
-    report = MapStore.check(location)
+    report = check_file(location)
     assert report.problems == ()
     assert report.abandoned_rows > 100
     with begin_bulk(target) as writer:
         copy_into(writer, source)
         writer.commit()
     assert_same_contents(target, source)
-    assert MapStore.check(location).abandoned_rows == 0
+    assert check_file(location).abandoned_rows == 0
     with pytest.raises(RevisionError, match="committed or abandoned"):
         writer.flush()
 
 
 def test_killed_before_the_commit_the_map_is_as_it_was(tmp_path, source):
     path = tmp_path / "town.engram"
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         write_drive(begin(store, session("robot-9")), 3)  # interrupted, and to stay so
         before = store.content_hash()
     script = "import sys; from tests.maps.copying import copy_and_die; copy_and_die(*sys.argv[1:])"
@@ -159,11 +152,11 @@ def test_killed_before_the_commit_the_map_is_as_it_was(tmp_path, source):
         check=False,
     )
     assert ended.returncode == -9
-    report = MapStore.check(path)
+    report = check_file(path)
     assert report.problems == ()
     assert report.interrupted == (session("robot-9").id,)
     assert report.abandoned_rows > 100
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         assert store.content_hash() == before
         assert [one.session for one in store.interrupted()] == [session("robot-9")]
         assert store.clean() == report.abandoned_rows
@@ -184,12 +177,12 @@ def test_omissions_and_partial_paths_are_read_back(target, source, landmark_hash
         with pytest.raises(InputError, match="twice"):
             writer.add_omission(Omission(omitted, equivalent, transform))
         writer.commit()
-    (found,) = target.omissions().values()
+    (found,) = target.omissions.values()
     assert (found.omitted, found.node) == (omitted, equivalent)
     assert found.landmark_hash == landmark_hash
-    assert target.landmark_hashes().get(omitted) == landmark_hash
+    assert target.landmark_hashes.get(omitted) == landmark_hash
     np.testing.assert_array_equal(found.node_from_omitted.matrix(), transform.matrix())
-    assert target.partial_paths() == {path_id(session("robot-2").id)}
+    assert target.partial_paths == {path_id(session("robot-2").id)}
 
 
 def test_paths_may_be_filled_in_any_order_and_by_several_revisions(target, source):
@@ -248,10 +241,10 @@ def test_what_was_hidden_is_shown_again_when_it_comes_again(target, location, so
         writer.commit()
     assert target.load().nodes == source.load().nodes
     assert target.load().path_entries == source.load().path_entries
-    assert MapStore.check(location).problems == ()
+    assert check_file(location).problems == ()
 
 
-def hide_session(store: MapStore, drive) -> None:
+def hide_session(store: Map, drive) -> None:
     """A revision that hides a session, as a revert does."""
     with begin_bulk(store) as writer, store._database.reading() as connection:
         tables = {

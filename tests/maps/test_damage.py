@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import threading
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -26,7 +27,7 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.graph.model import path_id
-from engram.maps import MapStore, sqlite
+from engram.maps import Map, check_file, sqlite
 from engram.maps.rows import sealed
 from engram.maps.schema import FORMAT_VERSION, edges, nodes, path_entries
 
@@ -39,7 +40,7 @@ def sound(tmp_path_factory):
     """A map of two committed sessions, and what is in it."""
     path = tmp_path_factory.mktemp("sound") / "town.engram"
     drives = []
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         for name in ("robot-1", "robot-2"):
             writer = begin(store, session(name))
             drives.append(write_drive(writer, 3))
@@ -55,7 +56,7 @@ def broken(sound, tmp_path):
 
 
 def assert_unharmed(path, drives: list[Drive]) -> None:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         contents = store.load()
         assert contents.sessions == tuple(drive.session for drive in drives)
         assert contents.nodes == tuple(node for drive in drives for node in drive.nodes)
@@ -69,7 +70,7 @@ def assert_unharmed(path, drives: list[Drive]) -> None:
 
 
 def read_all(path) -> None:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         for node in store.load().nodes:
             store.frames.frame(node.id)
             store.frames.thumbnail(node.id)
@@ -80,7 +81,7 @@ def read_all(path) -> None:
 
 def assert_found_or_harmless(path, drives: list[Drive]) -> None:
     try:
-        report = MapStore.check(path)
+        report = check_file(path)
     except MapError:
         return
     if report.sound:
@@ -109,7 +110,7 @@ def test_a_truncated_file_is_found(sound, tmp_path, share):
     path = tmp_path / "cut.engram"
     path.write_bytes(content[: int(share * len(content))])
     try:
-        report = MapStore.check(path)
+        report = check_file(path)
     except MapError:
         return
     assert not report.sound
@@ -121,7 +122,7 @@ def test_random_bytes_are_no_map(sound, tmp_path, content, head):
     path = tmp_path / "random.engram"
     path.write_bytes(sound[0].read_bytes()[:head] + content)
     with pytest.raises(MapError):
-        MapStore.open(path)
+        Map.open(path)
 
 
 def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
@@ -139,7 +140,7 @@ def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
         (folder, "folder"),
         (other, "no Engram map"),
     ):
-        for opener in (MapStore.open, MapStore.open_for_writing, MapStore.check):
+        for opener in (Map.open, partial(Map.open, writes=True), check_file):
             with pytest.raises(NotAMapError, match=fact):
                 opener(path)
 
@@ -149,7 +150,7 @@ def test_a_newer_format_is_named(broken):
         connection.execute(f"PRAGMA user_version={FORMAT_VERSION + 1}")
     connection.close()
     told = rf"format {FORMAT_VERSION + 1}.*up to {FORMAT_VERSION}"
-    for opener in (MapStore.open, MapStore.open_for_writing, MapStore.check):
+    for opener in (Map.open, partial(Map.open, writes=True), check_file):
         with pytest.raises(FormatVersionError, match=told):
             opener(broken)
 
@@ -170,23 +171,23 @@ def test_a_strangers_tables_views_and_triggers_are_refused(broken, statement):
         connection.execute(statement)
     connection.close()
     with pytest.raises(MapCorruptError, match=r"sneaky|vocabularies"):
-        MapStore.open(broken)
+        Map.open(broken)
 
 
 def test_creating_never_replaces_anything(tmp_path, broken):
     before = broken.read_bytes()
     with pytest.raises(InputError, match="exists already"):
-        MapStore.create(broken)
+        Map.create(broken)
     assert broken.read_bytes() == before
     with pytest.raises(InputError, match="no folder"):
-        MapStore.create(tmp_path / "nowhere" / "town.engram")
+        Map.create(tmp_path / "nowhere" / "town.engram")
 
 
 def test_a_link_to_a_map_is_the_same_map(tmp_path, broken):
     link = tmp_path / "link.engram"
     link.symlink_to(broken)
-    with MapStore.open_for_writing(broken), pytest.raises(MapLockedError):
-        MapStore.open_for_writing(link)
+    with Map.open(broken, writes=True), pytest.raises(MapLockedError):
+        Map.open(link, writes=True)
 
 
 def test_a_map_is_made_where_there_are_no_hard_links(tmp_path, monkeypatch):
@@ -195,10 +196,10 @@ def test_a_map_is_made_where_there_are_no_hard_links(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "link", refuse)
     path = tmp_path / "town.engram"
-    MapStore.create(path).close()
-    assert MapStore.check(path).problems == ()
+    Map.create(path).close()
+    assert check_file(path).problems == ()
     with pytest.raises(InputError, match="exists already"):
-        MapStore.create(path)
+        Map.create(path)
 
 
 def change(path, statement: str, *values: object) -> None:
@@ -215,7 +216,7 @@ def insert_row(path, table: Table, row: dict[str, object]) -> None:
 
 
 def problems(path) -> list[str]:
-    return [str(problem) for problem in MapStore.check(path).problems]
+    return [str(problem) for problem in check_file(path).problems]
 
 
 class TestCheckNamesTableUuidAndFact:
@@ -229,19 +230,19 @@ class TestCheckNamesTableUuidAndFact:
         )
         (fact, *_) = problems(broken)
         assert fact == f"frames {node}: does not match its checksum"
-        with MapStore.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
+        with Map.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
             store.frames.frame(node)
 
     def test_a_changed_stamp(self, broken, sound):
         node = sound[1][1].nodes[2].id
         change(broken, "UPDATE nodes SET stamp_ns = stamp_ns + 1 WHERE uuid = ?", node.bytes)
         assert f"nodes {node}: does not match its checksum" in problems(broken)
-        with MapStore.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
+        with Map.open(broken) as store, pytest.raises(MapCorruptError, match=str(node)):
             store.load()
 
     def test_whoever_meets_damage_is_told_the_map_once(self, broken, sound):
         node = sound[1][1].nodes[2]
-        with MapStore.open(broken) as store:
+        with Map.open(broken) as store:
             change(broken, "UPDATE nodes SET stamp_ns = 0 WHERE uuid = ?", node.id.bytes)
             for read in (
                 store.load,
@@ -392,13 +393,13 @@ def test_a_map_on_read_only_media_is_read(sound, tmp_path_factory):
     folder.chmod(0o555)
 
     def read() -> list[str]:
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             frames = [store.frames.frame(node.id) for node in store.load().nodes]
         try:
-            MapStore.open_for_writing(path)
+            Map.open(path, writes=True)
         except MapError as error:
             refusal = str(error)
-        return [str(len(frames)), str(MapStore.check(path).problems), refusal]
+        return [str(len(frames)), str(check_file(path).problems), refusal]
 
     count, found, refusal = in_a_child_without_rights(read)
     assert (count, found) == ("6", "()")
@@ -423,13 +424,13 @@ def test_a_map_written_under_a_reader_without_rights_is_no_damaged_one(sound, tm
     def write() -> None:
         opened.read_bytes()
         folder.chmod(0o755)
-        with MapStore.open_for_writing(path) as store:
+        with Map.open(path, writes=True) as store:
             store.tag("seen", author="tester")
         folder.chmod(0o555)
         go_on.write_bytes(b"")
 
     def read() -> list[str]:
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             first = len(store.load().nodes)
             opened.write_bytes(b"")
             go_on.read_bytes()
@@ -437,7 +438,7 @@ def test_a_map_written_under_a_reader_without_rights_is_no_damaged_one(sound, tm
                 told = str(len(store.load().nodes))
             except MapError as error:
                 told = f"{type(error).__name__}: {error}"
-        with MapStore.open(path) as store:
+        with Map.open(path) as store:
             return [str(first), told, str(len(store.load().nodes))]
 
     writer = threading.Thread(target=write)
@@ -463,9 +464,9 @@ def test_a_map_on_a_full_disk_is_read(sound, tmp_path, monkeypatch):
         raise error
 
     monkeypatch.setattr(sqlite, "_connect", no_room)
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         assert len(store.load().nodes) == 6
     # A log may hold what the file does not have yet.
     path.with_name("town.engram-wal").write_bytes(b"something")
     with pytest.raises(StorageFullError, match="cannot grow"):
-        MapStore.open(path)
+        Map.open(path)

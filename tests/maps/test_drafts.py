@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from engram.errors import InputError
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.maps.drafts import draft_folder, remove_left_drafts
 
 _WRITES_ON = """
@@ -51,7 +51,7 @@ def test_the_next_draft_for_a_name_removes_what_a_killed_process_left(tmp_path: 
     writer = Writer(path)
     writer.kill()
     assert (writer.folder / "half").exists()
-    MapStore.create(path).close()
+    Map.create(path).close()
     assert not writer.folder.exists()
     assert not [left for left in tmp_path.iterdir() if left.suffix == ".draft"]
 
@@ -59,7 +59,7 @@ def test_the_next_draft_for_a_name_removes_what_a_killed_process_left(tmp_path: 
 def test_a_draft_that_is_being_written_stays(tmp_path: Path) -> None:
     path = tmp_path / "town.engram"
     writer = Writer(path)
-    MapStore.create(path).close()
+    Map.create(path).close()
     assert (writer.folder / "half").exists()
     assert writer.finish() == 0
     assert not writer.folder.exists()
@@ -68,9 +68,9 @@ def test_a_draft_that_is_being_written_stays(tmp_path: Path) -> None:
 def test_drafts_of_other_names_stay(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "town[1].engram")
     writer.kill()
-    MapStore.create(tmp_path / "town1.engram").close()
+    Map.create(tmp_path / "town1.engram").close()
     assert writer.folder.exists()
-    MapStore.create(tmp_path / "town[1].engram").close()
+    Map.create(tmp_path / "town[1].engram").close()
     assert not writer.folder.exists()
 
 

@@ -14,7 +14,7 @@ from engram.errors import IncompatibleError
 from engram.frontend import BRIEF, TEBLID
 from engram.geometry import SE3
 from engram.graph.model import EdgeKind, NodeId, Omission
-from engram.maps import MapStore, SessionState
+from engram.maps import Map, SessionState, check_file
 from engram.maps.schema import FORMAT_VERSION, metadata
 
 from .maps import begin, node, session
@@ -31,7 +31,7 @@ def old(tmp_path):
 
 
 def test_format_1_reads_as_it_was_written(old):
-    with MapStore.open(old) as store:
+    with Map.open(old) as store:
         contents = store.load()
         assert contents.sessions == (session("robot-1"), session("robot-2"))
         expected = [node(session("robot-1"), index) for index in range(4)]
@@ -57,12 +57,12 @@ def test_format_1_reads_as_it_was_written(old):
     [(1, "fdd08fe8b0d456052e442cf7aa78c177"), (2, "6b2b5e50d8e8c3be77655846e443c042")],
 )
 def test_format_1_keeps_its_content_hash(old, at, expected):
-    with MapStore.open(old, at=at) as store:
+    with Map.open(old, at=at) as store:
         assert store.content_hash() == expected
 
 
 def test_format_1_supersedes_edges(old):
-    with MapStore.open(old, at=1) as before, MapStore.open(old, at=2) as after:
+    with Map.open(old, at=1) as before, Map.open(old, at=2) as after:
         (was,) = (e for e in before.load().edges if e.kind is EdgeKind.PROXIMITY)
         (now,) = (e for e in after.load().edges if e.kind is EdgeKind.PROXIMITY)
     assert (was.a, was.b) == (now.a, now.b)
@@ -70,15 +70,15 @@ def test_format_1_supersedes_edges(old):
 
 
 def test_format_1_is_sound_and_can_be_written_on(old):
-    assert MapStore.check(old).problems == ()
-    with MapStore.open_for_writing(old) as store:
+    assert check_file(old).problems == ()
+    with Map.open(old, writes=True) as store:
         with pytest.raises(IncompatibleError):
             begin(store, session("robot-4"), descriptor=TEBLID)
         assert store.session_state(session("robot-1").id) is SessionState.COMMITTED
         assert store.seal(session("robot-3").id).contents["nodes"] == 2
         begin(store, session("robot-4")).commit()
         assert store.revision == 4
-    assert MapStore.check(old).problems == ()
+    assert check_file(old).problems == ()
 
 
 def test_the_page_on_the_format_names_every_table_and_column():
@@ -96,10 +96,10 @@ def test_the_page_on_the_format_names_every_table_and_column():
 @pytest.mark.parametrize("version", range(1, FORMAT_VERSION))
 def test_older_maps_become_of_the_newest_format_when_they_are_written_on(tmp_path, version):
     path = shutil.copy(DATA / f"format-{version}.engram", tmp_path / "old.engram")
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         assert store.format_version == version
         before, contents = store.content_hash(), store.load()
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         assert store.format_version == FORMAT_VERSION
         assert store.content_hash() == before
         omitted = Omission(
@@ -108,9 +108,9 @@ def test_older_maps_become_of_the_newest_format_when_they_are_written_on(tmp_pat
         with store.begin_revision(author="tests", message="", configuration={}) as writer:
             writer.add_omission(omitted)
             writer.commit()
-        assert store.landmark_hashes()[omitted.omitted] == HASH
+        assert store.landmark_hashes[omitted.omitted] == HASH
         assert store.content_hash() != before
-    assert MapStore.check(path).problems == ()
+    assert check_file(path).problems == ()
 
 
 @pytest.fixture
@@ -123,18 +123,18 @@ def test_format_2_reads_as_it_was_written(second):
     drives = (session("robot-1"), session("robot-2"))
     counts = {1: (3, 0), 2: (3, 3), 3: (3, 0), 4: (3, 4)}
     for at, (first, other) in counts.items():
-        with MapStore.open(second, at=at) as store:
+        with Map.open(second, at=at) as store:
             expected = [node(drives[0], index) for index in range(first)]
             expected += [node(drives[1], index) for index in range(other)]
             assert set(store.load().nodes) == set(expected)
             assert len(store.load().path_entries) == len(expected)
-    with MapStore.open(second, at="both") as store:
+    with Map.open(second, at="both") as store:
         assert store.revision == 2
         assert store.tags()["both"].message == "two drives"
         (found,) = store.words(bytes(16)).items()
         assert found[0] == node(drives[1], 0).id
         np.testing.assert_array_equal(found[1], [1, 5, 9])
-    assert MapStore.check(second).problems == ()
+    assert check_file(second).problems == ()
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_format_2_reads_as_it_was_written(second):
     [(2, "c9d498a5dce9f96aee4ff70849091cb5"), (4, "9f56160275237e470163fb0528ea3502")],
 )
 def test_format_2_keeps_its_content_hash(second, at, expected):
-    with MapStore.open(second, at=at) as store:
+    with Map.open(second, at=at) as store:
         assert store.content_hash() == expected
 
 
@@ -153,17 +153,17 @@ def third(tmp_path):
 
 
 def test_format_3_reads_as_it_was_written(third):
-    with MapStore.open(third) as store:
-        (omission,) = store.omissions().values()
+    with Map.open(third) as store:
+        (omission,) = store.omissions.values()
         assert omission.omitted == NodeId(UUID(int=3))
         assert omission.node == node(session("robot-1"), 1).id
         assert omission.landmark_hash == HASH
-        assert set(store.landmark_hashes()) == {one.id for one in store.load().nodes} | {
+        assert set(store.landmark_hashes) == {one.id for one in store.load().nodes} | {
             omission.omitted
         }
-    with MapStore.open(third, at=1) as store:
-        assert len(store.landmark_hashes()) == 3
-    assert MapStore.check(third).problems == ()
+    with Map.open(third, at=1) as store:
+        assert len(store.landmark_hashes) == 3
+    assert check_file(third).problems == ()
 
 
 @pytest.mark.parametrize(
@@ -171,5 +171,5 @@ def test_format_3_reads_as_it_was_written(third):
     [(1, "34f49b799af7925db24ff73b39a16a21"), (2, "5faf38a7d236dd3b61d25bc49e553f96")],
 )
 def test_format_3_keeps_its_content_hash(third, at, expected):
-    with MapStore.open(third, at=at) as store:
+    with Map.open(third, at=at) as store:
         assert store.content_hash() == expected

@@ -10,7 +10,7 @@ import pytest
 
 from engram.errors import InputError, RevisionError
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
-from engram.maps import MapStore, SessionState
+from engram.maps import Map, SessionState, check_file
 from engram.maps.schema import FORMAT_VERSION
 
 from .frames import assert_same_landmarks
@@ -22,7 +22,7 @@ OLD = Path(__file__).parent / "data" / "format-1.engram"
 
 @pytest.fixture
 def store(location):
-    with MapStore.create(location) as store:
+    with Map.create(location) as store:
         yield store
 
 
@@ -41,7 +41,7 @@ def two(store) -> list[Drive]:
     return drives
 
 
-def map_again(store: MapStore, drive: Drive, count: int = 3) -> Drive:
+def map_again(store: Map, drive: Drive, count: int = 3) -> Drive:
     """The same drive, handed in again."""
     writer = begin(store, drive.session)
     again = write_drive(writer, count)
@@ -57,7 +57,7 @@ class TestTags:
             "winter~1": 0, 2: 2, None: 2,
         }.items():  # fmt: skip
             assert store.resolve(named) == number
-        with MapStore.open(location, at="winter") as old:
+        with Map.open(location, at="winter") as old:
             assert_holds(old, two[0])
             assert old.tags()["winter"].message == "before the snow melted"
 
@@ -65,7 +65,7 @@ class TestTags:
     def test_what_names_no_revision_is_refused(self, store, two, location, named):
         store.tag("winter", 1, author="me")
         with pytest.raises(RevisionError, match=r"winter|1 to 2"):
-            MapStore.open(location, at=named)
+            Map.open(location, at=named)
 
     @pytest.mark.parametrize("name", ["", "7", "head", "Head", "a b", "a~1", "-x", "ž", "a" * 101])
     def test_what_could_be_taken_for_something_else_is_no_tag(self, store, two, name):
@@ -87,7 +87,7 @@ class TestTags:
         before = store.content_hash(), store.log()
         store.tag("live", 1, author="me")
         assert (store.content_hash(), store.log()) == before
-        assert MapStore.check(location).problems == ()
+        assert check_file(location).problems == ()
 
     def test_an_empty_map_has_nothing_to_tag(self, store):
         with pytest.raises(RevisionError, match="no revision yet"):
@@ -98,18 +98,18 @@ class TestRevert:
     def test_what_a_revision_brought_is_gone_and_older_revisions_stay(self, store, two, location):
         hashes = []
         for at in (1, 2):
-            with MapStore.open(location, at=at) as old:
+            with Map.open(location, at=at) as old:
                 hashes.append(old.content_hash())
         done = store.revert(2, author="me", message="loose camera")
         assert done.revision.number == 3
         assert done.revision.message == "revert revision 2: loose camera"
         assert_holds(store, two[0])
         for at, drives in ((1, two[:1]), (2, two)):
-            with MapStore.open(location, at=at) as old:
+            with Map.open(location, at=at) as old:
                 assert_holds(old, *drives)
                 assert old.content_hash() == hashes[at - 1]
         assert store.content_hash() not in hashes
-        assert MapStore.check(location).problems == ()
+        assert check_file(location).problems == ()
 
     def test_what_others_built_on_it_goes_with_it_and_is_counted(self, store, two):
         done = store.revert(1, author="me")
@@ -125,7 +125,7 @@ class TestRevert:
         assert_holds(store, *two)
         store.revert("head", author="me")
         assert store.load().nodes == tuple(two[1].nodes)
-        assert MapStore.check(location).problems == ()
+        assert check_file(location).problems == ()
 
     def test_what_others_get_back_is_counted_by_itself(self, store, two):
         nothing = {"edges": 0, "path_entries": 0, "omissions": 0}
@@ -160,9 +160,9 @@ class TestRevert:
         assert store.log()[-1].contents["nodes"] == 1  # three came back, one is new
         assert store.session_state(two[1].session.id) is SessionState.COMMITTED
         for at, drives in ((2, two), (3, two[:1]), (4, [two[0], again])):
-            with MapStore.open(location, at=at) as old:
+            with Map.open(location, at=at) as old:
                 assert_holds(old, *drives)
-        assert MapStore.check(location).problems == ()
+        assert check_file(location).problems == ()
 
     def test_what_comes_back_goes_again_when_its_revision_is_reverted(self, store, two):
         store.revert(2, author="me")
@@ -180,10 +180,10 @@ class TestRevert:
             two[1].frames[two[1].nodes[0].id].landmarks,
         )
         store.close()
-        with MapStore.open_for_writing(location) as again:
+        with Map.open(location, writes=True) as again:
             (left,) = again.interrupted()
             assert (left.session, left.nodes) == (two[1].session, 2)
-            assert MapStore.check(location).interrupted == (two[1].session.id,)
+            assert check_file(location).interrupted == (two[1].session.id,)
             with pytest.raises(RevisionError, match="resume"):
                 begin(again, two[1].session)
             resumed = again.resume_session(two[1].session.id)
@@ -194,7 +194,7 @@ class TestRevert:
             assert {node.id for node in again.load().nodes} == {
                 node.id for one in two for node in one.nodes
             }
-        assert MapStore.check(location).problems == ()
+        assert check_file(location).problems == ()
 
     def test_a_drive_may_come_back_only_as_what_it_was(self, store, two):
         store.revert(2, author="me")
@@ -241,7 +241,7 @@ class TestContentHashWithHistory:
     def test_the_same_steps_give_the_same_hash(self, store, two, tmp_path):
         store.revert(2, author="me")
         map_again(store, two[1])
-        with MapStore.create(tmp_path / "other.engram") as other:
+        with Map.create(tmp_path / "other.engram") as other:
             for number in (1, 2):
                 writer = begin(other, session(f"robot-{number}"))
                 drive = Drive(writer.session)
@@ -269,9 +269,9 @@ class TestBlame:
 
     def test_as_of_an_older_revision(self, store, two, location):
         store.revert(2, author="me")
-        with MapStore.open(location, at=2) as old:
+        with Map.open(location, at=2) as old:
             assert old.origin(str(two[1].nodes[0].id)).visible
-        with MapStore.open(location, at=1) as old, pytest.raises(InputError, match="none of"):
+        with Map.open(location, at=1) as old, pytest.raises(InputError, match="none of"):
             old.origin(str(two[1].nodes[0].id))
 
     def test_a_prefix_of_several_nodes_lists_them(self, store, location):
@@ -291,16 +291,16 @@ class TestBlame:
 
 def test_an_old_map_is_raised_when_it_is_written_and_reads_the_same(tmp_path):
     old = shutil.copy(OLD, tmp_path / "old.engram")
-    with MapStore.open(old) as reader:
+    with Map.open(old) as reader:
         assert reader.info().format_version == 1
         assert reader.tags() == {}
         before = reader.content_hash()
-        with MapStore.open_for_writing(old) as writer:
+        with Map.open(old, writes=True) as writer:
             assert writer.content_hash() == before
             assert writer.info().format_version == FORMAT_VERSION
             writer.tag("first", 1, author="me")
             # Who had opened the file before goes on reading.
             assert reader.content_hash() == before
-        with MapStore.open(old, at="first") as other:
+        with Map.open(old, at="first") as other:
             assert other.revision == 1
-    assert MapStore.check(old).problems == ()
+    assert check_file(old).problems == ()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from engram.errors import MapLockedError
-from engram.maps import MapStore
+from engram.maps import Map, check_file, copy_map
 
 from .frames import assert_same_landmarks
 from .maps import begin, node, node_frame, session, write_drive
@@ -49,7 +49,7 @@ def run_and_kill(path: Path, rng: random.Random, *, in_commit: bool) -> tuple[st
 def assert_as_said(path: Path, heard: tuple[str, int, int]) -> None:
     """The map holds all that was said to be checkpointed, and at most the batch in flight more."""
     verb, number, count = heard
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         contents = store.load()
         interrupted = store.interrupted()
         per_session = {one.id: 0 for one in contents.sessions}
@@ -73,28 +73,28 @@ def assert_as_said(path: Path, heard: tuple[str, int, int]) -> None:
         assert one.nodes in {count, count - 3 * (verb == "checkpointing")}
     if verb == "committing" and committed == number:
         assert interrupted[0].nodes == NODES
-    report = MapStore.check(path)
+    report = check_file(path)
     assert report.problems == ()
     assert report.interrupted == tuple(one.session.id for one in interrupted)
 
 
 def kill_and_resume(path: Path, seed: int, kills: int) -> None:
     rng = random.Random(seed)
-    MapStore.create(path).close()
+    Map.create(path).close()
     for kill in range(kills):
         heard = run_and_kill(path, rng, in_commit=kill % 3 == 2)
         assert_as_said(path, heard)
         if heard[0] == "done":
             path.unlink()
-            MapStore.create(path).close()
+            Map.create(path).close()
         elif kill % 4 == 3:
-            with MapStore.open_for_writing(path) as store:
+            with Map.open(path, writes=True) as store:
                 for one in store.interrupted():
                     store.resume_session(one.session.id).abandon()
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         for one in store.interrupted():
             assert store.seal(one.session.id).number == store.revision
-    assert MapStore.check(path).problems == ()
+    assert check_file(path).problems == ()
 
 
 def test_killed_at_any_moment_the_map_holds_what_was_checkpointed(tmp_path):
@@ -110,27 +110,27 @@ def test_killed_many_times_the_map_holds_what_was_checkpointed(tmp_path, seed):
 def test_a_map_made_where_another_was_removed_takes_nothing_of_its_log(tmp_path):
     """A killed writer leaves its log; people remove the map and overlook what lies beside it."""
     path, aside = tmp_path / "town.engram", tmp_path / "aside"
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         writer = begin(store, session())
         write_drive(writer)
         writer.checkpoint()
         log = path.with_name("town.engram-wal")
         shutil.copy(log, aside)  # as it is now, for closing empties it
     other = tmp_path / "other.engram"
-    MapStore.create(other).close()
-    for make in (lambda: MapStore.create(path).close(), lambda: MapStore.copy(other, path)):
+    Map.create(other).close()
+    for make in (lambda: Map.create(path).close(), lambda: copy_map(other, path)):
         path.unlink()
         shutil.copy(aside, log)
         make()
-        assert MapStore.check(path).problems == ()
-        with MapStore.open(path) as store:
+        assert check_file(path).problems == ()
+        with Map.open(path) as store:
             assert store.interrupted() == []
 
 
 def test_a_log_whose_writer_is_alive_is_not_removed(tmp_path):
     path = tmp_path / "town.engram"
-    with MapStore.create(path):
+    with Map.create(path):
         path.unlink()
         with pytest.raises(MapLockedError):
-            MapStore.create(path)
+            Map.create(path)
         assert path.with_name("town.engram-wal").exists()

@@ -14,7 +14,7 @@ from engram.errors import IncompatibleError, InputError, MapLockedError, Revisio
 from engram.frontend import BRIEF, TEBLID
 from engram.geometry import StereoCamera
 from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind
-from engram.maps import MapStore, SessionState
+from engram.maps import Map, SessionState, check_file
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
 
@@ -34,11 +34,11 @@ from .maps import (
 
 @pytest.fixture
 def store(location):
-    with MapStore.create(location) as store:
+    with Map.create(location) as store:
         yield store
 
 
-def assert_holds(store: MapStore, *drives: Drive) -> None:
+def assert_holds(store: Map, *drives: Drive) -> None:
     contents = store.load()
     assert contents.sessions == tuple(drive.session for drive in drives)
     assert contents.nodes == tuple(node for drive in drives for node in drive.nodes)
@@ -73,7 +73,7 @@ class TestSessions:
         assert revision.parent is None
         assert revision.configuration == {"mapper": {"distance_m": 1.0}}
         assert_holds(store, drive)
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             assert_holds(reader, drive)
             assert reader.log() == [revision]
 
@@ -81,13 +81,13 @@ class TestSessions:
         writer = begin(store, session())
         drive = write_drive(writer)
         writer.checkpoint()
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             assert reader.load().nodes == ()
             with pytest.raises(InputError, match="not part of the map"):
                 reader.frames.frame(drive.nodes[0].id)
             writer.commit()
             assert reader.load().nodes == ()
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             assert_holds(reader, drive)
 
     def test_a_writer_reads_its_own_frames_before_the_checkpoint(self, store):
@@ -142,11 +142,11 @@ class TestInterruption:
         lost = node(session(), 9)
         writer.add_node(lost, node_frame(session(), 9))
         store.close()
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             (found,) = reader.interrupted()
             assert found.session == session()
             assert (found.nodes, found.last_stamp_ns) == (5, drive.nodes[-1].stamp_ns)
-        with MapStore.open_for_writing(location) as again:
+        with Map.open(location, writes=True) as again:
             assert again.session_state(session().id) is SessionState.INTERRUPTED
             with pytest.raises(RevisionError, match="resume"):
                 begin(again, session())
@@ -165,7 +165,7 @@ class TestInterruption:
         drive = write_drive(writer)
         writer.checkpoint()
         store.close()
-        with MapStore.open_for_writing(location) as again:
+        with Map.open(location, writes=True) as again:
             assert again.seal(session().id).number == 1
             assert_holds(again, drive)
             with pytest.raises(RevisionError, match="no interrupted session"):
@@ -173,13 +173,13 @@ class TestInterruption:
 
     def test_a_live_writer_is_not_interrupted(self, store, location):
         begin(store, session())
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             assert reader.interrupted() == []
             assert reader.session_state(session().id) is SessionState.OPEN
 
     def test_the_second_writer_learns_who_the_first_is(self, store, location):
         with pytest.raises(MapLockedError, match=f"process {os.getpid()} on "):
-            MapStore.open_for_writing(location)
+            Map.open(location, writes=True)
 
 
 class TestRecords:
@@ -198,7 +198,7 @@ class TestRecords:
         later = begin(store, session("robot-2"))
         later.add_edge(edge(a, b, EdgeKind.PROXIMITY, seed=10))
         later.commit()
-        with MapStore.open(location, at=1) as old, MapStore.open(location, at=2) as new:
+        with Map.open(location, at=1) as old, Map.open(location, at=2) as new:
             assert_same_edges([old.load().edges[-1]], [edge(a, b, EdgeKind.PROXIMITY, seed=9)])
             assert_same_edges([new.load().edges[-1]], [edge(a, b, EdgeKind.PROXIMITY, seed=10)])
             assert len(new.load().edges) == 2
@@ -255,7 +255,7 @@ class TestRecords:
         writer = begin(store, session())
         drive = write_drive(writer, 1)
         writer.commit()
-        with MapStore.open(location) as reader:
+        with Map.open(location) as reader:
             assert reader.frames.frame(drive.nodes[0].id).thumbnail is None
             assert reader.frames.thumbnail(drive.nodes[0].id).shape == (30, 40)
 
@@ -265,7 +265,7 @@ class TestRecords:
             writer.put_statistics("basin", {"g": [0.9, 0.1 * number]})
             writer.commit()
         assert store.statistics() == {"basin": {"g": [0.9, 0.2]}}
-        with MapStore.open(location, at=1) as old:
+        with Map.open(location, at=1) as old:
             assert old.statistics() == {"basin": {"g": [0.9, 0.1]}}
 
     def test_the_camera_comes_back_to_the_last_bit(self, store):
@@ -281,34 +281,34 @@ class TestHistory:
             drives.append(write_drive(writer, 2 + number))
             writer.commit()
         for at in range(4):
-            with MapStore.open(location, at=at) as old:
+            with Map.open(location, at=at) as old:
                 assert_holds(old, *drives[:at])
                 assert [one.number for one in old.log()] == list(range(1, at + 1))
                 assert old.info().nodes == sum(len(drive.nodes) for drive in drives[:at])
         for at in (-1, 4):
             with pytest.raises(RevisionError, match="1 to 3"):
-                MapStore.open(location, at=at)
+                Map.open(location, at=at)
 
     def test_a_session_committed_late_does_not_change_older_revisions(self, store, location):
         first = begin(store, session("interrupted"))
         early = write_drive(first)
         first.checkpoint()
         store.close()
-        with MapStore.open_for_writing(location) as again:
+        with Map.open(location, writes=True) as again:
             second = begin(again, session("quick"))
             late = write_drive(second)
             second.commit()
             assert_holds(again, late)
             again.seal(session("interrupted").id)
             assert_holds(again, late, early)
-        with MapStore.open(location, at=1) as old:
+        with Map.open(location, at=1) as old:
             assert_holds(old, late)
 
 
 class TestHidden:
     """`revert` will hide rows; what readers make of hidden rows stands already."""
 
-    def hide(self, store: MapStore, name: str, record: str, target: int, hide: int) -> None:
+    def hide(self, store: Map, name: str, record: str, target: int, hide: int) -> None:
         """A new revision with one `hidden` row."""
         writer = begin(store, session(name))
         row = {
@@ -335,14 +335,14 @@ class TestHidden:
         assert {a.iteration for a in attempts_of(contents, session().id)} == {1, 4}
         info = store.info()
         assert (info.nodes, info.edges, info.path_entries) == (4, 2, 4)
-        with MapStore.open(location) as reader, pytest.raises(InputError, match="not part"):
+        with Map.open(location) as reader, pytest.raises(InputError, match="not part"):
             reader.frames.frame(gone)
         self.hide(store, "shows", "nodes", target=3, hide=0)
         assert store.load().nodes == tuple(drive.nodes)
-        with MapStore.open(location) as reader, MapStore.open(location, at=2) as older:
+        with Map.open(location) as reader, Map.open(location, at=2) as older:
             assert_same_landmarks(reader.frames.frame(gone).landmarks, drive.frames[gone].landmarks)
             assert len(older.load().nodes) == 4
-        assert MapStore.check(location).problems == ()
+        assert check_file(location).problems == ()
 
     def test_a_hidden_edge_shows_the_one_it_superseded(self, store):
         writer = begin(store, session())
@@ -363,7 +363,7 @@ class TestContentHash:
         drive = write_drive(writer)
         writer.add_edge(edge(drive.nodes[0].id, drive.nodes[4].id, EdgeKind.PROXIMITY, seed=1))
         writer.commit()
-        with MapStore.create(tmp_path / "other.engram") as other:
+        with Map.create(tmp_path / "other.engram") as other:
             gone = begin(other, session("gone"))
             write_drive(gone)
             gone.checkpoint()
@@ -389,7 +389,7 @@ class TestContentHash:
         for number, changes in enumerate(
             ({}, {"count": 4}, {"author": "else"}, {"statistic": 1}, {"more": 1}, {"name": "x"})
         ):
-            with MapStore.create(tmp_path / f"{number}.engram") as other:
+            with Map.create(tmp_path / f"{number}.engram") as other:
                 drive = session(changes.get("name", "robot-1"))
                 writer = begin(other, drive, author=changes.get("author", "tests"))
                 written = write_drive(writer, changes.get("count", 5))
@@ -409,7 +409,7 @@ class TestContentHash:
         found = store.record_hashes()
         assert set(found) == {"sessions", "nodes", "edges", "paths", "path_entries", "attempts"}
         for number, (author, count) in enumerate([("else", 5), ("tests", 4)]):
-            with MapStore.create(tmp_path / f"{number}.engram") as other:
+            with Map.create(tmp_path / f"{number}.engram") as other:
                 writer = begin(other, session(), author=author, configuration={"a": number})
                 write_drive(writer, count)
                 writer.commit()
@@ -428,7 +428,7 @@ class TestContentHash:
         assert store.content_hash() == before
         writer.commit()
         assert store.content_hash() != before
-        with MapStore.open(location, at=1) as old:
+        with Map.open(location, at=1) as old:
             assert old.content_hash() == before
 
 
@@ -440,21 +440,21 @@ class TestCheck:
         writer = begin(store, session("robot-2"))
         write_drive(writer)
         writer.checkpoint()
-        report = MapStore.check(location)
+        report = check_file(location)
         assert report.problems == ()
         assert report.interrupted == ()
         # Two sessions with five nodes each: landmarks, thumbnails, a body of attempts.
         assert report.blobs == 2 * (5 + 5 + 1)
         store.close()
-        assert MapStore.check(location).interrupted == (session("robot-2").id,)
+        assert check_file(location).interrupted == (session("robot-2").id,)
 
     def test_rows_of_abandoned_sessions_are_counted_and_cleaned(self, store, location):
         writer = begin(store, session())
         write_drive(writer)
         writer.checkpoint()
         writer.abandon()
-        assert MapStore.check(location).abandoned_rows == 1 + 5 + 5 + 4 + 1 + 5 + 1
+        assert check_file(location).abandoned_rows == 1 + 5 + 5 + 4 + 1 + 5 + 1
         assert store.clean() == 22
-        report = MapStore.check(location)
+        report = check_file(location)
         assert report.abandoned_rows == 0
         assert report.sound

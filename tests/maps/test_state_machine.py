@@ -20,7 +20,7 @@ from hypothesis.stateful import (
 
 from engram.errors import RevisionError
 from engram.graph.model import EdgeKind
-from engram.maps import MapStore, SessionState, SessionWriter, WritableMapStore
+from engram.maps import Map, SessionState, SessionWriter, check_file
 
 from .conftest import drop_postgres_map, new_postgres_map
 from .frames import assert_same_landmarks
@@ -52,7 +52,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @initialize()
     def create(self) -> None:
-        self.store: WritableMapStore = MapStore.create(self.location)
+        self.store: Map = Map.create(self.location)
 
     @precondition(lambda self: self.writer is None)
     @rule(robot=st.sampled_from(ROBOTS))
@@ -117,7 +117,7 @@ class MapMachine(RuleBasedStateMachine):
         if self.writer is not None:
             self.interrupted[self.writer.session.robot] = self.durable
         self.writer = self.writing = self.durable = None
-        self.store = MapStore.open_for_writing(self.location)
+        self.store = Map.open(self.location, writes=True)
 
     @precondition(lambda self: self.writer is None and self.interrupted)
     @rule(data=st.data(), seal=st.booleans())
@@ -141,7 +141,7 @@ class MapMachine(RuleBasedStateMachine):
     @rule(data=st.data())
     def read_at(self, data: st.DataObject) -> None:
         at = data.draw(st.integers(0, len(self.committed)))
-        with MapStore.open(self.location, at=at) as store:
+        with Map.open(self.location, at=at) as store:
             contents = store.load()
             drives = self.committed[:at]
             assert contents.sessions == tuple(one.session for one, _ in drives)
@@ -162,7 +162,7 @@ class MapMachine(RuleBasedStateMachine):
 
     @rule()
     def check(self) -> None:
-        report = MapStore.check(self.location)
+        report = check_file(self.location)
         assert report.problems == ()
         assert len(report.interrupted) == len(self.interrupted)
 
@@ -170,7 +170,7 @@ class MapMachine(RuleBasedStateMachine):
     def history_is_as_long_as_the_model(self) -> None:
         if not hasattr(self, "store"):
             return
-        with MapStore.open(self.location) as reader:
+        with Map.open(self.location) as reader:
             assert reader.revision == len(self.committed)
             assert {one.session.robot for one in reader.interrupted()} == self.interrupted.keys()
             for robot in ROBOTS:

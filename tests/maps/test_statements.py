@@ -4,17 +4,17 @@ from pathlib import Path
 
 from sqlalchemy.util import LRUCache
 
-from engram.maps import MapStore, sqlite
+from engram.maps import Map, sqlite
 
 from .maps import begin, session, write_drive
 
 
 def written_and_read(path: Path) -> None:
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         writer = begin(store, session())
         write_drive(writer, 1)
         writer.commit()
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         store.load()
         store.content_hash()
 

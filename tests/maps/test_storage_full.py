@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from engram.maps import MapStore
+from engram.maps import Map, check_file
 
 from .maps import node, session
 
@@ -16,10 +16,10 @@ from .maps import node, session
 WRITER = """
 import resource, sys
 from engram.errors import StorageFullError
-from engram.maps import MapStore
+from engram.maps import Map
 from tests.maps.maps import Drive, begin, session
 
-store = MapStore.create(sys.argv[1])
+store = Map.create(sys.argv[1])
 writer = begin(store, session())
 drive = Drive(session())
 for index in range(4):
@@ -61,11 +61,11 @@ def test_a_full_disk_costs_nothing_that_was_checkpointed(tmp_path, limit, afterw
     stored = max([4, *(int(line[1]) for line in lines if line[0] != "refused")])
     (refusal,) = (line[2] for line in lines if line[0] == "refused")
     assert "free some space" in refusal
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         if afterwards == "give up":
             (interrupted,) = store.interrupted()
             assert interrupted.nodes == stored
             store.seal(session().id)
         contents = store.load()
     assert contents.nodes == tuple(node(session(), index) for index in range(stored))
-    assert MapStore.check(path).problems == ()
+    assert check_file(path).problems == ()

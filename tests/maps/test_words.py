@@ -11,7 +11,7 @@ from tests.maps.maps import begin, session, write_drive
 
 from engram.errors import InputError, MapCorruptError
 from engram.graph.model import NodeId
-from engram.maps import MapStore
+from engram.maps import Map, check_file
 from engram.maps.words import decode_words, encode_words
 
 ONE, OTHER = b"1" * 16, b"2" * 16
@@ -49,7 +49,7 @@ def words_of(count: int) -> np.ndarray:
 
 def map_with_words(path: Path) -> list[NodeId]:
     """Three nodes, the first two with words."""
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         writer = begin(store, session("robot-1"))
         nodes = [node.id for node in write_drive(writer, 3).nodes]
         for count, node in enumerate(nodes[:2]):
@@ -60,19 +60,19 @@ def map_with_words(path: Path) -> list[NodeId]:
 
 def test_a_session_brings_the_words_of_its_nodes(path: Path) -> None:
     nodes = map_with_words(path)
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         kept = store.words(ONE)
         assert {node: words.tolist() for node, words in kept.items()} == {
             nodes[0]: [],
             nodes[1]: [0],
         }
         assert store.words(OTHER) == {}
-    assert MapStore.check(path).problems == ()
+    assert check_file(path).problems == ()
 
 
 def test_another_vocabulary_takes_the_place_of_the_first(path: Path) -> None:
     nodes = map_with_words(path)
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         store.put_words(OTHER, {nodes[1]: words_of(5), nodes[2]: words_of(7)})
         assert {len(words) for words in store.words(OTHER).values()} == {5, 7}
         assert list(store.words(ONE)) == [nodes[0]]
@@ -80,7 +80,7 @@ def test_another_vocabulary_takes_the_place_of_the_first(path: Path) -> None:
 
 def test_words_change_neither_history_nor_content(path: Path) -> None:
     nodes = map_with_words(path)
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         before = store.content_hash(), store.revision
         store.put_words(OTHER, {nodes[2]: words_of(7)})
         assert (store.content_hash(), store.revision) == before
@@ -91,15 +91,15 @@ def test_damaged_words_are_as_if_they_were_missing_and_check_names_them(path: Pa
     with sqlite3.connect(path) as connection:
         connection.execute("UPDATE words SET body = x'0102030405' WHERE length(body) = 2")
     connection.close()
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         assert list(store.words(ONE)) == [nodes[0]]
-    problems = MapStore.check(path).problems
+    problems = check_file(path).problems
     assert [problem.table for problem in problems] == ["words"]
     assert str(nodes[1]) in problems[0].record
 
 
 def test_words_of_an_abandoned_session_go_with_it(path: Path) -> None:
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         writer = begin(store, session("robot-1"))
         for node in write_drive(writer, 2).nodes:
             writer.add_words(node.id, ONE, words_of(3))
@@ -110,23 +110,23 @@ def test_words_of_an_abandoned_session_go_with_it(path: Path) -> None:
         write_drive(second, 2)
         second.commit()
         assert store.words(ONE) == {}
-    assert MapStore.check(path).problems == ()
+    assert check_file(path).problems == ()
 
 
 def test_only_nodes_of_the_map_have_words(path: Path) -> None:
     map_with_words(path)
-    with MapStore.open_for_writing(path) as store, pytest.raises(InputError, match="not in the"):
+    with Map.open(path, writes=True) as store, pytest.raises(InputError, match="not in the"):
         store.put_words(ONE, {NodeId(session("x").id): words_of(1)})
 
 
 def test_a_map_of_format_1_has_none_until_somebody_writes_them(tmp_path: Path) -> None:
     old = tmp_path / "old.engram"
     old.write_bytes((Path(__file__).parent / "data" / "format-1.engram").read_bytes())
-    with MapStore.open(old) as store:
+    with Map.open(old) as store:
         assert store.words(ONE) == {}
         node = store.load().nodes[0].id
-    with MapStore.open_for_writing(old) as store:
+    with Map.open(old, writes=True) as store:
         store.put_words(ONE, {node: words_of(4)})
-    with MapStore.open(old) as store:
+    with Map.open(old) as store:
         assert list(store.words(ONE)) == [node]
-    assert MapStore.check(old).problems == ()
+    assert check_file(old).problems == ()

@@ -14,7 +14,7 @@ from engram.errors import ConfigError
 from engram.frontend import StereoPair
 from engram.graph.model import path_id
 from engram.mapper import MapperConfig
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.monitor import deferred_interrupt
 from engram.robot import (
     DriveSequence,
@@ -51,7 +51,7 @@ def interrupt_after(frames: int | None) -> Callable[[str], None]:
 
 
 def path_of(town: Path) -> list[tuple[int, str, int]]:
-    with MapStore.open(town) as store:
+    with Map.open(town) as store:
         contents = store.load()
         last = path_id(contents.sessions[-1].id)
         entries = [one for one in contents.path_entries if one.path == last]
@@ -92,7 +92,7 @@ def test_a_resumed_first_drive_gives_the_same_map(
         if stop is not None:
             assert run(town, open_drive(street), stop).interrupted
         run(town, open_drive(street))
-        with MapStore.open(town) as store:
+        with Map.open(town) as store:
             hashes.append(store.content_hash())
     assert hashes[0] == hashes[1]
 

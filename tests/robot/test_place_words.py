@@ -11,10 +11,11 @@ from tests.synthetic_world import World, drive
 
 from engram.errors import IncompatibleError, InputError
 from engram.frontend import BRIEF, TEBLID
-from engram.maps import MapStore
+from engram.maps import Map, open_map
 from engram.places import TrainingConfig, default_vocabulary, encode_vocabulary
-from engram.places.stored_words import keep_missing_words, stored_words
-from engram.robot import MapOptions, OpenMap, Settings, map_drive, open_drive, open_map
+from engram.places.stored_words import keep_missing_words, stored_words, vocabulary_of
+from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot.localisers import relocaliser_in
 from engram.robot.vocabularies import train_map_vocabulary, use_vocabulary
 
 ROAD = World(length_m=60.0, seed=11)
@@ -30,13 +31,13 @@ def path(tmp_path: Path) -> Path:
 
 
 def fill(path: Path) -> int:
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         nodes = [node.id for node in store.load().nodes]
         return keep_missing_words(store, VOCABULARY, nodes)
 
 
 def count_nodes(path: Path) -> int:
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         return store.info().nodes
 
 
@@ -44,11 +45,9 @@ def landmarks_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
     """How many frames are read by opening a map with a relocaliser."""
     read = []
     with open_map(path) as opened:
-        reader = opened.store.frames.frame
-        monkeypatch.setattr(
-            opened.store.frames, "frame", lambda node: read.append(node) or reader(node)
-        )
-        opened.relocaliser("fabmap", BRIEF)
+        reader = opened.frames.frame
+        monkeypatch.setattr(opened.frames, "frame", lambda node: read.append(node) or reader(node))
+        relocaliser_in(opened, "fabmap", BRIEF)
     return len(read)
 
 
@@ -59,7 +58,7 @@ def test_words_are_worked_out_once(path: Path) -> None:
 
 def test_they_are_those_of_the_landmarks(path: Path) -> None:
     fill(path)
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         kept = stored_words(store, VOCABULARY)
         for node in store.load().nodes:
             frame = store.frames.frame(node.id)
@@ -95,7 +94,7 @@ def test_mapping_keeps_the_words_of_what_it_saves_and_of_what_was_there(
     write_campaign(tmp_path / "elsewhere", looks=(1,))
     (log,) = (tmp_path / "elsewhere").glob("*.framelog")
     map_drive(path, open_drive(log), Settings(), MapOptions())
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         nodes = {node.id for node in store.load().nodes}
         assert len(nodes) >= before + 10
         assert stored_words(store, VOCABULARY).keys() == nodes
@@ -115,9 +114,9 @@ def test_training_and_taking_a_vocabulary_fill_in_words(path: Path, tmp_path: Pa
     assert trained.hash == taken.hash
     assert told[-1] == "words"
     for one in (path, other):
-        with OpenMap(MapStore.open(one)) as opened:
+        with Map.open(one) as opened:
             assert opened.vocabulary is not None
-            assert len(stored_words(opened.store, opened.vocabulary)) == count_nodes(one)
+            assert len(stored_words(opened, vocabulary_of(opened))) == count_nodes(one)
     again = use_vocabulary(other, path, author="a", advance=advance)
     assert again.revision is None
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from engram.geometry import SE3
-from engram.maps import MapStore
+from engram.maps import check_file
 from engram.robot import (
     LocaliseOptions,
     LocaliseRun,
@@ -92,7 +92,7 @@ def test_a_room_walked_again_and_again_makes_a_sound_map(data_dir: Path, tmp_pat
     path = tmp_path / "room.engram"
     sparse = open_drive(data_dir / "euroc/V1_01_easy_sparse")
     map_drive(path, sparse, Settings(), MapOptions())
-    assert MapStore.check(path).sound
+    assert check_file(path).sound
     # The robot at rest stands in that room, before the first frame of the other drive.
     rest = map_drive(
         path, open_drive(data_dir / "euroc/V1_01_easy_at_rest"), Settings(), MapOptions()

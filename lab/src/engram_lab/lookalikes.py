@@ -14,9 +14,9 @@ from engram.errors import InputError
 from engram.frontend import BRIEF
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId
+from engram.maps import Map, open_map
 from engram.places import BagOfWords
-from engram.places.stored_words import stored_words
-from engram.robot.opened_map import OpenMap, open_map
+from engram.places.stored_words import stored_words, vocabulary_or_default
 
 # Edges are about a metre long; what is within so many of them may well look alike.
 _SURROUNDINGS_EDGES = 15
@@ -66,7 +66,7 @@ def find_lookalikes(
     """
     with open_map(map_path, at) as opened:
         words = _words(opened)
-        recogniser = BagOfWords(opened.vocabulary_or_default(BRIEF))
+        recogniser = BagOfWords(vocabulary_or_default(opened, BRIEF))
         for one in words:
             recogniser.add(one)
         ids = [node.id for node in opened.graph.nodes]
@@ -105,15 +105,15 @@ def write_confusion_picture(file: Path, confusion: Confusion) -> None:
         raise InputError(f"{file}: cannot be written")
 
 
-def _words(opened: OpenMap) -> list[NDArray[np.int32]]:
+def _words(opened: Map) -> list[NDArray[np.int32]]:
     """Of each node, kept in the map or worked out from its landmarks."""
-    vocabulary = opened.vocabulary_or_default(BRIEF)
-    kept = stored_words(opened.store, vocabulary)
+    vocabulary = vocabulary_or_default(opened, BRIEF)
+    kept = stored_words(opened, vocabulary)
     found = []
     for node in opened.graph.nodes:
         words = kept.get(node.id)
         if words is None:
-            frame = opened.store.frames.frame(node.id)
+            frame = opened.frames.frame(node.id)
             words = vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
         found.append(words)
     return found

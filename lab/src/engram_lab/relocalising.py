@@ -14,8 +14,9 @@ from engram.frontend import Frame, FrameStatus
 from engram.graph.model import NodeId, node_id
 from engram.localiser import UNNAMED_LIVE_SESSION, Budget, FrameMatcher, Relocaliser
 from engram.localiser.attempts import Attempter, Candidate, best_success
+from engram.maps import Map, open_map
 from engram.robot.live import live_frames
-from engram.robot.opened_map import OpenMap, open_map
+from engram.robot.localisers import relocaliser_in
 from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
 
@@ -94,8 +95,8 @@ def relocalise_drive(
     budget = budget or Budget()
     with open_map(map_path, at) as opened:
         settings = settings.for_descriptor(opened.descriptor)
-        finder = opened.relocaliser(relocaliser, settings.frontend.descriptor)
-        matcher = FrameMatcher(opened.store.frames, settings.localiser.lost_matcher)
+        finder = relocaliser_in(opened, relocaliser, settings.frontend.descriptor)
+        matcher = FrameMatcher(opened.frames, settings.localiser.lost_matcher)
         with (
             Attempter(matcher, matcher, budget.lanes, settings.localiser.acceptance) as attempter,
             closing(live_frames(sequence, settings)) as frames,
@@ -120,7 +121,7 @@ def summarise_cold_starts(starts: list[ColdStart]) -> dict[str, Any]:
 
 
 def _cold_start(
-    opened: OpenMap, frame: Frame, finder: Relocaliser, attempter: Attempter, budget: Budget
+    opened: Map, frame: Frame, finder: Relocaliser, attempter: Attempter, budget: Budget
 ) -> ColdStart:
     if frame.status is not FrameStatus.OK:
         return ColdStart(frame.stamp_ns, PlaceStatus.UNUSABLE_FRAME, None, 0, 0, None)

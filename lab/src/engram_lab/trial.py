@@ -22,7 +22,7 @@ from engram.fleet.merge.gate import check_held_out
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, Session
 from engram.localiser import Position
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.robot import (
@@ -30,7 +30,6 @@ from engram.robot import (
     FrameResult,
     LocaliseOptions,
     LocaliseRun,
-    OpenMap,
     Settings,
     measured,
     session_of_drive,
@@ -152,8 +151,8 @@ def check_not_sent(
         SequenceError: a drive cannot be read.
     """
     if drives:
-        with MapStore.open(centre, at=at) as store:
-            check_held_out(drives, store.sessions(), centre, "the drives")
+        with Map.open(centre, at=at) as store:
+            check_held_out(drives, store.sessions.values(), centre, "the drives")
 
 
 def try_downloads(
@@ -165,7 +164,7 @@ def try_downloads(
     monitor: Monitor = QUIET,
     *,
     at: int | str | None = None,
-    start: Callable[[OpenMap], Position | None] = lambda _: None,
+    start: Callable[[Map], Position | None] = lambda _: None,
     left_out: Callable[[LeftOut], None] | None = None,
 ) -> list[Trial]:
     """Download for each drive in each way, and localise it there without writing anything.

@@ -12,8 +12,8 @@ import pytest
 from lab.tests.evaluation.campaigns import write_campaign
 
 from engram.errors import ConfigError, InputError
-from engram.maps import MapStore
-from engram.robot import LocaliseOptions, Settings, open_map
+from engram.maps import Map, open_map
+from engram.robot import LocaliseOptions, Settings
 from engram_lab.studies import DriveSet
 from engram_lab.studies.fleet import (
     FleetOptions,
@@ -335,7 +335,7 @@ def test_a_study_that_was_stopped_comes_to_the_same_maps(campaign, plan, tmp_pat
         for fold in plan.folds:
             hashes = []
             for one in (plan, other):
-                with MapStore.open(one.folder(arm, fold) / f"{name}.engram") as store:
+                with Map.open(one.folder(arm, fold) / f"{name}.engram") as store:
                     hashes.append(store.content_hash())
             assert hashes[0] == hashes[1]
 

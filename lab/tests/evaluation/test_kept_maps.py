@@ -7,7 +7,7 @@ import pytest
 from tests.maps import maps
 
 from engram.errors import MapError
-from engram.maps import WritableMapStore
+from engram.maps import open_map
 from engram_lab.studies.kept_maps import KeptMaps
 
 
@@ -15,7 +15,7 @@ from engram_lab.studies.kept_maps import KeptMaps
 def town(tmp_path: Path) -> Path:
     """A map of two drives of five nodes."""
     path = tmp_path / "town.engram"
-    with WritableMapStore.opened_or_created(path) as store:
+    with open_map(path, create=True) as store, store.writing():
         for number in range(2):
             drive = maps.session(start_ns=1_000 + number * 10**12)
             writer = maps.begin(store, drive)

@@ -78,7 +78,7 @@ def test_held_out_sessions_are_not_in_the_map_and_leave_it_as_it_was(plan: Plan)
         with open_map(plan.map_path(fold)) as opened:
             assert held_out.isdisjoint(opened.sessions)
             assert len(opened.sessions) == len(fold.training)
-            assert len(opened.store.log()) == len(fold.training)
+            assert len(opened.log()) == len(fold.training)
 
 
 def test_what_is_memoised_is_what_a_robot_would_do_unguided(plan: Plan) -> None:

@@ -91,7 +91,7 @@ def diff(
       engram diff town.engram 3 7
       engram diff town.engram winter head --picture changes.png
     """
-    from engram.maps.difference import diff_revisions
+    from engram.maps.history import diff_revisions
     from engram.viewing.difference import draw_difference
 
     found = diff_revisions(map_path, before, after, stretch_m=stretch)

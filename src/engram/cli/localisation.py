@@ -104,9 +104,7 @@ def localise(
     interrupted = False
     with LocaliseRun(map_path, sequence, load_settings(config), asked) as run:
         writer = (
-            PictureWriter(pictures, every, run.localiser, run.opened.store.frames)
-            if pictures
-            else None
+            PictureWriter(pictures, every, run.localiser, run.opened.frames) if pictures else None
         )
         with progress("localise", len(sequence)) as advance:
             try:

@@ -14,7 +14,7 @@ def map_file(text: str) -> Path:
     Raises:
         BadParameter: it is an address. It may hold a password, so it is not repeated.
     """
-    from engram.maps.map_store import is_address
+    from engram.maps.map import is_address
 
     if is_address(text):
         raise typer.BadParameter(

@@ -1,19 +1,20 @@
 """A map on disk: revisions, transactions, integrity, history."""
 
 from engram.maps.bulk_writer import BulkWriter
-from engram.maps.difference import MapDifference, diff_revisions
+from engram.maps.difference import MapDifference
 from engram.maps.hiding import Reverted
 from engram.maps.history import (
     RevertReport,
     blame_node,
     delete_tag,
+    diff_revisions,
     map_log,
     map_tags,
     revert_revision,
     show_revision,
     tag_revision,
 )
-from engram.maps.map_store import MapStore, WritableMapStore
+from engram.maps.map import Map, check_file, compact_map, copy_map, open_map, publish_map
 from engram.maps.provenance import Origin
 from engram.maps.records import (
     AttemptArrays,
@@ -37,10 +38,10 @@ __all__ = [
     "BulkWriter",
     "CheckReport",
     "InterruptedSession",
+    "Map",
     "MapContents",
     "MapDifference",
     "MapInfo",
-    "MapStore",
     "Origin",
     "Problem",
     "RevertReport",
@@ -51,12 +52,16 @@ __all__ = [
     "StoredNode",
     "StoredSession",
     "Tag",
-    "WritableMapStore",
     "blame_node",
+    "check_file",
+    "compact_map",
+    "copy_map",
     "delete_tag",
     "diff_revisions",
     "map_log",
     "map_tags",
+    "open_map",
+    "publish_map",
     "revert_revision",
     "show_revision",
     "tag_revision",

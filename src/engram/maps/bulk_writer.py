@@ -69,7 +69,7 @@ _ROW_BYTES = 600
 class BulkWriter:
     """Adds records of any sessions to a map, in one revision that appears whole or not at all.
 
-    Made by `WritableMapStore.begin_revision`. Use it as a context manager: leaving it without
+    Made by `Map.begin_revision`. Use it as a context manager: leaving it without
     `commit` abandons it. Rows are written in bounded batches, so memory does not grow with the
     revision. They lie in a revision that is born *abandoned* and becomes committed in one small
     transaction: killed at any moment before, the map is as it was, no session is left to resume

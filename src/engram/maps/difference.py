@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, Session, SessionId
-from engram.maps.map_store import MapStore
 from engram.maps.records import MapContents
 from engram.maps.regions import STRETCH_M, Regions, regions_of
 
@@ -110,24 +108,6 @@ class MapDifference:
         lines.append("hour of day    " + _hours_text(told["hours"]))
         lines += [_region_text(one) for one in told["regions"]]
         return "\n".join(lines)
-
-
-def diff_revisions(
-    path: Path, before: int | str, after: int | str, *, stretch_m: float = STRETCH_M
-) -> MapDifference:
-    """Compare two revisions of a map.
-
-    Args:
-        path: NAME.engram.
-        before, after: numbers or names of the revisions.
-        stretch_m: length of the stretches by which changes are listed.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
-        InputError: the length is not positive.
-    """
-    with MapStore.open(path, at=before) as one, MapStore.open(path, at=after) as other:
-        return difference(one.revision, one.load(), other.revision, other.load(), stretch_m)
 
 
 def difference(

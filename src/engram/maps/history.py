@@ -13,8 +13,9 @@ from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock, Session
 from engram.maps.difference import MapDifference, difference, hours_of_nodes
 from engram.maps.hiding import Reverted
-from engram.maps.map_store import MapStore
+from engram.maps.map import open_map
 from engram.maps.records import MapContents, Revision
+from engram.maps.regions import STRETCH_M
 from engram.maps.tags import Tag
 
 # What a revision brought, in the order in which `log` tells it.
@@ -36,7 +37,7 @@ def map_log(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
     Raises:
         MapError: the map cannot be read, or has no such revision.
     """
-    with MapStore.open(path, at=at) as store:
+    with open_map(path, at=at) as store:
         names = _names(store.tags())
         return [_revision(one, names) for one in reversed(store.log())]
 
@@ -63,7 +64,7 @@ def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDiff
     Raises:
         MapError: the map cannot be read, or has no such revision.
     """
-    with MapStore.open(path, at=named) as store:
+    with open_map(path, at=named) as store:
         number = store.revision
         revision = _revision(store.log()[-1], _names(store.tags())) if number else {}
         new = store.load()
@@ -75,8 +76,26 @@ def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDiff
             "sessions": _sessions(new),
             "hours": hours_of_nodes(new),
         }
-    with MapStore.open(path, at=max(number - 1, 0)) as store:
+    with open_map(path, at=max(number - 1, 0)) as store:
         return shown, difference(max(number - 1, 0), store.load(), number, new)
+
+
+def diff_revisions(
+    path: Path, before: int | str, after: int | str, *, stretch_m: float = STRETCH_M
+) -> MapDifference:
+    """Compare two revisions of a map.
+
+    Args:
+        path: NAME.engram.
+        before, after: numbers or names of the revisions.
+        stretch_m: length of the stretches by which changes are listed.
+
+    Raises:
+        MapError: the map cannot be read, or has no such revision.
+        InputError: the length is not positive.
+    """
+    with open_map(path) as town:
+        return town.diff(before, after, stretch_m)
 
 
 def tag_revision(
@@ -88,14 +107,14 @@ def tag_revision(
     message: str = "",
     move: bool = False,
 ) -> Tag:
-    """Give a revision a name; see `WritableMapStore.tag` for the errors."""
-    with MapStore.open_for_writing(path) as store:
+    """Give a revision a name; see `Map.tag` for the errors."""
+    with open_map(path) as store:
         return store.tag(name, named, author=author, message=message, move=move)
 
 
 def delete_tag(path: Path, name: str, *, author: str) -> Tag:
-    """Take a name away; see `WritableMapStore.untag` for the errors."""
-    with MapStore.open_for_writing(path) as store:
+    """Take a name away; see `Map.untag` for the errors."""
+    with open_map(path) as store:
         return store.untag(name, author=author)
 
 
@@ -105,7 +124,7 @@ def map_tags(path: Path) -> list[dict[str, Any]]:
     Raises:
         MapError: the map cannot be read.
     """
-    with MapStore.open(path) as store:
+    with open_map(path) as store:
         return [tag_dict(tag) for tag in store.tags().values()]
 
 
@@ -177,7 +196,7 @@ def revert_revision(
         RevisionError: there is no such revision, or nothing of it is left.
         MapError: the map cannot be written.
     """
-    with MapStore.open_for_writing(path) as store:
+    with open_map(path) as store:
         head = store.revision
         done = store.revert(named, author=author, message=message, dry_run=dry_run)
     after = head + 1 if done.revision is None else done.revision.number
@@ -191,7 +210,7 @@ def blame_node(path: Path, prefix: str, at: int | str | None = None) -> dict[str
         InputError: no node, or several, begin so.
         MapError: the map cannot be read, or has no such revision.
     """
-    with MapStore.open(path, at=at) as store:
+    with open_map(path, at=at) as store:
         origin = store.origin(prefix)
         log = {one.number: one for one in store.log()}
         contents = store.load()

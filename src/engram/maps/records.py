@@ -280,7 +280,7 @@ class CheckReport:
         rows, blobs: how many were verified.
         interrupted: sessions that wait to be resumed or sealed; no problem.
         abandoned_rows: rows of abandoned revisions that are still in the file, until
-            `WritableMapStore.clean`; no problem.
+            `Map.clean`; no problem.
     """
 
     problems: tuple[Problem, ...]

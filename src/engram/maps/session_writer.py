@@ -45,7 +45,7 @@ from engram.maps.words import words_row, write_words
 
 
 class SessionWriter:
-    """Adds one session to a map. Thread-safe; made by `MapStore.begin_session` or `resume_session`.
+    """Adds one session to a map. Thread-safe; made by `Map.begin_session` or `resume_session`.
 
     What is added waits in memory until `checkpoint`, which makes it durable in one transaction;
     readers see it after `commit`. A checkpoint that fails (disk full) leaves the last one intact

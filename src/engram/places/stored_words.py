@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import MapCorruptError
+from engram.frontend import DescriptorKind
 from engram.graph.model import NodeId
-from engram.maps import MapStore, WritableMapStore
+from engram.maps import Map
 from engram.monitor import ignore
-from engram.places import Vocabulary, hash_of
+from engram.places import Vocabulary, decode_vocabulary, default_vocabulary, hash_of
 
 Words = NDArray[np.int32]
 
@@ -20,7 +21,22 @@ Words = NDArray[np.int32]
 _BATCH = 1000
 
 
-def stored_words(store: MapStore, vocabulary: Vocabulary) -> Mapping[NodeId, Words]:
+def vocabulary_of(opened: Map) -> Vocabulary | None:
+    """The vocabulary that was trained for a map; None if there is none: for `Map.derived`.
+
+    Raises:
+        MapCorruptError: it is damaged.
+    """
+    return None if opened.vocabulary is None else decode_vocabulary(opened.vocabulary)
+
+
+def vocabulary_or_default(opened: Map, descriptor: DescriptorKind) -> Vocabulary:
+    """A map's vocabulary, or the default one; `descriptor` counts while the map is empty."""
+    own = opened.derived(vocabulary_of)
+    return own or default_vocabulary(opened.descriptor or descriptor)
+
+
+def stored_words(store: Map, vocabulary: Vocabulary) -> Mapping[NodeId, Words]:
     """What a map keeps of words by this vocabulary, as far as they can be of it."""
     kept = store.words(hash_of(vocabulary))
     return {
@@ -29,7 +45,7 @@ def stored_words(store: MapStore, vocabulary: Vocabulary) -> Mapping[NodeId, Wor
 
 
 def keep_missing_words(
-    store: WritableMapStore,
+    store: Map,
     vocabulary: Vocabulary,
     nodes: Sequence[NodeId],
     advance: Callable[[str, float], None] | None = None,
@@ -65,7 +81,7 @@ def keep_missing_words(
 
 
 def worked_out_words(
-    store: MapStore, vocabulary: Vocabulary, nodes: Sequence[NodeId]
+    store: Map, vocabulary: Vocabulary, nodes: Sequence[NodeId]
 ) -> Iterator[tuple[NodeId, Words]]:
     """The words of nodes by a vocabulary, from their landmarks; damaged nodes are left out."""
     for node in nodes:

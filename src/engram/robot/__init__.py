@@ -1,10 +1,11 @@
 """Whole drives: open, replay, record, map, localise, summarise."""
 
+from engram.maps import open_map
 from engram.robot.inspecting import check_map, describe_map, seal_map
 from engram.robot.live import LiveFrame, live_frames
+from engram.robot.live_robot import LiveRobot
 from engram.robot.localising import LocaliseOptions, LocaliseRun
 from engram.robot.mapping import MapOptions, MapReport, map_drive
-from engram.robot.opened_map import LiveRobot, OpenMap, open_map
 from engram.robot.recording import ExtractReport, extract_log
 from engram.robot.results import FrameResult, measured, summarise
 from engram.robot.session import DriveSequence, open_drive, session_of_drive
@@ -20,7 +21,6 @@ __all__ = [
     "LocaliseRun",
     "MapOptions",
     "MapReport",
-    "OpenMap",
     "Settings",
     "check_map",
     "describe_map",

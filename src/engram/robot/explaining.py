@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from engram.errors import ConfigError
 from engram.graph.model import Clock, NodeId, SessionId
 from engram.localiser import Budget, LocalisationStatus
+from engram.maps import Map, open_map
 from engram.ranking import (
     Foreseen,
     RankingContext,
@@ -25,7 +26,7 @@ from engram.ranking import (
     reasons_of,
 )
 from engram.robot.live import live_frames
-from engram.robot.opened_map import OpenMap, open_map
+from engram.robot.localisers import localiser_in
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import Settings
 
@@ -184,7 +185,8 @@ def explain_frame(
     watching = _Watching(policy_named(options.policy))
     with open_map(map_path, options.at) as opened:
         settings = settings.for_descriptor(opened.descriptor)
-        localiser = opened.localiser(
+        localiser = localiser_in(
+            opened,
             sequence.camera,
             settings,
             policy=watching,
@@ -206,7 +208,7 @@ def explain_frame(
 
 
 def _explained(
-    opened: OpenMap,
+    opened: Map,
     options: ExplainOptions,
     status: LocalisationStatus,
     stamp_ns: int,
@@ -250,7 +252,7 @@ def _explained(
     )
 
 
-def _drives(opened: OpenMap) -> dict[SessionId, str]:
+def _drives(opened: Map) -> dict[SessionId, str]:
     """Each session in words."""
     words = {}
     for session in opened.sessions.values():

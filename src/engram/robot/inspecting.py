@@ -6,8 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from engram.maps import MapStore
-from engram.robot.opened_map import OpenMap
+from engram.maps import Map, check_file
 
 
 def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
@@ -16,24 +15,23 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
     Raises:
         MapError: the map cannot be read.
     """
-    with MapStore.open(path, at=at) as store:
+    with Map.open(path, at=at) as store:
         info = store.info()
-        opened = OpenMap(store)
-        components = Counter(opened.graph.components().tolist())
+        components = Counter(store.graph.components().tolist())
         return {
             "format_version": info.format_version,
             "revision": info.revision,
             "content_hash": store.content_hash(),
             "descriptor": info.descriptor,
             "sessions": info.sessions,
-            "robots": sorted({session.robot for session in opened.sessions.values()}),
+            "robots": sorted({session.robot for session in store.sessions.values()}),
             "cameras": info.cameras,
             "nodes": info.nodes,
-            "experiences": len(set(opened.graph.experiences.tolist())),
+            "experiences": len(set(store.graph.experiences.tolist())),
             "edges": dict(info.edges_of_kind),
             "components": len(components),
             "largest_component": max(components.values(), default=0),
-            "paths": len(opened.path_memory),
+            "paths": len(store.path_memory),
             "path_entries": info.path_entries,
             "attempts": info.attempts,
             "mapped_m": info.mapped_m,
@@ -46,13 +44,13 @@ def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
     """What is wrong with a map, for ``engram check``.
 
     Raises:
-        MapError: the file is no map, of a newer format, or too damaged to be opened.
+        MapError: the file is no map, of a newer format, or too damaged to be store.
     """
     removed = 0
     if clean:
-        with MapStore.open_for_writing(path) as store:
+        with Map.open(path, writes=True) as store:
             removed = store.clean()
-    report = MapStore.check(path)
+    report = check_file(path)
     return {
         "sound": report.sound,
         "problems": [
@@ -72,7 +70,7 @@ def seal_map(path: Path) -> list[dict[str, Any]]:
     Raises:
         MapError: the map cannot be written.
     """
-    with MapStore.open_for_writing(path) as store:
+    with Map.open(path, writes=True) as store:
         return [
             {
                 "session": str(one.session.id),

@@ -10,9 +10,10 @@ from typing import Self
 
 from engram.errors import ConfigError
 from engram.localiser import Budget, Localiser
+from engram.maps import open_map
 from engram.ranking import check_for_robot
 from engram.robot.live import LiveFrame, live_frames
-from engram.robot.opened_map import open_map
+from engram.robot.localisers import localiser_in
 from engram.robot.results import FrameResult
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import Settings
@@ -63,7 +64,8 @@ class LocaliseRun:
         self._settings = settings.for_descriptor(self.opened.descriptor)
         self._options = options
         self._frames: Generator[LiveFrame] | None = None
-        self.localiser: Localiser = self.opened.localiser(
+        self.localiser: Localiser = localiser_in(
+            self.opened,
             sequence.camera,
             self._settings,
             policy=options.policy,

@@ -20,13 +20,13 @@ from engram.geometry import StereoCamera
 from engram.graph.model import PathEntryKind, Session
 from engram.localiser import Budget, ByAppearance, FrameMatcher, Localiser, Position
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
-from engram.maps import SessionState, SessionWriter, StoredSession, WritableMapStore
+from engram.maps import Map, SessionState, SessionWriter, StoredSession, open_map
 from engram.monitor import ignore
 from engram.places import RECOGNISERS, hash_of
-from engram.places.stored_words import keep_missing_words
+from engram.places.stored_words import keep_missing_words, vocabulary_or_default
 from engram.ranking import check_for_robot
 from engram.robot.live import LiveFrame, live_frames
-from engram.robot.opened_map import OpenMap
+from engram.robot.localisers import drives_of, localiser_in
 from engram.robot.results import FrameResult, damage_warning, summarise
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import Settings
@@ -121,7 +121,7 @@ def map_drive(
     settings: Settings,
     options: MapOptions,
     advance: Callable[[str], None] = ignore,
-    start: Callable[[OpenMap], Position | None] | None = None,
+    start: Callable[[Map], Position | None] | None = None,
     descriptor: str | None = None,
 ) -> MapReport:
     """Adds a drive to a map, which is made if there is none.
@@ -152,26 +152,25 @@ def map_drive(
         _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
     session = session_of_drive(sequence)
     report = MapReport(session)
-    with WritableMapStore.opened_or_created(map_path) as store:
+    with open_map(map_path, create=True) as store, store.writing():
         if descriptor is not None:
             mend = "map the drive into another map"
-            _check_descriptor(descriptor, store.descriptor(), str(map_path), mend)
+            _check_descriptor(descriptor, store.descriptor, str(map_path), mend)
         state = store.session_state(session.id)
         if state is SessionState.COMMITTED:
             report.known = True
             return report
-        settings = settings.for_descriptor(store.descriptor())
+        settings = settings.for_descriptor(store.descriptor)
         if state is SessionState.ABSENT:
             writer = _begin(store, session, sequence, settings, options)
         else:
             writer = store.resume_session(session.id)
             report.resumed = True
-        opened = OpenMap(store)
-        opened.drives[session.id] = session
-        words = _node_words(opened, store, settings, options)
+        store.derived(drives_of)[session.id] = session
+        words = _node_words(store, settings, options)
         with closing(live_frames(sequence, settings, options.rate_hz)) as frames:
             _map_frames(
-                opened,
+                store,
                 writer,
                 sequence.camera,
                 frames,
@@ -179,7 +178,7 @@ def map_drive(
                 options,
                 report,
                 advance,
-                None if start is None or report.resumed else start(opened),
+                None if start is None or report.resumed else start(store),
                 words,
             )
     report.skipped = sequence.skipped
@@ -200,7 +199,7 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
 
 
 def _begin(
-    store: WritableMapStore,
+    store: Map,
     session: Session,
     sequence: DriveSequence,
     settings: Settings,
@@ -233,7 +232,7 @@ def _configuration(settings: Settings, options: MapOptions) -> dict[str, Any]:
 
 
 def _map_frames(
-    opened: OpenMap,
+    opened: Map,
     writer: SessionWriter,
     camera: StereoCamera,
     frames: Iterable[LiveFrame],
@@ -245,8 +244,9 @@ def _map_frames(
     words: NodeWords | None,
 ) -> None:
     """Feeds the mapper; commits at the end, or leaves the session to be resumed."""
-    saver = Saver(writer, opened.store.frames, settings.mapper.checkpoint_every, words)
-    localiser = opened.localiser(
+    saver = Saver(writer, opened.frames, settings.mapper.checkpoint_every, words)
+    localiser = localiser_in(
+        opened,
         camera,
         settings,
         policy=options.policy,
@@ -291,15 +291,13 @@ def _map_frames(
         report.revision = writer.commit().number
 
 
-def _node_words(
-    opened: OpenMap, store: WritableMapStore, settings: Settings, options: MapOptions
-) -> NodeWords | None:
+def _node_words(opened: Map, settings: Settings, options: MapOptions) -> NodeWords | None:
     """How the words of saved nodes are found; those that older nodes lack are filled in first."""
     if options.relocaliser not in RECOGNISERS:
         return None
     descriptor = settings.frontend.descriptor
-    vocabulary = opened.vocabulary_or_default(descriptor)
-    keep_missing_words(store, vocabulary, [node.id for node in opened.graph.nodes])
+    vocabulary = vocabulary_or_default(opened, descriptor)
+    keep_missing_words(opened, vocabulary, [node.id for node in opened.graph.nodes])
 
     def words_of(frame: Frame) -> NDArray[np.int32]:
         return vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
@@ -308,7 +306,7 @@ def _node_words(
 
 
 def loop_search(
-    opened: OpenMap, localiser: Localiser, settings: Settings
+    opened: Map, localiser: Localiser, settings: Settings
 ) -> AbstractContextManager[LoopSearch | None]:
     """Looks for loops by the words that the relocaliser knows; None where it knows none."""
     finder = localiser.relocaliser
@@ -318,7 +316,7 @@ def loop_search(
     return LoopSearch(
         opened.graph,
         finder.book,
-        FrameMatcher(opened.store.frames, matching.matcher),
+        FrameMatcher(opened.frames, matching.matcher),
         matching.acceptance,
         LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
     )

@@ -15,19 +15,17 @@ from engram.config import to_dict
 from engram.errors import IncompatibleError, InputError, MapCorruptError
 from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus
 from engram.graph.model import NodeId
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.places import (
     TrainingConfig,
     Vocabulary,
     decode_vocabulary,
-    default_vocabulary,
     encode_vocabulary,
     hash_of,
     train_vocabulary,
 )
-from engram.places.stored_words import keep_missing_words
+from engram.places.stored_words import keep_missing_words, vocabulary_or_default
 from engram.robot.live import live_frames
-from engram.robot.opened_map import OpenMap
 from engram.robot.session import DriveSequence, open_drive
 from engram.robot.settings import Settings
 
@@ -81,10 +79,9 @@ def describe_vocabulary(map_path: Path, at: int | str | None = None) -> Vocabula
     Raises:
         MapError: the map cannot be read, or has no such revision.
     """
-    with OpenMap(MapStore.open(map_path, at=at)) as opened:
-        own = opened.vocabulary
-        kind = opened.descriptor or BRIEF
-        return _report(own or default_vocabulary(kind), default=own is None)
+    with Map.open(map_path, at=at) as opened:
+        found = vocabulary_or_default(opened, BRIEF)
+        return _report(found, default=opened.vocabulary is None)
 
 
 def train_map_vocabulary(
@@ -109,8 +106,8 @@ def train_map_vocabulary(
         IncompatibleError: a source has another kind of descriptor than the map.
         MapError: a map cannot be read, or this one not written.
     """
-    with MapStore.open(map_path) as store:
-        kind = store.descriptor()
+    with Map.open(map_path) as store:
+        kind = store.descriptor
     frames: list[NDArray[np.uint8]] = []
     for at, source in enumerate(sources or [map_path]):
         for frame in _frames(source, kind):
@@ -126,7 +123,7 @@ def train_map_vocabulary(
         raise InputError(f"{map_path} is empty: map a drive first, or name drives to train on")
     trained_on = ", ".join(source.name for source in sources or [map_path])
     vocabulary = train_vocabulary(frames, kind, config, trained_on=trained_on, advance=advance)
-    with MapStore.open_for_writing(map_path) as writable:
+    with Map.open(map_path, writes=True) as writable:
         revision = writable.put_vocabulary(
             encode_vocabulary(vocabulary),
             author=author,
@@ -160,15 +157,15 @@ def use_vocabulary(
         MapError: a map cannot be read, or this one not written.
     """
     vocabulary = _read_vocabulary(source)
-    with MapStore.open_for_writing(map_path) as writable:
-        kind = writable.descriptor()
+    with Map.open(map_path, writes=True) as writable:
+        kind = writable.descriptor
         if kind not in {None, vocabulary.descriptor}:
             raise IncompatibleError(
                 f"the words of {source} are of {vocabulary.descriptor} descriptors, those of "
                 f"{map_path} are {kind}; train a vocabulary for it with engram vocabulary train"
             )
         body = encode_vocabulary(vocabulary)
-        if writable.vocabulary() == body:
+        if writable.vocabulary == body:
             return _report(vocabulary, default=False)
         revision = writable.put_vocabulary(
             body,
@@ -188,8 +185,8 @@ def _read_vocabulary(source: Path) -> Vocabulary:
             raise InputError(f"{source} cannot be read: {error.strerror}") from error
         except MapCorruptError as error:
             raise InputError(f"{source}: {error}") from error
-    with MapStore.open(source) as store:
-        body = store.vocabulary()
+    with Map.open(source) as store:
+        body = store.vocabulary
     if body is None:
         raise InputError(
             f"{source} has no vocabulary of its own; train one with engram vocabulary train"
@@ -197,7 +194,7 @@ def _read_vocabulary(source: Path) -> Vocabulary:
     return decode_vocabulary(body)
 
 
-def _node_ids(store: MapStore) -> list[NodeId]:
+def _node_ids(store: Map) -> list[NodeId]:
     return [node.id for node in store.load().nodes]
 
 
@@ -218,7 +215,7 @@ def _report(
 def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
     """The frames of a map's nodes, or those of a drive that are of use."""
     if source.suffix == MAP_SUFFIX:
-        with MapStore.open(source) as store:
+        with Map.open(source) as store:
             return [store.frames.frame(node.id) for node in store.load().nodes]
     sequence: DriveSequence = open_drive(source)
     settings = Settings().for_descriptor(kind)

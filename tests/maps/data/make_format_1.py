@@ -13,12 +13,12 @@ import sys
 from tests.maps.maps import begin, edge, session, write_drive
 
 from engram.graph.model import EdgeKind
-from engram.maps import MapStore
+from engram.maps import Map
 
 
 def main(path: str) -> None:
     socket.gethostname = lambda: "example"
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         first = begin(store, session("robot-1"), message="the first")
         drive = write_drive(first, 4)
         ends = (drive.nodes[0].id, drive.nodes[3].id)

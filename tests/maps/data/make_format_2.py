@@ -13,12 +13,12 @@ import sys
 import numpy as np
 from tests.maps.maps import begin, session, write_drive
 
-from engram.maps import MapStore
+from engram.maps import Map
 
 
 def main(path: str) -> None:
     socket.gethostname = lambda: "example"
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         for name in ("robot-1", "robot-2"):
             writer = begin(store, session(name), message=name)
             drive = write_drive(writer, 3)

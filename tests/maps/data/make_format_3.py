@@ -16,14 +16,14 @@ from tests.maps.maps import begin, session, write_drive
 
 from engram.geometry import SE3
 from engram.graph.model import NodeId, Omission
-from engram.maps import MapStore
+from engram.maps import Map
 
 OMITTED = NodeId(UUID(int=3))
 
 
 def main(path: str) -> None:
     socket.gethostname = lambda: "example"
-    with MapStore.create(path) as store:
+    with Map.create(path) as store:
         first = begin(store, session("robot-1"), message="the first")
         drive = write_drive(first, 3)
         first.commit()

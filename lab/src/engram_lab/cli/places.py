@@ -88,10 +88,10 @@ def places(
       engram places town.engram --top 50 --picture confusion.png
     """
     from engram.cli.progress import progress
-    from engram.maps import MapStore
+    from engram.maps import Map
     from engram_lab.lookalikes import find_lookalikes, write_confusion_picture
 
-    with MapStore.open(map_path, at=at) as store:
+    with Map.open(map_path, at=at) as store:
         count = store.node_count()
     with progress("compare", count) as advance:
         confusion = find_lookalikes(map_path, at, advance=advance)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.monitor import ignore
 from engram.robot import (
     FrameResult,
@@ -21,7 +21,6 @@ from engram.robot import (
     LocaliseRun,
     MapOptions,
     MapReport,
-    OpenMap,
     Settings,
     map_drive,
     open_drive,
@@ -132,7 +131,7 @@ def _localise(
         progress(f"localise: {policy}, {most} a frame", len(sequence)) as advance,
     ):
         writer = PictureWriter(
-            out / f"matches_{policy}_{most}", 40, run.localiser, run.opened.store.frames
+            out / f"matches_{policy}_{most}", 40, run.localiser, run.opened.frames
         )
         results = []
         for live, result in run:
@@ -166,8 +165,7 @@ def _experience_tracks(
     map_path: Path, drives: list[SimulatedDrive], conditions: list[str]
 ) -> list[Track]:
     """Nodes of each session, placed along the least uncertain chains from the first node."""
-    with MapStore.open(map_path) as store:
-        opened = OpenMap(store)
+    with Map.open(map_path) as opened:
         graph = opened.graph
         tree = graph.chains_from(0)
         tracks = []

@@ -15,9 +15,9 @@ from typing import Any
 from engram.config import to_dict
 from engram.errors import InputError
 from engram.localiser import Position
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.monitor import ignore
-from engram.robot import MapOptions, MapReport, OpenMap, Settings, map_drive
+from engram.robot import MapOptions, MapReport, Settings, map_drive
 from engram.sequences import FrameLog
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.starting import TrueNodes
@@ -131,7 +131,7 @@ def _built_session(
 ) -> BuiltSession:
     assert report.revision is not None
     localisations = [one.localisation for one in report.results]
-    with MapStore.open(draft) as store:
+    with Map.open(draft) as store:
         nodes = store.node_count()
     return BuiltSession(
         drive.name,
@@ -151,7 +151,7 @@ def read_built_map(path: Path) -> BuiltMap:
     recorded = read_record(path)
     if not (recorded.sessions and path.exists()):
         return BuiltMap(path)
-    with MapStore.open(path) as store:
+    with Map.open(path) as store:
         newest = store.revision
     return BuiltMap(path, [one for one in recorded.sessions if one.revision <= newest])
 
@@ -175,9 +175,7 @@ def read_record(path: Path) -> BuiltMap:
         ) from error
 
 
-def _start(
-    opened: OpenMap, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]
-) -> Position | None:
+def _start(opened: Map, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> Position | None:
     """Where the drive begins, by truth; None in an empty map, or where truth is not known."""
     truth = drive.truth()
     if truth is None:
@@ -190,7 +188,7 @@ def _start(
     return None if first is None else true_nodes(opened, drives).start(first)
 
 
-def true_nodes(opened: OpenMap, drives: Sequence[EvaluatedDrive]) -> TrueNodes:
+def true_nodes(opened: Map, drives: Sequence[EvaluatedDrive]) -> TrueNodes:
     """True poses of a map's nodes; `drives` are at least those that it was built from."""
     sessions = {node.session for node in opened.graph.nodes}
     truths = {one.session.id: one.truth() for one in drives if one.session.id in sessions}

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from engram.localiser import FrameMatcher, Matcher
-from engram.robot import OpenMap, Settings
+from engram.maps import Map
+from engram.robot import Settings
 from engram.sequences import LoggedFrame
 from engram_lab.studies.building import true_nodes
 from engram_lab.studies.configurations import Configuration
@@ -16,7 +17,7 @@ from engram_lab.studies.starting import start_by_matching
 
 
 def localise_held_out(
-    opened: OpenMap,
+    opened: Map,
     drive: EvaluatedDrive,
     frames: Sequence[LoggedFrame],
     training: Sequence[EvaluatedDrive],
@@ -50,7 +51,7 @@ def localise_held_out(
             opened,
             frames,
             drive.session.id,
-            FrameMatcher(opened.store.frames, config.matcher) if matcher is None else matcher,
+            FrameMatcher(opened.frames, config.matcher) if matcher is None else matcher,
             config.acceptance,
         )
     situation = Situation(opened, drive, frames, start, nodes, truth)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import OrderedDict
 from pathlib import Path
 
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
-from engram.robot import OpenMap
 
 
 class KeptMaps:
@@ -21,9 +20,9 @@ class KeptMaps:
     def __init__(self, files: int, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
         self._most = files
         self._cache_bytes = cache_bytes
-        self._files: OrderedDict[tuple[Path, int], dict[int | None, OpenMap]] = OrderedDict()
+        self._files: OrderedDict[tuple[Path, int], dict[int | None, Map]] = OrderedDict()
 
-    def open(self, path: Path, at: int | None = None) -> OpenMap:
+    def open(self, path: Path, at: int | None = None) -> Map:
         """A map, of a revision if one is given. It is closed here, once others were asked for.
 
         Raises:
@@ -36,7 +35,7 @@ class KeptMaps:
         while len(self._files) > self._most:
             _close(self._files.popitem(last=False)[1])
         if at not in maps:
-            maps[at] = OpenMap(MapStore.open(path, at=at, cache_bytes=self._cache_bytes))
+            maps[at] = Map.open(path, at=at, cache_bytes=self._cache_bytes)
         return maps[at]
 
     def close(self) -> None:
@@ -46,6 +45,6 @@ class KeptMaps:
         self._files.clear()
 
 
-def _close(maps: dict[int | None, OpenMap]) -> None:
+def _close(maps: dict[int | None, Map]) -> None:
     for opened in maps.values():
         opened.close()

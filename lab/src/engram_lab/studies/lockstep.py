@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter, thread_time
@@ -14,11 +14,14 @@ from numpy.typing import NDArray
 from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
-from engram.graph.model import NodeId
+from engram.graph.model import NodeId, PathEntryKind
 from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.paths import PathMemory
 from engram.localiser import Localiser, Matcher, Position
+from engram.maps import Map
 from engram.odometry import GapFiller, driven_steps_m
-from engram.robot import OpenMap, Settings
+from engram.robot import Settings
+from engram.robot.localisers import localiser_in
 from engram.sequences import LoggedFrame
 from engram_lab.studies.configurations import EVERYTHING, Configuration, PathKinds, Radius
 from engram_lab.studies.drives import EvaluatedDrive, Truth
@@ -126,7 +129,7 @@ class Situation:
         truth: true poses of the drive; None where they are not known.
     """
 
-    opened: OpenMap
+    opened: Map
     drive: EvaluatedDrive
     frames: Sequence[LoggedFrame]
     start: tuple[int, Position] | None
@@ -233,14 +236,14 @@ def _localisers(
     relocaliser: str | None,
 ) -> Iterator[list[Localiser]]:
     """One per configuration; in one map they share what is known of it."""
-    views: dict[PathKinds, OpenMap] = {}
+    memories: dict[PathKinds, PathMemory] = {}
     with ExitStack() as stack:
         localisers = []
         for one in configurations:
-            view = views.get(one.paths)
-            if view is None:
-                view = views[one.paths] = situation.opened.counting(one.paths.kinds)
-            localiser = view.localiser(
+            if one.paths not in memories:
+                memories[one.paths] = _counting(situation.opened, one.paths.kinds)
+            localiser = localiser_in(
+                situation.opened,
                 situation.drive.camera,
                 _settings_for(settings, one, guided=matcher is None),
                 policy=one.policy,
@@ -250,10 +253,23 @@ def _localisers(
                 matcher=matcher,
                 search=search,
                 clock=situation.drive.session,
+                path_memory=memories[one.paths],
             )
             localiser.keeps_attempts = False  # nothing is written
             localisers.append(stack.enter_context(localiser))
         yield localisers
+
+
+def _counting(opened: Map, kinds: Collection[PathEntryKind]) -> PathMemory:
+    """The paths of a map where only these kinds of entry count."""
+    known = opened.path_memory
+    if frozenset(kinds) == known.kinds:
+        return known
+    counted = PathMemory(opened.graph, kinds)
+    for path in known.paths:
+        for entry in known.entries(path):
+            counted.add(entry)
+    return counted
 
 
 def _settings_for(settings: Settings, configuration: Configuration, *, guided: bool) -> Settings:

@@ -14,9 +14,10 @@ from engram.config import config_hash, to_dict
 from engram.errors import ConfigError
 from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
+from engram.maps import Map, open_map
 from engram.monitor import ignore
 from engram.ranking import policy_named
-from engram.robot import MapOptions, OpenMap, Settings, open_map
+from engram.robot import MapOptions, Settings
 from engram.sequences import LoggedFrame
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import (
@@ -261,7 +262,7 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
     with open_map(built.path) as newest:
         config = plan.settings.localiser.matcher
         memo = MatchMemo(
-            FrameMatcher(newest.store.frames, config),
+            FrameMatcher(newest.frames, config),
             plan.work / f"memo-{drive.key}.matches.npz",
             matcher_hash(config),
         )
@@ -308,7 +309,7 @@ def _run_in(
     session: int,
     frames: Sequence[LoggedFrame],
     matcher: Matcher | None,
-    opened: OpenMap,
+    opened: Map,
     configurations: Sequence[Configuration],
 ) -> Runs:
     """One session in one map."""

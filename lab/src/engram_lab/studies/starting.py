@@ -14,7 +14,7 @@ from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId, SessionId, node_id
 from engram.localiser import AcceptanceConfig, Matcher, Position, accept_lost
-from engram.robot import OpenMap
+from engram.maps import Map
 from engram.sequences import LoggedFrame
 from engram_lab.studies.drives import Truth
 
@@ -32,7 +32,7 @@ class TrueNodes:
         truths: of the sessions that it was built from; may lack some.
     """
 
-    def __init__(self, opened: OpenMap, truths: Mapping[SessionId, Truth | None]) -> None:
+    def __init__(self, opened: Map, truths: Mapping[SessionId, Truth | None]) -> None:
         self._poses: dict[NodeId, SE3] = {}
         for node in opened.graph.nodes:
             truth = truths.get(node.session)
@@ -82,7 +82,7 @@ def _in_largest_component(graph: ExperienceGraph, nodes: Sequence[NodeId]) -> ND
 
 
 def start_by_matching(
-    opened: OpenMap,
+    opened: Map,
     frames: Sequence[LoggedFrame],
     live: SessionId,
     matcher: Matcher,

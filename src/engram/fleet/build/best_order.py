@@ -29,11 +29,11 @@ from engram.fleet.merge.gate import localise_drive
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.graph.model import Session
-from engram.maps import MapStore
+from engram.maps import Map, copy_map
 from engram.maps.drafts import remove_left_drafts
 from engram.measures import failure_curve, failure_route, route_not_localised
 from engram.monitor import Monitor
-from engram.robot import OpenMap, Settings, open_drive
+from engram.robot import Settings, open_drive
 
 # [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
 _AREA_TO_M = 50.0
@@ -123,8 +123,8 @@ class _Search:
         mapped: list[tuple[Session, str]] = []
         hashes = []
         for path in (*maps, *([] if root is None else [root])):
-            with MapStore.open(path) as store:
-                mapped += [(one, f"in {path}") for one in store.sessions()]
+            with Map.open(path) as store:
+                mapped += [(one, f"in {path}") for one in store.sessions.values()]
                 hashes.append(store.content_hash())
         check_held_out(judge, mapped)
         self._root_hash = None if root is None else hashes[-1]
@@ -156,7 +156,7 @@ class _Search:
         """The maps that were judged are those that merging would give now."""
         if self._root is None:
             return
-        with MapStore.open(self._root) as store:
+        with Map.open(self._root) as store:
             if store.content_hash() != self._root_hash:
                 raise MapError(
                     f"{self._root} was written to while the orders were tried, so that they were "
@@ -167,7 +167,7 @@ class _Search:
         """The map of an order: a copy of its prefix's, and one more group."""
         started = time.perf_counter()
         added = self._maps[order[-1]]
-        MapStore.copy(added if prefix is None else prefix, place)
+        copy_map(added if prefix is None else prefix, place)
         costs: dict[str, Any] = {"copies": 1, "copy_s": time.perf_counter() - started}
         if prefix is not None:
             costs |= self._merge(place, added)
@@ -193,7 +193,7 @@ class _Search:
         }
 
     def _judged(self, order: tuple[int, ...], place: Path) -> OrderResult:
-        with OpenMap(MapStore.open(place)) as opened:
+        with Map.open(place) as opened:
             drives, reported = (
                 [
                     self._localise(opened, one, self._settings, self._judge.localising)
@@ -201,7 +201,7 @@ class _Search:
                 ]
                 for sequences in (self._sequences, self._reported)
             )
-            nodes, content_hash = len(opened.graph), opened.store.content_hash()
+            nodes, content_hash = len(opened.graph), opened.content_hash()
         steps = np.arange(0.0, _AREA_TO_M, _AREA_STEP_M) + _AREA_STEP_M / 2
         area_m = sum(failure_route(drives, float(at)) for at in steps) * _AREA_STEP_M
         return OrderResult(

@@ -28,7 +28,7 @@ from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
 from engram.graph.model import SessionId, path_id
-from engram.maps import MapStore
+from engram.maps import Map, copy_map
 from engram.maps.drafts import check_parent
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.processes import run_in_processes
@@ -238,7 +238,7 @@ def _build(
         except KeyboardInterrupt:
             report.interrupted = True
     if not report.interrupted:
-        with MapStore.open(centre) as store:
+        with Map.open(centre) as store:
             report.content_hash = store.content_hash()
         report.notes += _not_as_judged(report)
         if grouped:
@@ -263,17 +263,17 @@ def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
         return frozenset(SessionId(UUID(one)) for one in scratch.unfinished.known)
     if not scratch.centre.exists():
         return frozenset()
-    with MapStore.open(scratch.centre) as store:
-        partial = store.partial_paths()
-        return frozenset(one for one in store.frontends() if path_id(one) not in partial)
+    with Map.open(scratch.centre) as store:
+        partial = store.partial_paths
+        return frozenset(one for one in store.frontends if path_id(one) not in partial)
 
 
 def _check_judges(judge: JudgeOptions, drives: Sequence[Drive], centre: Path) -> None:
     """Before hours of mapping: what judges the orders must be held out."""
     mapped = [(one.session, f"{one.source}, which is to be built from") for one in drives]
     if centre.exists():
-        with MapStore.open(centre) as store:
-            mapped += [(one, f"in {centre} already") for one in store.sessions()]
+        with Map.open(centre) as store:
+            mapped += [(one, f"in {centre} already") for one in store.sessions.values()]
     check_held_out(judge, mapped)
 
 
@@ -413,7 +413,7 @@ def _merge(
     """
     order = begun.order
     if not scratch.centre.exists():
-        MapStore.copy(scratch.group(order[0]), scratch.centre)
+        copy_map(scratch.group(order[0]), scratch.centre)
         order = order[1:]
     for number in order:
         report.merges += merge(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from engram.errors import MissingExtraError, SequenceError
-from engram.maps import MapStore, WritableMapStore
+from engram.maps import Map, copy_map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot import MapOptions, Settings, map_drive, open_drive
 
@@ -72,7 +72,7 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
     """
     result = GroupResult(task.number)
     started, cpu_started = time.perf_counter(), time.process_time()
-    with WritableMapStore.opened_or_created(task.path) as store:
+    with open_map(task.path, create=True) as store, store.writing():
         for one in store.interrupted():
             store.resume_session(one.session.id).abandon()
     for source in task.sources:
@@ -83,7 +83,7 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
         if report.interrupted:
             raise KeyboardInterrupt
         result.sessions.append({"source": source, **report.to_dict()})
-    with MapStore.open(task.path) as made:
+    with Map.open(task.path) as made:
         result.nodes = made.node_count()
     result.seconds = time.perf_counter() - started
     result.cpu_s = time.process_time() - cpu_started
@@ -96,7 +96,7 @@ def map_group_far_away(task: GroupTask, monitor: Monitor = QUIET) -> tuple[Group
         here = replace(task, path=Path(folder) / "group.engram")
         result = map_group(here, monitor)
         whole = Path(folder) / "whole.engram"
-        MapStore.copy(here.path, whole)  # without the write-ahead log beside it
+        copy_map(here.path, whole)  # without the write-ahead log beside it
         return result, whole.read_bytes()
 
 

@@ -18,8 +18,9 @@ from engram.config import config_hash, plain, to_dict
 from engram.errors import ConfigError
 from engram.fleet.merge.gate import GateOptions, held_as
 from engram.graph.model import Session
+from engram.maps import Map
 from engram.measures import Drive
-from engram.robot import DriveSequence, OpenMap, Settings, open_drive, session_of_drive
+from engram.robot import DriveSequence, Settings, open_drive, session_of_drive
 
 # 5,040 orders of 7 groups are a matter of days.
 _MOST_GROUPS = 6
@@ -41,7 +42,7 @@ class Orders(StrEnum):
         return math.factorial(groups) if self is Orders.ALL else groups
 
 
-Localise: TypeAlias = Callable[[OpenMap, DriveSequence, Settings, GateOptions], Drive]
+Localise: TypeAlias = Callable[[Map, DriveSequence, Settings, GateOptions], Drive]
 
 
 @dataclass(frozen=True, slots=True)

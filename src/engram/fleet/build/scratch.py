@@ -14,7 +14,7 @@ import msgspec
 from engram.errors import ConfigError, MapError, MapLockedError, storage_full
 from engram.fleet.build.group_mapping import GroupResult
 from engram.fleet.build.orders import BestOrder
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.maps.lock import WriterLock, current_holder
 from engram.monitor import write_whole
 
@@ -291,8 +291,8 @@ def sessions_of(centre: Path) -> frozenset[str]:
     """All sessions of a map, those of which it has a part only too; none of a map that is not."""
     if not centre.exists():
         return frozenset()
-    with MapStore.open(centre) as store:
-        return frozenset(map(str, store.frontends()))
+    with Map.open(centre) as store:
+        return frozenset(map(str, store.frontends))
 
 
 def _missing(centre: Path, plan: BuildPlan) -> list[str]:

@@ -23,7 +23,7 @@ from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.download.stock import Mask, Stock
 from engram.graph.model import Edge, PathId, path_id
-from engram.maps import BulkWriter, MapStore, WritableMapStore
+from engram.maps import BulkWriter, Map, compact_map, publish_map
 from engram.maps.drafts import check_parent, draft_folder
 from engram.monitor import QUIET, Monitor
 
@@ -138,7 +138,7 @@ def download(
     if out.exists() or out.is_symlink():
         raise InputError(f"{out} exists already; choose another name")
     check_parent(out)
-    with MapStore.open(centre, at=at) as store:
+    with Map.open(centre, at=at) as store:
         stock = Stock(store)
         if not len(stock):
             raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
@@ -147,9 +147,9 @@ def download(
         with draft_folder(out) as folder:
             sent = _fitting(stock, selection, options, folder, monitor)
             compact = folder / _COMPACT
-            MapStore.compact(folder / _DRAFT, compact)
+            compact_map(folder / _DRAFT, compact)
             report = _report(stock, sent, coverage, compact, out, options)
-            MapStore.publish(compact, out)
+            publish_map(compact, out)
     return report
 
 
@@ -248,7 +248,7 @@ def _beginning(selection: Selection, count: int) -> Selection:
 
 def _compacted_bytes(folder: Path) -> int:
     compact = folder / _COMPACT
-    MapStore.compact(folder / _DRAFT, compact)
+    compact_map(folder / _DRAFT, compact)
     size_bytes = compact.stat().st_size
     compact.unlink()
     return size_bytes
@@ -261,7 +261,7 @@ def _write_draft(
         old.unlink()
     bridges = close_gaps(stock.node_ids, stock.edges, selection.sent)
     with (
-        MapStore.create(folder / _DRAFT) as draft,
+        Map.create(folder / _DRAFT) as draft,
         monitor.stage("download", int(selection.sent.sum())) as part,
         _begin(draft, stock, options) as writer,
     ):
@@ -271,7 +271,7 @@ def _write_draft(
     return _Sent(selection, bridges)
 
 
-def _begin(draft: WritableMapStore, stock: Stock, options: DownloadOptions) -> BulkWriter:
+def _begin(draft: Map, stock: Stock, options: DownloadOptions) -> BulkWriter:
     newest = stock.store.log()[-1]
     return draft.begin_revision(
         author="centre",
@@ -311,18 +311,18 @@ def _write(
             writer.add_path_entry(entry)
     _write_attempts(writer, stock, sent)
     if options.policy == "copy":
-        for _, omission in sorted(stock.store.omissions().items()):
+        for _, omission in sorted(stock.store.omissions.items()):
             writer.add_omission(omission)
     for name, values in sorted(stock.store.statistics().items()):
         writer.put_statistics(name, values)
-    vocabulary = stock.store.vocabulary()
+    vocabulary = stock.store.vocabulary
     if vocabulary is not None:
         writer.put_vocabulary(vocabulary)
 
 
 def _write_sessions(writer: BulkWriter, stock: Stock, sent: Mask) -> None:
     """Those that saved, passed or tried what is sent; all for a whole map."""
-    frontends = stock.store.frontends()
+    frontends = stock.store.frontends
     partial = _partial_paths(stock, sent)
     wanted = _sessions_of(stock, sent)
     for at, session in enumerate(stock.sessions):
@@ -354,7 +354,7 @@ def _sessions_of(stock: Stock, sent: Mask) -> Mask:
 def _partial_paths(stock: Stock, sent: Mask) -> set[PathId]:
     """Paths of which some entries stay, here or before."""
     left = {path for path, nodes in stock.on_path.items() if not sent[nodes].all()}
-    return left | set(stock.store.partial_paths())
+    return left | set(stock.store.partial_paths)
 
 
 def _attempts_between(stock: Stock, sent: Mask) -> NDArray[np.intp]:
@@ -381,7 +381,7 @@ def _report(
 ) -> DownloadReport:
     """What was written to a file that is to be called `out`."""
     sent = done.selection.sent
-    with MapStore.open(file) as written:
+    with Map.open(file) as written:
         info = written.info()
         content_hash = written.content_hash()
     ends = np.array(

@@ -13,7 +13,7 @@ from engram.graph.basin import BasinCounts
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
-from engram.maps import AttemptArrays, MapStore
+from engram.maps import AttemptArrays, Map
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,7 +34,7 @@ class Stock:
         graph: of these nodes and edges; dense indices are places in `nodes`.
     """
 
-    def __init__(self, store: MapStore) -> None:
+    def __init__(self, store: Map) -> None:
         self.store = store
         self.contents = store.load()
         self.sessions: list[Session] = sorted(
@@ -138,7 +138,7 @@ class Stock:
     @cached_property
     def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(N,) bytes of the landmarks of each node, and (N,) of its thumbnail."""
-        found = self.store.blob_sizes()
+        found = self.store.blob_sizes
         both = np.array([found[node] for node in self.node_ids], np.int64).reshape(-1, 2)
         return both[:, 0], both[:, 1]
 

@@ -26,7 +26,7 @@ def check_fits(merge: Merge) -> None:
             the UUID of one of the centre's, and another content.
     """
     robot, known = merge.robot, merge.centre.sessions
-    kind, theirs = merge.centre.descriptor, robot.store.descriptor()
+    kind, theirs = merge.centre.descriptor, robot.store.descriptor
     if None not in {kind, theirs} and kind is not theirs:
         raise IncompatibleError(
             f"{robot.name} holds {theirs} descriptors, the centre {kind}; the two cannot be "

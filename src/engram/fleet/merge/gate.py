@@ -14,10 +14,11 @@ from engram.errors import ConfigError, RefusedError
 from engram.fleet.merge.report import HeldOutFigures, HeldOutReport
 from engram.graph.model import Session, session_id
 from engram.localiser import Budget, Localisation
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
 from engram.monitor import QUIET, Monitor
-from engram.robot import OpenMap, Settings, live_frames, measured, open_drive, session_of_drive
+from engram.robot import Settings, live_frames, measured, open_drive, session_of_drive
+from engram.robot.localisers import localiser_in
 from engram.robot.session import DriveSequence
 from engram.sequences import FrameLog, first_pair_hash
 
@@ -138,10 +139,10 @@ class Gate:
 
     def look_at(self, centre: Path, monitor: Monitor) -> None:
         """The centre as it is; once, before the first merge."""
-        with MapStore.open(centre) as store:
+        with Map.open(centre) as store:
             self._before = self._localise(store, monitor)
 
-    def __call__(self, store: MapStore, robot: str, monitor: Monitor) -> HeldOutReport:
+    def __call__(self, store: Map, robot: str, monitor: Monitor) -> HeldOutReport:
         """The centre as it would become.
 
         Args:
@@ -164,16 +165,16 @@ class Gate:
         self._before = after
         return HeldOutReport(names, _figures(before), _figures(after))
 
-    def _localise(self, store: MapStore, monitor: Monitor) -> list[Drive]:
-        opened = OpenMap(store)
+    def _localise(self, store: Map, monitor: Monitor) -> list[Drive]:
+        store.forget()  # in the midst of a merge its graph is the merge's, not the file's
         return [
-            localise_drive(opened, one, self._settings, self._options, monitor)
+            localise_drive(store, one, self._settings, self._options, monitor)
             for one in self._sequences
         ]
 
 
 def localise_drive(
-    opened: OpenMap,
+    opened: Map,
     sequence: DriveSequence,
     settings: Settings,
     options: GateOptions,
@@ -181,7 +182,8 @@ def localise_drive(
 ) -> Drive:
     """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
     settings = settings.for_descriptor(opened.descriptor)
-    localiser = opened.localiser(
+    localiser = localiser_in(
+        opened,
         sequence.camera,
         settings,
         policy=options.policy,

@@ -19,7 +19,7 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
-from engram.maps import MapStore
+from engram.maps import Map
 
 
 class HandedIn:
@@ -38,7 +38,7 @@ class HandedIn:
         partial_paths: paths of which the map holds some entries only.
     """
 
-    def __init__(self, store: MapStore, name: str) -> None:
+    def __init__(self, store: Map, name: str) -> None:
         self.store = store
         self.name = name
         self.content_hash = store.content_hash()
@@ -47,10 +47,10 @@ class HandedIn:
             self.contents.sessions, key=lambda session: (session.start_ns, session.id)
         )
         self.nodes = {node.id: node for node in self.contents.nodes}
-        self.omissions = store.omissions()
-        self.frontends = store.frontends()
-        self.landmark_hashes = store.landmark_hashes()
-        self.partial_paths = store.partial_paths()
+        self.omissions = store.omissions
+        self.frontends = store.frontends
+        self.landmark_hashes = store.landmark_hashes
+        self.partial_paths = store.partial_paths
 
     def __enter__(self) -> Self:
         return self

@@ -17,7 +17,7 @@ from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.state import Merge
 from engram.fleet.merge.steps import merge_one
-from engram.maps import FORMAT_VERSION, MapStore
+from engram.maps import FORMAT_VERSION, Map, copy_map, publish_map
 from engram.maps.drafts import draft_folder
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.robot import Settings
@@ -74,7 +74,7 @@ def merge(
     reports: list[MergeReport] = []
     with _place(centre, dry_run=dry_run) as drafted:
         place = drafted
-        with MapStore.open(place) as store:
+        with Map.open(place) as store:
             before = store.revision
         # One for all robots: a Ctrl-C when a merge is just done must not be forgotten with it.
         with interruptible(monitor) as watched:
@@ -84,7 +84,7 @@ def merge(
                 reports.append(_merged(place, robot, settings, options, gate, watched))
                 reports[-1].dry_run = dry_run
                 if not (reports[-1].interrupted or dry_run or place == centre):
-                    MapStore.publish(place, centre)
+                    publish_map(place, centre)
                     place = centre
                 watched.hear(reports[-1])
                 if reports[-1].interrupted:
@@ -99,15 +99,15 @@ def merge(
 def _check_given(centre: Path, robots: Sequence[Path], gate: Gate | None) -> None:
     """Looks at all that was given before anything is made or changed."""
     for robot in robots:
-        with MapStore.open(robot) as store:
+        with Map.open(robot) as store:
             if centre.exists() and robot.samefile(centre):
                 raise InputError(f"{robot} is the centre itself; hand in other maps")
             sessions = store.load().sessions
         if gate is not None:
             gate.check_held_out(sessions, robot)
     if gate is not None and centre.exists():
-        with MapStore.open(centre) as store:
-            gate.check_held_out(store.sessions(), centre)
+        with Map.open(centre) as store:
+            gate.check_held_out(store.sessions.values(), centre)
 
 
 def _merged(
@@ -120,18 +120,18 @@ def _merged(
 ) -> MergeReport:
     """One merge in a freshly opened map, so that it does not matter what came before it."""
     started = time.perf_counter()
-    with HandedIn(MapStore.open(path), str(path)) as robot:
+    with HandedIn(Map.open(path), str(path)) as robot:
         try:
             monitor.check()
             _check_before_raising(place, robot)
-            with MapStore.open_for_writing(place) as store:
-                settings = settings.for_descriptor(robot.store.descriptor())
+            with Map.open(place, writes=True) as store:
+                settings = settings.for_descriptor(robot.store.descriptor)
                 report = merge_one(store, robot, settings, options, gate, monitor)
             if report.revision is None:
                 monitor.check()
         except KeyboardInterrupt:
             report = MergeReport(str(path), robot.content_hash, robot.robots, interrupted=True)
-            with MapStore.open(place) as store:
+            with Map.open(place) as store:
                 report.content_hash = store.content_hash()
     report.seconds = time.perf_counter() - started
     return report
@@ -142,7 +142,7 @@ def _check_before_raising(place: Path, robot: HandedIn) -> None:
 
     A robot's map that is refused shall not do even that.
     """
-    with MapStore.open(place) as store:
+    with Map.open(place) as store:
         if store.format_version < FORMAT_VERSION:
             check_fits(Merge(store, robot))
             check_readable(robot, robot.contents.nodes)
@@ -157,12 +157,12 @@ def _place(centre: Path, *, dry_run: bool) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="engram-dry-run-") as folder:
             copy = Path(folder) / centre.name
             if centre.exists():
-                MapStore.copy(centre, copy)
+                copy_map(centre, copy)
             else:
-                MapStore.create(copy).close()
+                Map.create(copy).close()
             yield copy
     else:
         with draft_folder(centre) as folder:
             draft = folder / centre.name
-            MapStore.create(draft).close()
+            Map.create(draft).close()
             yield draft

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from engram.graph.layout import lay_out
-from engram.robot import OpenMap, open_map
+from engram.maps import Map, open_map
 from engram.viewing import Track, draw_panels
 
 
@@ -25,12 +25,12 @@ def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
     panels = []
     for at in (before, None):
         with open_map(centre, at) as opened:
-            words = f"{len(opened.graph)} nodes, revision {opened.store.revision}"
+            words = f"{len(opened.graph)} nodes, revision {opened.revision}"
             panels.append((f"{'before' if at is not None else 'after'}: {words}", _tracks(opened)))
     draw_panels(panels, path)
 
 
-def _tracks(opened: OpenMap) -> list[Track]:
+def _tracks(opened: Map) -> list[Track]:
     """One per robot."""
     places_m = lay_out(opened.graph)
     robots = np.array([opened.sessions[node.session].robot for node in opened.graph.nodes], object)

@@ -47,6 +47,7 @@ from engram.monitor import Monitor
 from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
 from engram.ranking import check_for_robot
 from engram.robot import Settings
+from engram.robot.localisers import localiser_in, relocaliser_in
 
 # A segment is seeded from a neighbour this far along it: farther, places are looked up instead.
 # Source: the distance after which own nodes are neighbours again (SPEC §3.1).
@@ -163,13 +164,14 @@ class Replay:
     def _lazy_relocaliser(self, name: str) -> LazyRelocaliser:
         """One for all segments."""
         centre, descriptor = self._merge.centre, self._settings.frontend.descriptor
-        return LazyRelocaliser(name, lambda: centre.relocaliser(name, descriptor))
+        return LazyRelocaliser(name, lambda: relocaliser_in(centre, name, descriptor))
 
     def _localiser(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None
     ) -> Localiser:
         robot, centre, options = self._merge.robot, self._merge.centre, self._options
-        localiser = centre.localiser(
+        localiser = localiser_in(
+            centre,
             robot.contents.cameras[segment.nodes[0].camera],
             self._settings,
             policy=options.policy,

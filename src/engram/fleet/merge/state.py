@@ -25,8 +25,7 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.localiser import Position
-from engram.maps import AttemptArrays, BulkWriter, MapStore, StoredNode
-from engram.robot import OpenMap
+from engram.maps import AttemptArrays, BulkWriter, Map, StoredNode
 
 # Entries that a merge adds itself stand behind all that robots wrote (docs/format.md).
 FIRST_REPLAYED = 2**32
@@ -55,17 +54,17 @@ class Merge:
 
     writer: BulkWriter
 
-    def __init__(self, store: MapStore, robot: HandedIn) -> None:
+    def __init__(self, store: Map, robot: HandedIn) -> None:
         self.store = store
-        self.centre = OpenMap(store)
+        self.centre = store
         self.graph = self.centre.graph
         self.robot = robot
         self.report = MergeReport(robot.name, robot.content_hash, robot.robots)
-        self.landmark_hashes = store.landmark_hashes()
+        self.landmark_hashes = store.landmark_hashes
         spread = np.diag([_OMITTED_SIGMA_M**2] * 3 + [_OMITTED_SIGMA_RAD**2] * 3)
         self._omitted = {
             omission.omitted: Position(omission.node, omission.node_from_omitted, spread)
-            for omission in store.omissions().values()
+            for omission in store.omissions.values()
         }
         self._entries: dict[PathId, set[_EntryKey]] = {}
         # Nodes that were taken, by what joins them: a graph search for each would take too long.
@@ -101,7 +100,7 @@ class Merge:
             or any(self.new_entry(entry) for entry in self.robot.contents.path_entries)
             or any(map(self.lacks_edge, self.robot.edges))
             or any(map(self.lacks_omission, self.robot.omissions))
-            or len(self.new_attempts(known, self.centre.remembered)) > 0
+            or len(self.new_attempts(known, self.centre.attempts)) > 0
         )
 
     def lacks_edge(self, edge: Edge) -> bool:

@@ -23,14 +23,15 @@ from engram.fleet.merge.segments import Segment, string_segments
 from engram.fleet.merge.state import Merge
 from engram.fleet.merge.words import keep_words
 from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
-from engram.maps import WritableMapStore
+from engram.maps import Map
 from engram.monitor import Monitor
 from engram.places import RECOGNISERS
 from engram.robot import Settings
+from engram.robot.localisers import drives_of
 
 
 def merge_one(
-    store: WritableMapStore,
+    store: Map,
     robot: HandedIn,
     settings: Settings,
     options: MergeOptions,
@@ -135,8 +136,8 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
 
 def _take_vocabulary(merge: Merge) -> None:
     """A centre without a vocabulary of its own takes that of the robot."""
-    theirs = merge.robot.store.vocabulary()
-    if theirs is not None and merge.store.vocabulary() is None:
+    theirs = merge.robot.store.vocabulary
+    if theirs is not None and merge.store.vocabulary is None:
         merge.writer.put_vocabulary(theirs)
 
 
@@ -150,7 +151,7 @@ def _add_session(merge: Merge, session: Session) -> None:
         frontend=frontend,
         partial=path_id(session.id) in robot.partial_paths,
     )
-    merge.centre.drives[session.id] = session
+    merge.centre.derived(drives_of)[session.id] = session
 
 
 def _unite_path(merge: Merge, session: Session, replay: Replay) -> list[PathEntry]:
@@ -197,7 +198,7 @@ def _carry_omissions(merge: Merge) -> None:
 
 def _carry_attempts(merge: Merge, replay: Replay) -> None:
     """Remembered attempts go along (SPEC §7 MERGE 4), those of the replay too."""
-    sessions, remembered = list(merge.centre.sessions), merge.centre.remembered
+    sessions, remembered = list(merge.centre.sessions), merge.centre.attempts
     if merge.writer.shows_again:
         # A node that is seen again brings back the attempts that were remembered at it.
         merge.writer.flush()

@@ -10,17 +10,22 @@ from numpy.typing import NDArray
 from engram.fleet.merge.state import Merge
 from engram.frontend import DescriptorKind
 from engram.graph.model import NodeId
-from engram.maps import MapStore, WritableMapStore
+from engram.maps import Map
 from engram.places import decode_vocabulary, default_vocabulary, hash_of
-from engram.places.stored_words import keep_missing_words, stored_words, worked_out_words
+from engram.places.stored_words import (
+    keep_missing_words,
+    stored_words,
+    vocabulary_or_default,
+    worked_out_words,
+)
 
 
-def keep_words(store: WritableMapStore, merge: Merge, descriptor: DescriptorKind) -> None:
+def keep_words(store: Map, merge: Merge, descriptor: DescriptorKind) -> None:
     """Copies the words that the robot's map has by the centre's vocabulary, and works out the rest.
 
     Words are no part of any revision: where this is interrupted, they are worked out later.
     """
-    vocabulary, graph = merge.centre.vocabulary_or_default(descriptor), merge.graph
+    vocabulary, graph = vocabulary_or_default(merge.centre, descriptor), merge.graph
     theirs = stored_words(merge.robot.store, vocabulary)
     brought = {node: theirs[node] for node in merge.robot.nodes if node in graph and node in theirs}
     if brought:
@@ -35,9 +40,9 @@ class CentreWords:
         store: the centre, which is left as it is.
     """
 
-    def __init__(self, store: MapStore) -> None:
+    def __init__(self, store: Map) -> None:
         self._store = store
-        body, descriptor = store.vocabulary(), store.descriptor()
+        body, descriptor = store.vocabulary, store.descriptor
         self._vocabulary = None
         if body is not None:
             self._vocabulary = decode_vocabulary(body)
@@ -47,7 +52,7 @@ class CentreWords:
         if self._vocabulary is not None:
             self._known.update(stored_words(store, self._vocabulary))
 
-    def give(self, download: WritableMapStore, nodes: Sequence[NodeId]) -> None:
+    def give(self, download: Map, nodes: Sequence[NodeId]) -> None:
         """Keeps the words of the nodes of a download in it, whether the centre kept them or not.
 
         So the same nodes make the same bytes.

@@ -8,9 +8,10 @@ from engram.fleet.build import JudgeOptions, find_best_order
 from engram.fleet.merge import GateOptions
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
+from engram.maps import Map
 from engram.measures import Drive
 from engram.monitor import QUIET
-from engram.robot import DriveSequence, OpenMap, Settings, session_of_drive
+from engram.robot import DriveSequence, Settings, session_of_drive
 from engram_lab.studies.configurations import Configuration
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm
@@ -32,7 +33,7 @@ class _Judge:
         self._drives = {one.session.id: one for one in plan.drives.drives}
 
     def __call__(
-        self, opened: OpenMap, sequence: DriveSequence, settings: Settings, options: GateOptions
+        self, opened: Map, sequence: DriveSequence, settings: Settings, options: GateOptions
     ) -> Drive:
         """See `JudgeOptions.localise`."""
         drive = self._drives[session_of_drive(sequence).id]
@@ -45,10 +46,10 @@ class _Judge:
         memo.save()
         return Drive(runs.step_m, runs.matched[0])
 
-    def _memo(self, opened: OpenMap, drive: EvaluatedDrive, settings: Settings) -> MatchMemo:
+    def _memo(self, opened: Map, drive: EvaluatedDrive, settings: Settings) -> MatchMemo:
         config = settings.localiser.matcher
         return MatchMemo(
-            FrameMatcher(opened.store.frames, config),
+            FrameMatcher(opened.frames, config),
             self._plan.folder(self._arm, self._fold) / f"memo-{drive.key}.matches.npz",
             matcher_hash(config),
         )

@@ -13,7 +13,9 @@ import numpy as np
 
 from engram.graph.model import node_id
 from engram.localiser import FrameMatcher, Localisation, Relocaliser, accept_lost
-from engram.robot import LocaliseOptions, LocaliseRun, OpenMap, Settings, session_of_drive
+from engram.maps import Map
+from engram.robot import LocaliseOptions, LocaliseRun, Settings, session_of_drive
+from engram.robot.localisers import relocaliser_in
 from engram.sequences import FrameLog
 from engram_lab.studies.fleet.arms import Arm
 from engram_lab.studies.fleet.plan import FleetPlan
@@ -133,7 +135,7 @@ def medians(
                 for stage, ms in _stages_of(result.localisation):
                     taken_ms[stage].append(ms)
             if options.relocaliser is not None:
-                relocaliser = run.opened.relocaliser(options.relocaliser, log.header.descriptor)
+                relocaliser = relocaliser_in(run.opened, options.relocaliser, log.header.descriptor)
                 taken_ms["proposed_ms"] += _in_vain_ms(run.opened, log, settings, relocaliser)
         log.close()
     return {name: float(np.median(some)) if some else 0.0 for name, some in taken_ms.items()}
@@ -149,14 +151,14 @@ def _stages_of(one: Localisation) -> Iterator[tuple[str, float]]:
 
 
 def _in_vain_ms(
-    opened: OpenMap, log: FrameLog, settings: Settings, relocaliser: Relocaliser
+    opened: Map, log: FrameLog, settings: Settings, relocaliser: Relocaliser
 ) -> Iterator[float]:
     """Each attempt that does not find a robot which is lost here and there along its drive.
 
     Not left to chance: where all held-out drives are found at once there would be none. The
     landmarks are in memory, as they are for those who are lost for a while.
     """
-    landmarks, acceptance = opened.store.frames, settings.localiser.acceptance
+    landmarks, acceptance = opened.frames, settings.localiser.acceptance
     matcher = FrameMatcher(landmarks, settings.localiser.lost_matcher, threads=False)
     session = session_of_drive(log).id
     for logged in islice(log, 0, None, max(len(log) // _LOST_PLACES, 1)):

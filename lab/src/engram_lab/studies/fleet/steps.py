@@ -16,7 +16,7 @@ from engram.frontend.matching import matcher_hash
 from engram.graph.clock import hour_of_day
 from engram.graph.model import path_id
 from engram.localiser import FrameMatcher
-from engram.maps import MapStore
+from engram.maps import Map, copy_map
 from engram.robot import MapReport, measured
 from engram_lab.studies.building import build_map
 from engram_lab.studies.drives import EvaluatedDrive
@@ -103,7 +103,7 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
     if path.exists() and record.exists():
         return
     draft = _draft(path)
-    MapStore.copy(map_path(plan, arm, fold, centre), draft)
+    copy_map(map_path(plan, arm, fold, centre), draft)
     (report,) = merge_maps(
         draft,
         [map_path(plan, arm, fold, robot)],
@@ -112,7 +112,7 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
     )
     if report.interrupted:
         raise KeyboardInterrupt
-    with MapStore.open(draft) as store:
+    with Map.open(draft) as store:
         nodes = store.node_count()
     made = MergeRecord(
         name=robot,
@@ -162,9 +162,9 @@ def download_for_foray(
     draft = _draft(path)
     report = _downloaded(whole, draft, policy if hour is not None else "copy", hour)
     paths = {path_id(one.session.id) for one in own}
-    with MapStore.open(whole) as store:
+    with Map.open(whole) as store:
         mine = {node.id for node in store.load().nodes if path_id(node.session) in paths}
-    with MapStore.open(draft) as store:
+    with Map.open(draft) as store:
         sent = {node.id for node in store.load().nodes}
     made = DownloadRecord(
         report.policy, hour, report.nodes, report.of_nodes, len(mine | sent), report.size_bytes,
@@ -199,7 +199,7 @@ def localise_in(
         frames = frames or drive.frames()
         opened = kept_maps.open(map_path(plan, arm, fold, name))
         memo = MatchMemo(
-            FrameMatcher(opened.store.frames, config),
+            FrameMatcher(opened.frames, config),
             plan.folder(arm, fold) / f"memo-{drive.key}.matches.npz",
             matcher_hash(config),
         )

@@ -22,7 +22,7 @@ from engram.fleet.download import DownloadOptions
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, SessionId
 from engram.localiser import Position
-from engram.maps import MapStore
+from engram.maps import Map
 from engram.measures import Drive
 from engram.monitor import QUIET
 from engram.places import (
@@ -33,7 +33,6 @@ from engram.places import (
     default_vocabulary,
 )
 from engram.places.stored_words import stored_words
-from engram.robot import OpenMap
 from engram.sequences import FrameLog
 from engram_lab.studies.building import true_nodes, write_json
 from engram_lab.studies.drives import EvaluatedDrive
@@ -183,7 +182,7 @@ def _kept(path: Path) -> list[dict[str, Any]] | None:
     return tried if values.get("thumbnails") is False else None
 
 
-def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: OpenMap) -> Position | None:
+def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: Map) -> Position | None:
     """Where the drive begins, by truth; None where that is not known: it is lost."""
     truth = drive.truth()
     log = FrameLog(drive.path)
@@ -196,8 +195,8 @@ class _Queries:
     """What asking FAB-MAP where a drive is costs in parts of a map."""
 
     def __init__(self, centre: Path, drive: EvaluatedDrive) -> None:
-        with MapStore.open(centre) as store:
-            body = store.vocabulary()
+        with Map.open(centre) as store:
+            body = store.vocabulary
             self._vocabulary = (
                 default_vocabulary(drive.descriptor) if body is None else decode_vocabulary(body)
             )

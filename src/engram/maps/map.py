@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property, wraps
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +20,8 @@ from engram.errors import IncompatibleError, InputError, MapCorruptError, Revisi
 from engram.frontend import DescriptorKind
 from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera
+from engram.graph.basin import BasinCounts
+from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
     NodeId,
     Omission,
@@ -25,6 +30,7 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
+from engram.graph.paths import PathMemory
 from engram.maps import reading
 from engram.maps.bulk_writer import BulkWriter
 from engram.maps.checking import check
@@ -32,6 +38,7 @@ from engram.maps.collecting import collect_abandoned
 from engram.maps.committing import change_revision, commit_revision
 from engram.maps.content import content_hash, record_hashes
 from engram.maps.database import Database, Lock
+from engram.maps.difference import MapDifference, difference
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import (
     Reverted,
@@ -42,9 +49,11 @@ from engram.maps.hiding import (
     hide_revision,
 )
 from engram.maps.keys import KeyBook
+from engram.maps.lock import Holder
 from engram.maps.postgresql import PostgresDatabase
 from engram.maps.provenance import Origin, origin_of
 from engram.maps.records import (
+    AttemptArrays,
     CheckReport,
     InterruptedSession,
     MapContents,
@@ -55,6 +64,7 @@ from engram.maps.records import (
     SessionState,
     StoredSession,
 )
+from engram.maps.regions import STRETCH_M
 from engram.maps.rows import (
     Row,
     checked_text,
@@ -76,6 +86,10 @@ from engram.maps.tags import Tag, checked_tag, load_tags, resolve, write_tag
 from engram.maps.view import View, head
 from engram.maps.words import load_words, words_row, write_words
 
+if TYPE_CHECKING:
+    from engram.robot.live_robot import LiveRobot
+    from engram.robot.settings import Settings
+
 
 def is_address(location: Path | str) -> bool:
     """Whether a map lies in PostgreSQL, not in a file."""
@@ -89,26 +103,99 @@ def open_database(location: Path | str) -> Database:
     return SqliteDatabase(Path(location))
 
 
-class MapStore:
-    """A map, read as of one revision. A context manager; safe to use from several threads.
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[Map, _P], _T]:
+    """The map is locked for writing while the method runs."""
+
+    @wraps(method)
+    def locked(self: Map, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        with self.writing():
+            return method(self, *args, **kwargs)
+
+    return locked
+
+
+# What is read anew once something was written.
+_SMALL = (
+    "vocabulary",
+    "descriptor",
+    "frontends",
+    "omissions",
+    "landmark_hashes",
+    "blob_sizes",
+    "partial_paths",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Contents:
+    """What a map is read for once: the graph and the paths grow with what is written."""
+
+    graph: ExperienceGraph
+    path_memory: PathMemory
+    attempts: AttemptArrays
+    basin_counts: BasinCounts
+    last_iterations: Mapping[SessionId, int]
+
+    @staticmethod
+    def of(contents: MapContents) -> _Contents:
+        graph = ExperienceGraph()
+        for node in contents.nodes:
+            graph.add_node(node)
+        graph.add_edges(contents.edges)
+        path_memory = PathMemory(graph)
+        for entry in contents.path_entries:
+            path_memory.add(entry)
+        return _Contents(
+            graph,
+            path_memory,
+            contents.attempts,
+            contents.basin_counts(graph.experiences),
+            contents.last_iterations(),
+        )
+
+
+class Map:
+    """A map on disk, seen as of one revision. A context manager; threads may share it.
 
     Readers never wait for the writer, nor it for them: they see the revisions that were committed
-    when they opened the map, whatever is added meanwhile.
+    when they opened the map, whatever is added meanwhile. What is read stays in memory. The graph
+    and the paths are read once, and grow with what this process writes.
 
     Attributes:
         frames: the frames of its nodes: a `LandmarkSource`.
     """
 
     def __init__(
-        self, database: Database, *, at: int | str | None, cache_bytes: int = DEFAULT_CACHE_BYTES
+        self,
+        database: Database,
+        *,
+        at: int | str | None = None,
+        writes: bool = False,
+        cache_bytes: int = DEFAULT_CACHE_BYTES,
     ) -> None:
         self._database = database
-        with database.reading() as connection:
-            self._view = View(resolve(connection, at, database.name))
-        self.frames = FrameReader(database, self._view, cache_bytes)
+        self._lock: Lock | None = database.lock_for_writing() if writes else None
+        try:
+            with database.reading() as connection:
+                self._view = View(resolve(connection, at, database.name))
+            self._pinned = at is not None
+            self._key_book = KeyBook(database, self._view) if writes else None
+            self.frames = FrameReader(database, self._view, cache_bytes)
+        except BaseException:
+            self._release()
+            raise
+        self._contents_lock = threading.RLock()
+        self._contents: _Contents | None = None
+        self._derived: dict[tuple[object, ...], Any] = {}
+        self._open_session: SessionWriter | None = None
+        self._bulk: BulkWriter | None = None
 
     @staticmethod
-    def create(location: Path | str) -> WritableMapStore:
+    def create(location: Path | str) -> Map:
         """Make an empty map and open it for writing.
 
         Raises:
@@ -119,42 +206,33 @@ class MapStore:
             PostgresDatabase.create(str(location))
         else:
             SqliteDatabase.create(Path(location))
-        return MapStore.open_for_writing(location)
+        return Map.open(location, writes=True)
 
     @staticmethod
     def open(
         location: Path | str,
         *,
         at: int | str | None = None,
+        writes: bool = False,
         cache_bytes: int = DEFAULT_CACHE_BYTES,
-    ) -> MapStore:
-        """Open a map for reading.
+    ) -> Map:
+        """Open an existing map.
 
         Args:
             location: path of the map file, or address of a map in PostgreSQL.
             at: number or name of the revision to see (`resolve`); None for the newest, 0 for the
                 map before the first.
+            writes: become its only writer at once, until `close`.
             cache_bytes: how much memory decoded frames may take.
 
         Raises:
             NotAMapError: nothing is there, or something else.
             FormatVersionError: a newer Engram wrote it.
             MapCorruptError: it is damaged so that it cannot be read.
+            MapLockedError: another process writes to it; names process and host.
             RevisionError: it has no such revision.
         """
-        return MapStore(open_database(location), at=at, cache_bytes=cache_bytes)
-
-    @staticmethod
-    def open_for_writing(
-        location: Path | str, *, cache_bytes: int = DEFAULT_CACHE_BYTES
-    ) -> WritableMapStore:
-        """Open a map for adding to it: its only writer until `close`.
-
-        Raises:
-            MapLockedError: another process writes to it; names process and host.
-            MapError: as `open`, or the file is read-only.
-        """
-        return WritableMapStore(open_database(location), cache_bytes=cache_bytes)
+        return Map(open_database(location), at=at, writes=writes, cache_bytes=cache_bytes)
 
     @property
     def location(self) -> str:
@@ -171,19 +249,137 @@ class MapStore:
         """Of the format in which the map is stored."""
         return self._database.format_version
 
+    @property
+    def graph(self) -> ExperienceGraph:
+        """Its experience graph."""
+        return self._read_contents().graph
+
+    @property
+    def path_memory(self) -> PathMemory:
+        """Its paths."""
+        return self._read_contents().path_memory
+
+    @property
+    def attempts(self) -> AttemptArrays:
+        """The attempts that it remembered when the graph was read.
+
+        Sessions are places in `sessions`, nodes are indices of `graph`.
+        """
+        return self._read_contents().attempts
+
+    @property
+    def basin_counts(self) -> BasinCounts:
+        """Counts of `attempts`, from which match basins are learnt."""
+        return self._read_contents().basin_counts
+
+    @property
+    def last_iterations(self) -> Mapping[SessionId, int]:
+        """Number of the newest of `attempts` of each session that has any."""
+        return self._read_contents().last_iterations
+
+    @cached_property
+    def sessions(self) -> dict[SessionId, Session]:
+        """The drives that the map knows, by id, in the order of their coming."""
+        return {one.id: one for one in self._read(reading.load_sessions)}
+
+    @cached_property
+    def vocabulary(self) -> bytes | None:
+        """The newest vocabulary of the map as it was put in; None if there is none.
+
+        Raises:
+            MapCorruptError: it does not match its hash.
+        """
+        return self._read(reading.load_vocabulary)
+
+    @cached_property
+    def descriptor(self) -> DescriptorKind | None:
+        """Kind of all descriptors of the map; None before its first session."""
+        return self._read(reading.descriptor_of)
+
+    @cached_property
+    def frontends(self) -> dict[SessionId, tuple[DescriptorKind, str]]:
+        """Descriptor kind and hash of the front-end of each session."""
+        return self._read(reading.frontends_of_sessions)
+
+    @cached_property
+    def omissions(self) -> dict[NodeId, Omission]:
+        """The nodes that merges did not take, by their ids; equivalents that are hidden left out.
+
+        Raises:
+            MapCorruptError: a row does not match its checksum.
+        """
+        return self._read(reading.load_omissions)
+
+    @cached_property
+    def landmark_hashes(self) -> dict[NodeId, bytes]:
+        """The 16 bytes that stand for each node's landmarks.
+
+        Also of nodes that were not taken, as far as it was kept.
+        """
+        return self._read(reading.landmark_hashes)
+
+    @cached_property
+    def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
+        """Bytes of each node's landmarks and of its thumbnail."""
+        return self._read(reading.blob_sizes)
+
+    @cached_property
+    def partial_paths(self) -> frozenset[PathId]:
+        """Paths of which some entries stayed elsewhere."""
+        return self._read(reading.partial_paths)
+
+    def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
+        """The words (n,) of nodes by the vocabulary of this hash, rising, as far as they are kept.
+
+        What is damaged is left out: it can be worked out again from the landmarks.
+        """
+        with self._database.reading() as connection:
+            return load_words(connection, vocabulary)
+
+    def derived(
+        self, make: Callable[Concatenate[Map, _P], _T], *args: _P.args, **kwargs: _P.kwargs
+    ) -> _T:
+        """What others make of this map: made once for each set of arguments, then shared.
+
+        Args:
+            make: called with the map and the arguments, which are hashable.
+        """
+        key = (make, *args, *sorted(kwargs.items()))
+        with self._contents_lock:
+            if key not in self._derived:
+                self._derived[key] = make(self, *args, **kwargs)
+            found: _T = self._derived[key]
+        return found
+
     def load(self) -> MapContents:
-        """Everything but the landmarks: for a writer, what its open session has checkpointed too.
+        """All records as they are now, also what this process has checkpointed of an open session.
 
         Raises:
             MapCorruptError: a row does not match its checksum or points at nothing.
         """
+        return self._read(reading.load)
+
+    def node_count(self) -> int:
+        """How many nodes the map has."""
+        return self._read(reading.node_count)
+
+    def info(self) -> MapInfo:
+        """The map in numbers."""
         with self._database.reading() as connection:
-            return reading.load(connection, self._view)
+            return reading.info(
+                connection,
+                self._view,
+                format_version=self._database.format_version,
+                size_bytes=self._database.size_bytes(),
+            )
+
+    def statistics(self) -> dict[str, dict[str, Any]]:
+        """The newest of every statistic of the map, by name."""
+        return self._read(reading.load_statistics)
 
     def log(self) -> list[Revision]:
         """The committed revisions that are seen, oldest first."""
-        with self._database.reading() as connection:
-            return reading.log(connection, self._view)
+        return self._read(reading.log)
 
     def tags(self) -> dict[str, Tag]:
         """The names that were given to revisions, also to those not seen from here."""
@@ -199,80 +395,23 @@ class MapStore:
         with self._database.reading() as connection:
             return resolve(connection, named, self._database.name)
 
-    def descriptor(self) -> DescriptorKind | None:
-        """Kind of all descriptors of the map; None before its first session."""
-        with self._database.reading() as connection:
-            return reading.descriptor_of(connection, self._view)
+    def diff(
+        self, before: int | str, after: int | str, stretch_m: float = STRETCH_M
+    ) -> MapDifference:
+        """Compare two revisions.
 
-    def node_count(self) -> int:
-        """How many nodes the map has."""
-        with self._database.reading() as connection:
-            return reading.node_count(connection, self._view)
-
-    def info(self) -> MapInfo:
-        """The map in numbers."""
-        with self._database.reading() as connection:
-            return reading.info(
-                connection,
-                self._view,
-                format_version=self._database.format_version,
-                size_bytes=self._database.size_bytes(),
-            )
-
-    def statistics(self) -> dict[str, dict[str, Any]]:
-        """The newest of every statistic of the map, by name."""
-        with self._database.reading() as connection:
-            return reading.load_statistics(connection, self._view)
-
-    def vocabulary(self) -> bytes | None:
-        """The newest vocabulary of the map as it was put in; None if there is none.
+        Args:
+            before, after: their numbers or names.
+            stretch_m: length of the stretches by which changes are listed.
 
         Raises:
-            MapCorruptError: it does not match its hash.
+            RevisionError: there is no such revision.
+            InputError: the length is below 1 m, or not finite.
         """
+        numbers = self.resolve(before), self.resolve(after)
         with self._database.reading() as connection:
-            return reading.load_vocabulary(connection, self._view)
-
-    def omissions(self) -> dict[NodeId, Omission]:
-        """The nodes that merges did not take, by their ids; equivalents that are hidden left out.
-
-        Raises:
-            MapCorruptError: a row does not match its checksum.
-        """
-        with self._database.reading() as connection:
-            return reading.load_omissions(connection, self._view)
-
-    def sessions(self) -> tuple[Session, ...]:
-        """The drives that the map knows, by order of their coming.
-
-        Raises:
-            MapCorruptError: a row does not match its checksum.
-        """
-        with self._database.reading() as connection:
-            return reading.load_sessions(connection, self._view)
-
-    def frontends(self) -> dict[SessionId, tuple[DescriptorKind, str]]:
-        """Descriptor kind and hash of the front-end of each session."""
-        with self._database.reading() as connection:
-            return reading.frontends_of_sessions(connection, self._view)
-
-    def landmark_hashes(self) -> dict[NodeId, bytes]:
-        """The 16 bytes that stand for each node's landmarks.
-
-        Also of nodes that were not taken, as far as it was kept.
-        """
-        with self._database.reading() as connection:
-            return reading.landmark_hashes(connection, self._view)
-
-    def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
-        """Bytes of each node's landmarks and of its thumbnail."""
-        with self._database.reading() as connection:
-            return reading.blob_sizes(connection, self._view)
-
-    def partial_paths(self) -> frozenset[PathId]:
-        """Paths of which some entries stayed elsewhere."""
-        with self._database.reading() as connection:
-            return reading.partial_paths(connection, self._view)
+            old, new = (reading.load(connection, View(number)) for number in numbers)
+        return difference(numbers[0], old, numbers[1], new, stretch_m)
 
     def origin(self, prefix: str) -> Origin:
         """Where a node comes from, also one that a revert has hidden.
@@ -286,13 +425,15 @@ class MapStore:
         with self._database.reading() as connection:
             return origin_of(connection, self._view, prefix)
 
-    def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-        """The words (n,) of nodes by the vocabulary of this hash, rising, as far as they are kept.
-
-        What is damaged is left out: it can be worked out again from the landmarks.
-        """
+    def content_hash(self) -> str:
+        """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
         with self._database.reading() as connection:
-            return load_words(connection, vocabulary)
+            return content_hash(connection, self._view.at)
+
+    def record_hashes(self) -> dict[str, str]:
+        """16 hexadecimal digits of each table's rows, free of what revisions tell of themselves."""
+        with self._database.reading() as connection:
+            return record_hashes(connection, self._view.at)
 
     def session_state(self, session: SessionId) -> SessionState:
         """What the map knows of a session: ask before handing one in."""
@@ -316,114 +457,79 @@ class MapStore:
                 one for row in gone for one in interrupted_sessions(connection, row, self._view.at)
             ]
 
-    def content_hash(self) -> str:
-        """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
-        with self._database.reading() as connection:
-            return content_hash(connection, self._view.at)
+    def check(self) -> CheckReport:
+        """Verify the whole file to the last byte; `check_map` also takes one that does not open."""
+        return check(self._database)
 
-    def record_hashes(self) -> dict[str, str]:
-        """16 hexadecimal digits of each table's rows, free of what revisions tell of themselves."""
-        with self._database.reading() as connection:
-            return record_hashes(connection, self._view.at)
+    def robot(
+        self,
+        camera: StereoCamera,
+        settings: Settings | None = None,
+        *,
+        policy: str = "recall",
+        lanes: int = 2,
+        rounds: int = 2,
+        relocaliser: str | None = "fabmap",
+    ) -> LiveRobot:
+        """A robot that localises in this map; see `LiveRobot.localise`.
 
-    @staticmethod
-    def copy(source: Path, target: Path) -> None:
-        """Copies a map file as it is now, also while somebody writes to it.
+        Args:
+            camera: its rectified stereo camera.
+            settings: the configuration; None for the defaults.
+            policy: key of `POLICIES`.
+            lanes: attempts at the same time (Np).
+            rounds: rounds of attempts for one frame (Nr).
+            relocaliser: how it is found when lost; None for not at all.
+        """
+        from engram.robot.live_robot import live_robot
+
+        return live_robot(
+            self,
+            camera,
+            settings,
+            policy=policy,
+            lanes=lanes,
+            rounds=rounds,
+            relocaliser=relocaliser,
+        )
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Be the map's only writer for a while, on top of its newest revision.
+
+        A map that was opened with `writes` is its writer anyway.
 
         Raises:
-            InputError: the target exists already, or its folder does not.
-            MapError: the source cannot be read, or the target not written.
+            MapLockedError: another process writes to it.
+            RevisionError: the map was opened as of a certain revision.
         """
-        database = SqliteDatabase(source)
+        if self._lock is not None:
+            yield
+            return
+        if self._pinned:
+            raise RevisionError(
+                f"{self.location} is open as of revision {self.revision}; to write to it, open it "
+                "without naming a revision"
+            )
+        self._lock = self._database.lock_for_writing()
         try:
-            database.copy_to(target)
+            newest = View(self.resolve(None))
+            if newest != self._view:
+                self.forget()
+            self._key_book = KeyBook(self._database, newest)
+            self._see(newest)
+            yield
         finally:
-            database.close()
+            self._key_book = None
+            self._release()
 
-    @staticmethod
-    def compact(source: Path, target: Path) -> None:
-        """Writes a map file anew, its rows in order and without gaps.
-
-        The same rows written in the same order give the same bytes, with one version of SQLite.
-
-        Raises:
-            InputError: the target exists already, or its folder does not.
-            MapError: the source cannot be read, or the target not written.
-        """
-        database = SqliteDatabase(source)
-        try:
-            database.compact_to(target)
-        finally:
-            database.close()
-
-    @staticmethod
-    def publish(draft: Path, target: Path) -> None:
-        """Gives a map file that nobody has open its name, in the same file system: last of all.
-
-        Raises:
-            InputError: the target exists already, or its folder does not.
-            MapError: the name cannot be given.
-        """
-        SqliteDatabase.publish(draft, target)
-
-    @staticmethod
-    def check(location: Path | str) -> CheckReport:
-        """Verify a map file to the last byte, also one that is too damaged to open.
-
-        Raises:
-            NotAMapError: nothing is there, or something else.
-            FormatVersionError: a newer Engram wrote it.
-        """
-        try:
-            database = open_database(location)
-        except MapCorruptError as error:
-            return CheckReport((Problem("file", "", str(error)),), 0, 0, (), 0)
-        try:
-            return check(database)
-        finally:
-            database.close()
-
-    def close(self) -> None:
-        """Give back files and threads. A session that is still open becomes interrupted."""
-        self.frames.close()
-        self._database.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _is_alive(self, revision: Row) -> bool:
-        holder = self._database.writer()
-        return holder is not None and holder.token == revision["writer"]
-
-
-class _DryRunError(Exception):
-    """Ends a transaction of which nothing shall stay."""
-
-
-class WritableMapStore(MapStore):
-    """A map and the right to be its only writer, until `close`."""
-
-    def __init__(self, database: Database, *, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
-        self._lock: Lock = database.lock_for_writing()
-        try:
-            super().__init__(database, at=None, cache_bytes=cache_bytes)
-            self._keys = KeyBook(database, self._view)
-        except BaseException:
-            self._lock.release()
-            raise
-        self._open_session: SessionWriter | None = None
-        self._bulk: BulkWriter | None = None
-        self._holder = self._lock.holder
-
-    @staticmethod
-    def opened_or_created(location: Path) -> WritableMapStore:
-        """A map file open for writing, made if there is none."""
-        if location.exists():
-            return MapStore.open_for_writing(location)
-        return MapStore.create(location)
+    def forget(self) -> None:
+        """Read anew, when next asked for, what has been read of this map."""
+        with self._contents_lock:
+            self._contents = None
+            self._derived.clear()
+            for name in (*_SMALL, "sessions"):
+                self.__dict__.pop(name, None)
 
     def begin_session(
         self,
@@ -487,6 +593,7 @@ class WritableMapStore(MapStore):
             stored = stored_session(connection, View(self._view.at, revision["key"]), row)
         return self._writer(session, stored)
 
+    @_writes
     def seal(self, session: SessionId) -> Revision:
         """Commit what an interrupted session had checkpointed.
 
@@ -540,6 +647,7 @@ class WritableMapStore(MapStore):
         )
         return self._bulk
 
+    @_writes
     def revert(
         self, named: int | str, *, author: str, message: str = "", dry_run: bool = False
     ) -> Reverted:
@@ -574,10 +682,12 @@ class WritableMapStore(MapStore):
         except _DryRunError:
             return done
         self.frames.forget()
+        self.forget()
         self._keys.forget_nodes()
         self._see(View(self.resolve(None)))
         return done
 
+    @_writes
     def put_words(self, vocabulary: bytes, found: Mapping[NodeId, NDArray[np.int32]]) -> None:
         """Keep words of nodes, in one transaction: no revision, since they follow from other rows.
 
@@ -598,6 +708,7 @@ class WritableMapStore(MapStore):
         with self._database.writing() as connection:
             write_words(connection, self._database, rows)
 
+    @_writes
     def put_vocabulary(
         self, body: bytes, *, author: str, message: str, configuration: Mapping[str, Any]
     ) -> Revision:
@@ -625,9 +736,11 @@ class WritableMapStore(MapStore):
             connection.execute(insert(revisions), [sealed(revisions, opened)])
             connection.execute(insert(vocabularies), [sealed(vocabularies, row)])
             revision = commit_revision(connection, opened["key"])
+        self._derived.clear()
         self._see(View(revision.number))
         return revision
 
+    @_writes
     def tag(
         self,
         name: str,
@@ -671,6 +784,7 @@ class WritableMapStore(MapStore):
                 write_tag(connection, self._keys, name, number, author, message)
             return load_tags(connection)[name]
 
+    @_writes
     def untag(self, name: str, *, author: str) -> Tag:
         """Take a name away; returns what it was.
 
@@ -685,6 +799,7 @@ class WritableMapStore(MapStore):
             write_tag(connection, self._keys, name, None, author, "")
         return known[name]
 
+    @_writes
     def clean(self) -> int:
         """Remove the rows of abandoned revisions; returns how many there were."""
         self._check_none_open()
@@ -692,11 +807,54 @@ class WritableMapStore(MapStore):
             return collect_abandoned(connection)
 
     def close(self) -> None:
-        """Give back files, threads and the right to write."""
+        """Give back files, threads and the right to write.
+
+        A session that is still open becomes interrupted.
+        """
         try:
-            super().close()
+            self.frames.close()
+            self._database.close()
         finally:
+            self._release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _read(self, load: Callable[[Connection, View], _T]) -> _T:
+        with self._database.reading() as connection:
+            return load(connection, self._view)
+
+    def _read_contents(self) -> _Contents:
+        with self._contents_lock:
+            if self._contents is None:
+                found = self.load()
+                self._contents = _Contents.of(found)
+                # Attempts name sessions by their places: those of the same moment.
+                self.__dict__["sessions"] = {one.id: one for one in found.sessions}
+            return self._contents
+
+    @property
+    def _holder(self) -> Holder:
+        assert self._lock is not None  # whoever asks has keys
+        return self._lock.holder
+
+    @property
+    def _keys(self) -> KeyBook:
+        if self._key_book is None:
+            raise RevisionError(f"{self.location} is open for reading; open it with writes=True")
+        return self._key_book
+
+    def _release(self) -> None:
+        if self._lock is not None:
             self._lock.release()
+            self._lock = None
+
+    def _is_alive(self, revision: Row) -> bool:
+        holder = self._database.writer()
+        return holder is not None and holder.token == revision["writer"]
 
     def _revision_row(self, author: str, message: str, configuration: str) -> Row:
         return {
@@ -751,6 +909,7 @@ class WritableMapStore(MapStore):
             frontend = reading.load_frontends(connection)[row["frontend"]]
             own = View(self._view.at, revision["key"])
             hidden_nodes = hidden_rows(connection, own, nodes)
+        self.forget()  # what is read from now on includes the session
         self._see(own)
         self._open_session = SessionWriter(
             self._database,
@@ -776,6 +935,8 @@ class WritableMapStore(MapStore):
 
     def _see(self, view: View) -> None:
         self._view = view
+        for name in _SMALL if self._contents else (*_SMALL, "sessions"):
+            self.__dict__.pop(name, None)
         self._keys.set_view(view)
         self.frames.set_view(view)
 
@@ -816,3 +977,73 @@ class WritableMapStore(MapStore):
                 connection, reading.load_frontends(connection)[found[0]["frontend"]][0]
             )
         return found
+
+
+class _DryRunError(Exception):
+    """Ends a transaction of which nothing shall stay."""
+
+
+def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
+    """Opens a map to localise in it, to add to it, or to look at it.
+
+    Args:
+        path: NAME.engram.
+        at: number or tag of a revision, to see the map as it was then; None for the newest.
+        create: make an empty map where nothing is.
+
+    Raises:
+        MapError: the file is no map, of a newer format, or damaged.
+        RevisionError: there is no such revision.
+    """
+    if create and not is_address(path) and not Path(path).exists():
+        Map.create(path).close()
+    return Map.open(path, at=at)
+
+
+def copy_map(source: Path, target: Path) -> None:
+    """Copies a map file as it is now, also while somebody writes to it.
+
+    Raises:
+        InputError: the target exists already, or its folder does not.
+        MapError: the source cannot be read, or the target not written.
+    """
+    with closing(SqliteDatabase(source)) as database:
+        database.copy_to(target)
+
+
+def compact_map(source: Path, target: Path) -> None:
+    """Writes a map file anew, its rows in order and without gaps.
+
+    The same rows written in the same order give the same bytes, with one version of SQLite.
+
+    Raises:
+        InputError: the target exists already, or its folder does not.
+        MapError: the source cannot be read, or the target not written.
+    """
+    with closing(SqliteDatabase(source)) as database:
+        database.compact_to(target)
+
+
+def publish_map(draft: Path, target: Path) -> None:
+    """Gives a map file that nobody has open its name, in the same file system: last of all.
+
+    Raises:
+        InputError: the target exists already, or its folder does not.
+        MapError: the name cannot be given.
+    """
+    SqliteDatabase.publish(draft, target)
+
+
+def check_file(location: Path | str) -> CheckReport:
+    """Verify a map file to the last byte, also one that is too damaged to open.
+
+    Raises:
+        NotAMapError: nothing is there, or something else.
+        FormatVersionError: a newer Engram wrote it.
+    """
+    try:
+        database = open_database(location)
+    except MapCorruptError as error:
+        return CheckReport((Problem("file", "", str(error)),), 0, 0, (), 0)
+    with closing(database):
+        return check(database)

@@ -1,0 +1,149 @@
+"""Localisers in a map: they share what they learn of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from engram.errors import ConfigError
+from engram.frontend import DescriptorKind
+from engram.geometry import StereoCamera
+from engram.graph.basin import MatchBasin
+from engram.graph.clock import Clocked
+from engram.graph.model import Session, SessionId, path_id
+from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.paths import PathMemory
+from engram.localiser import (
+    RELOCALISERS,
+    UNNAMED_LIVE_SESSION,
+    Budget,
+    Localiser,
+    Matcher,
+    Relocaliser,
+    Searched,
+)
+from engram.maps import Map
+from engram.places.stored_words import stored_words, vocabulary_or_default
+from engram.ranking import (
+    Background,
+    Lessons,
+    PastAttempts,
+    QuantisedWords,
+    RankingPolicy,
+    policy_named,
+    uses_words,
+)
+from engram.robot.settings import Settings
+
+
+def localiser_in(
+    opened: Map,
+    camera: StereoCamera,
+    settings: Settings,
+    *,
+    policy: str | RankingPolicy = "recall",
+    budget: Budget | None = None,
+    relocaliser: str | Relocaliser | None = "fabmap",
+    live: SessionId = UNNAMED_LIVE_SESSION,
+    saves: bool = False,
+    matcher: Matcher | None = None,
+    threads: bool = True,
+    search: Callable[..., Neighbourhood] | None = None,
+    clock: Clocked | None = None,
+    path_memory: PathMemory | None = None,
+) -> Localiser:
+    """A localiser for one session in a map.
+
+    Args:
+        opened: the map.
+        camera: the live camera, which need not be one of the map's.
+        settings: the resolved configuration.
+        policy: key of `POLICIES`, or a policy of the caller's own.
+        budget: by default 2 lanes × 2 rounds.
+        relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
+        live: the live session.
+        saves: whether it is being mapped.
+        threads: whether lanes run on threads.
+        matcher, search: in place of the usual ones; see `Localiser`.
+        clock: what its stamps mean, and where it is; None if unknown.
+        path_memory: in place of the map's.
+
+    Raises:
+        ConfigError: there is no such policy or relocaliser.
+    """
+    ranking = policy_named(policy) if isinstance(policy, str) else policy
+    descriptor = settings.frontend.descriptor
+    words = opened.derived(words_of, descriptor)
+    background = Background(opened.derived(drives_of), opened.derived(lessons_of, camera.fx), words)
+    if uses_words(ranking):
+        words.prepare()
+    return Localiser(
+        opened.graph,
+        path_memory or opened.path_memory,
+        opened.frames,
+        policy=ranking,
+        budget=budget or Budget(),
+        relocaliser=relocaliser_in(opened, relocaliser, descriptor)
+        if isinstance(relocaliser, str)
+        else relocaliser,
+        basin=MatchBasin.of(camera.fx, opened.basin_counts),
+        live=live,
+        saves=saves,
+        config=settings.localiser,
+        matcher=matcher,
+        threads=threads,
+        search=search,
+        background=background,
+        clock=clock,
+    )
+
+
+def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Relocaliser:
+    """What finds a lost robot in a map.
+
+    Args:
+        opened: the map.
+        name: key of `RELOCALISERS`.
+        descriptor: kind of the live frames' descriptors; counts while the map is empty.
+
+    Raises:
+        ConfigError: there is no such relocaliser.
+        MapCorruptError: the vocabulary or a node's landmarks are damaged.
+    """
+    if name not in RELOCALISERS:
+        raise ConfigError(f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}")
+    return RELOCALISERS[name](
+        Searched(
+            opened.graph,
+            opened.frames,
+            lambda: vocabulary_or_default(opened, descriptor),
+            lambda vocabulary: stored_words(opened, vocabulary),
+        )
+    )
+
+
+def words_of(opened: Map, descriptor: DescriptorKind) -> QuantisedWords:
+    """The words of its nodes and of live frames of this kind: for `Map.derived`."""
+    return QuantisedWords(
+        opened.graph,
+        opened.frames,
+        lambda: vocabulary_or_default(opened, descriptor),
+        lambda vocabulary: stored_words(opened, vocabulary),
+    )
+
+
+def drives_of(opened: Map) -> dict[SessionId, Session]:
+    """Its sessions, and those that are being added, by id: for `Map.derived`."""
+    return dict(opened.sessions)
+
+
+def lessons_of(opened: Map, focal_px: float) -> Lessons:
+    """What its drives learnt, for a live camera of this focal length, px: for `Map.derived`."""
+    made, basin = opened.attempts, MatchBasin.of(focal_px, opened.basin_counts)
+    along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
+    attempts = PastAttempts(
+        made.session, made.node, basin.success_rate(along_m, across_m), made.accepted
+    )
+    viewers = [path_id(session) for session in opened.sessions]
+    return Lessons.learnt(opened.graph, opened.path_memory, viewers, attempts)
