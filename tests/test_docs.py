@@ -33,9 +33,10 @@ def test_every_command_shown_is_a_verb_with_these_options(page: str, words: list
     verbs = typer.main.get_command(app).commands
     assert words[1] in verbs, f"{page}: engram {words[1]}"
     verb = verbs[words[1]]
-    if hasattr(verb, "commands"):
-        assert words[2] in verb.commands, f"{page}: engram {words[1]} {words[2]}"
-        verb = verb.commands[words[2]]
+    for word in words[2:]:
+        if hasattr(verb, "commands"):
+            assert word in verb.commands, f"{page}: {' '.join(words)}"
+            verb = verb.commands[word]
     known = {
         option
         for parameter in verb.params
@@ -70,7 +71,7 @@ def test_every_section_that_is_cited_is_in_the_method() -> None:
     assert "".join(sections) == "123456789"
     cited = [
         (path, section, item)
-        for folder in ("src", "benchmarks", "tests")
+        for folder in ("src", "lab/src", "tests")
         for path in (ROOT / folder).rglob("*")
         if path.suffix in {".py", ".hpp", ".cpp"} and path != Path(__file__)
         for section, item in cited_sections(path.read_text())

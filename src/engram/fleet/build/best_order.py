@@ -1,6 +1,6 @@
 """The best order of merging k groups: all k! of them, over a prefix tree ([G16] §VI-E, SPEC §7).
 
-Or only which of them comes first, on which most depends (docs/results-fleet.md).
+Or only which of them comes first, on which most depends (lab/reports/fleet.md).
 """
 
 from __future__ import annotations
