@@ -48,7 +48,7 @@ def test_every_reading_verb_takes_a_tag(engram, town: Path, street: Path) -> Non
     assert len(engram("log", town, "--at", "first", "--json").json) == 1
     for verb in ("places", "relocalise"):
         arguments = (street,) if verb == "relocalise" else ()
-        assert engram(verb, town, *arguments, "--at", "head~1", "--json").status == 0
+        assert engram("lab", verb, town, *arguments, "--at", "head~1", "--json").status == 0
 
 
 def test_show_and_diff_tell_the_same_change(engram, town: Path, tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import shutil
 import subprocess
 import sys
@@ -178,12 +176,6 @@ def test_a_kind_of_descriptor_that_is_insisted_on_is_not_passed_over(
     assert engram("map", new, log, "--descriptor", "brief").status == 0
 
 
-def test_simulate_refuses_a_drive_that_is_not_there(engram, tmp_path: Path) -> None:
-    ran = engram("simulate", "hamlet", "--sessions", "9", "--out", tmp_path)
-    assert ran.status == 2
-    assert "9" in ran.err
-
-
 def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text("[mapper]\nsave_every_m = 2.0\n")
@@ -209,13 +201,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("map", "TOWN", "STREET", "--longitude", 400), "400"),
         (("extract", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
         (("info", "STREET"), "street"),
-        (("bench", "--only", "warp"), "warp"),
         (("map", "TOWN", "STREET", "--descriptor", "sift"), "sift"),
-        (("simulate", "atlantis"), "atlantis"),
-        (("simulate", "hamlet", "--size", "huge"), "huge"),
-        (("simulate", "hamlet", "--sessions", "one"), "one"),
-        (("simulate", "hamlet", "--sessions", ""), "--sessions ''"),
-        (("simulate", "hamlet", "--sessions", "0,"), "--sessions '0,'"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_status_two(
@@ -273,17 +259,6 @@ def test_a_second_writer_is_told_who_writes(engram, street: Path, town: Path) ->
         assert engram("localise", town, street, "--json").json["summary"]["frames"] == 12
     finally:
         holder.communicate()
-
-
-def test_bench_gives_the_documented_json(engram) -> None:
-    ran = engram("bench", "--only", "attempt_512,rank_path_150", "--repeats", 3, "--json")
-    stages = ran.json["stages"]
-    assert set(stages) == {"attempt_512", "rank_path_150"}
-    for stage in stages.values():
-        assert {"ms", "p99_ms", "reference_ms", "ratio"} <= set(stage)
-        assert math.isfinite(stage["ms"])
-    assert ran.json["machine"]
-    json.dumps(ran.json)
 
 
 @pytest.mark.parametrize("frames", [0, 3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from engram.frontend import BRIEF
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId
 from engram.maps import Map, open_map
+from engram.monitor import QUIET, Monitor
 from engram.places import BagOfWords
 from engram.places.stored_words import stored_words, vocabulary_or_default
 
@@ -42,24 +42,26 @@ class Confusion:
     """How alike the places of a map look.
 
     Attributes:
+        nodes: how many the map has.
         lookalikes: one per node that has a place outside of its surroundings, most alike first.
         matrix: (M, M) float32, similarity of M nodes, evenly taken in the order of saving, to
             each other.
     """
 
+    nodes: int
     lookalikes: tuple[Lookalike, ...]
     matrix: NDArray[np.float32]
 
 
 def find_lookalikes(
-    map_path: Path, at: int | str | None = None, *, advance: Callable[[str], None]
+    map_path: Path, at: int | str | None = None, monitor: Monitor = QUIET
 ) -> Confusion:
     """Compares every node of a map with every other by their words.
 
     Args:
         map_path: the map.
         at: number of its revision; None for the newest.
-        advance: called once per node.
+        monitor: hears of each node.
 
     Raises:
         MapError: the map cannot be read.
@@ -73,17 +75,20 @@ def find_lookalikes(
         shown = np.unique(np.linspace(0, max(len(ids) - 1, 0), _PICTURE_PX).astype(np.int64))
         shown = shown[: len(ids)]
         rows, found = [], []
-        for index, one in enumerate(words):
-            similarity = recogniser.similarities(one)
-            if index in shown:
-                rows.append(similarity[shown].astype(np.float32))
-            similarity[_surroundings(opened.graph, index)] = -1
-            like = int(similarity.argmax())
-            if similarity[like] >= 0:
-                found.append(Lookalike(ids[index], ids[like], float(similarity[like])))
-            advance("")
+        with monitor.stage("compare", len(ids)) as part:
+            for index, one in enumerate(words):
+                similarity = recogniser.similarities(one)
+                if index in shown:
+                    rows.append(similarity[shown].astype(np.float32))
+                similarity[_surroundings(opened.graph, index)] = -1
+                like = int(similarity.argmax())
+                if similarity[like] >= 0:
+                    found.append(Lookalike(ids[index], ids[like], float(similarity[like])))
+                part.advance()
     found.sort(key=lambda pair: -pair.similarity)
-    return Confusion(tuple(found), np.array(rows, np.float32).reshape(len(rows), len(shown)))
+    return Confusion(
+        len(ids), tuple(found), np.array(rows, np.float32).reshape(len(rows), len(shown))
+    )
 
 
 def write_confusion_picture(file: Path, confusion: Confusion) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,6 +14,7 @@ from engram.graph.model import NodeId, node_id
 from engram.localiser import UNNAMED_LIVE_SESSION, Budget, FrameMatcher, Relocaliser
 from engram.localiser.attempts import Attempter, Candidate, best_success
 from engram.maps import Map, open_map
+from engram.monitor import QUIET, Monitor
 from engram.robot.live import live_frames
 from engram.robot.localisers import relocaliser_in
 from engram.robot.session import DriveSequence
@@ -75,7 +75,7 @@ def relocalise_drive(
     relocaliser: str = "fabmap",
     budget: Budget | None = None,
     at: int | str | None = None,
-    advance: Callable[[str], None],
+    monitor: Monitor = QUIET,
 ) -> list[ColdStart]:
     """Finds every frame of a drive in a map as if the robot had just been switched on.
 
@@ -86,7 +86,7 @@ def relocalise_drive(
         relocaliser: key of `RELOCALISERS`.
         budget: of each frame: that of a lost robot.
         at: number or tag of the map's revision; None for the newest.
-        advance: called once per frame with a word on how it went.
+        monitor: hears of each frame, with its status.
 
     Raises:
         ConfigError: there is no such relocaliser.
@@ -100,12 +100,13 @@ def relocalise_drive(
         with (
             Attempter(matcher, matcher, budget.lanes, settings.localiser.acceptance) as attempter,
             closing(live_frames(sequence, settings)) as frames,
+            monitor.stage("relocalise", len(sequence)) as part,
         ):
             found = []
             for live in frames:
                 finder.forget()
                 found.append(_cold_start(opened, live.frame, finder, attempter, budget))
-                advance(found[-1].status.value)
+                part.advance(found[-1].status.value)
     return found
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -47,7 +47,6 @@ class Trial:
     Attributes:
         name: of the options.
         drive: session of the drive, as text.
-        start_h: the drive's hour of day; None if it is not known.
         report: of the download.
         steps: of the drive: distances and matches.
         ms_per_frame: mean time of localising a frame, relocalisation included, without front-end
@@ -59,18 +58,12 @@ class Trial:
 
     name: str
     drive: str
-    start_h: float | None
     report: DownloadReport
     steps: Drive
     ms_per_frame: float
     lookup_ms_per_frame: float
     lookups: int
     nodes: Sequence[Node]
-
-    @property
-    def missed(self) -> float:
-        """Share of the drive without a match."""
-        return route_not_localised([self.steps])
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,10 +118,6 @@ class LeftOut:
     start_h: float | None
     why: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
     def text(self) -> str:
         """One line for people."""
         hour = "" if self.start_h is None else f", of {self.start_h:.1f} h"
@@ -152,7 +141,7 @@ def check_not_sent(
     """
     if drives:
         with Map.open(centre, at=at) as store:
-            check_held_out(drives, store.sessions.values(), centre, "the drives")
+            check_held_out(drives, store.sessions.values(), centre, "--check")
 
 
 def try_downloads(
@@ -175,7 +164,7 @@ def try_downloads(
         drives: open a held-out drive each.
         settings: of the localiser.
         localise: policy and budget.
-        monitor: hears how it goes.
+        monitor: hears of each frame.
         at: revision of the centre; None for the newest.
         start: where a drive begins in a download; None if nobody knows: it begins lost.
         left_out: is told of a drive for which one of the options fits nothing; it is tried in
@@ -214,7 +203,7 @@ def try_downloads(
                         run.localiser.start_at(position)
                     results = _localised(run, len(sequence), monitor)
                     nodes = list(run.opened.graph.nodes)
-                own.append(_trial(name, session, hour, report, results, nodes))
+                own.append(_trial(name, session, report, results, nodes))
                 out.unlink()
             trials += own
     return trials
@@ -223,22 +212,23 @@ def try_downloads(
 def _trial(
     name: str,
     session: Session,
-    hour: float | None,
     report: DownloadReport,
     results: Sequence[FrameResult],
     nodes: Sequence[Node],
 ) -> Trial:
     """What came of a drive in a download."""
-    lookups = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
+    lookups_ms = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
+    in_map_ms = [
+        ms for one in results for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP
+    ]
     return Trial(
         name=name,
         drive=str(session.id),
-        start_h=hour,
         report=report,
         steps=measured([one.localisation for one in results]),
-        ms_per_frame=_ms(results),
-        lookup_ms_per_frame=sum(lookups) / max(len(results), 1),
-        lookups=len(lookups),
+        ms_per_frame=sum(in_map_ms) / max(len(results), 1),
+        lookup_ms_per_frame=sum(lookups_ms) / max(len(results), 1),
+        lookups=len(lookups_ms),
         nodes=nodes,
     )
 
@@ -275,32 +265,10 @@ def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
     return summaries
 
 
-def trial_dict(trial: Trial) -> dict[str, Any]:
-    """A trial as plain values."""
-    return {
-        "name": trial.name,
-        "drive": trial.drive,
-        "start_h": trial.start_h,
-        "nodes": trial.report.nodes,
-        "size_bytes": trial.report.size_bytes,
-        "expected_missed": trial.report.expected_missed,
-        "missed": trial.missed,
-        "ms_per_frame": trial.ms_per_frame,
-    }
-
-
 def _localised(run: LocaliseRun, frames: int, monitor: Monitor) -> list[FrameResult]:
+    results = []
     with monitor.stage("localise", frames) as part:
-        results = []
         for _, result in run:
             results.append(result)
             part.advance(result.localisation.status.value)
-        return results
-
-
-def _ms(results: Sequence[FrameResult]) -> float:
-    times = [
-        sum(ms for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP)
-        for one in results
-    ]
-    return float(np.mean(times)) if times else 0.0
+    return results

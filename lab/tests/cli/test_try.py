@@ -41,7 +41,7 @@ def morning(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_promise_is_held_against_a_drive(engram, centre: Path, street: Path) -> None:
     asked = ("--policy", "tod", "--start", "9:00", "--window", 700, "--json")
-    (mine, whole) = engram("try", centre, street, *asked).json
+    (mine, whole) = engram("lab", "try", centre, street, *asked).json
     assert (mine["name"], whole["name"]) == ("tod", "copy")
     # The very images of which the map was made, as of another time.
     assert mine["missed"] == whole["missed"] == 0.0
@@ -55,17 +55,17 @@ def test_a_drive_that_the_centre_holds_is_refused(
 ) -> None:
     known = shutil.copy(centre, tmp_path / "centre.engram")
     map_drive(known, open_drive(morning, robot=robot), Settings(), MapOptions())
-    ran = engram("try", known, morning)
+    ran = engram("lab", "try", known, morning)
     assert ran.status == 2
     assert f"{morning} is not held out" in ran.err
     # The revision that is sent did not have it yet.
-    assert engram("try", known, morning, "--at", 1).status == 0
+    assert engram("lab", "try", known, morning, "--at", 1).status == 0
 
 
 def test_a_drive_for_whose_hour_there_is_nothing_is_a_row_of_its_own(
     engram, centre: Path, morning: Path, night: Path
 ) -> None:
-    asked = ("try", centre, morning, night, "--policy", "tod", "--start", "9:30")
+    asked = ("lab", "try", centre, morning, night, "--policy", "tod", "--start", "9:30")
     ran = engram(*asked, "--json")
     assert ran.status == 0
     mine, whole, left_out = ran.json

@@ -3,7 +3,6 @@
 import csv
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from lab.tests.evaluation.campaigns import write_campaign
 
 from engram.errors import ConfigError, InputError
 from engram.maps import Map, open_map
+from engram.monitor import QUIET, Monitor
 from engram.robot import LocaliseOptions, Settings
 from engram_lab.studies import DriveSet
 from engram_lab.studies.fleet import (
@@ -48,10 +48,8 @@ def campaign(tmp_path_factory) -> DriveSet:
     return write_campaign(folder, (0, 1) * 4, road=np.arange(0.0, 9.0, 0.9))
 
 
-def run(plan: FleetPlan, workers: int = 1) -> list[str]:
-    words: list[str] = []
-    run_tasks(fleet_tasks(plan), workers, words.append)
-    return words
+def run(plan: FleetPlan, workers: int = 1) -> None:
+    run_tasks(fleet_tasks(plan), workers, QUIET)
 
 
 @pytest.fixture(scope="module")
@@ -314,21 +312,20 @@ def test_a_study_that_was_stopped_comes_to_the_same_maps(campaign, plan, tmp_pat
     class StoppedError(Exception):
         pass
 
-    def stop_after(steps: int) -> Callable[[str], None]:
-        words: list[str] = []
+    class StopAfter(Monitor):
+        def __init__(self, steps: int) -> None:
+            self.left = steps
 
-        def advance(word: str) -> None:
-            words.append(word)
-            if len(words) == steps:
+        def advance(self, word: str = "") -> None:
+            self.left -= 1
+            if self.left == 0:
                 raise StoppedError
-
-        return advance
 
     other = make_fleet_plan(campaign, Settings(), replace(OPTIONS, experiments=(7,)), tmp_path)
     tasks = fleet_tasks(other)
     for count in range(3, len(tasks), 7):
         with pytest.raises(StoppedError):
-            run_tasks(tasks, 1, stop_after(count))
+            run_tasks(tasks, 1, StopAfter(count))
     run_tasks(tasks, 1, lambda _: None)
     (arm,) = plan.arms
     for name in ("single", "merged2-1", "pairs2-0-0"):

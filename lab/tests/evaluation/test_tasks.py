@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from engram.errors import WorkerError
+from engram.monitor import QUIET
 from engram_lab.studies.tasks import Task, run_tasks
 
 
@@ -29,7 +30,7 @@ def test_a_worker_that_dies_is_said_in_one_line(tmp_path: Path) -> None:
         Task("second", _die, needs=("first",)),
     ]
     with pytest.raises(WorkerError, match=r"a worker of 2 died .* --workers"):
-        run_tasks(tasks, 2, lambda _: None)
+        run_tasks(tasks, 2, QUIET)
     assert first.read_text() == "done"
 
 
@@ -48,7 +49,7 @@ def test_workers_end_with_a_run_that_is_killed() -> None:
 
 def wait_for_ever() -> None:
     """In a process of its own: two workers that tell who they are and do not end."""
-    run_tasks([Task("one", _tell_and_wait), Task("two", _tell_and_wait)], 2, lambda _: None)
+    run_tasks([Task("one", _tell_and_wait), Task("two", _tell_and_wait)], 2, QUIET)
 
 
 def _tell_and_wait() -> None:

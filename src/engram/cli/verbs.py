@@ -56,10 +56,18 @@ def register(app: typer.Typer) -> None:
         if not isinstance(brought, typer.Typer):
             app.command(entry.name)(_tells_of_interruption(brought))
             continue
-        for command in brought.registered_commands:
-            assert command.callback is not None
-            command.callback = _tells_of_interruption(command.callback, _GOES_ON)
+        _all_tell_of_interruption(brought)
         app.add_typer(brought, name=entry.name)
+
+
+def _all_tell_of_interruption(group: typer.Typer) -> None:
+    """The same for every verb of a group, and of the groups in it."""
+    for command in group.registered_commands:
+        assert command.callback is not None
+        command.callback = _tells_of_interruption(command.callback, _GOES_ON)
+    for inner in group.registered_groups:
+        assert inner.typer_instance is not None
+        _all_tell_of_interruption(inner.typer_instance)
 
 
 def _tells_of_interruption(

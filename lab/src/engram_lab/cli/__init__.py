@@ -1,10 +1,21 @@
-"""The laboratory's verbs, which join the program by entry points."""
+"""The laboratory's verbs, which join the program by entry points: `engram demo`, `engram lab …`."""
 
-from engram_lab.cli.benchmark import bench
-from engram_lab.cli.demonstration import demo
-from engram_lab.cli.evaluation import evaluate
-from engram_lab.cli.places import places, relocalise
-from engram_lab.cli.simulation import simulate
-from engram_lab.cli.trying import try_
+import typer
 
-__all__ = ["bench", "demo", "evaluate", "places", "relocalise", "simulate", "try_"]
+from engram_lab.cli.maps import places, relocalise, try_
+from engram_lab.cli.studies import evaluate
+from engram_lab.cli.town import bench, demo, simulate
+
+lab = typer.Typer(
+    name="lab",
+    help="Simulated drives, the papers' experiments, and measurements of maps and speed.",
+    no_args_is_help=True,
+)
+lab.command("simulate")(simulate)
+lab.command("relocalise")(relocalise)
+lab.command("places")(places)
+lab.command("try")(try_)
+lab.command("bench")(bench)
+lab.add_typer(evaluate)
+
+__all__ = ["demo", "lab"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.maps import Map
-from engram.monitor import ignore
+from engram.monitor import QUIET, Monitor
 from engram.robot import (
     FrameResult,
     LocaliseOptions,
@@ -37,8 +35,6 @@ _POLICIES = ("distance", "path-near")
 _ATTEMPTS = (1, 4)
 # The place that is shown in every condition, as a share of the drive.
 _SHOWN_AT = 0.35
-
-Progress = Callable[[str, int], Any]
 
 
 @dataclass(slots=True)
@@ -67,21 +63,14 @@ class DemoReport:
         }
 
 
-@contextmanager
-def silent(what: str, total: int) -> Iterator[Callable[[str], None]]:
-    """Progress that is not shown."""
-    del what, total
-    yield ignore
-
-
-def run_demo(out: Path, progress: Progress = silent, workers: int = 2) -> DemoReport:
+def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoReport:
     """Renders the drives, maps all but the last, localises the last, and draws pictures.
 
     What an earlier run has rendered is not rendered again.
 
     Args:
         out: folder to write to, made where there is none.
-        progress: makes a progress bar: a context manager of title and length.
+        monitor: hears of every frame.
         workers: processes that render.
 
     Raises:
@@ -96,19 +85,19 @@ def run_demo(out: Path, progress: Progress = silent, workers: int = 2) -> DemoRe
     drives = [SimulatedDrive(campaign, i) for i in range(len(campaign.sessions))]
     report = DemoReport(out)
     report.conditions = [_condition(drive) for drive in drives]
-    with progress("drive", sum(len(drive) for drive in drives)) as advance:
-        rendered = simulate(campaign, out, workers=workers, advance=advance)
+    rendered = simulate(campaign, out, workers=workers, monitor=monitor)
     logs = [Path(file) for file in rendered.files]
     map_path = out / f"{_CAMPAIGN}.engram"
     map_path.unlink(missing_ok=True)
     for log, condition in zip(logs[:-1], report.conditions, strict=False):
         sequence = open_drive(log)
-        with progress(f"map: {condition}", len(sequence)) as advance:
-            report.mapped.append(map_drive(map_path, sequence, Settings(), MapOptions(), advance))
+        with monitor.stage(f"map: {condition}", len(sequence)) as part:
+            mapped = map_drive(map_path, sequence, Settings(), MapOptions(), part.advance)
+        report.mapped.append(mapped)
     thorough = {}
     for policy in _POLICIES:
         runs = {
-            most: _localise(map_path, logs[-1], policy, most, out, progress) for most in _ATTEMPTS
+            most: _localise(map_path, logs[-1], policy, most, out, monitor) for most in _ATTEMPTS
         }
         report.localised[policy] = {most: summarise(found) for most, found in runs.items()}
         thorough[policy] = runs[max(_ATTEMPTS)]
@@ -122,13 +111,13 @@ def _condition(drive: SimulatedDrive) -> str:
 
 
 def _localise(
-    map_path: Path, log: Path, policy: str, most: int, out: Path, progress: Progress
+    map_path: Path, log: Path, policy: str, most: int, out: Path, monitor: Monitor
 ) -> list[FrameResult]:
     sequence = open_drive(log)
     options = LocaliseOptions(policy=policy, lanes=1, rounds=most)
     with (
         LocaliseRun(map_path, sequence, Settings(), options) as run,
-        progress(f"localise: {policy}, {most} a frame", len(sequence)) as advance,
+        monitor.stage(f"localise: {policy}, {most} a frame", len(sequence)) as part,
     ):
         writer = PictureWriter(
             out / f"matches_{policy}_{most}", 40, run.localiser, run.opened.frames
@@ -137,7 +126,7 @@ def _localise(
         for live, result in run:
             results.append(result)
             writer.offer(live, result)
-            advance(result.localisation.status.value)
+            part.advance(result.localisation.status.value)
         return results
 
 

@@ -4,7 +4,7 @@ from engram_lab.studies.configurations import DEFAULT_LANES, UNLIMITED, Configur
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive, drives_of, open_campaign
 from engram_lab.studies.folds import Fold, split
 from engram_lab.studies.report import write_report
-from engram_lab.studies.running import Plan, RankingOptions, forget, make_plan, run, task_count
+from engram_lab.studies.running import Plan, RankingOptions, forget, make_plan, run
 
 __all__ = [
     "DEFAULT_LANES",
@@ -21,6 +21,5 @@ __all__ = [
     "open_campaign",
     "run",
     "split",
-    "task_count",
     "write_report",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from engram.errors import ConfigError
 from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
 from engram.maps import Map, open_map
-from engram.monitor import ignore
+from engram.monitor import QUIET, Monitor
 from engram.ranking import policy_named
 from engram.robot import MapOptions, Settings
 from engram.sequences import LoggedFrame
@@ -178,7 +178,7 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
     return plan
 
 
-def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -> None:
+def run(plan: Plan, workers: int = 1, monitor: Monitor = QUIET) -> None:
     """Builds, runs, and leaves the results in the plan's folder; what is there is kept.
 
     Fold by fold: sessions are run as soon as their map is built. Results do not depend on the
@@ -187,7 +187,7 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
     Args:
         plan: what to run.
         workers: processes.
-        advance: called once per task with a word; see `task_count`.
+        monitor: hears of each task that is done.
 
     Raises:
         MapError: a map cannot be written, or no space is left.
@@ -196,7 +196,9 @@ def run(plan: Plan, workers: int = 1, advance: Callable[[str], None] = ignore) -
     """
     try:
         with writing(plan.work), alone_in(plan.work):
-            run_tasks(_tasks(plan), workers, advance)
+            tasks = _tasks(plan)
+            with monitor.stage(f"evaluate {plan.drives.name}", len(tasks)) as part:
+                run_tasks(tasks, workers, part)
     finally:
         _earlier_maps.close()
 
@@ -230,11 +232,6 @@ def forget(plan: Plan, policies: Sequence[str]) -> None:
             if runs is not None:
                 kept = {one for one in runs.configurations if one.policy not in policies}
                 write_runs(path, only(runs, kept))
-
-
-def task_count(plan: Plan) -> int:
-    """How often `run` will call `advance`."""
-    return len(_tasks(plan))
 
 
 def _build(plan: Plan, fold: Fold) -> None:

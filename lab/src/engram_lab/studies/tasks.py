@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 
 from engram.errors import ConfigError, WorkerError
+from engram.monitor import Monitor
 from engram.processes import end_with_parent
 
 
@@ -36,13 +37,13 @@ class Task:
     alone: bool = False
 
 
-def run_tasks(tasks: Sequence[Task], workers: int, advance: Callable[[str], None]) -> None:
+def run_tasks(tasks: Sequence[Task], workers: int, monitor: Monitor) -> None:
     """Runs tasks in their order, side by side where they do not need each other.
 
     Args:
         tasks: each behind those that it needs.
         workers: processes; with one everything runs in this process.
-        advance: called once per task with its word.
+        monitor: hears of each task that is done.
 
     Raises:
         ConfigError: there is no worker.
@@ -69,7 +70,7 @@ def run_tasks(tasks: Sequence[Task], workers: int, advance: Callable[[str], None
                         task = running.pop(future)
                         future.result()
                         done.add(task.name)
-                        advance(task.word)
+                        monitor.advance(task.word)
         except BrokenProcessPool as error:
             raise WorkerError(
                 f"a worker of {workers} died (out of memory?); give the same command again, "
@@ -80,7 +81,7 @@ def run_tasks(tasks: Sequence[Task], workers: int, advance: Callable[[str], None
             raise
     for task in timed:
         task.work()
-        advance(task.word)
+        monitor.advance(task.word)
 
 
 class _Here(Executor):

@@ -27,6 +27,18 @@ class Size(StrEnum):
     STANDARD = "standard"
     FULL = "full"
 
+    @classmethod
+    def named(cls, text: str) -> Size:
+        """By the name that is given on the command line.
+
+        Raises:
+            ConfigError: there is no such size.
+        """
+        try:
+            return cls(text)
+        except ValueError:
+            raise ConfigError(f"size {text!r} is unknown; known: {', '.join(cls)}") from None
+
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:

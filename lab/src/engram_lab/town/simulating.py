@@ -2,40 +2,32 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from queue import Empty
 from typing import Any
 
 import cv2
 import numpy as np
+from platformdirs import user_cache_path
 
-from engram.config import config_hash
 from engram.errors import (
     ConfigError,
-    IncompatibleError,
     SequenceError,
     StorageFullError,
-    WorkerError,
     storage_full,
 )
-from engram.frontend import Frontend
 from engram.geometry import SE3
-from engram.monitor import ignore
-from engram.processes import end_with_parent
+from engram.monitor import QUIET, Monitor, write_whole
+from engram.processes import run_in_processes
 from engram.robot.recording import extract_log
 from engram.robot.settings import Settings
 from engram.sequences import FrameLog
 from engram.sequences.trajectories import truth_path, write_tum
 from engram_lab.town import WORLD_VERSION, Campaign
 from engram_lab.town.sequence import SimulatedSequence
-
-_PENDING_S = 0.2  # between looks at the queue of the workers
+from engram_lab.town.upkeep import bring_up_to_date
 
 
 @dataclass(slots=True)
@@ -76,6 +68,12 @@ class _Task:
     settings: Settings
 
 
+def campaigns_folder() -> Path:
+    """$ENGRAM_CAMPAIGNS, or a folder in the user's cache: rendered once, read often."""
+    named = os.environ.get("ENGRAM_CAMPAIGNS")
+    return Path(named) if named else user_cache_path("engram") / "campaigns"
+
+
 def campaign_folder(out: Path, campaign: Campaign) -> Path:
     """Where a campaign's sessions stand below `out`: by campaign, seed, size and world version."""
     name = f"{campaign.home}-{campaign.size.value}-seed{campaign.seed}-v{WORLD_VERSION}"
@@ -90,9 +88,11 @@ def simulate(
     sessions: Sequence[int] | None = None,
     workers: int = 1,
     settings: Settings | None = None,
-    advance: Callable[[str], None] = ignore,
+    monitor: Monitor = QUIET,
 ) -> SimulateReport:
     """Renders a campaign's sessions that are not there yet.
+
+    Odometry that has changed is run anew over the landmarks of sessions that are there.
 
     Frame logs stand as `NAME.framelog` with `NAME.truth.txt` beside them; images in KITTI's
     odometry layout, `sequences/NN` and `poses/NN.txt`. A killed run is resumed by the same call:
@@ -106,11 +106,11 @@ def simulate(
             all.
         workers: processes; each renders one session at a time and holds about 0.7 GB.
         settings: of front-end and odometry; None for the defaults.
-        advance: called with a session's name, once per pair that is rendered or was there already.
+        monitor: hears of every pair that is rendered or was there already, with its session's name.
 
     Raises:
         ConfigError: no such session, or fewer than one worker.
-        IncompatibleError: a session that is there was made by another front-end or odometry.
+        IncompatibleError: a session that is there was made by another front-end.
         StorageFullError: no space is left; what was finished is kept.
         SequenceError: a file cannot be written.
         WorkerError: a worker died, perhaps for want of memory; finished sessions are kept.
@@ -119,21 +119,27 @@ def simulate(
         raise ConfigError(f"workers is {workers}, must be >= 1")
     folder = campaign_folder(out, campaign)
     report = SimulateReport(str(folder))
-    tasks = []
-    every = range(len(campaign.sessions))
-    for number in every if sessions is None else sorted(set(sessions)):
-        task = _task(campaign, number, folder, images, settings or Settings())
-        report.files.append(str(task.target))
-        if _is_done(task):
-            report.already_there += 1
-            for _ in range(len(SimulatedSequence(campaign, number))):
-                advance(campaign.session(number).name)
-        else:
-            tasks.append(task)
     _make_folder(folder)
-    run = _run_here if workers == 1 or len(tasks) < 2 else _run_in_workers
-    report.frames = run(tasks, workers, advance)
-    report.rendered = len(tasks)
+    every = range(len(campaign.sessions))
+    numbers = every if sessions is None else sorted(set(sessions))
+    asked = [_task(campaign, one, folder, images, settings or Settings()) for one in numbers]
+    report.files = [str(task.target) for task in asked]
+    tasks = [task for task in asked if not _is_done(task)]
+    lengths = {task.session: len(SimulatedSequence(campaign, task.session)) for task in asked}
+    with monitor.stage(f"simulate {campaign.name}", sum(lengths.values())) as part:
+        for task in asked:
+            if task not in tasks:
+                for _ in range(lengths[task.session]):
+                    part.advance(campaign.session(task.session).name)
+        if workers == 1 or len(tasks) < 2:
+            for task in tasks:
+                _render(task, part)
+        else:
+            # Sessions of one process share the town, which takes seconds to make.
+            shares = {f"share {first + 1}": tasks[first::workers] for first in range(workers)}
+            run_in_processes(_render_share, shares, workers, part, lambda *_: None)
+    report.frames = sum(lengths[task.session] for task in tasks)
+    report.rendered, report.already_there = len(tasks), len(asked) - len(tasks)
     return report
 
 
@@ -154,88 +160,28 @@ def _is_done(task: _Task) -> bool:
     if not (task.target.exists() and truth_path(task.target).exists()):
         return False
     log = FrameLog(task.target)
-    try:
-        if log.complete:
-            _check_made_by(task, log)
-        return log.complete
-    finally:
-        log.close()
+    log.close()
+    if log.complete:  # a campaign is of one make, or its sessions do not compare
+        bring_up_to_date(task.target, task.settings)
+    return log.complete
 
 
-def _check_made_by(task: _Task, log: FrameLog) -> None:
-    """Refuses logs of other settings: a campaign is of one make, or its sessions do not compare."""
-    for what, made, wanted in (
-        ("front-end", log.header.frontend, Frontend(task.settings.frontend).hash),
-        ("odometry", log.header.odometry, config_hash(task.settings.odometry)),
-    ):
-        if made != wanted:
-            raise IncompatibleError(
-                f"{task.target}: was rendered with another version or other settings of the {what} "
-                f"({made}, now {wanted}); give another --out, or remove the folder to render anew"
-            )
+def _render_share(tasks: Sequence[_Task], monitor: Monitor) -> None:
+    """Several sessions; those that a worker had finished before it died are whole."""
+    for task in tasks:
+        if not _is_done(task):
+            _render(task, monitor)
 
 
-def _run_here(tasks: list[_Task], workers: int, advance: Callable[[str], None]) -> int:
-    del workers
-    return sum(_render(task, advance) for task in tasks)
-
-
-def _run_in_workers(tasks: list[_Task], workers: int, advance: Callable[[str], None]) -> int:
-    # Started afresh: a forked child would share the parent's threads half way through.
-    context = multiprocessing.get_context("spawn")
-    words: multiprocessing.Queue[str] = context.Queue()
-    with ProcessPoolExecutor(workers, context, _remember_queue, (words,)) as pool:
-        frames = 0
-        try:
-            pending: set[Future[int]] = {pool.submit(_render_in_worker, task) for task in tasks}
-            while pending:
-                done, pending = wait(pending, _PENDING_S, FIRST_COMPLETED)
-                _pass_on(words, advance)
-                frames += sum(future.result() for future in done)
-        except BrokenProcessPool as error:
-            raise WorkerError(
-                f"a worker of {workers} died (out of memory?); give the same command again, "
-                "perhaps with fewer --workers; finished sessions are kept"
-            ) from error
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    _pass_on(words, advance)
-    return frames
-
-
-_words: multiprocessing.Queue[str] | None = None
-
-
-def _remember_queue(words: multiprocessing.Queue[str]) -> None:
-    global _words  # noqa: PLW0603, the one way to hand a queue to a pool's workers
-    _words = words
-    end_with_parent()
-
-
-def _render_in_worker(task: _Task) -> int:
-    assert _words is not None
-    cv2.setNumThreads(1)  # the sessions run side by side
-    return _render(task, _words.put)
-
-
-def _pass_on(words: multiprocessing.Queue[str], advance: Callable[[str], None]) -> None:
-    while True:
-        try:
-            advance(words.get_nowait())
-        except Empty:
-            return
-
-
-def _render(task: _Task, advance: Callable[[str], None]) -> int:
-    """One session; returns its number of pairs."""
+def _render(task: _Task, monitor: Monitor) -> None:
+    """One session."""
     sequence = SimulatedSequence(task.campaign, task.session)
     if task.images:
-        _write_images(sequence, task.target, advance)
-        return len(sequence)
+        _write_images(sequence, task.target, monitor)
+        return
 
     def count(_: str) -> None:
-        advance(sequence.info.name)
+        monitor.advance(sequence.info.name)
 
     report = extract_log(sequence, task.target, task.settings, count)
     if report.interrupted:
@@ -243,12 +189,9 @@ def _render(task: _Task, advance: Callable[[str], None]) -> int:
     plan = sequence.drive.plan
     comments = [f"{plan.name}: {plan.weather}, {plan.start:%Y-%m-%d %H:%M} UTC, {plan.robot}"]
     write_tum(truth_path(task.target), sequence.truth(), comments)
-    return len(sequence)
 
 
-def _write_images(
-    sequence: SimulatedSequence, target: Path, advance: Callable[[str], None]
-) -> None:
+def _write_images(sequence: SimulatedSequence, target: Path, monitor: Monitor) -> None:
     """KITTI odometry's layout; the poses come last and mark the sequence as whole."""
     camera = sequence.camera
     for name in ("image_0", "image_1"):
@@ -259,7 +202,7 @@ def _write_images(
         for name, image in (("image_0", pair.left), ("image_1", pair.right)):
             _write(target / name / f"{k:06d}.png", cv2.imencode(".png", image)[1].tobytes())
         stamps.append(pair.stamp_ns)
-        advance(sequence.info.name)
+        monitor.advance(sequence.info.name)
     projection = np.array(
         [[camera.fx, 0, camera.cx, 0], [0, camera.fy, camera.cy, 0], [0, 0, 1, 0]]
     )
@@ -293,13 +236,10 @@ def _make_folder(folder: Path) -> None:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """In one step: a killed run leaves no half file under the name."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        draft.write_bytes(content)
-        draft.replace(path)
+        with write_whole(path) as draft:
+            draft.write_bytes(content)
     except OSError as error:
-        draft.unlink(missing_ok=True)
         raise _cannot_write(path, error) from error
 
 

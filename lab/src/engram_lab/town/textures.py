@@ -27,7 +27,7 @@ class Style:
     """How much of what one sees is paint and how much is relief.
 
     These two set how hard a change of light is, and were chosen by the calibration
-    (`docs/simulation.md`), before any evaluation.
+    (`lab/reports/town.md`), before any evaluation.
 
     Attributes:
         paint_contrast: exponent on albedo about its mean; 1 is as painted, less is flatter.

@@ -118,8 +118,13 @@ class FrameLog:
     @property
     def first_pair_hash(self) -> str:
         """`first_pair_hash` of the images of the first chosen frame (SPEC §2.7)."""
+        return self.pair_hash(0)
+
+    def pair_hash(self, index: int) -> str:
+        """`first_pair_hash` of the images of a chosen frame."""
+        number = self._numbers[index]
         with file.plain_errors(self._path), self._engine.connect() as connection:
-            return next(self._steps(connection, self._numbers[0], self._numbers[0])).pair_hash
+            return next(self._steps(connection, number, number)).pair_hash
 
     @property
     def skipped(self) -> int:

@@ -9,11 +9,11 @@ in the end, both robots having driven in a copy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from engram.monitor import ignore
+from engram.monitor import QUIET, Monitor
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm
 from engram_lab.studies.fleet.orders import try_orders
@@ -44,13 +44,13 @@ def merged_name(groups: int, merges: int) -> str:
     return f"merged{groups}-{merges}" if merges else f"group{groups}-0"
 
 
-def run_fleet(plan: FleetPlan, workers: int = 1, advance: Callable[[str], None] = ignore) -> None:
+def run_fleet(plan: FleetPlan, workers: int = 1, monitor: Monitor = QUIET) -> None:
     """Runs what is missing of a study.
 
     Args:
         plan: what to run.
         workers: processes.
-        advance: called once per task with a word; see `fleet_tasks`.
+        monitor: hears of each task that is done.
 
     Raises:
         MapError: a map cannot be written, or no space is left.
@@ -59,7 +59,9 @@ def run_fleet(plan: FleetPlan, workers: int = 1, advance: Callable[[str], None] 
     """
     try:
         with writing(plan.work), alone_in(plan.work):
-            run_tasks(fleet_tasks(plan), workers, advance)
+            tasks = fleet_tasks(plan)
+            with monitor.stage(f"evaluate {plan.drives.name}", len(tasks)) as part:
+                run_tasks(tasks, workers, part)
     finally:
         kept_maps.close()
 

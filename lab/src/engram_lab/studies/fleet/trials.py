@@ -24,7 +24,6 @@ from engram.graph.model import Node, SessionId
 from engram.localiser import Position
 from engram.maps import Map
 from engram.measures import Drive
-from engram.monitor import QUIET
 from engram.places import (
     DenseTable,
     FabMap,
@@ -107,7 +106,6 @@ def try_downloads_for(
         drives=[lambda: FrameLog(drive.path)],
         settings=plan.settings,
         localise=arm.localising(plan.options.relocaliser),
-        monitor=QUIET,
         start=partial(_start, plan, fold, drive),
     )
     found, refused = trials({COPY: _wanted(COPY)}), {}

@@ -1,0 +1,188 @@
+"""`engram lab relocalise`, `engram lab places` and `engram lab try`: what a map is good for."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from engram.cli import options
+
+
+def relocalise(
+    map_path: options.MapPath,
+    path: options.DrivePath,
+    *,
+    relocaliser: Annotated[
+        str, typer.Option("--relocaliser", help="fabmap, bag-of-words or exhaustive.")
+    ] = "fabmap",
+    lanes: options.Lanes = 2,
+    rounds: options.Rounds = 32,
+    at: options.At = None,
+    format_: options.Format = None,
+    rig: options.Rig = "grey",
+    channel: options.Channel = "grey",
+    frames: options.Frames = None,
+    skip_bad: options.SkipBad = False,
+    config: options.Settings = None,
+    as_json: options.Json = False,
+) -> None:
+    """Find each frame of a drive by itself.
+
+    Every frame is treated as that of a robot that was just switched on.
+
+    \b
+    Examples:
+      engram lab relocalise town.engram drives/tuesday
+      engram lab relocalise town.engram drives/tuesday --frames 0:1000:10 --json
+    """
+    from engram.cli.progress import Bars
+    from engram.localiser import Budget
+    from engram.robot import load_settings, open_drive
+    from engram.robot.results import damage_warning
+    from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
+
+    sequence = open_drive(
+        path, format=format_, rig=rig, channel=channel, frames=frames, skip_bad=skip_bad
+    )
+    starts = relocalise_drive(
+        map_path,
+        sequence,
+        load_settings(config),
+        relocaliser=relocaliser,
+        budget=Budget(lanes, lost_rounds=rounds),
+        at=at,
+        monitor=Bars(),
+    )
+    summary = summarise_cold_starts(starts)
+    if as_json:
+        print(json.dumps({"summary": summary, "frames": [one.to_dict() for one in starts]}))
+        return
+    if summary["damaged_nodes"]:
+        typer.echo(damage_warning(summary["damaged_nodes"]), err=True)
+    typer.echo(
+        f"{summary['found']} of {summary['frames']} frames found, {summary['unknown']} not found, "
+        f"{summary['unusable_frame']} unusable; {summary['attempts']} attempts"
+    )
+
+
+def places(
+    map_path: options.MapPath,
+    *,
+    top: Annotated[int, typer.Option("--top", min=1, help="How many pairs to list.")] = 10,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help="Draw how similar all places look."),
+    ] = None,
+    at: options.At = None,
+    as_json: options.Json = False,
+) -> None:
+    """List distant places that look alike.
+
+    \b
+    Examples:
+      engram lab places town.engram
+      engram lab places town.engram --top 50 --picture confusion.png
+    """
+    from engram.cli.progress import Bars
+    from engram_lab.lookalikes import find_lookalikes, write_confusion_picture
+
+    confusion = find_lookalikes(map_path, at, Bars())
+    if picture is not None:
+        write_confusion_picture(picture, confusion)
+    pairs = confusion.lookalikes[:top]
+    if as_json:
+        listed = [
+            {"node": str(one.node), "like": str(one.like), "similarity": one.similarity}
+            for one in pairs
+        ]
+        print(json.dumps({"nodes": confusion.nodes, "lookalikes": listed}))
+        return
+    for one in pairs:
+        typer.echo(f"{one.node} looks like {one.like}: {one.similarity:.2f}")
+    if not pairs:
+        typer.echo("no two distant places look alike")
+
+
+def try_(
+    centre: Annotated[
+        Path, typer.Argument(metavar="FLEET", help="The fleet map.", parser=options.map_file)
+    ],
+    drives: Annotated[
+        list[Path], typer.Argument(metavar="DRIVE...", help="Drives that the map does not hold.")
+    ],
+    *,
+    policy: Annotated[
+        str, typer.Option("--policy", help="copy, tod, paths, tod+paths or budget.")
+    ] = "copy",
+    start: Annotated[
+        str | None, typer.Option("--start", metavar="H:MM", help="When the mission begins.")
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--end", metavar="H:MM", help="When the mission ends.")
+    ] = None,
+    window: Annotated[
+        float, typer.Option("--window", metavar="MIN", help="tod: how far from the start.")
+    ] = 180.0,
+    budget: Annotated[
+        str | None, typer.Option("--budget", metavar="SIZE", help="budget: 200MB or 25%.")
+    ] = None,
+    lanes: options.Lanes = 2,
+    rounds: options.Rounds = 2,
+    at: options.At = None,
+    config: options.Settings = None,
+    as_json: options.Json = False,
+) -> None:
+    """Hold downloads against held-out drives.
+
+    Each drive is localised in a mission's download and in a full one, beside the forecast.
+
+    \b
+    Examples:
+      engram lab try fleet.engram monday.framelog --policy tod --start 9:30
+      engram lab try fleet.engram monday.framelog tuesday.framelog --policy budget --budget 25%
+    """
+    from engram.cli.progress import Bars
+    from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
+    from engram.robot import LocaliseOptions, load_settings, open_drive, session_of_drive
+    from engram_lab.trial import (
+        LeftOut,
+        TrialSummary,
+        check_not_sent,
+        summarise_trials,
+        try_downloads,
+    )
+
+    budget_bytes, budget_percent = budget_from_text(budget)
+    asked = DownloadOptions(
+        policy=policy,
+        start_h=hour_from_text(start, "start"),
+        end_h=hour_from_text(end, "end"),
+        window_min=window,
+        budget_bytes=budget_bytes,
+        budget_percent=budget_percent,
+    )
+    opened = [(drive, open_drive(drive)) for drive in drives]
+    check_not_sent(centre, opened, at)
+    named = {str(session_of_drive(sequence).id): drive for drive, sequence in opened}
+    left_out: list[LeftOut] = []
+    trials = try_downloads(
+        centre,
+        {asked.policy: asked, "copy": DownloadOptions()},
+        [partial(open_drive, drive) for drive in drives],
+        load_settings(config),
+        LocaliseOptions(lanes=lanes, rounds=rounds),
+        Bars(),
+        at=at,
+        left_out=lambda one: left_out.append(replace(one, drive=str(named[one.drive]))),
+    )
+    rows: list[TrialSummary | LeftOut] = [*summarise_trials(trials), *left_out]
+    typer.echo(
+        json.dumps([asdict(one) for one in rows])
+        if as_json
+        else "\n".join(one.text() for one in rows)
+    )

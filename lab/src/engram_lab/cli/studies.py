@@ -1,0 +1,306 @@
+"""`engram lab evaluate …`: the papers' experiments."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from engram.cli import options
+from engram_lab.cli.lists import numbers
+
+if TYPE_CHECKING:
+    from engram_lab.studies import DriveSet
+
+evaluate = typer.Typer(
+    name="evaluate",
+    help="Redo the papers' experiments on simulated campaigns or your own frame logs.",
+    no_args_is_help=True,
+)
+
+
+@dataclass(frozen=True)
+class _Study:
+    """What both studies take."""
+
+    drives: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="CAMPAIGN|LOG…",
+            help="Rendered campaigns (begbroke, or village@2 for another town seed), or frame "
+            "logs of your own, which form one campaign.",
+        ),
+    ]
+    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard"
+    folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5
+    only_folds: Annotated[
+        str | None,
+        typer.Option("--only-folds", metavar="N,N…", help="Run these now, numbered from 0 [all]."),
+    ] = None
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
+    ] = 0
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2
+    report_only: Annotated[
+        bool, typer.Option("--report-only", help="Run nothing; report what was run.")
+    ] = False
+    campaigns: Annotated[
+        Path | None,
+        typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
+    ] = None
+    work: Annotated[
+        Path | None,
+        typer.Option("--work", metavar="DIR", help="Maps and results [default: user's cache]."),
+    ] = None
+    config: options.Settings = None
+    as_json: options.Json = False
+
+    def drive_sets(self) -> list[DriveSet]:
+        """Each name of a campaign is one; all frame logs together are one."""
+        from engram.errors import ConfigError
+        from engram_lab.studies import DriveSet, drives_of, open_campaign
+        from engram_lab.town import Size
+        from engram_lab.town.simulating import campaigns_folder
+
+        names = [one for one in self.drives if _names_campaign(one)]
+        if twice := [one for one in set(names) if names.count(one) > 1]:
+            raise ConfigError(f"campaign {twice[0]!r} is given twice; give it once")
+        logs = [Path(one) for one in self.drives if one not in names]
+        folder = self.campaigns or campaigns_folder()
+        sets = [open_campaign(name, folder, Size.named(self.size)) for name in names]
+        if logs:
+            sets.append(DriveSet(logs[0].resolve().parent.name or "logs", drives_of(logs)))
+        return sets
+
+    @property
+    def chosen_folds(self) -> tuple[int, ...]:
+        """Numbers of the folds that are run; empty for all."""
+        return () if self.only_folds is None else numbers(self.only_folds, "--only-folds")
+
+    @property
+    def folder(self) -> Path:
+        """Where maps and results are kept."""
+        from platformdirs import user_cache_path
+
+        return self.work or user_cache_path("engram") / "evaluation"
+
+    def tell(self, files: list[Path], started: float) -> None:
+        """Names the files that the report consists of."""
+        seconds = time.perf_counter() - started
+        if self.as_json:
+            print(json.dumps({"files": [str(one) for one in files], "seconds": round(seconds, 1)}))
+        else:
+            typer.echo("\n".join([*map(str, files), f"{seconds:.0f} s"]))
+
+
+def _studying(verb: Callable[..., None]) -> Callable[..., None]:
+    """Gives a verb the options of `_Study` beside its own, and hands them to it as `study`."""
+    hints = get_type_hints(_Study, include_extras=True)
+    defaults = {one.name: one.default for one in fields(_Study) if one.name != "drives"}
+    shared = [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=defaults.get(name, inspect.Parameter.empty),
+            annotation=hints[name],
+        )
+        for name in hints
+    ]
+    signature = inspect.signature(verb, eval_str=True)
+    own = [one for one in signature.parameters.values() if one.name != "study"]
+
+    @functools.wraps(verb)
+    def run(**given: Any) -> None:
+        verb(study=_Study(**{name: given.pop(name) for name in hints}), **given)
+
+    parameters = [*shared, *own]
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return run
+
+
+@evaluate.command("ranking")
+@_studying
+def ranking(
+    *,
+    study: _Study,
+    policies: Annotated[
+        str | None,
+        typer.Option("--policies", metavar="NAME,NAME…", help="Only these [default: all]."),
+    ] = None,
+    lanes: Annotated[
+        str | None,
+        typer.Option(
+            "--lanes",
+            metavar="N,N…",
+            help="Np; 0 for as many as there are candidates [default: 1,2,3,4,6,8,12,16,0].",
+        ),
+    ] = None,
+    rounds: Annotated[
+        str, typer.Option("--rounds", metavar="N,N…", help="Nr; the first for all policies.")
+    ] = "1,2",
+    map_sizes: Annotated[
+        bool,
+        typer.Option("--map-sizes/--no-map-sizes", help="Run earlier revisions too (Fig. 9)."),
+    ] = True,
+    live_folds: Annotated[
+        int,
+        typer.Option("--live-folds", min=0, help="Folds also run as on a robot, timed."),
+    ] = 1,
+    relocaliser: Annotated[str, typer.Option("--relocaliser", help="For lost robots.")] = "none",
+    redo: Annotated[
+        str | None,
+        typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again."),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
+        "results/ranking"
+    ),
+) -> None:
+    """Compare ranking policies by cross-validation.
+
+    The same command resumes a run that was stopped; adding policies or lanes runs only those.
+
+    \b
+    Examples:
+      engram lab evaluate ranking hamlet --policies distance,path --lanes 1,2 --folds 3
+      engram lab evaluate ranking begbroke keble oxford --out results/ranking
+      engram lab evaluate ranking begbroke --policies distance,path,recall --only-folds 0
+      engram lab evaluate ranking monday.framelog tuesday.framelog … --out results/mine
+    """
+    from engram.cli.progress import Bars
+    from engram.robot import load_settings
+    from engram_lab.policies import STUDIED
+    from engram_lab.studies import (
+        DEFAULT_LANES,
+        UNLIMITED,
+        RankingOptions,
+        forget,
+        make_plan,
+        run,
+        write_report,
+    )
+
+    asked = RankingOptions(
+        policies=tuple(policies.split(",") if policies else STUDIED),
+        lanes=tuple(n or UNLIMITED for n in numbers(lanes, "--lanes")) if lanes else DEFAULT_LANES,
+        rounds=numbers(rounds, "--rounds"),
+        folds=study.folds,
+        seed=study.seed,
+        map_sizes=map_sizes,
+        live_folds=live_folds,
+        relocaliser=None if relocaliser == "none" else relocaliser,
+        only_folds=study.chosen_folds,
+    )
+    again = _redone(redo, asked.policies, report_only=study.report_only)
+    started, settings = time.perf_counter(), load_settings(study.config)
+    plans = [make_plan(one, settings, asked, study.folder) for one in study.drive_sets()]
+    for plan in [] if study.report_only else plans:
+        forget(plan, again)
+        run(plan, study.workers, Bars())
+    study.tell(write_report(out, plans), started)
+
+
+@evaluate.command("fleet")
+@_studying
+def fleet(
+    *,
+    study: _Study,
+    arms: Annotated[
+        str,
+        typer.Option(
+            "--arms",
+            metavar="X,X…",
+            help="A: distance, 8 attempts a frame; B: recall, 8 attempts; C: all candidates; "
+            "P: A, but every match omits, as in the paper.",
+        ),
+    ] = "A,B,C",
+    experiments: Annotated[
+        str, typer.Option("--experiments", metavar="N,N…", help="Figures of Checkout My Map.")
+    ] = "7,8,9,10",
+    groups: Annotated[
+        str,
+        typer.Option(
+            "--groups", metavar="N,N…", help="Of the parallel build; further ones on one fold."
+        ),
+    ] = "4,2,8",
+    tried: Annotated[
+        int | None,
+        typer.Option(
+            "--tried", min=1, metavar="N", help="Held-out drives a fold for downloads [all]."
+        ),
+    ] = None,
+    relocaliser: Annotated[str, typer.Option("--relocaliser", help="For lost robots.")] = "fabmap",
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
+        "results/fleet"
+    ),
+) -> None:
+    """Measure merging, sharing and downloads.
+
+    The experiments of Gadd and Newman by cross-validation. The same command resumes a run that was
+    stopped, map by map and drive by drive.
+
+    \b
+    Examples:
+      engram lab evaluate fleet village --arms A --experiments 7,9
+      engram lab evaluate fleet begbroke24h --out results/fleet
+      engram lab evaluate fleet begbroke24h --arms A --experiments 7,9 --only-folds 0
+      engram lab evaluate fleet begbroke24h --report-only
+    """
+    from engram.cli.progress import Bars
+    from engram.robot import load_settings
+    from engram_lab.studies.fleet import (
+        FleetOptions,
+        make_fleet_plan,
+        run_fleet,
+        write_fleet_report,
+    )
+
+    counts = numbers(groups, "--groups")
+    asked = FleetOptions(
+        arms=tuple(arms.split(",")),
+        experiments=numbers(experiments, "--experiments"),
+        folds=study.folds,
+        seed=study.seed,
+        groups=counts[0],
+        more_groups=counts[1:],
+        tried=tried,
+        relocaliser=None if relocaliser == "none" else relocaliser,
+        only_folds=study.chosen_folds,
+    )
+    started, settings = time.perf_counter(), load_settings(study.config)
+    plans = [make_fleet_plan(one, settings, asked, study.folder) for one in study.drive_sets()]
+    for plan in [] if study.report_only else plans:
+        run_fleet(plan, study.workers, Bars())
+    study.tell(write_fleet_report(out, plans), started)
+
+
+def _names_campaign(text: str) -> bool:
+    """Whether it is to be a campaign: a known one comes before a folder of the same name."""
+    from engram_lab.town import CAMPAIGNS
+
+    name = text.partition("@")[0]
+    return name in CAMPAIGNS or not (text.endswith(".framelog") or Path(text).exists())
+
+
+def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -> tuple[str, ...]:
+    """Policies whose results are dropped: only such as are then run again."""
+    from engram.errors import ConfigError
+
+    if redo is None:
+        return ()
+    if report_only:
+        raise ConfigError("--redo runs policies again, and --report-only runs nothing: give one")
+    again = tuple(redo.split(","))
+    for name in again:
+        if name not in policies:
+            raise ConfigError(
+                f"--redo {name!r}: is not among the policies of this run ({', '.join(policies)})"
+            )
+    return again

@@ -1,0 +1,161 @@
+"""`engram demo`, `engram lab simulate` and `engram lab bench`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from engram.cli import options
+
+if TYPE_CHECKING:
+    from engram_lab.demo import DemoReport
+
+
+def demo(
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Where logs, map and pictures go.")
+    ] = Path("demo"),
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes that render.")] = 2,
+    as_json: options.Json = False,
+) -> None:
+    """Drive a small simulated town with two robots.
+
+    Five drives make a map; a sixth is localised in it on a tight budget.
+
+    \b
+    Examples:
+      engram demo
+      engram demo --out /tmp/demo --workers 4
+    """
+    from engram.cli.progress import Bars
+    from engram_lab.demo import run_demo
+
+    report = run_demo(out, Bars(), workers)
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        _show(report)
+
+
+def _show(report: DemoReport) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    grown = Table("drive", title="The map grows where a drive does not know the place")
+    for column in ("localised", "new nodes"):
+        grown.add_column(column, justify="right")
+    for condition, mapped in zip(report.conditions, report.mapped, strict=False):
+        share = mapped.to_dict()["share_localised"]
+        grown.add_row(condition, f"{share:.0%}", str(mapped.saved))
+    console.print(grown)
+    found = Table("policy", title=f"Then: {report.conditions[-1]}")
+    for column in ("attempts allowed", "made a frame", "localised", "longest gap, m"):
+        found.add_column(column, justify="right")
+    for policy, summaries in report.localised.items():
+        for most, summary in summaries.items():
+            found.add_row(
+                policy,
+                str(most),
+                f"{summary['attempts_per_frame']:.2f}",
+                f"{summary['share_localised']:.0%}",
+                f"{summary['longest_gap_m']:.1f}",
+            )
+    console.print(found)
+    console.print(
+        f"Pictures are in {report.out}. one_place.png: the same place in six conditions. "
+        "matches_path-near_4/: map node left, live image right, matched landmarks joined. "
+        "map_from_above.png: the drives that saved each part. attempts.png: attempts per frame.\n"
+        "`distance` tries the nearest node first. `path-near` first tries nodes that earlier "
+        "drives used together with the latest matches; the more experiences a place has, the "
+        "more attempts that saves."
+    )
+
+
+def simulate(
+    campaign: Annotated[
+        str,
+        typer.Argument(help="hamlet, village, begbroke, keble, oxford or begbroke24h."),
+    ],
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Where to [default: the user's cache]."),
+    ] = None,
+    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard",
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the town.")] = 1,
+    images: Annotated[
+        bool, typer.Option("--images", help="Images in KITTI's layout instead of frame logs.")
+    ] = False,
+    sessions: Annotated[
+        str | None, typer.Option("--sessions", metavar="N,N…", help="Only these drives.")
+    ] = None,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
+    config: options.Settings = None,
+    as_json: options.Json = False,
+) -> None:
+    """Render drives through a simulated town.
+
+    Exact truth is written beside each drive. The same command resumes a run that was stopped.
+
+    \b
+    Examples:
+      engram lab simulate hamlet --out campaigns
+      engram lab simulate village --images --sessions 0,3 --out campaigns
+    """
+    from engram.cli.progress import Bars
+    from engram.robot import load_settings
+    from engram_lab.cli.lists import numbers
+    from engram_lab.town import Size, campaign_named
+    from engram_lab.town.simulating import campaigns_folder
+    from engram_lab.town.simulating import simulate as render
+
+    chosen = campaign_named(campaign, seed, Size.named(size))
+    wanted = None if sessions is None else numbers(sessions, "--sessions")
+    report = render(
+        chosen,
+        out or campaigns_folder(),
+        images=images,
+        sessions=wanted,
+        workers=workers,
+        settings=load_settings(config),
+        monitor=Bars(),
+    )
+    typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
+
+
+def bench(
+    *,
+    only: Annotated[
+        str | None, typer.Option("--only", metavar="STAGES", help="Stages, joined by commas.")
+    ] = None,
+    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Runs of each stage.")] = 200,
+    as_json: options.Json = False,
+) -> None:
+    """Time each stage beside plain OpenCV.
+
+    Everything runs on one core, in memory, each stage interleaved with its reference.
+
+    \b
+    Examples:
+      engram lab bench
+      engram lab bench --only frontend_odometry_512,attempt_512 --json
+    """
+    from rich.console import Console
+
+    from engram_lab.bench import run_bench
+
+    with Console(stderr=True).status("") as status:
+        report = run_bench(
+            only.split(",") if only else None,
+            repeats=repeats,
+            progress=lambda stage, done, of: status.update(f"{stage} ({done + 1} of {of})"),
+        )
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        Console().print(report.table())
