@@ -599,3 +599,38 @@ def test_a_gigapixel_first_image_does_not_set_the_size(tmp_path: Path) -> None:
     drive = open_sequence(path, skip_bad=True)
     assert (drive.camera.width, drive.camera.height) == (WIDTH, HEIGHT)
     assert len(list(drive)) == PAIRS - 1
+
+
+class TestFirstHour:
+    """What a newcomer tries first is refused with the cure, or simply works."""
+
+    @pytest.mark.parametrize("name", ["kitti", "kitti-raw", "euroc"])
+    def test_a_folder_above_drives_names_them(self, tmp_path: Path, name: str) -> None:
+        path = LAYOUTS[name].write(tmp_path)
+        (tmp_path / "notes.txt").write_text("sunny")
+        with pytest.raises(SequenceError, match="holds some; name one of") as caught:
+            open_sequence(tmp_path)
+        assert str(path) in str(caught.value)
+
+    def test_many_drives_are_counted(self, tmp_path: Path) -> None:
+        for number in range(12):
+            (tmp_path / f"drive_{number:02d}" / "mav0" / "cam0").mkdir(parents=True)
+        with pytest.raises(SequenceError, match="and 2 more"):
+            open_sequence(tmp_path)
+
+    def test_frame_numbers_are_not_taken_for_stamps(self, tmp_path: Path) -> None:
+        path = LAYOUTS["folder"].write(tmp_path)
+        (path / "times.txt").unlink()
+        for side in ("left", "right"):
+            for index, file in enumerate(sorted((path / side).iterdir())):
+                file.rename(file.with_name(f"{index:06d}.png"))
+        with pytest.raises(SequenceError, match=r"000000\.png.*frame numbers.*times\.txt"):
+            open_sequence(path)
+        (path / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(PAIRS)))
+        assert len(list(open_sequence(path))) == PAIRS
+
+    def test_both_spellings_are_known(self, tmp_path: Path) -> None:
+        path = LAYOUTS["kitti"].write(tmp_path)
+        with pytest.raises(SequenceError, match="colour rig"):
+            open_sequence(path, rig="color")
+        assert isinstance(open_sequence(path, rig="gray", channel="gray"), ImageSequence)

@@ -24,10 +24,16 @@ from engram.geometry.rectification import (
 )
 from engram.graph.model import Clock
 from engram.sequences.image_sequence import ImageDrive
-from engram.sequences.listing import BadPlace, StampedFile, image_files, pair_by_stamp
+from engram.sequences.listing import (
+    StampedFile,
+    image_files,
+    nanoseconds,
+    pair_by_stamp,
+    read_calibration_text,
+    read_text,
+)
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
-from engram.sequences.stamps import nanoseconds, read_calibration_text, read_text
 
 # What the tools of the field write into `distortion_model`.
 _DISTORTION = {
@@ -98,7 +104,7 @@ def _mav_folder(path: Path) -> Path:
     return inner if inner.is_dir() else path
 
 
-def _stamped_files(side: Path) -> Iterator[StampedFile | BadPlace]:
+def _stamped_files(side: Path) -> Iterator[StampedFile | str]:
     """The images that `data.csv` names, in its order, then those that it does not name."""
     table, folder = side / "data.csv", side / "data"
     present = {path.name: path for path in image_files(folder)}
@@ -116,7 +122,7 @@ def _stamped_files(side: Path) -> Iterator[StampedFile | BadPlace]:
     if not named:
         raise SequenceError(f"{table}: names no image")
     for name in sorted(present.keys() - named):
-        yield BadPlace(f"{present[name]}: extra image, not in {table.name}")
+        yield f"{present[name]}: extra image, not in {table.name}"
 
 
 def _read_sensor(path: Path) -> tuple[RawCamera, SE3]:

@@ -27,12 +27,22 @@ from engram.sequences.listing import (
     Listing,
     StampedFile,
     image_files,
+    nanoseconds,
     pair_by_number,
     pair_by_stamp,
+    read_calibration_text,
+    read_stamps,
+    seconds_as_ns,
 )
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
-from engram.sequences.stamps import nanoseconds, read_calibration_text, read_stamps, seconds_as_ns
+
+# No camera delivers images this close together: names that count so are frame numbers.
+_CLOSEST_NS = 100_000
+_TIMES_NEEDED = (
+    "write times.txt beside left/ and right/, with one line for each pair: its time in seconds, "
+    "such as 0.0, 0.1, 0.2 at 10 Hz"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,8 +201,13 @@ def _named_by_stamp(folder: Path) -> list[StampedFile]:
     for path in image_files(folder):
         stamp_ns = nanoseconds(path.stem)
         if stamp_ns is None:
-            raise SequenceError(
-                f"{path}: without times.txt beside the folder, the name must be the stamp in ns"
-            )
+            raise SequenceError(f"{path}: the name is not a stamp in ns; {_TIMES_NEEDED}")
         files.append(StampedFile(stamp_ns, path))
-    return sorted(files, key=lambda file: file.stamp_ns)
+    files.sort(key=lambda file: file.stamp_ns)
+    span_ns = files[-1].stamp_ns - files[0].stamp_ns
+    if len(files) > 1 and span_ns < _CLOSEST_NS * (len(files) - 1):
+        raise SequenceError(
+            f"{files[0].path}, {files[1].path.name}, …: the names are frame numbers, not stamps "
+            f"in ns; {_TIMES_NEEDED}"
+        )
+    return files

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,9 +15,8 @@ from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
 from engram.geometry.rectification import Rectification, RemapTable
 from engram.graph.model import Clock
-from engram.sequences.frame_range import FrameRange
-from engram.sequences.images import Channel, read_image
-from engram.sequences.listing import BadPlace, Listing, PairFiles, usable_pairs
+from engram.sequences.images import read_image
+from engram.sequences.listing import Listing, PairFiles, usable_pairs
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
@@ -42,45 +41,36 @@ class ImageDrive:
 
 
 class ImageSequence:
-    """A `StereoSequence` over image files. Pairs are decoded when they are asked for."""
+    """A `StereoSequence` over image files. Pairs are decoded when they are asked for.
 
-    def __init__(
-        self,
-        drive: ImageDrive,
-        pairs: Sequence[PairFiles],
-        faults: Sequence[str] = (),
-        *,
-        channel: Channel = Channel.GREY,
-        skip_bad: bool = False,
-        frames: FrameRange | None = None,
-    ) -> None:
+    Attributes:
+        info: what is known of the drive as a whole.
+        camera: its one camera, rectified.
+        frames: which frames of the drive these are.
+
+    Raises:
+        SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.
+        ConfigError: a start time is given for a drive whose clock is UTC already.
+    """
+
+    def __init__(self, drive: ImageDrive, options: OpenOptions) -> None:
+        self.info = with_options(drive.info, options)
+        self.camera = drive.camera
+        self.frames = options.frames
         self._drive = drive
-        self._pairs = tuple(pairs)
-        self._listing_faults = tuple(faults)
+        self._options = options
+        places = drive.places
+        if options.start_ns is not None:
+            places = _shifted(places, options.start_ns)
+        self._pairs, self._listing_faults = usable_pairs(
+            places, options.skip_bad, drive.path, options.frames.of
+        )
         self._reading_faults: list[str] = []
-        self._channel = channel
-        self._skip_bad = skip_bad
-        self._frames = frames or FrameRange()
-
-    @property
-    def info(self) -> SequenceInfo:
-        """What is known of the drive as a whole."""
-        return self._drive.info
-
-    @property
-    def camera(self) -> StereoCamera:
-        """The one camera of the drive, rectified."""
-        return self._drive.camera
 
     @property
     def rectification(self) -> Rectification | None:
         """How raw images become rectified; None for a drive that is delivered rectified."""
         return self._drive.rectification
-
-    @property
-    def frames(self) -> FrameRange:
-        """Which frames of the drive these are."""
-        return self._frames
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -112,7 +102,7 @@ class ImageSequence:
             try:
                 pair = self.read(index)
             except SequenceError as error:
-                if not self._skip_bad:
+                if not self._options.skip_bad:
                     raise SequenceError(f"{error}; --skip-bad goes on without it") from error
                 self._reading_faults.append(str(error))
                 continue
@@ -132,34 +122,12 @@ class ImageSequence:
 
     def _load(self, path: Path, table: RemapTable | None) -> NDArray[np.uint8]:
         # Rectification keeps the size, so the camera's is that of the files too.
-        image = read_image(path, self.camera.width, self.camera.height, self._channel)
+        image = read_image(path, self.camera.width, self.camera.height, self._options.channel)
         if table is None:
             return image
         return np.asarray(
             cv2.remap(image, table.pixels, table.fractions, cv2.INTER_LINEAR), dtype=np.uint8
         )
-
-
-def open_drive(drive: ImageDrive, options: OpenOptions) -> ImageSequence:
-    """Apply a caller's choices to a drive.
-
-    Raises:
-        SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.
-        ConfigError: a start time is given for a drive whose clock is UTC already.
-    """
-    info = with_options(drive.info, options)
-    places = drive.places
-    if options.start_ns is not None:
-        places = _shifted(places, options.start_ns)
-    pairs, faults = usable_pairs(places, options.skip_bad, drive.path, options.frames.of)
-    return ImageSequence(
-        replace(drive, info=info, places=places),
-        pairs,
-        faults,
-        channel=options.channel,
-        frames=options.frames,
-        skip_bad=options.skip_bad,
-    )
 
 
 def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
@@ -190,9 +158,8 @@ def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
 def _shifted(places: Listing, start_ns: int) -> Listing:
     """The same places with the first good stamp of the whole drive moved to `start_ns`."""
     first_ns = next((place.stamp_ns for place in places if isinstance(place, PairFiles)), 0)
+    moved_ns = start_ns - first_ns
     return [
-        place
-        if isinstance(place, BadPlace)
-        else replace(place, stamp_ns=place.stamp_ns - first_ns + start_ns)
+        place if isinstance(place, str) else replace(place, stamp_ns=place.stamp_ns + moved_ns)
         for place in places
     ]

@@ -7,7 +7,6 @@ gigapixel cost nothing.
 from __future__ import annotations
 
 import struct
-from enum import StrEnum
 from pathlib import Path
 
 import cv2
@@ -15,29 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError, SequenceError
+from engram.sequences.options import Channel
 
 # What OpenCV's wheels decode. Files of other kinds beside the images (notes, thumbnails' caches)
 # are no concern of a reader.
 IMAGE_SUFFIXES = frozenset(
-    [
-        ".png",
-        ".jpg",
-        ".jpeg",
-        ".jpe",
-        ".jp2",
-        ".bmp",
-        ".dib",
-        ".pgm",
-        ".ppm",
-        ".pnm",
-        ".pbm",
-        ".tif",
-        ".tiff",
-        ".webp",
-        ".avif",
-        ".ras",
-        ".sr",
-    ]
+    f".{ending}"
+    for ending in (
+        *("png", "jpg", "jpeg", "jpe", "jp2", "bmp", "dib", "pgm", "ppm"),
+        *("pnm", "pbm", "tif", "tiff", "webp", "avif", "ras", "sr"),
+    )
 )
 
 # An uncompressed 16-bit colour image of 64 megapixels fits; nothing a stereo camera delivers is
@@ -46,28 +32,7 @@ _MAX_FILE_BYTES = 400_000_000
 _MAX_PIXELS = 64_000_000
 
 
-class Channel(StrEnum):
-    """What is taken of a colour image: its luma, or one channel alone."""
-
-    GREY = "grey"
-    RED = "red"
-    GREEN = "green"
-    BLUE = "blue"
-
-
 _BGR_INDEX = {Channel.BLUE: 0, Channel.GREEN: 1, Channel.RED: 2}
-
-
-def parse_channel(text: str) -> Channel:
-    """Look a channel up by name.
-
-    Raises:
-        ConfigError: there is no such channel.
-    """
-    try:
-        return Channel(text)
-    except ValueError:
-        raise ConfigError(f"channel {text!r} is unknown; known: {', '.join(Channel)}") from None
 
 
 def read_image(
@@ -87,15 +52,7 @@ def read_image(
     if content.startswith(b"\xff\xd8") and not _jpeg_is_whole(content):
         # libjpeg would fill the missing rows with grey and only warn.
         raise SequenceError(f"{path}: the JPEG is cut short ({len(content)} bytes)")
-    try:
-        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise SequenceError(f"{path}: cannot be decoded: {error.err or error}") from error
-    if image is None:
-        raise SequenceError(
-            f"{path}: no readable image ({len(content)} bytes): damaged, cut short, or something "
-            "else"
-        )
+    image = _decoded(path, content)
     _check_size(path, (image.shape[1], image.shape[0]), width, height)
     return _one_channel(path, _eight_bit(path, image), channel)
 
@@ -109,13 +66,8 @@ def image_size(path: Path) -> tuple[int, int]:
     content = _read_bytes(path)
     size = header_size(content)
     if size is None:
-        try:
-            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error as error:
-            raise SequenceError(f"{path}: cannot be decoded: {error.err or error}") from error
-        if image is None:
-            raise SequenceError(f"{path}: no readable image ({len(content)} bytes)")
-        size = (image.shape[1], image.shape[0])
+        height, width = _decoded(path, content).shape[:2]
+        size = (width, height)
     _check_not_huge(path, size)
     return size
 
@@ -152,6 +104,19 @@ def _read_bytes(path: Path) -> bytes:
     if not content:
         raise SequenceError(f"{path}: the image is empty (0 bytes)")
     return content
+
+
+def _decoded(path: Path, content: bytes) -> NDArray[np.generic]:
+    try:
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise SequenceError(f"{path}: cannot be decoded: {error.err or error}") from error
+    if image is None:
+        raise SequenceError(
+            f"{path}: no readable image ({len(content)} bytes): damaged, cut short, or something "
+            "else"
+        )
+    return image
 
 
 def _check_size(path: Path, size: tuple[int, int] | None, width: int, height: int) -> None:

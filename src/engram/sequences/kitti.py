@@ -15,16 +15,19 @@ from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.images import image_size
-from engram.sequences.listing import Listing, PairFiles, numbered_files, pair_by_number
-from engram.sequences.options import OpenOptions, Rig
-from engram.sequences.sequence import SequenceInfo
-from engram.sequences.stamps import (
+from engram.sequences.listing import (
+    Listing,
+    PairFiles,
     date_as_ns,
+    numbered_files,
+    pair_by_number,
     read_calibration_text,
     read_stamps,
     read_text,
     seconds_as_ns,
 )
+from engram.sequences.options import OpenOptions, Rig
+from engram.sequences.sequence import SequenceInfo
 
 _CAMERAS = {Rig.GREY: (0, 1), Rig.COLOUR: (2, 3)}
 

@@ -1,18 +1,31 @@
-"""What a layout on disk amounts to: numbered places, each a pair of files or a fault.
+"""What a layout on disk amounts to: numbered places, each a pair of files or what is wrong there.
 
 Each reader turns its layout into a listing; what is bad about a place is noted there and decided
-upon later, so that `--frames` and `--skip-bad` mean the same for every layout.
+upon later, so that `--frames` and `--skip-bad` mean the same for every layout. Stamps are read from
+decimal seconds, dates or nanoseconds, all exact, as whole nanoseconds.
 """
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from decimal import Decimal
 from pathlib import Path
 
-from engram.errors import SequenceError
+from engram.errors import CalibrationError, SequenceError
 from engram.sequences.images import IMAGE_SUFFIXES
+
+# Text files beside images; the longest real one (an hour of ROS images at 100 Hz) has 20 MB.
+_MAX_TEXT_BYTES = 100_000_000
+# Beyond the year 2200 a stamp no longer fits into 64 bits: nothing that was driven.
+_MAX_STAMP_NS = 2**63 - 1
+
+_SECONDS = re.compile(r"[+-]?\d{1,12}(\.\d{0,30})?([eE][+-]?\d{1,2})?", re.ASCII)
+_NANOSECONDS = re.compile(r"\d{1,19}", re.ASCII)
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,12}))?Z?", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,14 +37,8 @@ class PairFiles:
     right: Path
 
 
-@dataclass(frozen=True, slots=True)
-class BadPlace:
-    """A place of the drive without a usable pair, and why."""
-
-    reason: str
-
-
-Listing = Sequence[PairFiles | BadPlace]
+# A place without a usable pair is the reason why, for people.
+Listing = Sequence[PairFiles | str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +48,85 @@ class StampedFile:
     stamp_ns: int
     path: Path
     fault: str | None = None
+
+
+def read_text(path: Path) -> str:
+    """A text file beside the images.
+
+    Raises:
+        SequenceError: it is missing, unreadable, too large, or no UTF-8 text.
+    """
+    try:
+        size = path.stat().st_size
+        if size > _MAX_TEXT_BYTES:
+            raise SequenceError(f"{path}: {size} bytes, at most {_MAX_TEXT_BYTES} are read")
+        return path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise SequenceError(f"{path}: the file is missing") from None
+    except UnicodeDecodeError as error:
+        raise SequenceError(f"{path}: no text at byte {error.start}") from error
+    except OSError as error:
+        raise SequenceError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def read_calibration_text(path: Path) -> str:
+    """As `read_text`, for a calibration.
+
+    Raises:
+        CalibrationError: it is missing, unreadable, too large, or no UTF-8 text.
+    """
+    try:
+        return read_text(path)
+    except SequenceError as error:
+        raise CalibrationError(str(error)) from error
+
+
+def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
+    """The stamps of a file with one stamp a line, ns. Empty lines at the end do not count.
+
+    Raises:
+        SequenceError: as `read_text`; a line is no stamp, or there is none at all.
+    """
+    lines = read_text(path).rstrip().splitlines()
+    stamps_ns: list[int] = []
+    for number, line in enumerate(lines, start=1):
+        stamp_ns = parse(line.strip())
+        if stamp_ns is None:
+            raise SequenceError(f"{path}: line {number} is no stamp: {line[:60]!r}")
+        stamps_ns.append(stamp_ns)
+    if not stamps_ns:
+        raise SequenceError(f"{path}: holds no stamp")
+    return stamps_ns
+
+
+def seconds_as_ns(text: str) -> int | None:
+    """Decimal seconds, such as `1.044989e-01`; None if the text is none."""
+    if not _SECONDS.fullmatch(text):
+        return None
+    return _in_range(int((Decimal(text) * 1_000_000_000).to_integral_value()))
+
+
+def nanoseconds(text: str) -> int | None:
+    """Whole nanoseconds; None if the text is none."""
+    return _in_range(int(text)) if _NANOSECONDS.fullmatch(text) else None
+
+
+def date_as_ns(text: str) -> int | None:
+    """A UTC date such as `2011-09-26 13:02:25.967790592` as ns since 1970; None if it is none."""
+    match = _DATE.fullmatch(text)
+    if not match:
+        return None
+    day, time, fraction = match.groups()
+    try:
+        whole = datetime.fromisoformat(f"{day}T{time}").replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    nanos = int((fraction or "0").ljust(9, "0")[:9])
+    return _in_range(int(whole.timestamp()) * 1_000_000_000 + nanos)
+
+
+def _in_range(stamp_ns: int) -> int | None:
+    return stamp_ns if abs(stamp_ns) <= _MAX_STAMP_NS else None
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -89,32 +175,29 @@ def pair_by_number(
     stamps_ns: Sequence[int], left: dict[int, Path], right: dict[int, Path], stamps_file: Path
 ) -> Listing:
     """Listing of a layout in which line i of a file of stamps belongs to image i on both sides."""
-    places: list[PairFiles | BadPlace] = []
-    order = _OrderCheck(stamps_file)
-    for number, stamp_ns in enumerate(stamps_ns):
-        fault = order.fault(stamp_ns, f"line {number + 1}")
+    places: list[PairFiles | str] = []
+    faults = _order_faults(
+        stamps_ns, stamps_file, [f"line {at + 1}" for at in range(len(stamps_ns))]
+    )
+    for number, (stamp_ns, fault) in enumerate(zip(stamps_ns, faults, strict=True)):
         missing = [
             f"image {number} is missing in {next(iter(side.values())).parent}"
             for side in (left, right)
             if number not in side
         ]
         if missing:
-            places.append(BadPlace(f"{'; '.join(missing)} ({stamps_file.name} has a stamp for it)"))
-        elif fault:
-            places.append(BadPlace(fault))
+            places.append(f"{'; '.join(missing)} ({stamps_file.name} has a stamp for it)")
         else:
-            places.append(PairFiles(stamp_ns, left[number], right[number]))
+            places.append(fault or PairFiles(stamp_ns, left[number], right[number]))
     for number in sorted(number for number in {*left, *right} if number >= len(stamps_ns)):
         extra = " and ".join(str(side[number]) for side in (left, right) if number in side)
-        places.append(
-            BadPlace(f"{extra}: extra image, {stamps_file.name} has only {len(stamps_ns)} stamps")
-        )
+        places.append(f"{extra}: extra image, {stamps_file.name} has only {len(stamps_ns)} stamps")
     return places
 
 
 def pair_by_stamp(
-    left: Iterable[StampedFile | BadPlace],
-    right: Iterable[StampedFile | BadPlace],
+    left: Iterable[StampedFile | str],
+    right: Iterable[StampedFile | str],
     tolerance_ns: int,
     sources: tuple[Path, Path],
 ) -> Listing:
@@ -123,19 +206,18 @@ def pair_by_stamp(
     A left image goes with the nearest right one within the tolerance; the pair has the left stamp.
 
     Args:
-        left: the left images in the order of their files.
+        left: the left images, or what is wrong with one, in the order of their files.
         right: the right images likewise.
         tolerance_ns: largest difference within a pair.
         sources: the file or folder that gave the left and the right stamps, for messages.
     """
-    lefts = _in_order(left, sources[0])
-    rights = _in_order(right, sources[1])
+    lefts, rights = _in_order(left, sources[0]), _in_order(right, sources[1])
     right_files = [item for item in rights if isinstance(item, StampedFile)]
     right_stamps = [file.stamp_ns for file in right_files]
     taken: set[int] = set()
-    places: list[PairFiles | BadPlace] = []
+    places: list[PairFiles | str] = []
     for item in lefts:
-        if isinstance(item, BadPlace):
+        if isinstance(item, str):
             places.append(item)
             continue
         index = _nearest(right_stamps, item.stamp_ns)
@@ -143,22 +225,16 @@ def pair_by_stamp(
         if index is None or off_ns is None or off_ns > tolerance_ns or index in taken:
             nearest = "there is none" if off_ns is None else f"the nearest is {off_ns / 1e6:.3f} ms"
             places.append(
-                BadPlace(
-                    f"{item.path}: no right image within {tolerance_ns / 1e6:g} ms ({nearest} off)"
-                )
+                f"{item.path}: no right image within {tolerance_ns / 1e6:g} ms ({nearest} off)"
             )
             continue
         taken.add(index)
         other = right_files[index]
         faults = [file.fault for file in (item, other) if file.fault]
-        places.append(
-            BadPlace("; ".join(faults))
-            if faults
-            else PairFiles(item.stamp_ns, item.path, other.path)
-        )
-    places += [item for item in rights if isinstance(item, BadPlace)]
+        places.append("; ".join(faults) or PairFiles(item.stamp_ns, item.path, other.path))
+    places += [item for item in rights if isinstance(item, str)]
     places += [
-        BadPlace(f"{file.path}: no left image within {tolerance_ns / 1e6:g} ms")
+        f"{file.path}: no left image within {tolerance_ns / 1e6:g} ms"
         for index, file in enumerate(right_files)
         if index not in taken
     ]
@@ -174,7 +250,7 @@ def usable_pairs(
         SequenceError: a chosen place is bad and `skip_bad` is not set, or no pair is left.
     """
     chosen = choose(places)
-    reasons = [place.reason for place in chosen if isinstance(place, BadPlace)]
+    reasons = [place for place in chosen if isinstance(place, str)]
     if reasons and not skip_bad:
         more = f" (and {len(reasons) - 1} more such faults)" if len(reasons) > 1 else ""
         raise SequenceError(f"{reasons[0]}{more}; --skip-bad goes on without them")
@@ -188,18 +264,13 @@ def usable_pairs(
     return pairs, reasons
 
 
-def _in_order(
-    items: Iterable[StampedFile | BadPlace], source: Path
-) -> list[StampedFile | BadPlace]:
-    order = _OrderCheck(source)
-    checked: list[StampedFile | BadPlace] = []
-    for item in items:
-        if isinstance(item, StampedFile):
-            fault = order.fault(item.stamp_ns, f"image {item.path.name}")
-            checked.append(BadPlace(fault) if fault else item)
-        else:
-            checked.append(item)
-    return checked
+def _in_order(items: Iterable[StampedFile | str], source: Path) -> list[StampedFile | str]:
+    """The items, with the reason in place of those whose stamps do not rise."""
+    listed = list(items)
+    files = [item for item in listed if isinstance(item, StampedFile)]
+    names = [f"image {file.path.name}" for file in files]
+    faults = iter(_order_faults([file.stamp_ns for file in files], source, names))
+    return [item if isinstance(item, str) else next(faults) or item for item in listed]
 
 
 def _nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
@@ -208,17 +279,15 @@ def _nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
     return min(around, key=lambda index: abs(stamps_ns[index] - stamp_ns), default=None)
 
 
-class _OrderCheck:
-    """Stamps must rise; one that does not is a fault and does not count for those after it."""
-
-    def __init__(self, source: Path) -> None:
-        self._source = source
-        self._last_ns: int | None = None
-
-    def fault(self, stamp_ns: int, what: str) -> str | None:
-        last_ns = self._last_ns
+def _order_faults(stamps_ns: Sequence[int], source: Path, names: Sequence[str]) -> list[str | None]:
+    """What is wrong with each stamp: they must rise; one that does not counts for none after it."""
+    faults: list[str | None] = []
+    last_ns: int | None = None
+    for stamp_ns, name in zip(stamps_ns, names, strict=True):
         if last_ns is None or stamp_ns > last_ns:
-            self._last_ns = stamp_ns
-            return None
+            last_ns = stamp_ns
+            faults.append(None)
+            continue
         how = "repeats the stamp" if stamp_ns == last_ns else "is stamped before the stamp"
-        return f"{self._source}: {what} ({stamp_ns} ns) {how} of the one before ({last_ns} ns)"
+        faults.append(f"{source}: {name} ({stamp_ns} ns) {how} of the one before ({last_ns} ns)")
+    return faults

@@ -11,17 +11,25 @@ from types import MappingProxyType
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.euroc import find_euroc, is_euroc
 from engram.sequences.folder import find_folder, is_folder
-from engram.sequences.frame_range import FrameRange
 from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
-from engram.sequences.image_sequence import ImageDrive, ImageSequence, open_drive
-from engram.sequences.images import Channel, parse_channel
+from engram.sequences.image_sequence import ImageDrive, ImageSequence
 from engram.sequences.kitti import (
     find_kitti_odometry,
     find_kitti_raw,
     is_kitti_odometry,
     is_kitti_raw,
 )
-from engram.sequences.options import OpenOptions, Rig, parse_rig, parse_start
+from engram.sequences.options import (
+    Channel,
+    FrameRange,
+    OpenOptions,
+    Rig,
+    parse_choice,
+    parse_start,
+)
+
+# Of the drives inside a folder that is given in their place.
+_MOST_NAMED = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +52,7 @@ class SequenceFormat:
 def _images(
     find: Callable[[Path, OpenOptions], ImageDrive],
 ) -> Callable[[Path, OpenOptions], ImageSequence]:
-    return lambda path, options: open_drive(find(path, options), options)
+    return lambda path, options: ImageSequence(find(path, options), options)
 
 
 SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
@@ -102,7 +110,7 @@ def open_sequence(
     Args:
         path: folder or file of the drive.
         format: key of `SEQUENCES`; None recognises the layout from what is there.
-        rig: "grey" or "colour", where a robot carries both (KITTI).
+        rig: "grey" or "colour" (or "color"), where a robot carries both (KITTI).
         channel: "grey", or one channel of colour images: "red", "green", "blue".
         frames: which frames are used, as `FrameRange` or text START:STOP:STEP.
         skip_bad: leave bad pairs out and count them (`skipped`), instead of failing.
@@ -123,8 +131,8 @@ def open_sequence(
     """
     path = Path(path)
     options = OpenOptions(
-        rig=parse_rig(rig),
-        channel=parse_channel(channel),
+        rig=parse_choice(Rig, rig),
+        channel=parse_choice(Channel, channel),
         frames=FrameRange.parse(frames) if isinstance(frames, str) else frames or FrameRange(),
         skip_bad=skip_bad,
         pair_tolerance_ns=pair_tolerance_ns,
@@ -158,7 +166,38 @@ def recognise(path: Path) -> str:
         return found[0]
     if found:
         raise SequenceError(f"{path}: could be {' or '.join(found)}: name the layout with --format")
+    inside = drives_inside(path)
+    if inside:
+        named = "\n".join(f"  {one}" for one in inside[:_MOST_NAMED])
+        more = f"\n  and {len(inside) - _MOST_NAMED} more" if len(inside) > _MOST_NAMED else ""
+        raise SequenceError(f"{path}: is not a drive but holds some; name one of\n{named}{more}")
     raise SequenceError(f"{path}: no drive of a known layout; known are\n{_known_layouts()}")
+
+
+def drives_inside(path: Path) -> list[Path]:
+    """The drives up to two folders below a path, by name; looks at names only.
+
+    KITTI keeps them in `sequences/NN` and `DATE/DATE_drive_NNNN_sync`.
+    """
+    found: list[Path] = []
+    for child in _entries(path):
+        if _is_drive(child):
+            found.append(child)
+        elif not child.name.startswith("."):
+            found += filter(_is_drive, _entries(child))
+    return found
+
+
+def _is_drive(path: Path) -> bool:
+    return any(layout.recognises(path) for layout in SEQUENCES.values())
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What a folder holds, by name; nothing where it is a file or may not be read."""
+    try:
+        return sorted(folder.iterdir())
+    except OSError:
+        return []
 
 
 def _known(name: str) -> str:

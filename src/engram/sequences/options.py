@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from typing import Annotated, TypeVar
 
+from msgspec import Meta
+
+from engram.config import check_bounds
 from engram.errors import ConfigError
 from engram.graph.clock import check_longitude, check_zone
-from engram.sequences.frame_range import FrameRange
-from engram.sequences.images import Channel
 
+T = TypeVar("T")
+E = TypeVar("E", bound=StrEnum)
+
+_PART = re.compile(r"[0-9]{1,9}")
 _MICROSECOND = timedelta(microseconds=1)
+_SPELLINGS = {"color": "colour", "gray": "grey"}
 
 
 class Rig(StrEnum):
@@ -19,6 +28,80 @@ class Rig(StrEnum):
 
     GREY = "grey"
     COLOUR = "colour"
+
+
+class Channel(StrEnum):
+    """What is taken of a colour image: its luma, or one channel alone."""
+
+    GREY = "grey"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRange:
+    """Frames `start`, `start + step`, … below `stop`, counted from 0 in the layout's own order.
+
+    Frames that are left out as bad keep their numbers, so that a range names the same frames with
+    and without `skip_bad`.
+
+    Attributes:
+        start: first frame, >= 0.
+        stop: end, not included; None for all the rest.
+        step: distance of successive frames, >= 1.
+
+    Raises:
+        ConfigError: a part is negative, the step is 0, or stop is not behind start.
+    """
+
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or (self.stop is not None and self.stop < 0) or self.step < 1:
+            raise ConfigError(
+                f"frames {self}: start and stop must be >= 0 and step >= 1 "
+                "(counting from the end is not supported)"
+            )
+        if self.stop is not None and self.stop <= self.start:
+            raise ConfigError(f"frames {self}: holds no frame, stop must be larger than start")
+
+    @staticmethod
+    def parse(text: str) -> FrameRange:
+        """Read START:STOP:STEP, the words of a Python slice; any part may be missing.
+
+        A single number N means the one frame N.
+
+        Raises:
+            ConfigError: the text is not such a range.
+        """
+        parts = [part.strip() for part in text.split(":")]
+        if len(parts) > 3 or text.strip() == "":
+            raise ConfigError(f"frames {text!r}: write START:STOP:STEP, such as 0:100:2")
+        for part in parts:
+            if part and not _PART.fullmatch(part):
+                why = "counts from the end, which is not supported" if part[0] == "-" else "is none"
+                raise ConfigError(
+                    f"frames {text!r}: {part!r} {why}; each part is a whole number >= 0 or missing"
+                )
+        start = int(parts[0] or 0)
+        if len(parts) == 1:
+            return FrameRange(start, start + 1)
+        stop = int(parts[1]) if parts[1] else None
+        return FrameRange(start, stop, int(parts[2]) if len(parts) == 3 and parts[2] else 1)
+
+    def __str__(self) -> str:
+        return f"{self.start}:{'' if self.stop is None else self.stop}:{self.step}"
+
+    def indices(self, length: int) -> range:
+        """The frames of a drive of `length` frames that are in the range."""
+        return range(length)[self.start : self.stop : self.step]
+
+    def of(self, items: Sequence[T]) -> list[T]:
+        """The members of `items` that are in the range."""
+        return [items[index] for index in self.indices(len(items))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +129,7 @@ class OpenOptions:
     channel: Channel = Channel.GREY
     frames: FrameRange = field(default_factory=FrameRange)
     skip_bad: bool = False
-    pair_tolerance_ns: int = 5_000_000
+    pair_tolerance_ns: Annotated[int, Meta(ge=0)] = 5_000_000
     robot: str | None = None
     start_ns: int | None = None
     longitude_deg: float | None = None
@@ -55,20 +138,21 @@ class OpenOptions:
     def __post_init__(self) -> None:
         check_longitude(self.longitude_deg)
         check_zone(self.zone)
-        if self.pair_tolerance_ns < 0:
-            raise ConfigError(f"pair tolerance is {self.pair_tolerance_ns} ns, must be >= 0")
+        check_bounds(self)
 
 
-def parse_rig(text: str) -> Rig:
-    """Look a rig up by name.
+def parse_choice(kind: type[E], text: str) -> E:
+    """A `Rig` or `Channel` by name, in British or American spelling.
 
     Raises:
-        ConfigError: there is no such rig.
+        ConfigError: there is no such name.
     """
     try:
-        return Rig(text)
+        return kind(_SPELLINGS.get(text, text))
     except ValueError:
-        raise ConfigError(f"rig {text!r} is unknown; known: {', '.join(Rig)}") from None
+        raise ConfigError(
+            f"{kind.__name__.lower()} {text!r} is unknown; known: {', '.join(kind)}"
+        ) from None
 
 
 def parse_start(start: str | datetime | int | None) -> int | None:
@@ -77,7 +161,7 @@ def parse_start(start: str | datetime | int | None) -> int | None:
     A time without an offset is taken as UTC.
 
     Raises:
-        ConfigError: the text is no ISO 8601 time, or the time lies before 1970.
+        ConfigError: the text is not an ISO 8601 time, or the time lies before 1970.
     """
     if start is None:
         return None
@@ -91,8 +175,7 @@ def parse_start(start: str | datetime | int | None) -> int | None:
     if isinstance(start, datetime):
         aware = start if start.tzinfo else start.replace(tzinfo=UTC)
         # Whole microseconds: `timestamp()` is a float and would lose the last digits.
-        micros = (aware - datetime(1970, 1, 1, tzinfo=UTC)) // _MICROSECOND
-        start = micros * 1000
+        start = (aware - datetime(1970, 1, 1, tzinfo=UTC)) // _MICROSECOND * 1000
     if not 0 <= start < 2**63:
         raise ConfigError(f"start is {start} ns since 1970, must be between 1970 and 2262")
     return start

@@ -1,15 +1,21 @@
-"""The two protocols behind which every source of data stands."""
+"""The two protocols behind which every source of data stands, and who a drive is."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from engram.frontend import Frame, StereoPair
 from engram.geometry import StereoCamera
-from engram.graph.model import Clock
+from engram.graph.model import Clock, Session, session_id
 from engram.odometry import OdometryStep
+
+# The robot of a drive whose source and caller name none.
+UNNAMED_ROBOT = "robot"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,3 +92,34 @@ class FrameSequence(Protocol):
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[LoggedFrame]: ...
+
+
+def first_pair_hash(pair: StereoPair) -> str:
+    """32 hexadecimal digits of a pair's pixels, part of a session's identity (SPEC §2.7)."""
+    digest = hashlib.sha256(f"{pair.left.shape}{pair.right.shape}".encode())
+    digest.update(np.ascontiguousarray(pair.left).data)
+    digest.update(np.ascontiguousarray(pair.right).data)
+    return digest.hexdigest()[:32]
+
+
+def session_of(
+    info: SequenceInfo, camera: StereoCamera, start_ns: int, first_pair_hash: str
+) -> Session:
+    """The session of a drive, equal whenever the same frames of it are read.
+
+    Args:
+        info: what is known of the drive.
+        camera: its camera.
+        start_ns: stamp of the first pair that is used.
+        first_pair_hash: `first_pair_hash` of that pair; a frame log has it as a property.
+    """
+    robot = info.robot or UNNAMED_ROBOT
+    return Session(
+        id=session_id(robot, camera.id, start_ns, first_pair_hash),
+        robot=robot,
+        camera=camera.id,
+        start_ns=start_ns,
+        clock=info.clock,
+        longitude_deg=info.longitude_deg,
+        zone=info.zone,
+    )

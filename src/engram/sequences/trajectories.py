@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, SequenceError
 from engram.geometry import SE3
-from engram.sequences.stamps import nanoseconds, read_text, seconds_as_ns
+from engram.monitor import write_whole
+from engram.sequences.listing import nanoseconds, read_text, seconds_as_ns
+
+T = TypeVar("T")
 
 # Frame logs have their truth beside them: NAME.framelog, NAME.truth.txt.
 TRUTH_SUFFIX = ".truth.txt"
@@ -63,16 +66,15 @@ def read_kitti_poses(path: str | Path, stamps_ns: Sequence[int] | NDArray[np.int
 
     Args:
         path: the file.
-        stamps_ns: stamps of the frames (the file has none), one a line.
+        stamps_ns: (N,) stamps of the frames, ns; the file has none, one line each.
 
     Raises:
         SequenceError: a line is no pose, or there are more or fewer of them than stamps.
     """
-    path = Path(path)
-    poses = [_matrix_pose(path, number, fields) for number, fields in _rows(path)]
+    poses = _read(path, _matrix_pose)
     if len(poses) != len(stamps_ns):
         raise SequenceError(f"{path}: {len(poses)} poses for {len(stamps_ns)} stamps")
-    return _trajectory(path, list(stamps_ns), poses)
+    return _trajectory(path, zip(stamps_ns, poses, strict=True))
 
 
 def read_matrix_truth(path: str | Path) -> Trajectory:
@@ -81,12 +83,11 @@ def read_matrix_truth(path: str | Path) -> Trajectory:
     Raises:
         SequenceError: a line is something else, or the stamps do not rise.
     """
-    path = Path(path)
-    stamps_ns, poses = [], []
-    for number, fields in _rows(path):
-        stamps_ns.append(_stamp(path, number, nanoseconds(fields[0])))
-        poses.append(_matrix_pose(path, number, fields[1:]))
-    return _trajectory(path, stamps_ns, poses)
+
+    def stamped(fields: list[str]) -> tuple[int, SE3]:
+        return _stamp(nanoseconds(fields[0])), _matrix_pose(fields[1:])
+
+    return _trajectory(path, _read(path, stamped))
 
 
 def read_euroc_truth(path: str | Path, body_from_cam: SE3) -> Trajectory:
@@ -100,13 +101,13 @@ def read_euroc_truth(path: str | Path, body_from_cam: SE3) -> Trajectory:
     Raises:
         SequenceError: a line is something else, or the stamps do not rise.
     """
-    path = Path(path)
-    stamps_ns, poses = [], []
-    for number, fields in _rows(path, delimiter=","):
-        values = _floats(path, number, fields[1:8], 7)
-        stamps_ns.append(_stamp(path, number, nanoseconds(fields[0].strip())))
-        poses.append(_quaternion_pose(path, number, values[3:], values[:3]) @ body_from_cam)
-    return _trajectory(path, stamps_ns, poses)
+
+    def stamped(fields: list[str]) -> tuple[int, SE3]:
+        values = _floats(fields[1:8], 7)
+        world_from_body = SE3.from_quaternion(values[3:], values[:3])
+        return _stamp(nanoseconds(fields[0].strip())), world_from_body @ body_from_cam
+
+    return _trajectory(path, _read(path, stamped, delimiter=","))
 
 
 def read_tum(path: str | Path) -> Trajectory:
@@ -115,13 +116,13 @@ def read_tum(path: str | Path) -> Trajectory:
     Raises:
         SequenceError: a line is something else, or the stamps do not rise.
     """
-    path = Path(path)
-    stamps_ns, poses = [], []
-    for number, fields in _rows(path):
-        stamps_ns.append(_stamp(path, number, seconds_as_ns(fields[0])))
-        x, y, z, qx, qy, qz, qw = _floats(path, number, fields[1:], 7)
-        poses.append(_quaternion_pose(path, number, [qw, qx, qy, qz], [x, y, z]))
-    return _trajectory(path, stamps_ns, poses)
+
+    def stamped(fields: list[str]) -> tuple[int, SE3]:
+        stamp_ns = _stamp(seconds_as_ns(fields[0]))
+        x, y, z, qx, qy, qz, qw = _floats(fields[1:], 7)
+        return stamp_ns, SE3.from_quaternion([qw, qx, qy, qz], [x, y, z])
+
+    return _trajectory(path, _read(path, stamped))
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
@@ -144,12 +145,10 @@ def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] 
         w, x, y, z = pose.quaternion_wxyz()
         numbers = " ".join(f"{value:.9f}" for value in (*pose.translation, x, y, z, w))
         lines.append(f"{sign}{seconds}.{nanos:09d} {numbers}")
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        draft.replace(path)
+        with write_whole(path) as draft:
+            draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
-        draft.unlink(missing_ok=True)
         raise SequenceError(f"{path}: cannot be written: {error.strerror}") from error
 
 
@@ -168,51 +167,39 @@ def read_truth(framelog: str | Path) -> Trajectory | None:
     return read_tum(path) if path.exists() else None
 
 
-def _rows(path: Path, delimiter: str | None = None) -> Iterator[tuple[int, list[str]]]:
-    """Numbered rows of fields, without comments and empty lines."""
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+def _read(path: str | Path, row: Callable[[list[str]], T], delimiter: str | None = None) -> list[T]:
+    """What each row of fields comes to; comments and empty lines are passed over."""
+    found = []
+    for number, line in enumerate(read_text(Path(path)).splitlines(), start=1):
         if line.strip() and not line.startswith("#"):
-            yield number, line.split(delimiter)
+            try:
+                found.append(row(line.split(delimiter)))
+            except (InputError, ValueError) as error:
+                raise SequenceError(f"{path}: line {number}: {error}") from error
+    return found
 
 
-def _trajectory(path: Path, stamps_ns: list[int], poses: list[SE3]) -> Trajectory:
+def _trajectory(path: str | Path, poses: Iterable[tuple[int, SE3]]) -> Trajectory:
+    listed = list(poses)
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in listed], dtype=np.int64)
     try:
-        return Trajectory(np.array(stamps_ns, dtype=np.int64), poses)
+        return Trajectory(stamps_ns, [pose for _, pose in listed])
     except InputError as error:
         raise SequenceError(f"{path}: {error}") from error
 
 
-def _stamp(path: Path, number: int, stamp_ns: int | None) -> int:
+def _stamp(stamp_ns: int | None) -> int:
     if stamp_ns is None:
-        raise SequenceError(f"{path}: line {number} does not begin with a stamp")
+        raise ValueError("does not begin with a stamp")
     return stamp_ns
 
 
-def _floats(path: Path, number: int, fields: Sequence[str], count: int) -> list[float]:
-    try:
-        values = [float(field) for field in fields]
-    except ValueError as error:
-        raise SequenceError(f"{path}: line {number}: {error}") from None
+def _floats(fields: Sequence[str], count: int) -> list[float]:
+    values = [float(field) for field in fields]
     if len(values) != count or not np.isfinite(values).all():
-        raise SequenceError(
-            f"{path}: line {number} must have {count} finite numbers for the pose, has "
-            f"{len(values)}"
-        )
+        raise ValueError(f"must have {count} finite numbers for the pose, has {len(values)}")
     return values
 
 
-def _matrix_pose(path: Path, number: int, fields: Sequence[str]) -> SE3:
-    values = np.array(_floats(path, number, fields, 12)).reshape(3, 4)
-    try:
-        return SE3.from_matrix(values)
-    except InputError as error:
-        raise SequenceError(f"{path}: line {number}: {error}") from error
-
-
-def _quaternion_pose(
-    path: Path, number: int, wxyz: Sequence[float], translation: Sequence[float]
-) -> SE3:
-    try:
-        return SE3.from_quaternion(wxyz, translation)
-    except InputError as error:
-        raise SequenceError(f"{path}: line {number}: {error}") from error
+def _matrix_pose(fields: list[str]) -> SE3:
+    return SE3.from_matrix(np.array(_floats(fields, 12)).reshape(3, 4))

@@ -20,8 +20,7 @@ from engram.sequences.framelog.file import frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
 from engram.sequences.image_sequence import with_options
-from engram.sequences.images import Channel
-from engram.sequences.options import OpenOptions
+from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
 
 SUFFIX = ".framelog"
