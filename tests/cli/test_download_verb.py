@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 KEYS = {
     "out", "policy", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",
@@ -19,7 +19,7 @@ KEYS = {
 def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fleet") / "centre.engram"
     sequence = open_drive(street, start="2026-03-01T09:30:00", longitude_deg=0.0)
-    map_drive(path, sequence, Settings(), MapOptions())
+    map_drive(path, sequence, Settings(), RobotOptions())
     return path
 
 

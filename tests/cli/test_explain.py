@@ -11,10 +11,10 @@ from engram.ranking import policy_names
 
 @pytest.fixture(scope="module")
 def town(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from engram.robot import MapOptions, Settings, map_drive, open_drive
+    from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
     path = tmp_path_factory.mktemp("explained") / "town.engram"
-    map_drive(path, open_drive(street), Settings(), MapOptions())
+    map_drive(path, open_drive(street), Settings(), RobotOptions())
     return path
 
 

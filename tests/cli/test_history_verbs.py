@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from engram.maps import Map
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def two_drives(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("maps") / "town.engram"
     for robot in ("r1", "r2"):
         sequence = open_drive(street, robot=robot, start="2026-03-01T09:30:00", longitude_deg=0.0)
-        map_drive(path, sequence, Settings(), MapOptions())
+        map_drive(path, sequence, Settings(), RobotOptions())
     return path
 
 

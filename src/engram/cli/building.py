@@ -101,7 +101,7 @@ def build(
     from engram.cli.progress import Bars
     from engram.fleet.build import BuildOptions, build_map
     from engram.fleet.merge import MergeOptions
-    from engram.robot import MapOptions, load_settings
+    from engram.robot import RobotOptions, load_settings
 
     if seed is not None and grouping != "random":
         raise ConfigError("--seed is of random grouping: leave it out, or give --grouping random")
@@ -111,7 +111,7 @@ def build(
         groups=groups,
         grouping=grouping,
         seed=0 if seed is None else seed,
-        mapping=MapOptions(
+        mapping=RobotOptions(
             policy=policy, lanes=lanes, rounds=rounds, relocaliser=found, author=author
         ),
         merging=MergeOptions(policy, lanes, rounds, found, author, sure_inliers),

@@ -38,7 +38,7 @@ def extract(
       engram extract drives/monday monday.framelog
       engram extract 2011_09_26_drive_0001_sync colour.framelog --rig colour --channel blue
     """
-    from engram.cli.progress import progress
+    from engram.cli.progress import Bars
     from engram.robot import extract_log, load_settings, open_drive
 
     sequence = open_drive(
@@ -53,8 +53,8 @@ def extract(
         longitude_deg=longitude,
         zone=zone,
     )
-    with progress("extract", len(sequence)) as advance:
-        report = extract_log(sequence, out, load_settings(config, descriptor), advance)
+    with Bars().stage("extract", len(sequence)) as monitor:
+        report = extract_log(sequence, out, load_settings(config, descriptor), monitor)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

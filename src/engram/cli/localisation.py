@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from engram.cli import options
+
+if TYPE_CHECKING:
+    from engram.localiser import Localisation
 
 
 def localise(
@@ -42,9 +45,6 @@ def localise(
         float | None,
         typer.Option("--rate", metavar="HZ", help="Replay in real time and count late frames."),
     ] = None,
-    preload: Annotated[
-        bool, typer.Option("--preload", help="Decode all images before the first frame.")
-    ] = False,
     format_: options.Format = None,
     rig: options.Rig = "grey",
     channel: options.Channel = "grey",
@@ -63,18 +63,11 @@ def localise(
     Examples:
       engram localise town.engram drives/tuesday
       engram localise town.engram drives/tuesday --policy distance --lanes 1 --rounds 2 --json
-      engram localise town.engram drives/tuesday --rate 20 --deadline 40 --preload
+      engram localise town.engram drives/tuesday --rate 20 --deadline 40
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures pictures
     """
-    from engram.cli.progress import progress
-    from engram.robot import (
-        FrameResult,
-        LocaliseOptions,
-        LocaliseRun,
-        load_settings,
-        open_drive,
-        summarise,
-    )
+    from engram.cli.progress import Bars
+    from engram.robot import RobotOptions, load_settings, open_drive, open_map, robot_on, summarise
     from engram.viewing.pictures import PictureWriter
     from engram.viewing.trajectory import write_trajectory
 
@@ -90,34 +83,31 @@ def localise(
         longitude_deg=longitude,
         zone=zone,
     )
-    asked = LocaliseOptions(
+    asked = RobotOptions(
         policy=policy,
         lanes=lanes,
         rounds=rounds,
         deadline_ms=deadline,
         relocaliser=None if relocaliser == "none" else relocaliser,
-        at=at,
-        rate_hz=rate,
-        preload=preload,
     )
-    results: list[FrameResult] = []
+    results: list[Localisation] = []
     interrupted = False
-    with LocaliseRun(map_path, sequence, load_settings(config), asked) as run:
-        writer = (
-            PictureWriter(pictures, every, run.localiser, run.opened.frames) if pictures else None
-        )
-        with progress("localise", len(sequence)) as advance:
+    with (
+        open_map(map_path, at) as opened,
+        robot_on(opened, sequence, load_settings(config), asked) as driver,
+    ):
+        writer = PictureWriter(pictures, every, opened.frames) if pictures else None
+        with Bars().stage("localise", len(sequence)) as monitor:
             try:
-                for live, result in run:
-                    results.append(result)
-                    advance(result.localisation.status.value)
-                    if writer is not None:
-                        writer.offer(live, result)
+                for found in driver.drive(sequence, monitor, rate):
+                    results.append(found)
+                    if writer is not None and driver.last is not None:
+                        writer.offer(driver.last, found)
             except KeyboardInterrupt:
                 interrupted = True
                 typer.echo("interrupted: what follows is of the frames so far", err=True)
         if trajectory is not None:
-            write_trajectory(trajectory, run.opened.graph, results)
+            write_trajectory(trajectory, opened.graph, results)
     summary = {
         **summarise(results),
         "skipped_pairs": sequence.skipped,

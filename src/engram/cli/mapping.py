@@ -41,8 +41,8 @@ def map_(
       engram map town.engram drives/tuesday --robot r2 --start 2026-03-01T09:30:00Z
       engram map town.engram kitti/sequences/06 --frames 0:50:2
     """
-    from engram.cli.progress import progress
-    from engram.robot import MapOptions, load_settings, map_drive, open_drive
+    from engram.cli.progress import Bars
+    from engram.robot import RobotOptions, load_settings, map_drive, open_drive
 
     sequence = open_drive(
         path,
@@ -56,10 +56,10 @@ def map_(
         longitude_deg=longitude,
         zone=zone,
     )
-    asked = MapOptions(policy=policy, lanes=lanes, rounds=rounds, deadline_ms=deadline)
-    with progress("map", len(sequence)) as advance:
+    asked = RobotOptions(policy=policy, lanes=lanes, rounds=rounds, deadline_ms=deadline)
+    with Bars().stage("map", len(sequence)) as monitor:
         settings = load_settings(config, descriptor)
-        report = map_drive(map_path, sequence, settings, asked, advance, descriptor=descriptor)
+        report = map_drive(map_path, sequence, settings, asked, monitor, descriptor=descriptor)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

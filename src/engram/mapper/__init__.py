@@ -2,7 +2,8 @@
 
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopConfig, LoopSearch
-from engram.mapper.mapper import Mapper, MapperConfig, MappingStep
+from engram.mapper.mapper import Mapper, MapperConfig
+from engram.mapper.memory import Memory, Walk
 from engram.mapper.saver import NodeWords, Records, RecordWriter, Saver
 
 __all__ = [
@@ -10,11 +11,12 @@ __all__ = [
     "LoopSearch",
     "Mapper",
     "MapperConfig",
-    "MappingStep",
+    "Memory",
     "NodeWords",
     "RecordWriter",
     "Records",
     "Saver",
+    "Walk",
     "edge_through_live",
     "match_edges",
 ]

@@ -87,7 +87,7 @@ from engram.maps.view import View, head
 from engram.maps.words import load_words, words_row, write_words
 
 if TYPE_CHECKING:
-    from engram.robot.live_robot import LiveRobot
+    from engram.robot.robot import Robot
     from engram.robot.settings import Settings
 
 
@@ -470,8 +470,8 @@ class Map:
         lanes: int = 2,
         rounds: int = 2,
         relocaliser: str | None = "fabmap",
-    ) -> LiveRobot:
-        """A robot that localises in this map; see `LiveRobot.localise`.
+    ) -> Robot:
+        """A robot that localises in this map; see `Robot.step`.
 
         Args:
             camera: its rectified stereo camera.
@@ -481,17 +481,11 @@ class Map:
             rounds: rounds of attempts for one frame (Nr).
             relocaliser: how it is found when lost; None for not at all.
         """
-        from engram.robot.live_robot import live_robot
+        from engram.robot.localisers import robot_in
+        from engram.robot.settings import RobotOptions
 
-        return live_robot(
-            self,
-            camera,
-            settings,
-            policy=policy,
-            lanes=lanes,
-            rounds=rounds,
-            relocaliser=relocaliser,
-        )
+        asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser)
+        return robot_in(self, camera, settings, asked)
 
     @contextmanager
     def writing(self) -> Iterator[None]:

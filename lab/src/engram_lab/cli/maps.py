@@ -148,7 +148,7 @@ def try_(
     """
     from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
-    from engram.robot import LocaliseOptions, load_settings, open_drive, session_of_drive
+    from engram.robot import RobotOptions, load_settings, open_drive, session_of_drive
     from engram_lab.trial import (
         LeftOut,
         TrialSummary,
@@ -175,7 +175,7 @@ def try_(
         {asked.policy: asked, "copy": DownloadOptions()},
         [partial(open_drive, drive) for drive in drives],
         load_settings(config),
-        LocaliseOptions(lanes=lanes, rounds=rounds),
+        RobotOptions(lanes=lanes, rounds=rounds),
         Bars(),
         at=at,
         left_out=lambda one: left_out.append(replace(one, drive=str(named[one.drive]))),
