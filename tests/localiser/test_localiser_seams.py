@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from tests.mapping_rig import localised, map_simulated
-from tests.synthetic_world import World, drive
+from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
 from engram.errors import MapCorruptError
 from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
@@ -100,7 +100,12 @@ def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_
             search=search,
         ) as localiser:
             localiser.place_at(Position.at(opened.graph.node(0).id))
-            gone = [replace(seen, odometry=blind) for seen in elsewhere[10:16] * 20]
+            last_ns = live[9].frame.stamp_ns
+            stamps_ns = range(last_ns + PERIOD_NS, last_ns + 121 * PERIOD_NS, PERIOD_NS)
+            gone = [
+                Seen(replace(seen.frame, stamp_ns=stamp_ns), blind, seen.world_from_live)
+                for seen, stamp_ns in zip(elsewhere[10:16] * 20, stamps_ns, strict=True)
+            ]
             found = localised(localiser, [*live[:10], *gone])
     known, lost = found[:10], found[10:]
     assert known[-1].status is LocalisationStatus.LOCALISED

@@ -22,6 +22,7 @@ from engram.graph.model import (
     Attempt,
     LandmarkSource,
     NodeId,
+    Session,
     SessionId,
     node_id,
     path_id,
@@ -147,6 +148,11 @@ class Localiser:
         self.close()
 
     @property
+    def graph(self) -> ExperienceGraph:
+        """The experience graph that it works on."""
+        return self._graph
+
+    @property
     def relocaliser(self) -> Relocaliser | None:
         """What finds a lost robot."""
         return self._relocaliser
@@ -212,6 +218,16 @@ class Localiser:
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
+
+    def begin(self, session: Session) -> None:
+        """The frames to come are of this session: a live robot knows it with its first frame."""
+        self._background = replace(
+            self._background, sessions={**self._background.sessions, session.id: session}
+        )
+        self._clock = session
+        self._own_session = session.id if self._own_session is not None else None
+        self._own_path = path_id(session.id)
+        self.live = session.id
 
     def resume(self, driven_m: float, next_iteration: int) -> None:
         """The frames to come are those of the session from there on (SPEC §7 MERGE 3).

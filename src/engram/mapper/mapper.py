@@ -39,12 +39,15 @@ class MapperConfig:
         tie_within_m: a new experience is also tied to the session's last saved node within this
             distance; the search radius.
         checkpoint_every: live frames between two checkpoints of the map.
+        memory_bytes: how large the memory of a drive that saves no nodes may become before it is
+            committed; what comes later is not remembered. About a day at 20 frames a second.
     """
 
     save_every_m: float = 1.0
     save_every_rad: float = float(np.deg2rad(15.0))
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
+    memory_bytes: int = 256_000_000
 
     def __post_init__(self) -> None:
         for name in ("save_every_m", "save_every_rad", "tie_within_m"):

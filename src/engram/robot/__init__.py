@@ -3,13 +3,13 @@
 from engram.maps import open_map
 from engram.robot.front import Front, arriving
 from engram.robot.inspecting import check_map, describe_map, seal_map
-from engram.robot.localisers import robot_on
 from engram.robot.mapping import MapReport, map_drive
 from engram.robot.recording import ExtractReport, extract_log
 from engram.robot.results import localise_drive, measure, measured, summarise
 from engram.robot.robot import Robot
 from engram.robot.session import DriveSequence, open_drive, session_of_drive
 from engram.robot.settings import RobotOptions, Settings, load_settings
+from engram.robot.starting import robot_on
 
 __all__ = [
     "DriveSequence",

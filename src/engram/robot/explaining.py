@@ -26,9 +26,9 @@ from engram.ranking import (
     reasons_of,
 )
 from engram.robot.front import arriving
-from engram.robot.localisers import robot_on
 from engram.robot.session import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,10 +34,7 @@ from engram.ranking import (
     policy_named,
     uses_words,
 )
-from engram.robot.front import Front
-from engram.robot.robot import Robot
-from engram.robot.session import DriveSequence, session_of_drive
-from engram.robot.settings import RobotOptions, Settings
+from engram.robot.settings import Settings
 
 
 def localiser_in(
@@ -100,58 +97,6 @@ def localiser_in(
         background=background,
         clock=clock,
     )
-
-
-def robot_on(
-    opened: Map,
-    sequence: DriveSequence,
-    settings: Settings,
-    options: RobotOptions | None = None,
-    policy: RankingPolicy | None = None,
-) -> Robot:
-    """A robot that localises a drive in a map, and keeps nothing.
-
-    Args:
-        opened: the map.
-        sequence: the drive, for `Robot.drive`.
-        settings: the resolved configuration.
-        options: how; None for the defaults.
-        policy: in place of that of the options.
-
-    Raises:
-        ConfigError: there is no such policy or relocaliser.
-        SequenceError: the drive has no usable frame.
-    """
-    options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
-    localiser = localiser_in(
-        opened,
-        sequence.camera,
-        settings,
-        policy=policy or options.policy,
-        budget=options.budget,
-        relocaliser=options.relocaliser,
-        live=session_of_drive(sequence).id,
-        threads=options.threads,
-        clock=sequence.info,
-    )
-    return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
-
-
-def robot_in(
-    opened: Map, camera: StereoCamera, settings: Settings | None, options: RobotOptions
-) -> Robot:
-    """See `Map.robot`."""
-    settings = (settings or Settings()).for_descriptor(opened.descriptor)
-    localiser = localiser_in(
-        opened,
-        camera,
-        settings,
-        policy=options.policy,
-        budget=options.budget,
-        relocaliser=options.relocaliser,
-        threads=options.threads,
-    )
-    return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
 
 
 def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Relocaliser:

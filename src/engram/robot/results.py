@@ -13,9 +13,9 @@ from engram.maps import Map
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.odometry.motion import driven_steps_m
-from engram.robot.localisers import robot_on
 from engram.robot.session import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
 
 
 def localise_drive(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Self
@@ -25,6 +25,7 @@ from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion
 from engram.robot.front import Arrived, Front, arriving, paced
+from engram.robot.live import LiveKeeper, Saving
 from engram.sequences import FrameSequence, StereoSequence
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.
@@ -60,7 +61,6 @@ class Robot:
         localiser: of this drive.
         keeper: what becomes of what is found.
         deadline_ms: of each frame; None for none.
-        close: called when the robot is closed, with whether the drive ended well.
     """
 
     def __init__(
@@ -70,26 +70,41 @@ class Robot:
         keeper: Keeper = KEEPS_NOTHING,
         *,
         deadline_ms: float | None = None,
-        close: Callable[[bool], None] | None = None,
     ) -> None:
         self.last: Seen | None = None
-        self.keeper = keeper
+        self._keeper = keeper
+        self._live = keeper if isinstance(keeper, LiveKeeper) else None
         self._front = front
         self._localiser = localiser
         self._deadline_ms = deadline_ms
-        self._close = close
+        self._saving = Saving() if self._live is None else self._live.saving
         self._stamp_ns: int | None = None
         self._track: deque[tuple[int, Localisation]] = deque(maxlen=_REMEMBERED)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._end(well=kind is None)
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
-        """Ends the drive, and the robot's threads; what it keeps becomes part of the map."""
-        self._end(well=True)
+        """Ends the drive, and the robot's threads; what a live robot keeps becomes a revision.
+
+        Raises:
+            MapError: it cannot be written, though nothing had failed while the robot drove; see
+                `saving`.
+        """
+        live, self._live = self._live, None
+        try:
+            if live is not None:
+                live.close()
+        finally:
+            self._localiser.close()
+
+    @property
+    def saving(self) -> Saving:
+        """Whether what a live robot finds is saved, and where it came to."""
+        return self._saving
 
     def step(
         self,
@@ -126,8 +141,8 @@ class Robot:
         self._localiser.move(motion)
         found = self._known(frame, motion)
         if found is None:
-            found = self._localiser.localise(frame, deadline, self.keeper, clock)
-        found = self.keeper.keep(frame, found)
+            found = self._localiser.localise(frame, deadline, self._keeper, clock)
+        found = self._keeper.keep(frame, found)
         if deadline is not None and time.perf_counter() > deadline:
             found = replace(found, late=True)
         self.last = Seen(arrived, frame, self._localiser.outcomes)
@@ -219,7 +234,7 @@ class Robot:
 
     def _known(self, frame: Frame, motion: Motion) -> Localisation | None:
         """What the keeper knows of the frame: the robot is placed there, or needs no looking."""
-        hint = self.keeper.hint(frame, motion)
+        hint = self._keeper.hint(frame, motion)
         if hint is None:
             return None
         if hint.position is not None:
@@ -227,7 +242,7 @@ class Robot:
         return hint.found
 
     def _checked(self, arrived: Arrived) -> Arrived:
-        """The same; time only goes on.
+        """The same; time only goes on. With the first one the drive of a live robot begins.
 
         Raises:
             InputError: it does not.
@@ -238,16 +253,10 @@ class Robot:
                 f"stamp {pair.stamp_ns} ns is not later than {self._stamp_ns} ns, that of the "
                 "frame before; give the frames of a drive in the order of time, each once"
             )
+        if self._stamp_ns is None and self._live is not None:
+            self._live.begin(arrived)
         self._stamp_ns = pair.stamp_ns
         return arrived
-
-    def _end(self, *, well: bool) -> None:
-        close, self._close = self._close, None
-        try:
-            if close is not None:
-                close(well)
-        finally:
-            self._localiser.close()
 
 
 def _word(found: Localisation) -> str:

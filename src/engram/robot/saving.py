@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import __version__
-from engram.config import plain
+from engram.config import to_dict
 from engram.frontend import DescriptorKind, Frame
 from engram.geometry import StereoCamera
 from engram.graph.model import Session
@@ -55,7 +55,7 @@ class SavedDrive:
         self._stack = ExitStack()
         loops = self._stack.enter_context(loop_search(opened, localiser, settings))
         self.mapper = Mapper(
-            opened.graph,
+            localiser.graph,
             localiser,
             self._saver,
             writer.session,
@@ -121,8 +121,8 @@ def begin_or_resume(
 def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any]:
     """The resolved configuration, which every revision keeps (STYLE: reproducible)."""
     return {
-        "settings": plain(settings),
-        "options": plain(options),
+        "settings": to_dict(settings),
+        "options": to_dict(options),
         "machine": platform.machine(),
         "engram": __version__,
     }
@@ -150,7 +150,7 @@ def loop_search(
         return nullcontext()
     matching = settings.localiser
     return LoopSearch(
-        opened.graph,
+        localiser.graph,
         finder.book,
         FrameMatcher(opened.frames, matching.matcher),
         matching.acceptance,
