@@ -57,27 +57,38 @@ def extract(
 # --- graph search
 
 def pivoted_error(covariance: NDArray[np.float64]) -> NDArray[np.float64]: ...
+
+class GraphArrays:
+    def __init__(
+        self,
+        first_half: NDArray[np.int32],
+        next_half: NDArray[np.int32],
+        target: NDArray[np.int32],
+        a_from_b: NDArray[np.float64],
+        errors: NDArray[np.float64],
+        sessions: NDArray[np.int32],
+        driven_m: NDArray[np.float64],
+    ) -> None: ...
+
+class CandidateLimits:
+    radius_m: float
+    margin_m: float
+    view_gate_rad: float
+    slack_sigmas: float
+    slack_m: float
+    vague_m: float
+    detour_m: float
+    own_session: int
+    own_driven_m: float
+    own_exclusion_m: float
+    def __init__(self) -> None: ...
+
 def graph_candidates(
-    first_half: NDArray[np.int32],
-    next_half: NDArray[np.int32],
-    target: NDArray[np.int32],
-    a_from_b: NDArray[np.float64],
-    errors: NDArray[np.float64],
+    graph: GraphArrays,
     reference: int,
     reference_from_live: NDArray[np.float64],
     live_error: NDArray[np.float64],
-    radius_m: float,
-    margin_m: float,
-    view_gate_rad: float,
-    slack_sigmas: float,
-    slack_m: float,
-    vague_m: float,
-    detour_m: float,
-    sessions: NDArray[np.int32],
-    driven_m: NDArray[np.float64],
-    own_session: int,
-    own_driven_m: float,
-    own_exclusion_m: float,
+    limits: CandidateLimits,
 ) -> tuple[
     NDArray[np.int32],
     NDArray[np.float64],
@@ -90,11 +101,7 @@ def graph_candidates(
     NDArray[np.float64],
 ]: ...
 def graph_chains(
-    first_half: NDArray[np.int32],
-    next_half: NDArray[np.int32],
-    target: NDArray[np.int32],
-    a_from_b: NDArray[np.float64],
-    errors: NDArray[np.float64],
+    graph: GraphArrays,
     root: int,
     goals: NDArray[np.int32],
     usable: NDArray[np.uint8] | None = None,
@@ -180,7 +187,7 @@ def attempt(
 # --- ordering
 
 def order_rows(
-    nodes: NDArray[np.int32], uuid_words: NDArray[np.uint64], *keys: NDArray[np.float64]
+    uuid_words: NDArray[np.uint64], *keys: NDArray[np.float64]
 ) -> NDArray[np.int64]: ...
 def success_rates(
     rates: NDArray[np.float64],
@@ -191,79 +198,93 @@ def success_rates(
 
 # --- recall
 
+class RecallRun:
+    def __init__(
+        self,
+        driven_m: float,
+        at_m: NDArray[np.float64],
+        nodes: NDArray[np.int32],
+        sessions: NDArray[np.int32],
+        distance_m: NDArray[np.float64],
+        rates: NDArray[np.float64],
+        accepted: NDArray[np.bool_],
+        inliers: NDArray[np.int64],
+    ) -> None: ...
+
+class RecallCandidates:
+    def __init__(
+        self,
+        nodes: NDArray[np.int32],
+        sessions: NDArray[np.int32],
+        costs: NDArray[np.float64],
+        prior: NDArray[np.float64],
+        session_count: int,
+    ) -> None: ...
+
+class RecallConstants:
+    per_m: float
+    level: float
+    memory_m: float
+    prior_weight: float
+    regret: float
+    tally: float
+    tally_memory_m: float
+    untried_rate: float
+    untried_attempts: float
+    needed: int
+    attempts: int
+    picks: int
+    shortlist: int
+    def __init__(self) -> None: ...
+
 def recall_order(
-    driven_m: float,
-    at_m: NDArray[np.float64],
-    attempted: NDArray[np.int32],
-    distance_m: NDArray[np.float64],
-    rates: NDArray[np.float64],
-    accepted: NDArray[np.bool_],
-    inliers: NDArray[np.int64],
-    nodes: NDArray[np.int32],
-    costs: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    sessions: NDArray[np.int32],
-    session_count: int,
-    *,
-    per_m: float,
-    level: float,
-    memory_m: float,
-    prior_weight: float,
-    regret: float,
-    tally: float,
-    tally_memory_m: float,
-    untried_rate: float,
-    untried_count: float,
-    needed: int,
-    attempts: int,
-    picks: int,
-    shortlist: int,
+    run: RecallRun, candidates: RecallCandidates, constants: RecallConstants
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
 
 # --- path memory
 
-def co_occurrence(
-    bits: NDArray[np.uint64],
-    path_count: int,
-    a: NDArray[np.int32],
-    b: NDArray[np.int32],
-    excluded: int = -1,
-) -> NDArray[np.int32]: ...
+class PathBits:
+    def __init__(self, bits: NDArray[np.uint64], count: int) -> None: ...
+
+class PathEvidence:
+    def __init__(
+        self,
+        observed: NDArray[np.int32],
+        outcomes: NDArray[np.bool_],
+        reference: int,
+        excluded: int,
+        alpha: float,
+        gamma: float,
+    ) -> None: ...
+
+class PathCandidates:
+    def __init__(
+        self,
+        nodes: NDArray[np.int32],
+        along_m: NDArray[np.float64],
+        across_m: NDArray[np.float64],
+        distance_m: NDArray[np.float64],
+        uuid_words: NDArray[np.uint64],
+    ) -> None: ...
 
 class ObservedPaths:
     def __init__(self) -> None: ...
     def add(self, node: int, path: int) -> None: ...
 
+def co_occurrence(
+    paths: PathBits, a: NDArray[np.int32], b: NDArray[np.int32], excluded: int = -1
+) -> NDArray[np.int32]: ...
 def path_scores(
-    known: ObservedPaths,
-    bits: NDArray[np.uint64],
-    path_count: int,
-    candidates: NDArray[np.int32],
-    observed: NDArray[np.int32],
-    outcomes: NDArray[np.bool_],
-    reference: int,
-    alpha: float,
-    gamma: float,
-    excluded: int = -1,
+    known: ObservedPaths, paths: PathBits, candidates: NDArray[np.int32], evidence: PathEvidence
 ) -> NDArray[np.float64]: ...
 def path_order(
     known: ObservedPaths,
-    bits: NDArray[np.uint64],
-    path_count: int,
-    candidates: NDArray[np.int32],
-    along_m: NDArray[np.float64],
-    across_m: NDArray[np.float64],
-    distance_m: NDArray[np.float64],
-    uuid_words: NDArray[np.uint64],
+    paths: PathBits,
+    candidates: PathCandidates,
+    evidence: PathEvidence,
     basin_rates: NDArray[np.float64],
     bin_m: float,
     level: float,
-    observed: NDArray[np.int32],
-    outcomes: NDArray[np.bool_],
-    reference: int,
-    alpha: float,
-    gamma: float,
-    excluded: int = -1,
 ) -> NDArray[np.int64]: ...
 
 # --- places: vocabularies of binary words, and which places show them

@@ -8,6 +8,7 @@ from tests.worlds import covariance_of, make_node, session_uuid
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind
+from engram.graph.neighbourhood import Search
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
 
 GATE_RAD = np.deg2rad(60)
@@ -133,10 +134,12 @@ class _Drive:
             self.reference,
             self.reference_from_live,
             self.covariance,
-            radius_m=max(8.0, MATCH_BASIN_M + 2 * sigma_m),
-            view_gate_rad=GATE_RAD,
-            own_session=session_uuid(self.session),
-            own_driven_m=float(step),
+            Search(
+                max(8.0, MATCH_BASIN_M + 2 * sigma_m),
+                GATE_RAD,
+                own_session=session_uuid(self.session),
+                own_driven_m=float(step),
+            ),
         )
 
     def _judge(self, step: int, near, world_from_live: SE3) -> None:

@@ -13,6 +13,7 @@ from engram.errors import InputError
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind
+from engram.graph.neighbourhood import Search, SearchConfig
 
 TIGHT = covariance_of(1e-3, 1e-4)
 
@@ -67,8 +68,9 @@ def test_neighbourhood_equals_plain_python(
     root = rng.normal(size=(6, 6)) * 0.03
     found = graph.neighbourhood(
         5, reference_from_live, root @ root.T,
-        radius_m=radius_m, view_gate_rad=gate_rad, margin_m=margin_m, slack_sigmas=0.0,
-        vague_m=vague_m, detour_m=detour_m,
+        Search(radius_m, gate_rad, config=SearchConfig(
+            margin_m=margin_m, slack_sigmas=0.0, vague_m=vague_m, detour_m=detour_m
+        )),
     )  # fmt: skip
     expected = oracle.neighbourhood(
         graph, 5, reference_from_live, root @ root.T,
@@ -149,9 +151,7 @@ def test_heading_error_swings_what_lies_far_along_the_chain() -> None:
         graph.add_node(node)
     for a, b in itertools.pairwise(nodes):
         graph.add_edge(make_edge(a.id, b.id, forward(1.0), sigma=(1e-9, 0.01)))
-    near = graph.neighbourhood(
-        100, SE3.identity(), np.zeros((6, 6)), radius_m=200.0, view_gate_rad=3.2
-    )
+    near = graph.neighbourhood(100, SE3.identity(), np.zeros((6, 6)), Search(200.0, 3.2))
     far = near.nodes.tolist().index(0)
     assert near.sigma_m[far] == pytest.approx(
         0.01 * np.sqrt(np.sum(np.arange(1, 101) ** 2)), rel=0.02
@@ -161,15 +161,17 @@ def test_heading_error_swings_what_lies_far_along_the_chain() -> None:
 def test_own_recent_nodes_are_gone_through_but_are_no_candidates() -> None:
     graph, _ = chain_graph(60)
     near = graph.neighbourhood(
-        59, SE3.identity(), TIGHT, radius_m=40.0, view_gate_rad=1.0,
-        own_session=session_uuid(0), own_driven_m=59.0, slack_sigmas=0.0,
-    )  # fmt: skip
+        59,
+        SE3.identity(),
+        TIGHT,
+        Search(40.0, 1.0, session_uuid(0), 59.0, config=SearchConfig(slack_sigmas=0.0)),
+    )
     assert sorted(near.nodes.tolist()) == list(range(19, 30))
 
 
 def test_reference_far_behind_does_not_cut_the_search_off() -> None:
     graph, _ = chain_graph(60)
-    near = graph.neighbourhood(0, forward(50.0), TIGHT, radius_m=3.0, view_gate_rad=1.0)
+    near = graph.neighbourhood(0, forward(50.0), TIGHT, Search(3.0, 1.0))
     assert {47, 50, 53} <= set(near.nodes.tolist())
 
 
@@ -182,10 +184,10 @@ def test_a_loop_out_of_the_radius_and_back_is_followed_within_the_margin() -> No
         graph.add_node(node)
     for (a, b), step in zip(itertools.pairwise(nodes), steps, strict=True):
         graph.add_edge(make_edge(a.id, b.id, step))
-    near = graph.neighbourhood(0, SE3.identity(), TIGHT, radius_m=8.0, view_gate_rad=3.2)
+    near = graph.neighbourhood(0, SE3.identity(), TIGHT, Search(8.0, 3.2))
     assert len(steps) in near.nodes
     narrow = graph.neighbourhood(
-        0, SE3.identity(), TIGHT, radius_m=8.0, view_gate_rad=3.2, margin_m=2.0
+        0, SE3.identity(), TIGHT, Search(8.0, 3.2, config=SearchConfig(margin_m=2.0))
     )
     assert len(steps) not in narrow.nodes
 
@@ -196,8 +198,11 @@ def test_uncertain_candidates_are_kept_though_predicted_just_outside() -> None:
     graph.add_node(other)
     graph.add_edge(make_edge(nodes[0].id, other.id, forward(9.0), EdgeKind.PROXIMITY, (1.0, 0.1)))
     query = {"radius_m": 8.0, "view_gate_rad": 1.0}
-    loose = graph.neighbourhood(0, SE3.identity(), TIGHT, **query)
-    strict = graph.neighbourhood(0, SE3.identity(), TIGHT, slack_sigmas=0.0, **query)
+    loose = graph.neighbourhood(0, SE3.identity(), TIGHT, Search(**query))
+    strictly = SearchConfig(slack_sigmas=0.0)
+    strict = graph.neighbourhood(
+        0, SE3.identity(), TIGHT, Search(**query, config=strictly)
+    )
     assert 2 in loose.nodes
     assert 2 not in strict.nodes
 
@@ -207,9 +212,12 @@ def test_a_vague_chain_does_not_bring_near_what_is_known_to_be_elsewhere() -> No
     gap = make_edge(nodes[0].id, nodes[35].id, forward(30.0), EdgeKind.PROXIMITY, (15.0, 0.1))
     graph.add_edge(gap)
     query = {"radius_m": 8.0, "view_gate_rad": 1.0}
-    taken_in = graph.neighbourhood(0, SE3.identity(), TIGHT, detour_m=0.0, **query)
+    direct = SearchConfig(detour_m=0.0)
+    taken_in = graph.neighbourhood(
+        0, SE3.identity(), TIGHT, Search(**query, config=direct)
+    )
     assert {35, 36}.issubset(taken_in.nodes.tolist())
-    near = graph.neighbourhood(0, SE3.identity(), TIGHT, **query)
+    near = graph.neighbourhood(0, SE3.identity(), TIGHT, Search(**query))
     assert sorted(near.nodes.tolist()) == list(range(9))
 
 
@@ -259,7 +267,7 @@ def test_many_nodes_survive_the_growing_of_the_arrays() -> None:
     graph, nodes = chain_graph(100)
     assert [graph.index(node.id) for node in nodes] == list(range(100))
     assert graph.driven_m.tolist() == [float(i) for i in range(100)]
-    words = graph.uuid_words[42].tolist()
+    words = graph.uuid_words_of(np.array([42], np.int32))[0].tolist()
     assert (words[0] << 64) | words[1] == nodes[42].id.int
 
 
@@ -285,4 +293,4 @@ def test_a_reference_that_is_not_there_is_refused() -> None:
     graph, _ = chain_graph(2)
     for reference in (-1, 2):
         with pytest.raises(ValueError, match="reference"):
-            graph.neighbourhood(reference, SE3.identity(), TIGHT, radius_m=8.0, view_gate_rad=1.0)
+            graph.neighbourhood(reference, SE3.identity(), TIGHT, Search(8.0, 1.0))

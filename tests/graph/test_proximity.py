@@ -8,6 +8,7 @@ from tests.worlds import covariance_of, forward, make_edge, make_node
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind
+from engram.graph.neighbourhood import Search
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
 
 # Per step of 1 m: 1 % of the way and 0.02 degrees, fresh at each step.
@@ -141,7 +142,7 @@ def test_a_chain_lost_from_the_start_is_joined_backwards_once_it_is_found() -> N
     laid = tighten_chain(graph, indices)
     assert min(graph.index(edge.b) for edge in laid) - indices[0] < 6
     near = graph.neighbourhood(
-        indices[0], SE3.identity(), covariance_of(0.01, 0.001), radius_m=3.0, view_gate_rad=1.0
+        indices[0], SE3.identity(), covariance_of(0.01, 0.001), Search(3.0, 1.0)
     )
     assert 0 in near.nodes
 

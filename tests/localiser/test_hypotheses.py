@@ -11,7 +11,7 @@ from engram.frontend.matching import Match
 from engram.geometry import SE3, CameraId
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser import AcceptanceConfig, Position
 from engram.localiser.attempts import Candidate, Outcome
 from engram.localiser.hypotheses import Hypotheses
@@ -44,8 +44,7 @@ def near(position: Position) -> Neighbourhood:
         GRAPH.index(position.node),
         position.node_from_live,
         position.covariance,
-        radius_m=8.0,
-        view_gate_rad=1.0,
+        Search(radius_m=8.0, view_gate_rad=1.0),
     )
 
 

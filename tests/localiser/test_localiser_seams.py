@@ -54,9 +54,9 @@ def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candida
         matcher = _Counting(opened.frames, Settings().localiser.matcher)
         searched = []
 
-        def search(*args, **options):
+        def search(*args):
             searched.append(args)
-            return opened.graph.neighbourhood(*args, **options)
+            return opened.graph.neighbourhood(*args)
 
         with localiser_in(
             opened,
@@ -86,9 +86,9 @@ def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_
     radii_m = []
     with Map.open(path) as opened:
 
-        def search(*args, **options):
-            radii_m.append(options["radius_m"])
-            return opened.graph.neighbourhood(*args, **options)
+        def search(*args):
+            radii_m.append(args[-1].radius_m)
+            return opened.graph.neighbourhood(*args)
 
         settings = Settings()
         with localiser_in(

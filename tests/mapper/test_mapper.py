@@ -13,6 +13,7 @@ from engram.frontend import FrameStatus
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntryKind
+from engram.graph.neighbourhood import Search
 from engram.maps import Map
 from engram.odometry import OdometryStatus, OdometryStep
 
@@ -88,7 +89,7 @@ def test_a_parallel_experience_is_in_the_neighbourhood(path: Path) -> None:
     seen_count = beside_count = 0
     for node, world_from_node in first.saved.items():
         near = graph.neighbourhood(
-            graph.index(node), SE3.identity(), np.zeros((6, 6)), radius_m=8.0, view_gate_rad=1.0
+            graph.index(node), SE3.identity(), np.zeros((6, 6)), Search(8.0, 1.0)
         )
         found = set(graph.node_ids(near.nodes))
         for other, world_from_other in second.saved.items():

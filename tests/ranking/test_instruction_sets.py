@@ -9,6 +9,8 @@ import numpy as np
 
 from engram import _core
 from engram.geometry import SE3
+from engram.graph.neighbourhood import Search
+from engram.ranking.path import PathPolicy
 from engram.ranking.recall import RecallPolicy
 from engram_lab.bench.synthetic import SyntheticPlace
 
@@ -27,18 +29,8 @@ def digest() -> str:
     for path_count in (0, 1, 150, 700):
         context = SyntheticPlace(path_count).context()
         parts.append(RecallPolicy().judge(context).chances.tobytes())
-        parts.append(
-            context.path_memory.scores(
-                context.neighbourhood.nodes,
-                context.observations.nodes,
-                context.observations.succeeded,
-                context.reference,
-                excluded=context.own_path,
-            ).tobytes()
-        )
-    near = random_graph(1).neighbourhood(
-        5, SE3.identity(), 0.01 * np.eye(6), radius_m=12.0, view_gate_rad=3.2
-    )
+        parts.append(PathPolicy().scores(context, context.neighbourhood.nodes).tobytes())
+    near = random_graph(1).neighbourhood(5, SE3.identity(), 0.01 * np.eye(6), Search(12.0, 3.2))
     parts += [near.nodes.tobytes(), near.node_from_live.tobytes(), near.sigma_m.tobytes()]
     return hashlib.sha256(b"".join(parts)).hexdigest()
 

@@ -15,8 +15,14 @@ from engram.ranking.path import PathPolicy
 from engram.ranking.path_near import PathNearPolicy
 
 
+def scores_of(memory: PathMemory, candidates, *evidence, **options) -> np.ndarray:
+    """(Y,) log posterior of candidates, given W, z and k."""
+    return memory.scores(candidates, memory.evidence(*evidence, **options))
+
+
 def posterior_of(memory: PathMemory, candidates, observed, outcomes, reference, **options):
-    scores = memory.scores(
+    scores = scores_of(
+        memory,
         np.array(candidates, np.int32),
         np.array(observed, np.int32),
         np.array(outcomes, np.bool_),
@@ -185,7 +191,7 @@ def test_scores_equal_numpy_for_any_number_of_observations(count: int) -> None:
     counts = membership[candidates].astype(float) @ membership[observed].T
     theta = (counts + 0.5) / (counts + 0.5).sum(axis=1, keepdims=True)
     expected = np.log(np.where(outcomes, theta, 1 - theta)).sum(axis=1)
-    scores = memory.scores(candidates, observed, outcomes, None, alpha=0.5)
+    scores = scores_of(memory, candidates, observed, outcomes, None, alpha=0.5)
     np.testing.assert_allclose(scores, expected, rtol=1e-12)
 
 
@@ -225,21 +231,22 @@ def test_what_is_kept_from_frame_to_frame_changes_no_score(data) -> None:
             np.array([n % 2 == 0 for n in observed], np.bool_),
             3,
         )
-        np.testing.assert_array_equal(kept.scores(*situation), fresh.scores(*situation))
+        np.testing.assert_array_equal(scores_of(kept, *situation), scores_of(fresh, *situation))
 
 
 def test_a_node_observed_twice_is_refused_and_harms_nothing() -> None:
     memory = memory_of(flat_graph(10), EXAMPLE_PATHS)
-    before = memory.scores(*_example())
+    before = scores_of(memory, *_example())
     for observed in ([1, 2, 1], [1, 2, 3, 4, 8, 8]):
         with pytest.raises(ValueError, match="twice"):
-            memory.scores(
+            scores_of(
+                memory,
                 np.array([5, 9], np.int32),
                 np.array(observed, np.int32),
                 np.ones(len(observed), np.bool_),
                 4,
             )
-        np.testing.assert_array_equal(memory.scores(*_example()), before)
+        np.testing.assert_array_equal(scores_of(memory, *_example()), before)
 
 
 def _example():

@@ -12,6 +12,7 @@ from engram.errors import ConfigError
 from engram.graph.basin import BASIN_LEVEL
 from engram.ranking import Foreseen, RankingContext, policy_named, policy_names
 from engram.ranking.context import order_by
+from engram.ranking.path import PathPolicy
 
 
 @st.composite
@@ -197,11 +198,9 @@ def test_path_near_ranks_by_distance_beyond_the_basin_and_the_published_formula_
 @given(context=contexts())
 @settings(max_examples=60, deadline=None)
 def test_path_near_is_the_formula_within_the_basin_and_distance_beyond(context) -> None:
-    near, seen = context.neighbourhood, context.observations
+    near = context.neighbourhood
     beyond = context.success_rates() < BASIN_LEVEL
-    scores = context.path_memory.scores(
-        near.nodes, seen.nodes, seen.succeeded, context.reference, excluded=context.own_path
-    )
+    scores = PathPolicy().scores(context, near.nodes)
     # The core adds up in another order: what differs in its last bits only may stand in either.
     scores = np.where(beyond, 0, scores.round(9))
     order, expected = policy_named("path-near").rank(context), order_by(context, beyond, -scores)
@@ -218,7 +217,7 @@ def test_path_near_refuses_arrays_that_do_not_fit() -> None:
         dataclasses.replace(near, distance_m=near.distance_m[:1]),
         dataclasses.replace(near, along_m=near.along_m[:1]),
     ):
-        with pytest.raises(ValueError, match=r"node 99|one offset and one distance"):
+        with pytest.raises((IndexError, ValueError), match=r"index 99|one offset and one distance"):
             policy_named("path-near").rank(dataclasses.replace(context, neighbourhood=broken))
 
 

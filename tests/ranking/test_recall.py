@@ -297,57 +297,62 @@ class TestPicking:
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
     one, node = np.zeros(1), np.zeros(1, np.int32)
-    good = {
-        "driven_m": 0.0,
-        "at_m": one,
-        "attempted": node,
-        "distance_m": one,
-        "rates": one,
-        "accepted": np.ones(1, np.bool_),
-        "inliers": np.full(1, 30),
-        "nodes": node,
-        "costs": one,
-        "prior": one,
-        "sessions": node,
-        "session_count": 1,
-        "per_m": 1.0,
-        "level": 0.5,
-        "memory_m": 1.0,
-        "prior_weight": 1.0,
-        "regret": 1.0,
-        "tally": 0.5,
-        "tally_memory_m": 1.0,
-        "untried_rate": 0.3,
-        "untried_count": 1.0,
-        "needed": 20,
-        "attempts": 10,
-        "picks": 1,
-        "shortlist": 1,
+    groups = {
+        _core.RecallRun: {
+            "driven_m": 0.0,
+            "at_m": one,
+            "nodes": node,
+            "sessions": node,
+            "distance_m": one,
+            "rates": one,
+            "accepted": np.ones(1, np.bool_),
+            "inliers": np.full(1, 30),
+        },
+        _core.RecallCandidates: {
+            "nodes": node,
+            "sessions": node,
+            "costs": one,
+            "prior": one,
+            "session_count": 1,
+        },
     }
-    _core.recall_order(**good)
+    good_run, good_candidates = (make(**values) for make, values in groups.items())
+    constants = RecallPolicy()._bound
+    _core.recall_order(good_run, good_candidates, constants)
+    for make, name, bad in (
+        (_core.RecallRun, "at_m", np.zeros(2)),
+        (_core.RecallRun, "sessions", np.zeros(2, np.int32)),
+        (_core.RecallRun, "distance_m", np.zeros(0)),
+        (_core.RecallRun, "rates", np.zeros(2)),
+        (_core.RecallRun, "accepted", np.ones(2, np.bool_)),
+        (_core.RecallRun, "inliers", np.ones(2, np.int64)),
+        (_core.RecallCandidates, "costs", np.zeros(2)),
+        (_core.RecallCandidates, "prior", np.zeros(0)),
+    ):
+        with pytest.raises(ValueError, match="recall_order"):
+            make(**{**groups[make], name: bad})
+    elsewhere = _core.RecallRun(**{**groups[_core.RecallRun], "sessions": np.ones(1, np.int32)})
+    nowhere = _core.RecallCandidates(
+        **{**groups[_core.RecallCandidates], "sessions": np.full(1, -1, np.int32)}
+    )
+    for run, candidates in ((elsewhere, good_candidates), (good_run, nowhere)):
+        with pytest.raises(ValueError, match="no such session"):
+            _core.recall_order(run, candidates, constants)
     for name, bad in (
-        ("at_m", np.zeros(2)),
-        ("attempted", np.ones(1, np.int32)),
-        ("distance_m", np.zeros(0)),
-        ("rates", np.zeros(2)),
-        ("accepted", np.ones(2, np.bool_)),
-        ("inliers", np.ones(2, np.int64)),
-        ("nodes", np.full(1, -1, np.int32)),
-        ("costs", np.zeros(2)),
-        ("prior", np.zeros(0)),
-        ("sessions", np.ones(1, np.int32)),
         ("memory_m", 0.0),
         ("tally_memory_m", np.nan),
         ("prior_weight", 0.0),
         ("regret", -1.0),
         ("untried_rate", 0.0),
-        ("untried_count", -1.0),
+        ("untried_attempts", -1.0),
         ("needed", 0),
         ("attempts", -1),
         ("picks", -1),
     ):
+        constants = RecallPolicy()._bound
+        setattr(constants, name, bad)
         with pytest.raises(ValueError, match="recall_order"):
-            _core.recall_order(**{**good, name: bad})
+            _core.recall_order(good_run, good_candidates, constants)
 
 
 def test_path_memory_is_left_alone() -> None:

@@ -15,22 +15,37 @@ namespace {
 
 using engram::Input;
 
-engram::GraphView view_of(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
-                          const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
-                          const Input<double, 2> &errors) {
-  const size_t edges = a_from_b.shape(0);
-  if (next_half.shape(0) != 2 * edges || target.shape(0) != 2 * edges ||
-      errors.shape(0) != edges || a_from_b.shape(1) != 12 || errors.shape(1) != 8)
-    throw std::invalid_argument("graph arrays: expected next_half and target (2E,), a_from_b "
-                                "(E, 12), errors (E, 8)");
-  return {static_cast<int64_t>(first_half.shape(0)),
-          static_cast<int64_t>(edges),
-          first_half.data(),
-          next_half.data(),
-          target.data(),
-          a_from_b.data(),
-          errors.data()};
-}
+// Holds on to a graph's arrays; checked once, so that the searches need not.
+struct Graph {
+  Input<int32_t, 1> first_half, next_half, target;
+  Input<double, 2> a_from_b, errors;
+  Input<int32_t, 1> sessions;
+  Input<double, 1> driven_m;
+
+  Graph(Input<int32_t, 1> first_half, Input<int32_t, 1> next_half, Input<int32_t, 1> target,
+        Input<double, 2> a_from_b, Input<double, 2> errors, Input<int32_t, 1> sessions,
+        Input<double, 1> driven_m)
+      : first_half(first_half), next_half(next_half), target(target), a_from_b(a_from_b),
+        errors(errors), sessions(sessions), driven_m(driven_m) {
+    const size_t nodes = first_half.shape(0), edges = a_from_b.shape(0);
+    if (next_half.shape(0) != 2 * edges || target.shape(0) != 2 * edges ||
+        errors.shape(0) != edges || a_from_b.shape(1) != 12 || errors.shape(1) != 8 ||
+        sessions.shape(0) != nodes || driven_m.shape(0) != nodes)
+      throw std::invalid_argument(
+          "graph arrays: expected next_half and target (2E,), a_from_b (E, 12), errors (E, 8), "
+          "sessions and driven_m as long as first_half (N,)");
+  }
+
+  engram::GraphView view() const {
+    return {static_cast<int64_t>(first_half.shape(0)),
+            static_cast<int64_t>(a_from_b.shape(0)),
+            first_half.data(),
+            next_half.data(),
+            target.data(),
+            a_from_b.data(),
+            errors.data()};
+  }
+};
 
 void check_node(const engram::GraphView &graph, int64_t node, const char *name) {
   if (node < 0 || node >= graph.node_count)
@@ -38,36 +53,20 @@ void check_node(const engram::GraphView &graph, int64_t node, const char *name) 
                                 ": the graph has " + std::to_string(graph.node_count) + " nodes");
 }
 
-auto graph_candidates(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
-                      const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
-                      const Input<double, 2> &errors, int64_t reference,
+auto graph_candidates(const Graph &arrays, int64_t reference,
                       const Input<double, 1> &reference_from_live,
-                      const Input<double, 1> &live_error, double radius_m, double margin_m,
-                      double view_gate_rad, double slack_sigmas, double slack_m, double vague_m,
-                      double detour_m, const Input<int32_t, 1> &sessions,
-                      const Input<double, 1> &driven_m, int32_t own_session, double own_driven_m,
-                      double own_exclusion_m) {
-  const engram::GraphView graph = view_of(first_half, next_half, target, a_from_b, errors);
+                      const Input<double, 1> &live_error, const engram::CandidateLimits &limits) {
+  const engram::GraphView graph = arrays.view();
   check_node(graph, reference, "reference");
-  if (reference_from_live.shape(0) != 12 || live_error.shape(0) != 5 ||
-      sessions.shape(0) != first_half.shape(0) || driven_m.shape(0) != first_half.shape(0))
-    throw std::invalid_argument("graph_candidates: expected reference_from_live (12,), live_error "
-                                "(5,), sessions and driven_m (N,)");
+  if (reference_from_live.shape(0) != 12 || live_error.shape(0) != 5)
+    throw std::invalid_argument(
+        "graph_candidates: expected reference_from_live (12,) and live_error (5,)");
   const engram::CandidateQuery query{static_cast<int32_t>(reference),
                                      reference_from_live.data(),
                                      live_error.data(),
-                                     radius_m,
-                                     margin_m,
-                                     view_gate_rad,
-                                     slack_sigmas,
-                                     slack_m,
-                                     vague_m,
-                                     detour_m,
-                                     sessions.data(),
-                                     driven_m.data(),
-                                     own_session,
-                                     own_driven_m,
-                                     own_exclusion_m};
+                                     limits,
+                                     arrays.sessions.data(),
+                                     arrays.driven_m.data()};
   engram::Candidates found;
   {
     nb::gil_scoped_release unlocked;
@@ -85,13 +84,11 @@ auto graph_candidates(const Input<int32_t, 1> &first_half, const Input<int32_t, 
                         engram::to_numpy(std::move(found.pivot_in_node), {count, 3}));
 }
 
-auto graph_chains(const Input<int32_t, 1> &first_half, const Input<int32_t, 1> &next_half,
-                  const Input<int32_t, 1> &target, const Input<double, 2> &a_from_b,
-                  const Input<double, 2> &errors, int64_t root, const Input<int32_t, 1> &goals,
+auto graph_chains(const Graph &arrays, int64_t root, const Input<int32_t, 1> &goals,
                   std::optional<Input<uint8_t, 1>> usable) {
-  const engram::GraphView graph = view_of(first_half, next_half, target, a_from_b, errors);
+  const engram::GraphView graph = arrays.view();
   check_node(graph, root, "root");
-  if (usable && usable->shape(0) != a_from_b.shape(0))
+  if (usable && usable->shape(0) != static_cast<size_t>(graph.edge_count))
     throw std::invalid_argument("graph_chains: expected usable (E,)");
   // The search counts each goal once, and finds it by halving.
   std::vector<int32_t> ascending(goals.data(), goals.data() + goals.shape(0));
@@ -135,13 +132,29 @@ auto pivoted_error(const Input<double, 2> &covariance) {
 void bind_graph_search(nb::module_ &module) {
   module.def("pivoted_error", &pivoted_error, "covariance"_a,
              "The error model (5,) tau, v, pivot of a covariance (6, 6).");
-  module.def("graph_candidates", &graph_candidates, "first_half"_a, "next_half"_a, "target"_a,
-             "a_from_b"_a, "errors"_a, "reference"_a, "reference_from_live"_a, "live_error"_a,
-             "radius_m"_a, "margin_m"_a, "view_gate_rad"_a, "slack_sigmas"_a, "slack_m"_a, "vague_m"_a,
-             "detour_m"_a, "sessions"_a, "driven_m"_a, "own_session"_a, "own_driven_m"_a, "own_exclusion_m"_a,
+  nb::class_<Graph>(module, "GraphArrays", "The arrays of an experience graph, checked for shape.")
+      .def(nb::init<Input<int32_t, 1>, Input<int32_t, 1>, Input<int32_t, 1>, Input<double, 2>,
+                    Input<double, 2>, Input<int32_t, 1>, Input<double, 1>>(),
+           "first_half"_a, "next_half"_a, "target"_a, "a_from_b"_a, "errors"_a, "sessions"_a,
+           "driven_m"_a);
+  nb::class_<engram::CandidateLimits>(module, "CandidateLimits",
+                                      "Which nodes are near; see `engram.graph.Search`.")
+      .def(nb::init<>())
+      .def_rw("radius_m", &engram::CandidateLimits::radius_m)
+      .def_rw("margin_m", &engram::CandidateLimits::margin_m)
+      .def_rw("view_gate_rad", &engram::CandidateLimits::view_gate_rad)
+      .def_rw("slack_sigmas", &engram::CandidateLimits::slack_sigmas)
+      .def_rw("slack_m", &engram::CandidateLimits::slack_m)
+      .def_rw("vague_m", &engram::CandidateLimits::vague_m)
+      .def_rw("detour_m", &engram::CandidateLimits::detour_m)
+      .def_rw("own_session", &engram::CandidateLimits::own_session)
+      .def_rw("own_driven_m", &engram::CandidateLimits::own_driven_m)
+      .def_rw("own_exclusion_m", &engram::CandidateLimits::own_exclusion_m);
+  module.def("graph_candidates", &graph_candidates, "graph"_a, "reference"_a,
+             "reference_from_live"_a, "live_error"_a, "limits"_a,
              "Columns of a Neighbourhood: the nodes near the live camera.");
-  module.def("graph_chains", &graph_chains, "first_half"_a, "next_half"_a, "target"_a,
-             "a_from_b"_a, "errors"_a, "root"_a, "goals"_a, "usable"_a = nb::none(),
+  module.def("graph_chains", &graph_chains, "graph"_a, "root"_a, "goals"_a,
+             "usable"_a = nb::none(),
              "Least uncertain chains from a root: nodes (N,), parent rows (N,), half edges (N,), "
              "root_from_node (N, 12), errors (N, 6: tau, s0, s1, s2).");
 }

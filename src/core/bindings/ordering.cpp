@@ -3,7 +3,6 @@
 #include "bindings/arrays.hpp"
 
 #include <stdexcept>
-#include <string>
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -12,28 +11,22 @@ namespace {
 
 using engram::Input;
 
-auto order_rows(const Input<int32_t, 1> &nodes, const Input<uint64_t, 2> &uuid_words,
-                const nb::args &arguments) {
-  const size_t count = nodes.shape(0);
+auto order_rows(const Input<uint64_t, 2> &uuid_words, const nb::args &arguments) {
+  const size_t count = uuid_words.shape(0);
   if (uuid_words.shape(1) != 2)
-    throw nb::value_error("order_rows: uuid_words must have shape (N, 2)");
-  for (size_t i = 0; i < count; ++i)
-    if (nodes.data()[i] < 0 || static_cast<size_t>(nodes.data()[i]) >= uuid_words.shape(0))
-      throw nb::index_error(
-          ("order_rows: no node " + std::to_string(nodes.data()[i])).c_str());
+    throw nb::value_error("order_rows: uuid_words must have shape (Y, 2)");
   std::vector<Input<double, 1>> held;
   std::vector<const double *> keys;
   for (const nb::handle &argument : arguments) {
     held.push_back(nb::cast<Input<double, 1>>(argument));
     if (held.back().shape(0) != count)
-      throw nb::value_error("order_rows: a key must have one value per node");
+      throw nb::value_error("order_rows: a key must have one value per row");
     keys.push_back(held.back().data());
   }
   std::vector<int64_t> order(count);
   {
     nb::gil_scoped_release unlocked;
-    ENGRAM_CALL(order_rows, keys, nodes.data(), static_cast<int64_t>(count), uuid_words.data(),
-                order.data());
+    ENGRAM_CALL(order_rows, keys, static_cast<int64_t>(count), uuid_words.data(), order.data());
   }
   return engram::to_numpy(std::move(order), {count});
 }
@@ -57,9 +50,8 @@ auto success_rates(const Input<double, 2> &rates, double bin_m, const Input<doub
 } // namespace
 
 void bind_ordering(nb::module_ &module) {
-  module.def("order_rows", &order_rows, "nodes"_a, "uuid_words"_a, "keys"_a,
-             "Rows (Y,) int64 of the nodes (Y,) by key after key (Y,) float64, smallest first, then "
-             "by UUID (N, 2).");
+  module.def("order_rows", &order_rows, "uuid_words"_a, "keys"_a,
+             "Rows (Y,) int64 by key after key (Y,) float64, smallest first, then by UUID (Y, 2).");
   module.def("success_rates", &success_rates, "rates"_a, "bin_m"_a, "along_m"_a, "across_m"_a,
              "g(along) g(across) / g(0), (N,) float64, of rates (2, B) in the middle of the bins.");
 }

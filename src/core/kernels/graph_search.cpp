@@ -230,8 +230,9 @@ private:
 };
 
 bool is_own_recent(const CandidateQuery &query, int32_t node) {
-  return query.own_session >= 0 && query.sessions[node] == query.own_session &&
-         query.own_driven_m - query.driven_m[node] < query.own_exclusion_m;
+  const CandidateLimits &limits = query.limits;
+  return limits.own_session >= 0 && query.sessions[node] == limits.own_session &&
+         limits.own_driven_m - query.driven_m[node] < limits.own_exclusion_m;
 }
 
 // The point about which the chain's rotation errors balance, or the live camera if there are none.
@@ -261,9 +262,10 @@ Sight sight_of(const CandidateQuery &query, const Reached &row) {
 }
 
 bool may_be_near(const CandidateQuery &query, const Sight &sight) {
+  const CandidateLimits &limits = query.limits;
   return sight.distance <=
-             query.radius_m + std::min(query.slack_sigmas * sight.sigma, query.slack_m) &&
-         std::abs(sight.yaw) <= query.view_gate_rad + query.slack_sigmas * sight.sigma_yaw;
+             limits.radius_m + std::min(limits.slack_sigmas * sight.sigma, limits.slack_m) &&
+         std::abs(sight.yaw) <= limits.view_gate_rad + limits.slack_sigmas * sight.sigma_yaw;
 }
 
 void add_candidate(const CandidateQuery &query, const Reached &row, Candidates &found) {
@@ -391,8 +393,9 @@ void search_chains(const GraphView &graph, int32_t root, const SearchLimits &lim
 void find_candidates(const GraphView &graph, const CandidateQuery &query, Candidates &found) {
   // The reference may lie behind, after a while on odometry alone: reach at least as far as it.
   const double *live = query.reference_from_live + 9;
-  const double reach = std::max(query.radius_m, std::sqrt(dot(live, live))) + query.margin_m;
-  SearchLimits limits{live, reach, query.slack_sigmas, query.slack_m, nullptr, nullptr, 0};
+  const CandidateLimits &asked = query.limits;
+  const double reach = std::max(asked.radius_m, std::sqrt(dot(live, live))) + asked.margin_m;
+  SearchLimits limits{live, reach, asked.slack_sigmas, asked.slack_m, nullptr, nullptr, 0};
   static thread_local std::vector<Reached> near, wide;
   std::vector<const Reached *> chains;
   std::vector<int32_t> vague;
@@ -400,7 +403,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
     Search search(graph, limits, near);
     for (const int32_t row : search.run(query.reference)) {
       const Reached &chain = near[static_cast<size_t>(row)];
-      if (variance_at(chain.error, live) <= query.vague_m * query.vague_m)
+      if (variance_at(chain.error, live) <= asked.vague_m * asked.vague_m)
         chains.push_back(&chain);
       else if (may_be_near(query, sight_of(query, chain)))
         vague.push_back(chain.node);
@@ -408,7 +411,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
   }
   if (!vague.empty()) {
     std::sort(vague.begin(), vague.end());
-    limits.reach_m += query.detour_m;
+    limits.reach_m += asked.detour_m;
     limits.goals = vague.data();
     limits.goal_count = static_cast<int32_t>(vague.size());
     Search search(graph, limits, wide);

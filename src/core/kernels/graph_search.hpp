@@ -55,18 +55,22 @@ struct Candidates {
   std::vector<double> pivot_in_node; // (Y, 3)
 };
 
+struct CandidateLimits {
+  double radius_m = 0, margin_m = 0, view_gate_rad = 0, slack_sigmas = 0, slack_m = 0;
+  // Where the chain to a node is vaguer than this, a better one is looked for that goes so much
+  // further out: a vague chain may say that a node is near of which others know that it is not.
+  double vague_m = 0, detour_m = 0;
+  int32_t own_session = -1; // -1 for none
+  double own_driven_m = 0, own_exclusion_m = 0;
+};
+
 struct CandidateQuery {
   int32_t reference;
   const double *reference_from_live; // (12)
   const double *live_error;          // (5) tau, v, pivot in the reference's frame
-  double radius_m, margin_m, view_gate_rad, slack_sigmas, slack_m;
-  // Where the chain to a node is vaguer than this, a better one is looked for that goes so much
-  // further out: a vague chain may say that a node is near of which others know that it is not.
-  double vague_m, detour_m;
+  CandidateLimits limits;
   const int32_t *sessions; // (nodes)
   const double *driven_m;  // (nodes)
-  int32_t own_session;     // -1 for none
-  double own_driven_m, own_exclusion_m;
 };
 
 } // namespace engram

@@ -29,8 +29,8 @@ double interpolate(const double *values, int64_t bins, double at) {
 
 } // namespace
 
-void order_rows(const std::vector<const double *> &keys, const int32_t *nodes, int64_t count,
-                const uint64_t *uuid_words, int64_t *order) {
+void order_rows(const std::vector<const double *> &keys, int64_t count, const uint64_t *uuid_words,
+                int64_t *order) {
   struct Row {
     uint64_t first;
     int64_t number;
@@ -44,8 +44,8 @@ void order_rows(const std::vector<const double *> &keys, const int32_t *nodes, i
     for (size_t k = 1; k < keys.size(); ++k)
       if (const uint64_t x = sortable(keys[k][a.number]), y = sortable(keys[k][b.number]); x != y)
         return x < y;
-    const uint64_t *x = uuid_words + 2 * int64_t{nodes[a.number]};
-    const uint64_t *y = uuid_words + 2 * int64_t{nodes[b.number]};
+    const uint64_t *x = uuid_words + 2 * a.number;
+    const uint64_t *y = uuid_words + 2 * b.number;
     return x[0] != y[0] ? x[0] < y[0] : x[1] != y[1] ? x[1] < y[1] : a.number < b.number;
   });
   for (int64_t i = 0; i < count; ++i)

@@ -8,8 +8,8 @@
 
 ENGRAM_DECLARE_KERNELS(
     // order = the rows 0 … count − 1 by key after key (each (count,)), smallest first, what is no
-    // number last; then by the UUIDs (high word, low word) of their nodes.
-    void order_rows(const std::vector<const double *> &keys, const int32_t *nodes, int64_t count,
+    // number last; then by their UUIDs (count, 2), high word and low word.
+    void order_rows(const std::vector<const double *> &keys, int64_t count,
                     const uint64_t *uuid_words, int64_t *order);
 
     // result = g(along) g(across) / g(0) with g piecewise linear through the rates (2, bins) in the

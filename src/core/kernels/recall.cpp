@@ -41,7 +41,7 @@ public:
     judged.tally.resize(count);
     judged.margins.resize(count);
     for (int64_t row = 0; row < candidates.count; ++row) {
-      judged.tally[at(row)] = tally(of_sessions_[session(candidates.nodes[row])]);
+      judged.tally[at(row)] = tally(of_sessions_[session(row)]);
       judge(row);
     }
     judged.first = judged.margins;
@@ -72,7 +72,7 @@ public:
   RecallJudgement judged;
 
 private:
-  size_t session(int32_t node) const { return at(candidates_.sessions[node]); }
+  size_t session(int64_t row) const { return at(candidates_.sessions[row]); }
 
   // A failure without a prediction tells nothing: a lost robot has dozens of them in every frame.
   static bool tells(const RecallRun &run, int64_t j) {
@@ -93,7 +93,7 @@ private:
       if (!tells(run, j))
         continue;
       const double back_m = run.at_m[j] - run.driven_m;
-      Shown &drive = of_sessions_[session(run.nodes[j])];
+      Shown &drive = of_sessions_[at(run.sessions[j])];
       count(run, j, std::exp(back_m / constants_.tally_memory_m), drive);
       const double margin = margin_of(run, j);
       if (std::isnan(margin))
@@ -131,14 +131,14 @@ private:
   // Margin won by the rate at which this run matched the drive. Failures add up here as long as
   // they go on, so that no candidate is tried for ever.
   double tally(const Shown &drive) const {
-    const double rate = constants_.untried_rate, worth = constants_.untried_count;
+    const double rate = constants_.untried_rate, worth = constants_.untried_attempts;
     const double successes = drive.successes + rate * worth;
     return constants_.tally *
            std::log(successes / (drive.successes + drive.failures + worth) / rate);
   }
 
   void judge(int64_t row) {
-    const Tally &whole = of_sessions_[session(candidates_.nodes[row])].margins;
+    const Tally &whole = of_sessions_[session(row)].margins;
     const Tally &own = of_nodes_[at(row)];
     const double prior = constants_.prior_weight;
     const double mean = (prior * candidates_.prior[row] + whole.sum + own.sum) /
@@ -149,11 +149,11 @@ private:
   double cost(int64_t row) const { return candidates_.costs[row] - judged.tally[at(row)]; }
 
   void suppose_failure(int64_t picked, int64_t from, int64_t to) {
-    const size_t same = session(candidates_.nodes[picked]);
+    const size_t same = session(picked);
     of_sessions_[same].margins.add(constants_.regret, failed_ + cost(picked));
     for (int64_t place = from; place < to; ++place) {
       const int64_t other = judged.order[at(place)];
-      if (session(candidates_.nodes[other]) == same)
+      if (session(other) == same)
         judge(other);
     }
   }

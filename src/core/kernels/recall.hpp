@@ -13,6 +13,7 @@ struct RecallRun {
   double driven_m;
   const double *at_m;       // driven when each was made
   const int32_t *nodes;
+  const int32_t *sessions;  // that saved them
   const double *distance_m; // to the node; NaN where there was no prediction
   const double *rates;      // how likely a match was; NaN likewise
   const uint8_t *accepted;
@@ -23,27 +24,26 @@ struct RecallRun {
 // The candidates, nearest first: of equals the first is preferred.
 struct RecallCandidates {
   const int32_t *nodes;
+  const int32_t *sessions; // that saved them, below `session_count`
   const double *costs; // margin lost by distance, but for what looks win
   const double *prior; // margin at no distance as past drives have it
-  int64_t count;
-  const int32_t *sessions; // (graph_nodes) which session saved each node of the graph
-  int64_t graph_nodes, session_count;
+  int64_t count, session_count;
 };
 
 // See `RecallConstants` in engram/ranking/recall.py for those that are named alike.
 struct RecallConstants {
-  double per_m; // margin lost per metre
-  double level;
-  double memory_m;
-  double prior_weight;
-  double regret;
-  double tally, tally_memory_m;
-  double untried_rate;  // of a session, and
-  double untried_count; // how many attempts that is worth
-  int64_t needed;       // fewest inliers of a match
-  int64_t attempts;     // how many of the run's newest are enough
-  int64_t picks;        // how many picks are made greedily
-  int64_t shortlist;    // among how many
+  double per_m = 0; // margin lost per metre
+  double level = 0;
+  double memory_m = 0;
+  double prior_weight = 0;
+  double regret = 0;
+  double tally = 0, tally_memory_m = 0;
+  double untried_rate = 0;     // of a session, and
+  double untried_attempts = 0; // how many attempts that is worth
+  int64_t needed = 0;          // fewest inliers of a match
+  int64_t attempts = 0;        // how many of the run's newest are enough
+  int64_t picks = 0;           // how many picks are made greedily
+  int64_t shortlist = 0;       // among how many
 };
 
 struct RecallJudgement {

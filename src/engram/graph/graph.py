@@ -16,20 +16,7 @@ from engram.geometry import SE3
 from engram.graph.chain_error import ChainError, edge_error_rows
 from engram.graph.growing import Column
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.graph.neighbourhood import Neighbourhood
-
-# Routes that bend out of the search radius and back must not be cut off: a block's corner or a
-# turning loop fits into this.
-DEFAULT_MARGIN_M = 12.0
-# A node that is predicted just outside may truly lie inside. Two sigmas keep 95 % of them.
-DEFAULT_SLACK_SIGMAS = 2.0
-# Beyond this the map does not know where the node is, and looking for it there costs too much.
-DEFAULT_SLACK_M = 30.0
-# Chains through a gap of odometry are vaguer. 0.5 and 2 m give nearly the same candidates.
-DEFAULT_VAGUE_M = 1.0
-# How much further out a better chain is looked for: about a block of houses. From 30 m on
-# candidates change by an eighth at most, and the search gets slower.
-DEFAULT_DETOUR_M = 60.0
+from engram.graph.neighbourhood import Neighbourhood, Search
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,6 +119,7 @@ class ExperienceGraph:
         self._target = Column(np.int32)
         self._a_from_b = Column(np.float64, (12,))
         self._errors = Column(np.float64, (8,))
+        self._bound: _core.GraphArrays | None = None  # until something is added
 
     def __len__(self) -> int:
         return len(self._nodes)
@@ -146,6 +134,7 @@ class ExperienceGraph:
         known = self._index.get(node.id)
         if known is not None:
             return known
+        self._bound = None
         index = len(self._nodes)
         session = self._session_index.setdefault(node.session, len(self._sessions))
         if session == len(self._sessions):
@@ -186,6 +175,7 @@ class ExperienceGraph:
             self._errors.rows[known] = error_row
 
     def _link(self, a: int, b: int, edge: Edge) -> int:
+        self._bound = None
         number = len(self._edges)
         self._edges.append(edge)
         self._edge_index[a, b, edge.kind] = number
@@ -270,10 +260,13 @@ class ExperienceGraph:
         """(N,) float64: for each node the odometry distance from its session's start. A view."""
         return self._driven_m.rows
 
-    @property
-    def uuid_words(self) -> NDArray[np.uint64]:
-        """(N, 2) uint64: each node's UUID, high word first, for ordering. A view."""
-        return self._uuid_words.rows
+    def sessions_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
+        """(Y,) int32: the session numbers of some nodes, (Y,) dense indices."""
+        return self._node_sessions.rows[nodes]
+
+    def uuid_words_of(self, nodes: NDArray[np.int32]) -> NDArray[np.uint64]:
+        """(Y, 2) uint64: UUIDs of some nodes, (Y,) dense indices; high word first, for ordering."""
+        return self._uuid_words.rows[nodes]
 
     @property
     def experiences(self) -> NDArray[np.int32]:
@@ -347,17 +340,7 @@ class ExperienceGraph:
         reference: int,
         reference_from_live: SE3,
         covariance: NDArray[np.float64],
-        *,
-        radius_m: float,
-        view_gate_rad: float,
-        own_session: SessionId | None = None,
-        own_driven_m: float = 0.0,
-        own_exclusion_m: float = 30.0,
-        margin_m: float = DEFAULT_MARGIN_M,
-        slack_sigmas: float = DEFAULT_SLACK_SIGMAS,
-        slack_m: float = DEFAULT_SLACK_M,
-        vague_m: float = DEFAULT_VAGUE_M,
-        detour_m: float = DEFAULT_DETOUR_M,
+        search: Search,
     ) -> Neighbourhood:
         """The candidates Y near the live camera (SPEC §3.1).
 
@@ -368,11 +351,6 @@ class ExperienceGraph:
         Where a few loose proximity edges compete with many tight odometry edges it is not, and its
         predictions would be as bad as the loosest edge.
 
-        A node is a candidate if its predicted distance is at most `radius_m`, and its heading
-        within the gate (yaw alone, SPEC §2.6), each plus `slack_sigmas` standard deviations of
-        the prediction (the distance by no more than `slack_m`): so nodes that are truly within are
-        in, also where the map is loose. The search's reach is extended alike.
-
         Sharp chains end at the reach, vague ones lead back into it: through a gap of odometry a
         node may seem to be near of which the road around knows that it is not. For such nodes a
         better chain is looked for that may go `detour_m` further out.
@@ -381,38 +359,28 @@ class ExperienceGraph:
             reference: dense index of the node that the position refers to.
             reference_from_live: the live camera in that node.
             covariance: (6, 6) of it, left perturbation, [translation, rotation].
-            radius_m: search radius.
-            view_gate_rad: greatest difference of heading.
-            own_session: the live session; its nodes saved within the last `own_exclusion_m` before
-                `own_driven_m` are no candidates (but are gone through).
-            own_driven_m: distance driven by the live session.
-            own_exclusion_m: see above.
-            margin_m: see above.
-            slack_sigmas: see above.
-            slack_m: see above.
-            vague_m: standard deviation of a chain past which a better one is looked for.
-            detour_m: see above.
+            search: what is near.
         """
-        number = None if own_session is None else self._session_index.get(own_session)
         columns = _core.graph_candidates(
-            *self._arrays(),
+            self._arrays(),
             reference,
             _pose_row(reference_from_live),
             _core.pivoted_error(np.ascontiguousarray(covariance)),
-            radius_m,
-            margin_m,
-            view_gate_rad,
-            slack_sigmas,
-            slack_m,
-            vague_m,
-            detour_m,
-            self._node_sessions.rows,
-            self._driven_m.rows,
-            -1 if number is None else number,
-            own_driven_m,
-            own_exclusion_m,
+            self._limits(search),
         )
         return Neighbourhood(*columns)
+
+    def _limits(self, search: Search) -> _core.CandidateLimits:
+        limits, config = _core.CandidateLimits(), search.config
+        limits.radius_m, limits.view_gate_rad = search.radius_m, search.view_gate_rad
+        limits.margin_m, limits.slack_m = config.margin_m, config.slack_m
+        limits.slack_sigmas = config.slack_sigmas
+        limits.vague_m, limits.detour_m = config.vague_m, config.detour_m
+        if search.own_session is not None:
+            limits.own_session = self._session_index.get(search.own_session, -1)
+        limits.own_driven_m = search.own_driven_m
+        limits.own_exclusion_m = search.own_exclusion_m
+        return limits
 
     def chains_from(
         self, root: int, *, goals: Sequence[int] = (), usable: NDArray[np.uint8] | None = None
@@ -424,7 +392,7 @@ class ExperienceGraph:
             goals: dense indices of the nodes to stop at; none to go on to the end.
             usable: (E,) uint8, 0 for edges (by their place in `edges`) to leave out.
         """
-        columns = _core.graph_chains(*self._arrays(), root, np.array(goals, dtype=np.int32), usable)
+        columns = _core.graph_chains(self._arrays(), root, np.array(goals, dtype=np.int32), usable)
         row_of = {int(node): row for row, node in enumerate(columns[0])}
         return ChainTree(root, row_of, *columns)
 
@@ -453,22 +421,18 @@ class ExperienceGraph:
         chain = self.shortest_chain(reference, node)
         return None if chain is None else (chain.start_from_end, chain.covariance)
 
-    def _arrays(
-        self,
-    ) -> tuple[
-        NDArray[np.int32],
-        NDArray[np.int32],
-        NDArray[np.int32],
-        NDArray[np.float64],
-        NDArray[np.float64],
-    ]:
-        return (
-            self._first_half.rows,
-            self._next_half.rows,
-            self._target.rows,
-            self._a_from_b.rows,
-            self._errors.rows,
-        )
+    def _arrays(self) -> _core.GraphArrays:
+        if self._bound is None:
+            self._bound = _core.GraphArrays(
+                self._first_half.rows,
+                self._next_half.rows,
+                self._target.rows,
+                self._a_from_b.rows,
+                self._errors.rows,
+                self._node_sessions.rows,
+                self._driven_m.rows,
+            )
+        return self._bound
 
 
 def _pose_row(transform: SE3) -> NDArray[np.float64]:

@@ -3,11 +3,95 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from engram.config import check_bounds
 from engram.graph.chain_error import PivotedError
+from engram.graph.model import SessionId
+
+
+@dataclass(frozen=True, slots=True)
+class SearchConfig:
+    """How far a search for what is near goes out (SPEC §3.1).
+
+    A node just outside may truly lie inside: hence the slack, which extends the search, too.
+
+    Raises:
+        ConfigError: one is out of its bounds.
+    """
+
+    margin_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="how far beyond the radius chains may lead and come back, m: a block's "
+            "corner or a turning loop fits in",
+        ),
+    ] = 12.0
+    slack_sigmas: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="by how many standard deviations of a prediction radius and gate are "
+            "extended; 2 keep 95 % of the nodes that are truly near",
+        ),
+    ] = 2.0
+    slack_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="by how much at most, m: beyond it the map does not know where a node is, "
+            "and looking for it there costs too much",
+        ),
+    ] = 30.0
+    vague_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="standard deviation of a chain past which a better one is looked for, m: "
+            "those through a gap of odometry. 0.5 and 2 give nearly the same nodes",
+        ),
+    ] = 1.0
+    detour_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="how much further out the better chain may lead, m: a block of houses. "
+            "From 30 on nodes change by an eighth at most, and the search gets slower",
+        ),
+    ] = 60.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+DEFAULT_SEARCH = SearchConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What of an experience graph is near (SPEC §3.1).
+
+    Attributes:
+        radius_m: a node is near if its predicted distance is at most this,
+        view_gate_rad: and its heading differs by at most this (yaw alone, SPEC §2.6).
+        own_session: the live session; its nodes saved within the last `own_exclusion_m` before
+            `own_driven_m` are not near (but are gone through).
+        own_driven_m: metres driven by the live session.
+        own_exclusion_m: see above.
+        config: how far the search goes out.
+    """
+
+    radius_m: float
+    view_gate_rad: float
+    own_session: SessionId | None = None
+    own_driven_m: float = 0.0
+    own_exclusion_m: float = 30.0
+    config: SearchConfig = DEFAULT_SEARCH
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -41,6 +41,8 @@ class PathMemory:
         self._number: dict[PathId, int] = {}
         self._bits = np.zeros((16, 1), dtype=np.uint64)
         self._observed = _core.ObservedPaths()
+        # The bits as the core takes them, of so many paths; until they grow.
+        self._view: tuple[int, _core.PathBits] | None = None
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -94,12 +96,10 @@ class PathMemory:
             b: (B,) int32, dense node indices.
             excluded: a path that does not count, such as the live session's own.
         """
-        self._make_room()
-        return _core.co_occurrence(self._bits, len(self._paths), a, b, self._excluded(excluded))
+        return _core.co_occurrence(self._bound(), a, b, self._excluded(excluded))
 
-    def scores(
+    def evidence(
         self,
-        candidates: NDArray[np.int32],
         observed: NDArray[np.int32],
         outcomes: NDArray[np.bool_],
         reference: int | None,
@@ -107,6 +107,28 @@ class PathMemory:
         excluded: PathId | None = None,
         alpha: float = 1.0,
         gamma: float = 1.0,
+    ) -> _core.PathEvidence:
+        """What candidates are judged by: W, z and k of [L15 §V].
+
+        Args:
+            observed: (W,) int32, dense indices of the nodes attempted lately, each once.
+            outcomes: (W,) bool, z: whether the latest attempt on each succeeded.
+            reference: node k in which the robot is localised; None makes the prior uniform.
+            excluded: a path that does not count, such as the live session's own.
+            alpha: pseudo-count of the likelihood.
+            gamma: pseudo-count of the prior.
+        """
+        return _core.PathEvidence(
+            observed,
+            outcomes,
+            -1 if reference is None else reference,
+            self._excluded(excluded),
+            alpha,
+            gamma,
+        )
+
+    def scores(
+        self, candidates: NDArray[np.int32], evidence: _core.PathEvidence
     ) -> NDArray[np.float64]:
         """(Y,) float64: log p(y = i | Z, θ, π) of each candidate, up to a common constant.
 
@@ -116,39 +138,16 @@ class PathMemory:
 
         Args:
             candidates: (Y,) int32, dense node indices.
-            observed: (W,) int32, the nodes attempted lately, each once.
-            outcomes: (W,) bool, z: whether the latest attempt on each succeeded.
-            reference: node k in which the robot is localised; None makes the prior uniform.
-            excluded: a path that does not count, such as the live session's own.
-            alpha: pseudo-count of the likelihood.
-            gamma: pseudo-count of the prior.
+            evidence: made by this path memory.
         """
-        self._make_room()
-        return _core.path_scores(
-            self._observed,
-            self._bits,
-            len(self._paths),
-            candidates,
-            observed,
-            outcomes,
-            -1 if reference is None else reference,
-            alpha,
-            gamma,
-            self._excluded(excluded),
-        )
+        return _core.path_scores(self._observed, self._bound(), candidates, evidence)
 
     def order(
         self,
         neighbourhood: Neighbourhood,
+        evidence: _core.PathEvidence,
         basin: MatchBasin,
         level: float,
-        observed: NDArray[np.int32],
-        outcomes: NDArray[np.bool_],
-        reference: int | None,
-        *,
-        excluded: PathId | None = None,
-        alpha: float = 1.0,
-        gamma: float = 1.0,
     ) -> NDArray[np.int64]:
         """(Y,) int64: rows by `scores` where g >= `level`, then the others, by distance.
 
@@ -157,30 +156,26 @@ class PathMemory:
 
         Args:
             neighbourhood: the candidates Y.
+            evidence: made by this path memory.
             basin: gives g.
             level: of g.
-            observed, outcomes, reference, excluded, alpha, gamma: see `scores`.
         """
-        self._make_room()
-        return _core.path_order(
-            self._observed,
-            self._bits,
-            len(self._paths),
+        candidates = _core.PathCandidates(
             neighbourhood.nodes,
             neighbourhood.along_m,
             neighbourhood.across_m,
             neighbourhood.distance_m,
-            self._graph.uuid_words,
-            basin.rates,
-            BIN_M,
-            level,
-            observed,
-            outcomes,
-            -1 if reference is None else reference,
-            alpha,
-            gamma,
-            self._excluded(excluded),
+            self._graph.uuid_words_of(neighbourhood.nodes),
         )
+        return _core.path_order(
+            self._observed, self._bound(), candidates, evidence, basin.rates, BIN_M, level
+        )
+
+    def _bound(self) -> _core.PathBits:
+        self._make_room()
+        if self._view is None or self._view[0] != len(self._paths):
+            self._view = len(self._paths), _core.PathBits(self._bits, len(self._paths))
+        return self._view[1]
 
     def _excluded(self, path: PathId | None) -> int:
         return -1 if path is None else self._number.get(path, -1)
@@ -196,7 +191,7 @@ class PathMemory:
             words *= 2
         grown = np.zeros((rows, words), dtype=np.uint64)
         grown[: self._bits.shape[0], : self._bits.shape[1]] = self._bits
-        self._bits = grown
+        self._bits, self._view = grown, None
 
 
 def _insert(entries: list[PathEntry], entry: PathEntry) -> bool:

@@ -19,7 +19,7 @@ from engram.geometry import SE3, propagate_covariance
 from engram.graph.chain_error import ChainError
 from engram.graph.graph import ChainTree, ExperienceGraph
 from engram.graph.model import Edge, EdgeKind
-from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.neighbourhood import Neighbourhood, Search
 
 Array = NDArray[np.float64]
 
@@ -119,11 +119,7 @@ def _beside(graph: ExperienceGraph, node: int, config: ProximityConfig) -> Neigh
         node,
         SE3.identity(),
         np.zeros((6, 6)),
-        radius_m=config.reach_m,
-        view_gate_rad=np.pi,
-        own_session=record.session,
-        own_driven_m=record.driven_m,
-        own_exclusion_m=_PASS_GAP_M,
+        Search(config.reach_m, np.pi, record.session, record.driven_m, _PASS_GAP_M),
     )
     return near.rows(np.flatnonzero(near.sigma_m <= config.greatest_sigma_m))
 

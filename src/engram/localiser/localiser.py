@@ -27,7 +27,7 @@ from engram.graph.model import (
     node_id,
     path_id,
 )
-from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.graph.paths import PathMemory
 from engram.localiser.acceptance import Prediction
 from engram.localiser.attempts import Attempter, Candidate, Matcher, Outcome, best_success
@@ -352,11 +352,13 @@ class Localiser:
             self._graph.index(position.node),
             position.node_from_live,
             position.covariance,
-            radius_m=radius_m,
-            view_gate_rad=self.config.view_gate_rad,
-            own_session=self._own_session,
-            own_driven_m=self._driven_m,
-            own_exclusion_m=self.config.own_exclusion_m,
+            Search(
+                radius_m,
+                self.config.view_gate_rad,
+                self._own_session,
+                self._driven_m,
+                self.config.own_exclusion_m,
+            ),
         )
 
     def _rank(self, live: Frame, neighbourhood: Neighbourhood | None) -> NDArray[np.int64]:

@@ -26,6 +26,7 @@ from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId
+from engram.graph.neighbourhood import Search
 from engram.localiser import (
     AcceptanceConfig,
     Matcher,
@@ -222,8 +223,7 @@ class LoopSearch:
             index,
             SE3.identity(),
             np.zeros((6, 6)),
-            radius_m=self.config.near_m,
-            view_gate_rad=np.pi,
+            Search(self.config.near_m, np.pi),
         )
         news[near.nodes] = False
         return news

@@ -77,7 +77,7 @@ class RankingContext:
     @property
     def sessions(self) -> NDArray[np.int32]:
         """(Y,) int32: for each candidate the number of the session that saved it."""
-        return self.graph.sessions[self.neighbourhood.nodes]
+        return self.graph.sessions_of(self.neighbourhood.nodes)
 
     def success_rates(self) -> NDArray[np.float64]:
         """(Y,) float64: g(d) of each candidate, appearance being compatible (SPEC §3.1)."""
@@ -119,5 +119,5 @@ def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.
     """Rows by the keys, (Y,) each, smallest first; ties by distance, then by UUID (SPEC §4)."""
     neighbourhood = context.neighbourhood
     values = (np.ascontiguousarray(key, dtype=np.float64) for key in keys)
-    uuid_words = context.graph.uuid_words
-    return _core.order_rows(neighbourhood.nodes, uuid_words, *values, neighbourhood.distance_m)
+    uuid_words = context.graph.uuid_words_of(neighbourhood.nodes)
+    return _core.order_rows(uuid_words, *values, neighbourhood.distance_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
 
@@ -61,12 +62,17 @@ class PathPolicy:
         Nodes that share as many paths with as many of W have the same to the last bit; others
         whose posterior is the same on paper may differ in that, and tie when they are ranked.
         """
-        return context.path_memory.scores(
-            nodes,
-            context.observations.nodes,
-            context.observations.succeeded,
-            context.reference,
-            excluded=context.own_path,
-            alpha=self._alpha,
-            gamma=self._gamma,
-        )
+        evidence = evidence_of(context, self._alpha, self._gamma)
+        return context.path_memory.scores(nodes, evidence)
+
+
+def evidence_of(context: RankingContext, alpha: float, gamma: float) -> _core.PathEvidence:
+    """W, z and k of a context, with the pseudo-counts of likelihood and prior."""
+    return context.path_memory.evidence(
+        context.observations.nodes,
+        context.observations.succeeded,
+        context.reference,
+        excluded=context.own_path,
+        alpha=alpha,
+        gamma=gamma,
+    )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from engram.graph.basin import BASIN_LEVEL
 from engram.ranking.context import RankingContext
-from engram.ranking.path import PathPolicy
+from engram.ranking.path import PathPolicy, evidence_of
 from engram.ranking.reasons import Reasons
 
 
@@ -40,12 +40,7 @@ class PathNearPolicy:
         """See `RankingPolicy`."""
         return context.path_memory.order(
             context.neighbourhood,
+            evidence_of(context, self._alpha, self._gamma),
             context.basin,
             BASIN_LEVEL,
-            context.observations.nodes,
-            context.observations.succeeded,
-            context.reference,
-            excluded=context.own_path,
-            alpha=self._alpha,
-            gamma=self._gamma,
         )

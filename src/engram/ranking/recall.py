@@ -130,6 +130,7 @@ class RecallPolicy:
 
     def __init__(self, constants: RecallConstants = RECALL) -> None:
         self._constants = constants
+        self._bound = _bound(constants)
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
@@ -189,7 +190,7 @@ class RecallPolicy:
         if not vague.any():
             return order, by_turn
         run = context.run.newest(_MOST_ATTEMPTS)
-        tried = np.bincount(run.nodes, minlength=len(context.graph))[near.nodes[order]]
+        tried = (run.nodes[:, None] == near.nodes[order]).sum(axis=0)
         turns = order[np.argsort(np.where(vague, tried, 0), kind="stable")]
         turn_first = run.frames % 2
         pair = [turns, order] if turn_first else [order, turns]
@@ -232,31 +233,35 @@ class RecallPolicy:
         self, context: RankingContext, canonical: NDArray[np.int64], costs: Array, prior: Array
     ) -> tuple[NDArray[np.int64], Array, Array, Array]:
         """Rows of `canonical` best first; margins as picked and at first, and the tally's part."""
-        c, graph, run = self._constants, context.graph, context.run
+        graph, run, nodes = context.graph, context.run, context.neighbourhood.nodes[canonical]
+        self._bound.per_m = self._per_m(context)
         return _core.recall_order(
-            run.driven_m,
-            run.at_m,
-            run.nodes,
-            run.distance_m,
-            run.rates,
-            run.accepted,
-            run.inliers,
-            context.neighbourhood.nodes[canonical],
-            costs,
-            prior,
-            graph.sessions,
-            graph.session_count,
-            per_m=self._per_m(context),
-            level=c.level,
-            memory_m=c.memory_m,
-            prior_weight=c.prior_weight,
-            regret=c.regret,
-            tally=c.tally,
-            tally_memory_m=c.tally_memory_m,
-            untried_rate=c.untried_rate,
-            untried_count=c.untried_attempts,
-            needed=_NEEDED,
-            attempts=_MOST_ATTEMPTS,
-            picks=_PICKS,
-            shortlist=_SHORTLIST,
+            _core.RecallRun(
+                run.driven_m,
+                run.at_m,
+                run.nodes,
+                graph.sessions_of(run.nodes),
+                run.distance_m,
+                run.rates,
+                run.accepted,
+                run.inliers,
+            ),
+            _core.RecallCandidates(
+                nodes, graph.sessions_of(nodes), costs, prior, graph.session_count
+            ),
+            self._bound,
         )
+
+
+def _bound(constants: RecallConstants) -> _core.RecallConstants:
+    """As the core takes them, but for `per_m`, which the lens decides."""
+    bound = _core.RecallConstants()
+    for name in ("level", "memory_m", "prior_weight", "regret", "tally", "tally_memory_m"):
+        setattr(bound, name, getattr(constants, name))
+    bound.untried_rate, bound.untried_attempts = (
+        constants.untried_rate,
+        constants.untried_attempts,
+    )
+    bound.needed, bound.attempts = _NEEDED, _MOST_ATTEMPTS
+    bound.picks, bound.shortlist = _PICKS, _SHORTLIST
+    return bound

@@ -23,6 +23,7 @@ import numpy as np
 from engram.geometry import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import EdgeKind
+from engram.graph.neighbourhood import Search
 from engram.localiser import Position
 from engram.maps import Map
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
@@ -79,7 +80,7 @@ def what_is_near(opened: Map, true: TrueNodes) -> str:
         if pose is None:
             continue
         found = graph.neighbourhood(
-            node, SE3.identity(), CERTAIN, radius_m=DEFAULT_RADIUS_M, view_gate_rad=VIEW_GATE_RAD
+            node, SE3.identity(), CERTAIN, Search(DEFAULT_RADIUS_M, VIEW_GATE_RAD)
         )
         ids = {graph.node(row).id for row in found.nodes.tolist()}
         truly = true.near(pose, DEFAULT_RADIUS_M)

@@ -51,7 +51,7 @@ class BanditPolicy:
 def session_tallies(context: RankingContext) -> tuple[Array, Array]:
     """Decayed successes and failures (Y,) of this run on the session that saved each candidate."""
     graph, run = context.graph, context.run
-    attempted, sessions = graph.sessions[run.nodes], context.sessions
+    attempted, sessions = graph.sessions_of(run.nodes), context.sessions
     weights, count = run.decay(_MEMORY_M), graph.session_count
     successes = np.bincount(attempted, weights * run.accepted, count)[sessions]
     failures = np.bincount(attempted, weights * run.failure_weights(), count)[sessions]

@@ -58,7 +58,7 @@ def _reached(
     """(S, N) 1 where the session saved the node or matched it on its way, else 0."""
     graph = context.graph
     paths = [path_id(graph.session(number)) for number in sessions]
-    saved = graph.sessions[nodes] == sessions[:, None]
+    saved = graph.sessions_of(nodes) == sessions[:, None]
     matched = context.path_memory.on_paths(paths, nodes)
     if context.own_path in paths:
         matched[paths.index(context.own_path)] = False

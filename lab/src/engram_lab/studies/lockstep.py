@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter, thread_time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import NodeId, PathEntryKind
-from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.graph.paths import PathMemory
 from engram.localiser import Localiser, Matcher, Position
 from engram.maps import Map
@@ -48,7 +47,7 @@ class SharedSearch:
         reference: int,
         reference_from_live: SE3,
         covariance: NDArray[np.float64],
-        **options: Any,
+        search: Search,
     ) -> Neighbourhood:
         """See `ExperienceGraph.neighbourhood`."""
         key = (
@@ -56,11 +55,11 @@ class SharedSearch:
             reference_from_live.translation.tobytes(),
             reference_from_live.rotation.tobytes(),
             covariance.tobytes(),
-            *options.values(),
+            search,
         )
         found = self._known.get(key)
         if found is None:
-            found = self._search(reference, reference_from_live, covariance, **options)
+            found = self._search(reference, reference_from_live, covariance, search)
             self._known[key] = found
         return found
 

@@ -38,6 +38,7 @@ from engram.fleet.download.stock import Mask, Stock
 from engram.geometry import SE3
 from engram.graph.basin import MatchBasin
 from engram.graph.model import path_id
+from engram.graph.neighbourhood import Search, SearchConfig
 
 Array = NDArray[np.float64]
 
@@ -46,6 +47,8 @@ _PLACE_M = 1.0
 # Nodes farther than this share of the basin give nothing that counts.
 _REACH = 2.0
 _GATE_RAD = float(np.deg2rad(60.0))
+# A node is near where it is expected: no slack.
+_STRICT = SearchConfig(slack_sigmas=0.0, slack_m=0.0)
 # Attempts on nodes of one session that looks alike fail together oftener than by chance: P(second
 # matches | first did not) was 0.2 to 0.3 where g says 0.5 (`village`, 12 drives with all nodes).
 _APART = 0.6
@@ -99,9 +102,8 @@ def _places(stock: Stock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         if place_of[node] >= 0:
             continue
         near = stock.graph.neighbourhood(
-            node, SE3.identity(), np.zeros((6, 6)), radius_m=_PLACE_M, view_gate_rad=_GATE_RAD,
-            slack_sigmas=0.0, slack_m=0.0,
-        )  # fmt: skip
+            node, SE3.identity(), np.zeros((6, 6)), Search(_PLACE_M, _GATE_RAD, config=_STRICT)
+        )
         closer = near.distance_m < distance_m[near.nodes]
         place_of[near.nodes[closer]] = len(places)
         distance_m[near.nodes[closer]] = near.distance_m[closer]
@@ -143,10 +145,11 @@ class Coverage:
         wanted = np.flatnonzero(self.demand.weight.sum(axis=1) > 0)
         for place in wanted.tolist():
             near = stock.graph.neighbourhood(
-                int(self.demand.places[place]), SE3.identity(), np.zeros((6, 6)),
-                radius_m=max(_REACH * basin.basin_m, _PLACE_M), view_gate_rad=_GATE_RAD,
-                slack_sigmas=0.0, slack_m=0.0,
-            )  # fmt: skip
+                int(self.demand.places[place]),
+                SE3.identity(),
+                np.zeros((6, 6)),
+                Search(max(_REACH * basin.basin_m, _PLACE_M), _GATE_RAD, config=_STRICT),
+            )
             rates = _APART * basin.success_rate(near.along_m, near.across_m)
             for node, rate in zip(near.nodes.tolist(), rates.tolist(), strict=True):
                 found[node][0].append(place)
