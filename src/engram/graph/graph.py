@@ -262,11 +262,11 @@ class ExperienceGraph:
 
     def sessions_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
         """(Y,) int32: the session numbers of some nodes, (Y,) dense indices."""
-        return self._node_sessions.rows[nodes]
+        return self._node_sessions.rows.take(nodes)
 
     def uuid_words_of(self, nodes: NDArray[np.int32]) -> NDArray[np.uint64]:
         """(Y, 2) uint64: UUIDs of some nodes, (Y,) dense indices; high word first, for ordering."""
-        return self._uuid_words.rows[nodes]
+        return self._uuid_words.rows.take(nodes, 0)
 
     @property
     def experiences(self) -> NDArray[np.int32]:
