@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 
 from engram.errors import InputError
-from engram.measures import (
-    Drive,
-    failure_gap,
-    failure_lost,
-    failure_route,
-    gaps,
-    longest_gap_m,
-    route_m,
-    route_not_localised,
-)
+from engram.measures import Drive, failure_route, gaps, longest_gap_m, route_m, route_not_localised
 
 
 def drive(steps: list[float], matched: str) -> Drive:
@@ -30,12 +21,9 @@ def test_gaps_are_closed_by_start_and_end() -> None:
     np.testing.assert_array_equal(found.failed, [True, False, True, True])
 
 
-def test_three_estimators_of_the_worked_case() -> None:
-    # route at 1.5 m: (0.5 + 3.5 + 0.5) / 10; gap: three of four; lost: three of three.
+def test_failures_of_the_worked_case() -> None:
+    # At 1.5 m: (0.5 + 3.5 + 0.5) / 10.
     assert failure_route([WORKED], 1.5) == pytest.approx(0.45)
-    assert failure_gap([WORKED], 1.5) == pytest.approx(0.75)
-    assert failure_lost([WORKED], 1.5) == pytest.approx(1.0)
-    assert failure_lost([WORKED], 2.5) == pytest.approx(1 / 3)
 
 
 def test_route_not_localised_counts_the_steps_that_end_unmatched() -> None:
@@ -52,7 +40,7 @@ def test_sessions_do_not_run_into_one_another() -> None:
 def test_a_match_where_the_session_starts_or_ends_makes_no_gap_there() -> None:
     whole = drive([0, 1, 1, 1, 1], "xxxxx")
     np.testing.assert_allclose(gaps([whole]).length_m, [1, 1, 1, 1])
-    assert failure_gap([whole], 1.0) == 1.0
+    assert not gaps([whole]).failed.any()
     # At rest between two matches is a gap of no length; at rest without one is a failed one.
     rest = drive([0, 0, 1, 0], "xxx.")
     np.testing.assert_allclose(gaps([rest]).length_m, [0, 1, 0])

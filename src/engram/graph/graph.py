@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from engram import _core
@@ -89,6 +89,45 @@ class HalfEdges:
         return HalfEdges(
             self.sources[rows], self.targets[rows], self.target_in_source[rows], self.of_edges
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Links:
+    """The lightest edge between every two nodes that any joins, a struct of arrays.
+
+    Attributes:
+        low, high: (L,) dense indices of its ends.
+        weight: (L,) float64.
+        edge: (L,) its place among the edges.
+    """
+
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    weight: NDArray[np.float64]
+    edge: NDArray[np.int64]
+
+    @staticmethod
+    def lightest(ends: NDArray[np.integer], weight: NDArray[np.float64]) -> Links:
+        """Of parallel edges the lightest, the earlier one of equals.
+
+        Args:
+            ends: (E, 2) dense indices of each edge's ends.
+            weight: (E,) of each edge.
+        """
+        low, high = ends.min(axis=1), ends.max(axis=1)
+        order = np.lexsort((weight, high, low))
+        low, high = low[order], high[order]
+        first = np.ones(len(order), np.bool_)
+        first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
+        order = order[first]
+        return Links(
+            low[first].astype(np.int64), high[first].astype(np.int64), weight[order], order
+        )
+
+    def matrix(self, count: int, rows: NDArray[np.bool_] | slice = slice(None)) -> csr_matrix:
+        """(count, count) sparse weights, each link once; of `rows` alone where they are given."""
+        ends = (self.low[rows], self.high[rows])
+        return csr_matrix((self.weight[rows], ends), shape=(count, count))
 
 
 class ExperienceGraph:
@@ -294,6 +333,11 @@ class ExperienceGraph:
     def edge_ends(self) -> NDArray[np.int32]:
         """(E, 2) int32: dense indices of the ends b and a of each of `edges`. A view."""
         return self._target.rows.reshape(-1, 2)
+
+    def lightest(self, weight: Callable[[Edge], float]) -> Links:
+        """Of parallel edges the lightest, the earlier one of equals."""
+        weights = np.array([weight(edge) for edge in self._edges], np.float64)
+        return Links.lightest(self.edge_ends, weights)
 
     def edges_of(self, node: int) -> list[Edge]:
         """The edges at a node, newest key first."""

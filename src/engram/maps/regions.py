@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from engram.errors import InputError
@@ -76,15 +76,5 @@ def regions_of(
 
 def edge_lengths(graph: ExperienceGraph) -> csr_matrix:
     """(N, N) sparse: length of the shortest edge between two nodes, metres, once for each pair."""
-    ends = np.array(
-        [(graph.index(edge.a), graph.index(edge.b)) for edge in graph.edges], np.int64
-    ).reshape(-1, 2)
-    lengths = np.array([edge.a_from_b.distance_m for edge in graph.edges], np.float64)
-    # Parallel edges would add up in a sparse matrix: the shortest counts.
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    order = np.lexsort((lengths, high, low))
-    low, high, lengths = low[order], high[order], np.maximum(lengths[order], _LEAST_STEP_M)
-    first = np.ones(len(low), bool)
-    first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    shape = (len(graph), len(graph))
-    return csr_matrix(coo_matrix((lengths[first], (low[first], high[first])), shape=shape))
+    links = graph.lightest(lambda edge: max(edge.a_from_b.distance_m, _LEAST_STEP_M))
+    return links.matrix(len(graph))

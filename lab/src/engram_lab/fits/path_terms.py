@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
-from engram.measures import Drive, Resamples, SessionSums, difference, not_localised_sums
+from engram.measures import Drive
 from engram.ranking import POLICIES, RankingContext
 from engram.ranking.path_near import PathNearPolicy
 from engram.robot import Settings, open_map
+from engram_lab.intervals import Resamples, SessionSums, difference, not_localised_sums
 from engram_lab.programs import command_line
 from engram_lab.studies.building import read_built_map
 from engram_lab.studies.configurations import Configuration

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from engram.measures import Resamples, SessionSums, beats, difference, excess_ratio, ratio
+from engram_lab.intervals import Resamples, SessionSums, beats, difference, excess_ratio, ratio
 from engram_lab.studies.configurations import (
     EVERYTHING,
     UNLIMITED,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.measures import FORMULAS, Estimator, Interval, SessionSums, Statistic, difference
 from engram.viewing import Line, Panel, draw_bars, draw_curves
+from engram_lab.intervals import FORMULAS, Estimator, Interval, SessionSums, Statistic, difference
 from engram_lab.studies.configurations import (
     T_SWEEP,
     UNLIMITED,

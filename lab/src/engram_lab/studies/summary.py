@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.measures import (
-    Drive,
+from engram.measures import Drive, longest_gap_m
+from engram_lab.accuracy import PoseErrors
+from engram_lab.intervals import (
     Estimator,
     Resamples,
     SessionSums,
     failure_sums,
-    longest_gap_m,
     not_localised_sums,
     product,
 )
-from engram_lab.accuracy import PoseErrors
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import BuiltMap
 from engram_lab.studies.configurations import (

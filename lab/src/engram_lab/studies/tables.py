@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from engram.measures import Estimator, Resamples
+from engram_lab.intervals import Estimator, Resamples
 from engram_lab.studies.configurations import Configuration
 from engram_lab.studies.summary import CampaignResult, ConfigurationResult
 

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from engram.measures import Interval, Resamples, SessionSums, difference
+from engram_lab.intervals import Interval, Resamples, SessionSums, difference
 
 # What a page of claims sets side by side: what, paper, must, aim, measured.
 Row: TypeAlias = tuple[str, str, str, str, str]

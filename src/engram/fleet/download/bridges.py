@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -21,32 +20,17 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from engram.geometry import SE3, propagate_covariance
+from engram.graph.graph import Links
 from engram.graph.model import Edge, EdgeKind, NodeId
 
 Array = NDArray[np.float64]
 
-# Beyond what a neighbourhood search looks at (`DEFAULT_MARGIN_M`), a bridge shortens nothing.
+# Beyond what a neighbourhood search looks at (`SearchConfig.margin_m`), a bridge shortens nothing.
 _NEAR_M = 12.0
 # One radian counts as much as so many metres: a landmark's usual distance.
 _LEVER_M = 10.0
 # Chains of perfectly known edges still prefer fewer edges.
 _LEAST_COST = 1e-12
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Steps:
-    """The surest edge between every two nodes that have any.
-
-    Attributes:
-        low, high: (E,) dense indices of its ends.
-        cost: (E,) its variance in m², rotation included.
-        edge: (E,) its place among the edges.
-    """
-
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    cost: Array
-    edge: NDArray[np.int64]
 
 
 def close_gaps(
@@ -67,7 +51,8 @@ def close_gaps(
         return []
     index = {node: at for at, node in enumerate(nodes)}
     ends = np.array([(index[edge.a], index[edge.b]) for edge in edges], np.int64).reshape(-1, 2)
-    steps = _surest(ends, edges)
+    # One edge of several between two nodes: the surest.
+    steps = Links.lightest(ends, np.array([_variance(edge.covariance) for edge in edges]))
     search = _Search(nodes, edges, ends, steps, sent)
     needed, near = search.candidates()
     chosen = {pair: search.bridge(*pair) for pair in needed}
@@ -84,17 +69,6 @@ def components(count: int, ends: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
-def _surest(ends: NDArray[np.int64], edges: Sequence[Edge]) -> _Steps:
-    """Of parallel edges the surest, the earlier one of equals."""
-    cost = np.array([_variance(edge.covariance) for edge in edges], np.float64)
-    low, high = ends.min(axis=1), ends.max(axis=1)
-    order = np.lexsort((np.arange(len(cost)), cost, high, low))
-    low, high = low[order], high[order]
-    first = np.ones(len(order), np.bool_)
-    first[1:] = (low[1:] != low[:-1]) | (high[1:] != high[:-1])
-    return _Steps(low[first], high[first], cost[order][first], order[first].astype(np.int64))
-
-
 def _variance(covariance: Array) -> float:
     diagonal = np.diag(covariance)
     return max(float(diagonal[:3].sum() + _LEVER_M**2 * diagonal[3:].sum()), _LEAST_COST)
@@ -108,7 +82,7 @@ class _Search:
         nodes: Sequence[NodeId],
         edges: Sequence[Edge],
         ends: NDArray[np.int64],
-        steps: _Steps,
+        steps: Links,
         sent: NDArray[np.bool_],
     ) -> None:
         self._nodes, self._edges, self._ends, self._steps = nodes, edges, ends, steps
@@ -128,10 +102,7 @@ class _Search:
     def _reach(self) -> None:
         """The surest chain from any sent node to each node that is left out."""
         steps, through = self._steps, self._through
-        shape = (len(self._nodes), len(self._nodes))
-        links = csr_matrix(
-            (steps.cost[through], (steps.low[through], steps.high[through])), shape=shape
-        )
+        links = steps.matrix(len(self._nodes), through)
         self._cost, self._before, self._source = dijkstra(
             links,
             directed=False,
@@ -154,7 +125,7 @@ class _Search:
             sources = int(self._source[low]), int(self._source[high])
             if min(sources) < 0 or sources[0] == sources[1]:  # unreached, or inside one basin
                 continue
-            cost = float(self._cost[low] + steps.cost[at] + self._cost[high])
+            cost = float(self._cost[low] + steps.weight[at] + self._cost[high])
             pair = (min(sources), max(sources))
             if pair not in self._border or cost < self._border[pair][0]:
                 self._border[pair] = (cost, int(at))

@@ -9,7 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from engram.fleet.build import order_costs
-from engram.measures import Resamples, not_localised_sums, route_not_localised
+from engram.measures import route_not_localised
+from engram_lab.intervals import Resamples, not_localised_sums
 from engram_lab.studies.fleet.experiments import SHARED, SINGLE, merged_name, pair_merges
 from engram_lab.studies.fleet.plan import ROBOTS
 from engram_lab.studies.fleet.records import DownloadRecord

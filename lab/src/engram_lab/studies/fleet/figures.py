@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.measures import Drive, Resamples, SessionSums, failure_sums, route_not_localised
+from engram.measures import Drive, route_not_localised
 from engram.viewing import Line, Panel, draw_bars, draw_curves
+from engram_lab.intervals import Resamples, SessionSums, failure_sums
 from engram_lab.studies.fleet.experiments import SHARED, SINGLE, merged_name
 from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS
 from engram_lab.studies.fleet.results import ArmResult, FoldResult, Time

@@ -5,35 +5,37 @@ import pytest
 
 from engram.errors import InputError
 from engram.geometry import SE3
-from engram.measures import (
-    Drive,
-    Estimator,
-    beats,
-    failure_curve,
-    failure_gap,
-    failure_lost,
-    failure_route,
-)
+from engram.measures import Drive, failure_curve, failure_route
 from engram_lab.accuracy import pose_errors
+from engram_lab.intervals import Estimator, beats, failure_sums
 
 
 def drive(marks: str, step_m: float = 1.0) -> Drive:
     return Drive(np.full(len(marks), step_m), np.array([mark == "x" for mark in marks]))
 
 
-@pytest.mark.parametrize(
-    ("estimator", "single"),
-    [
-        (Estimator.ROUTE, failure_route),
-        (Estimator.GAP, failure_gap),
-        (Estimator.LOST, failure_lost),
-    ],
-)
-def test_a_curve_is_its_points(estimator: Estimator, single) -> None:
+def curve_at(drives, x: float, estimator: Estimator) -> float:
+    parts = [failure_sums(one, np.array([x]), estimator) for one in drives]
+    return sum(part[0][0] for part in parts) / sum(part[1] for part in parts)
+
+
+def test_three_estimators_of_a_worked_case() -> None:
+    # Gaps of 2, 1, 5 and 2 m, that of 1 m without a failure. Route at 1.5 m:
+    # (0.5 + 3.5 + 0.5) / 10; gap: three of four; lost: three of three.
+    worked = drive(".xx....x..")
+    assert curve_at([worked], 1.5, Estimator.ROUTE) == pytest.approx(0.45)
+    assert curve_at([worked], 1.5, Estimator.GAP) == pytest.approx(0.75)
+    assert curve_at([worked], 1.5, Estimator.LOST) == pytest.approx(1.0)
+    assert curve_at([worked], 2.5, Estimator.LOST) == pytest.approx(1 / 3)
+
+
+def test_a_curve_is_its_points() -> None:
     drives = [drive(".xx....x.."), drive("x....x", 1.7), drive("......")]
     at_m = np.array([0.0, 0.5, 1.0, 1.7, 2.0, 5.0, 8.5, 50.0])
-    expected = [single(drives, float(x)) for x in at_m]
-    np.testing.assert_allclose(failure_curve(drives, at_m, estimator), expected, atol=1e-12)
+    found = failure_curve(drives, at_m)
+    np.testing.assert_allclose(found, [failure_route(drives, float(x)) for x in at_m], atol=1e-12)
+    by_session = [curve_at(drives, float(x), Estimator.ROUTE) for x in at_m]
+    np.testing.assert_allclose(found, by_session, atol=1e-12)
 
 
 def test_route_curve_begins_at_one_and_falls() -> None:
@@ -46,7 +48,7 @@ def test_route_curve_begins_at_one_and_falls() -> None:
 def test_nothing_driven_has_no_failures() -> None:
     nothing = Drive(np.zeros(0), np.zeros(0, bool))
     assert failure_curve([], np.array([1.0]))[0] == 0
-    assert failure_curve([nothing], np.array([1.0]), Estimator.LOST)[0] == 0
+    assert failure_curve([nothing], np.array([1.0]))[0] == 0
 
 
 def test_beats_needs_the_curve_below_and_no_much_longer_gap() -> None:

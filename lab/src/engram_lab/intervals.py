@@ -1,4 +1,4 @@
-"""Confidence intervals by bootstrap over sessions (SPEC §8).
+"""Failure curves by session, and confidence intervals by bootstrap over sessions (SPEC §8).
 
 Frames of one session share its light, weather and driving line, so that sessions, not frames, are
 what is drawn again. Every measure here is a ratio of sums over sessions (metres without a match ÷
@@ -8,14 +8,16 @@ Measures of one set of sessions are to be compared under the same draws: pass th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
+from engram.measures import Drive, failure_curve, gaps, longest_gap_m
 
 Array = NDArray[np.float64]
 # (N, S) weights of the sessions → (N,) values.
@@ -23,6 +25,12 @@ Statistic: TypeAlias = Callable[[Array], Array]
 
 # Intervals are stated at this level throughout ("90 % interval").
 LEVEL = 0.9
+
+
+# Source: SPEC §8: P_A ≤ P_B up to 20 m, and A's longest gap at most 1.5 times B's.
+_UP_TO_M = 20.0
+_STEP_M = 0.5
+_LONGEST_GAP_RATIO = 1.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +149,55 @@ def excess_ratio(a: SessionSums, b: SessionSums, bound: SessionSums) -> Statisti
         return _divided(np.maximum(a(weights) - floor, 0), np.maximum(b(weights) - floor, 0))
 
     return statistic
+
+
+class Estimator(StrEnum):
+    """How P(X >= x) is taken from the gaps g. Source: SPEC §8; the formulas stand in `FORMULAS`."""
+
+    ROUTE = "route"
+    GAP = "gap"
+    LOST = "lost"
+
+
+# What is printed beside every figure.
+FORMULAS = {
+    Estimator.ROUTE: "(1/L) Σ max(0, g − x)",
+    Estimator.GAP: "#{g ≥ x} / #{g}",
+    Estimator.LOST: "#{g ≥ x} / #{g}, gaps with a failed frame",
+}
+
+
+def failure_sums(
+    drive: Drive, at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
+) -> tuple[NDArray[np.float64], float]:
+    """One session's part of a failure curve: numerators (X,) at distances (X,), and denominator.
+
+    The curve over several sessions is the sum of the numerators ÷ the sum of the denominators.
+    """
+    found = gaps([drive])
+    lengths = found.length_m[found.failed] if estimator is Estimator.LOST else found.length_m
+    beyond = lengths[None, :] - at_m[:, None]
+    if estimator is Estimator.ROUTE:
+        return np.maximum(beyond, 0.0).sum(axis=1), float(drive.step_m.sum())
+    return (beyond >= 0).sum(axis=1).astype(np.float64), float(len(lengths))
+
+
+def not_localised_sums(drives: Sequence[Drive]) -> SessionSums:
+    """`route_not_localised` by its parts: metres without a match and metres driven, by session."""
+    missed_m = [float(one.step_m[~one.matched].sum()) for one in drives]
+    driven_m = [float(one.step_m.sum()) for one in drives]
+    return SessionSums(np.array(missed_m, np.float64), np.array(driven_m, np.float64))
+
+
+def beats(a: Sequence[Drive], b: Sequence[Drive]) -> bool:
+    """Whether A beats B (SPEC §8); equal results beat each other.
+
+    A's failure curve is nowhere above B's up to 20 m, and its longest gap is at most 1.5 times B's.
+    """
+    at_m = np.arange(0.0, _UP_TO_M + _STEP_M / 2, _STEP_M)
+    # Sums of the same gaps in another order differ in the last bits.
+    below = failure_curve(a, at_m) <= failure_curve(b, at_m) + 1e-12
+    return bool(below.all()) and longest_gap_m(a) <= _LONGEST_GAP_RATIO * longest_gap_m(b)
 
 
 def _divided(above: Array, below: Array) -> Array:

@@ -1,4 +1,4 @@
-"""How often a robot goes without a match: the failure curve and its three estimators (SPEC §8).
+"""How good is a map: how often, and how far, a robot goes without a match (SPEC §8).
 
 Everything here is a pure function of two arrays per session, one row per live frame: the
 odometry distance of the step that ends in the frame, and whether that frame was matched.
@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engram.errors import InputError
-from engram.measures.bootstrap import SessionSums
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,45 +90,16 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
     return Gaps(np.array(lengths, dtype=np.float64), np.array(failed, dtype=bool))
 
 
-class Estimator(StrEnum):
-    """How P(X >= x) is taken from the gaps g. Source: SPEC §8; the formulas stand in `FORMULAS`."""
+def failure_curve(drives: Sequence[Drive], at_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """P(X >= x) at distances (X,), metres, from a uniformly random point of the route.
 
-    ROUTE = "route"
-    GAP = "gap"
-    LOST = "lost"
-
-
-# What is printed beside every figure.
-FORMULAS = {
-    Estimator.ROUTE: "(1/L) Σ max(0, g − x)",
-    Estimator.GAP: "#{g ≥ x} / #{g}",
-    Estimator.LOST: "#{g ≥ x} / #{g}, gaps with a failed frame",
-}
-
-
-def failure_sums(
-    drive: Drive, at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
-) -> tuple[NDArray[np.float64], float]:
-    """One session's part of a failure curve: numerators (X,) at distances (X,), and denominator.
-
-    The curve over several sessions is the sum of the numerators ÷ the sum of the denominators.
+    Source: SPEC §8, estimator *route*. 0 for a route of no length.
     """
-    found = gaps([drive])
-    lengths = found.length_m[found.failed] if estimator is Estimator.LOST else found.length_m
-    beyond = lengths[None, :] - at_m[:, None]
-    if estimator is Estimator.ROUTE:
-        return np.maximum(beyond, 0.0).sum(axis=1), float(drive.step_m.sum())
-    return (beyond >= 0).sum(axis=1).astype(np.float64), float(len(lengths))
-
-
-def failure_curve(
-    drives: Sequence[Drive], at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
-) -> NDArray[np.float64]:
-    """P(X >= x) at distances (X,), metres; 0 where there is nothing to count. Source: SPEC §8."""
     above, below = np.zeros(len(at_m)), 0.0
     for drive in drives:
-        numerators, denominator = failure_sums(drive, at_m, estimator)
-        above, below = above + numerators, below + denominator
+        beyond = gaps([drive]).length_m[None, :] - at_m[:, None]
+        above = above + np.maximum(beyond, 0.0).sum(axis=1)
+        below = below + float(drive.step_m.sum())
     return above / below if below else above
 
 
@@ -145,22 +114,6 @@ def failure_route(drives: Sequence[Drive], at_m: float) -> float:
     return float(np.maximum(gaps(drives).length_m - at_m, 0.0).sum() / length_m)
 
 
-def failure_gap(drives: Sequence[Drive], at_m: float) -> float:
-    """P(X >= x) over the gaps: #{g >= x} / #{g}. Source: SPEC §8, estimator *gap*."""
-    lengths = gaps(drives).length_m
-    return float(np.mean(lengths >= at_m)) if len(lengths) else 0.0
-
-
-def failure_lost(drives: Sequence[Drive], at_m: float) -> float:
-    """P(X >= x) over the gaps with at least one failed frame.
-
-    Source: SPEC §8, estimator *lost*; [G16] §VI-B.
-    """
-    found = gaps(drives)
-    lengths = found.length_m[found.failed]
-    return float(np.mean(lengths >= at_m)) if len(lengths) else 0.0
-
-
 def route_m(drives: Sequence[Drive]) -> float:
     """Length of the route, metres."""
     return float(sum(drive.step_m.sum() for drive in drives))
@@ -171,13 +124,6 @@ def route_not_localised(drives: Sequence[Drive]) -> float:
     length_m = route_m(drives)
     missed_m = sum(float(drive.step_m[~drive.matched].sum()) for drive in drives)
     return missed_m / length_m if length_m else 0.0
-
-
-def not_localised_sums(drives: Sequence[Drive]) -> SessionSums:
-    """`route_not_localised` by its parts: metres without a match and metres driven, by session."""
-    missed_m = [float(one.step_m[~one.matched].sum()) for one in drives]
-    driven_m = [float(one.step_m.sum()) for one in drives]
-    return SessionSums(np.array(missed_m, np.float64), np.array(driven_m, np.float64))
 
 
 def longest_gap_m(drives: Sequence[Drive]) -> float:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import InputError
-from engram.measures import Resamples, SessionSums, difference, excess_ratio, ratio
+from engram_lab.intervals import Resamples, SessionSums, difference, excess_ratio, ratio
 
 
 def sums(numerator, denominator) -> SessionSums:
