@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,26 +10,28 @@ from pathlib import Path
 import numpy as np
 from tests.synthetic_world import Seen
 
+from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Session, session_id
 from engram.localiser import Budget, Localisation, Localiser
-from engram.mapper import Mapper, Saver
+from engram.mapper import Mapper, MappingStep, Saver
 from engram.maps import Map, open_map
-from engram.robot import Front, Robot, Settings
+from engram.odometry import GapFiller, Motion
+from engram.robot import Settings
 from engram.robot.localisers import localiser_in
-from engram.robot.saving import loop_search
+from engram.robot.mapping import loop_search
 
 
 @dataclass
 class Mapped:
     """What mapping a drive came to, beside the truth."""
 
-    steps: list[Localisation]
+    steps: list[MappingStep]
     drive: list[Seen]
 
     @property
     def statuses(self) -> list[str]:
-        return [step.status.value for step in self.steps]
+        return [step.localisation.status.value for step in self.steps]
 
     @property
     def saved(self) -> dict[NodeId, SE3]:
@@ -90,18 +92,27 @@ def map_simulated(
             searching = loop_search(opened, localiser, Settings())
         with localiser, searching as loops:
             mapper = Mapper(opened.graph, localiser, saver, session, loops=loops)
-            robot = Robot(Front(Settings()), localiser, mapper)
-            steps = [robot.step(seen.logged) for seen in drive]
+            steps = [mapper.process(frame, motion) for frame, motion in moving(drive)]
             mapper.finish()
         saver.finish()
         writer.commit()
     return Mapped(steps, drive)
 
 
+def moving(drive: Iterable[Seen]) -> Iterator[tuple[Frame, Motion]]:
+    """Frames with their motion, gaps filled."""
+    gaps = GapFiller()
+    for seen in drive:
+        yield seen.frame, gaps.motion(seen.odometry, seen.frame.stamp_ns)
+
+
 def localised(localiser: Localiser, drive: Iterable[Seen]) -> list[Localisation]:
     """What a localiser finds of frames, one after another."""
-    robot = Robot(Front(Settings()), localiser)
-    return [robot.step(seen.logged) for seen in drive]
+    found = []
+    for frame, motion in moving(drive):
+        localiser.move(motion)
+        found.append(localiser.localise(frame))
+    return found
 
 
 def localise_simulated(

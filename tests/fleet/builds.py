@@ -5,14 +5,15 @@ from __future__ import annotations
 import signal
 
 from engram.fleet.build import BuildOptions, JudgeOptions, build_map
+from engram.fleet.merge.gate import GateOptions
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings
+from engram.robot import MapOptions, Settings
 
 from .robots import OPTIONS
 
 
 def options(**changes: object) -> BuildOptions:
-    mapping = RobotOptions(relocaliser="exhaustive")
+    mapping = MapOptions(relocaliser="exhaustive")
     values = {"workers": 2, "groups": 2, "mapping": mapping, "merging": OPTIONS} | changes
     return BuildOptions(**values)
 
@@ -24,7 +25,7 @@ def build(centre, logs, names="abc", monitor=QUIET, keep=False, **changes):
 
 
 def judge(*drives: str, **changes: object) -> JudgeOptions:
-    localising = RobotOptions(relocaliser="exhaustive", lanes=1, rounds=8)
+    localising = GateOptions(relocaliser="exhaustive", lanes=1, rounds=8)
     return JudgeOptions(list(drives), **({"judge_at_m": 3.0, "localising": localising} | changes))
 
 

@@ -21,16 +21,17 @@ from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.merge.gate import check_held_out
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, Session
-from engram.localiser import Localisation, Position
-from engram.maps import Map, open_map
+from engram.localiser import Position
+from engram.maps import Map
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.robot import (
     DriveSequence,
-    RobotOptions,
+    FrameResult,
+    LocaliseOptions,
+    LocaliseRun,
     Settings,
     measured,
-    robot_on,
     session_of_drive,
 )
 
@@ -148,7 +149,7 @@ def try_downloads(
     wanted: Mapping[str, DownloadOptions],
     drives: Sequence[OpenDrive],
     settings: Settings,
-    localise: RobotOptions,
+    localise: LocaliseOptions,
     monitor: Monitor = QUIET,
     *,
     at: int | str | None = None,
@@ -196,16 +197,12 @@ def try_downloads(
                     left_out(LeftOut(name, str(session.id), hour, str(error)))
                     own = []
                     break
-                with (
-                    open_map(out) as opened_part,
-                    robot_on(opened_part, sequence, settings, localise) as robot,
-                    monitor.stage("localise", len(sequence)) as part,
-                ):
-                    position = start(opened_part)
+                with LocaliseRun(out, open_drive(), settings, localise) as run:
+                    position = start(run.opened)
                     if position is not None:
-                        robot.place_at(position)
-                    results = list(robot.drive(open_drive(), part))
-                    nodes = list(opened_part.graph.nodes)
+                        run.localiser.start_at(position)
+                    results = _localised(run, len(sequence), monitor)
+                    nodes = list(run.opened.graph.nodes)
                 own.append(_trial(name, session, report, results, nodes))
                 out.unlink()
             trials += own
@@ -216,7 +213,7 @@ def _trial(
     name: str,
     session: Session,
     report: DownloadReport,
-    results: Sequence[Localisation],
+    results: Sequence[FrameResult],
     nodes: Sequence[Node],
 ) -> Trial:
     """What came of a drive in a download."""
@@ -228,7 +225,7 @@ def _trial(
         name=name,
         drive=str(session.id),
         report=report,
-        steps=measured(results),
+        steps=measured([one.localisation for one in results]),
         ms_per_frame=sum(in_map_ms) / max(len(results), 1),
         lookup_ms_per_frame=sum(lookups_ms) / max(len(results), 1),
         lookups=len(lookups_ms),
@@ -266,3 +263,12 @@ def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
             )
         )
     return summaries
+
+
+def _localised(run: LocaliseRun, frames: int, monitor: Monitor) -> list[FrameResult]:
+    results = []
+    with monitor.stage("localise", frames) as part:
+        for _, result in run:
+            results.append(result)
+            part.advance(result.localisation.status.value)
+    return results

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from engram.monitor import Advancing, Monitor
+from engram.monitor import Monitor
 
 
 class Bars(Monitor):
@@ -15,7 +15,15 @@ class Bars(Monitor):
     def stage(self, what: str, total: int) -> Iterator[Monitor]:
         """One bar."""
         with progress(what, total) as advance:
-            yield Advancing(advance)
+            yield _Bar(advance)
+
+
+class _Bar(Monitor):
+    def __init__(self, advance: Callable[[str], None]) -> None:
+        self._advance = advance
+
+    def advance(self, word: str = "") -> None:
+        self._advance(word)
 
 
 @contextmanager

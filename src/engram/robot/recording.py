@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,10 +10,10 @@ from typing import Any
 
 from engram.config import config_hash
 from engram.errors import SequenceError
-from engram.frontend import Frame, FrameStatus, Frontend
-from engram.monitor import QUIET, Monitor, deferred_interrupt
-from engram.odometry import Odometry, OdometryStatus
-from engram.robot.front import arriving
+from engram.frontend import Frame, FrameStatus
+from engram.monitor import ignore
+from engram.odometry import OdometryStatus
+from engram.robot.live import live_frames
 from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
 from engram.sequences import (
@@ -69,7 +70,7 @@ def extract_log(
     sequence: DriveSequence,
     out: Path,
     settings: Settings,
-    monitor: Monitor = QUIET,
+    advance: Callable[[str], None] = ignore,
 ) -> ExtractReport:
     """Runs a drive's images through front-end and odometry and records the result.
 
@@ -81,7 +82,7 @@ def extract_log(
         sequence: the drive; images.
         out: NAME.framelog.
         settings: of front-end and odometry.
-        monitor: hears how each frame went, and may stop the recording.
+        advance: called once per frame with a word on how it went.
 
     Raises:
         SequenceError: the drive is a frame log already, or its images cannot be used.
@@ -89,28 +90,25 @@ def extract_log(
         MapError: the log cannot be written; what was recorded is intact.
     """
     report = ExtractReport(str(out))
-    frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
+    header: FrameLogHeader | None = None
     writer: FrameLogWriter | None = None
     try:
-        with closing(arriving(sequence)) as pairs, deferred_interrupt() as raise_if_asked:
-            for pair in pairs:
-                raise_if_asked()
-                if isinstance(pair, LoggedFrame):
+        with closing(live_frames(sequence, settings)) as frames:
+            for live in frames:
+                if live.pair is None:
                     raise SequenceError(f"{sequence.info.name}: is a frame log already")
-                frame = frontend.extract(pair)
-                step = odometry.step(frame)
                 if writer is None:
-                    writer = FrameLogWriter(out, _header(sequence, frame, settings))
-                _count(report, frame.status, step.status)
-                pair_hash = first_pair_hash(pair)
-                if writer.holds(frame.stamp_ns, pair_hash):
+                    header = _header(sequence, live.frame, settings)
+                    writer = FrameLogWriter(out, header)
+                _count(report, live.frame.status, live.motion.odometry.status)
+                pair_hash = first_pair_hash(live.pair)
+                if writer.holds(live.frame.stamp_ns, pair_hash):
                     report.already_recorded += 1
-                    monitor.advance("recorded already")
-                else:
-                    writer.append(LoggedFrame(frame, step), pair_hash)
-                    report.frames += 1
-                    monitor.advance(step.status.value)
-                monitor.check()
+                    advance("recorded already")
+                    continue
+                writer.append(LoggedFrame(live.frame, live.motion.odometry), pair_hash)
+                report.frames += 1
+                advance(live.motion.odometry.status.value)
         if writer is None:
             raise SequenceError(f"{sequence.info.name}: no frame can be read")
         writer.close(complete=True)

@@ -1,0 +1,85 @@
+"""The loop of `engram localise`: progress, pictures, trajectory, summary."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from engram.robot import LocaliseOptions, Settings
+    from engram.sequences import FrameLog, ImageSequence
+
+# So many match pictures are spread over a drive: enough to leaf through.
+_PICTURES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Where the results go.
+
+    Attributes:
+        trajectory: file in TUM format; None for none.
+        pictures: folder of match pictures; None for none.
+        as_json: JSON on stdout, in place of text.
+    """
+
+    trajectory: Path | None
+    pictures: Path | None
+    as_json: bool
+
+
+def localise_and_print(
+    map_path: Path,
+    sequence: ImageSequence | FrameLog,
+    settings: Settings,
+    asked: LocaliseOptions,
+    outputs: Outputs,
+) -> None:
+    """Localises a drive; Ctrl-C ends it with a summary of the frames so far.
+
+    Raises:
+        Exit: it was interrupted.
+    """
+    from engram.cli.progress import progress
+    from engram.cli.wording import localised_text, warnings
+    from engram.robot import FrameResult, LocaliseRun, summarise
+    from engram.viewing.pictures import PictureWriter
+    from engram.viewing.trajectory import write_trajectory
+
+    results: list[FrameResult] = []
+    interrupted = False
+    with LocaliseRun(map_path, sequence, settings, asked) as run:
+        writer = None
+        if outputs.pictures is not None:
+            every = max(1, len(sequence) // _PICTURES)
+            writer = PictureWriter(outputs.pictures, every, run.localiser, run.opened.frames)
+        with progress("localise", len(sequence)) as advance:
+            try:
+                for live, result in run:
+                    results.append(result)
+                    advance(result.localisation.status.value)
+                    if writer is not None:
+                        writer.offer(live, result)
+            except KeyboardInterrupt:
+                interrupted = True
+                typer.echo("interrupted: the summary covers the frames so far", err=True)
+        if outputs.trajectory is not None:
+            write_trajectory(outputs.trajectory, run.opened.graph, results)
+    summary = {
+        **summarise(results),
+        "skipped_pairs": sequence.skipped,
+        "interrupted": interrupted,
+    }
+    frames = [result.to_dict() for result in results]
+    if outputs.as_json:
+        print(json.dumps({"summary": summary, "frames": frames}))
+    else:
+        for warning in warnings(summary):
+            typer.echo(warning, err=True)
+        typer.echo(localised_text(summary, frames, map_path))
+    if interrupted:
+        raise typer.Exit(130)
