@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,28 +10,26 @@ from pathlib import Path
 import numpy as np
 from tests.synthetic_world import Seen
 
-from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Session, session_id
 from engram.localiser import Budget, Localisation, Localiser
-from engram.mapper import Mapper, MappingStep, Saver
+from engram.mapper import Mapper, Saver
 from engram.maps import Map, open_map
-from engram.odometry import GapFiller, Motion
-from engram.robot import Settings
+from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in
-from engram.robot.mapping import loop_search
+from engram.robot.saving import loop_search
 
 
 @dataclass
 class Mapped:
     """What mapping a drive came to, beside the truth."""
 
-    steps: list[MappingStep]
+    steps: list[Localisation]
     drive: list[Seen]
 
     @property
     def statuses(self) -> list[str]:
-        return [step.localisation.status.value for step in self.steps]
+        return [step.status.value for step in self.steps]
 
     @property
     def saved(self) -> dict[NodeId, SE3]:
@@ -92,27 +90,18 @@ def map_simulated(
             searching = loop_search(opened, localiser, Settings())
         with localiser, searching as loops:
             mapper = Mapper(opened.graph, localiser, saver, session, loops=loops)
-            steps = [mapper.process(frame, motion) for frame, motion in moving(drive)]
+            robot = Robot(Front(Settings()), localiser, mapper)
+            steps = [robot.step(seen.logged) for seen in drive]
             mapper.finish()
         saver.finish()
         writer.commit()
     return Mapped(steps, drive)
 
 
-def moving(drive: Iterable[Seen]) -> Iterator[tuple[Frame, Motion]]:
-    """Frames with their motion, gaps filled."""
-    gaps = GapFiller()
-    for seen in drive:
-        yield seen.frame, gaps.motion(seen.odometry, seen.frame.stamp_ns)
-
-
 def localised(localiser: Localiser, drive: Iterable[Seen]) -> list[Localisation]:
     """What a localiser finds of frames, one after another."""
-    found = []
-    for frame, motion in moving(drive):
-        localiser.move(motion)
-        found.append(localiser.localise(frame))
-    return found
+    robot = Robot(Front(Settings()), localiser)
+    return [robot.step(seen.logged) for seen in drive]
 
 
 def localise_simulated(

@@ -14,6 +14,7 @@ from engram.frontend import BRIEF, Frame, FrameStatus
 from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
 from engram.geometry import SE3, StereoCamera
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.sequences import LoggedFrame
 
 CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
 PERIOD_NS = 50_000_000
@@ -108,6 +109,11 @@ class Seen:
     frame: Frame
     odometry: OdometryStep
     world_from_live: SE3
+
+    @property
+    def logged(self) -> LoggedFrame:
+        """As a frame log has it."""
+        return LoggedFrame(self.frame, self.odometry)
 
 
 def drive(

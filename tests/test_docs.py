@@ -13,7 +13,7 @@ import typer
 
 import engram
 from engram.cli.app import app
-from engram.robot import MapOptions, map_drive, open_drive
+from engram.robot import RobotOptions, map_drive, open_drive
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -97,7 +97,7 @@ def test_the_example_of_the_readme_runs(
     street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    map_drive(tmp_path / "town.engram", open_drive(street), engram.Settings(), MapOptions())
+    map_drive(tmp_path / "town.engram", open_drive(street), engram.Settings(), RobotOptions())
     block = re.search(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.M | re.S)
     assert block is not None
     dark = np.zeros((370, 1226), dtype=np.uint8)
@@ -111,7 +111,7 @@ def test_the_example_of_the_readme_runs(
 
 def test_a_robot_that_hands_in_pairs_one_by_one_is_localised(street: Path, tmp_path: Path) -> None:
     path = tmp_path / "town.engram"
-    map_drive(path, open_drive(street), engram.Settings(), MapOptions())
+    map_drive(path, open_drive(street), engram.Settings(), RobotOptions())
     pairs = list(open_drive(street))
     with engram.open_map(path) as town, town.robot(pairs[0].camera, lanes=1) as robot:
         found = [robot.localise(pair, deadline_ms=1000) for pair in pairs]

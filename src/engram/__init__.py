@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from engram.geometry import SE3, StereoCamera
     from engram.localiser import Budget, Localisation, LocalisationStatus, Position
     from engram.maps import Map, open_map
-    from engram.robot import LiveRobot, Settings, map_drive, open_drive
+    from engram.robot import Robot, Settings, map_drive, open_drive
 
 __version__ = "0.1.0"
 
@@ -23,11 +23,11 @@ __all__ = [
     "SE3",
     "Budget",
     "EngramError",
-    "LiveRobot",
     "Localisation",
     "LocalisationStatus",
     "Map",
     "Position",
+    "Robot",
     "Settings",
     "StereoCamera",
     "StereoPair",
@@ -41,7 +41,7 @@ _HOMES = {
     "SE3": "engram.geometry",
     "Budget": "engram.localiser",
     "EngramError": "engram.errors",
-    "LiveRobot": "engram.robot",
+    "Robot": "engram.robot",
     "Localisation": "engram.localiser",
     "LocalisationStatus": "engram.localiser",
     "Map": "engram.maps",

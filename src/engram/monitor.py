@@ -37,6 +37,17 @@ class Monitor:
 QUIET = Monitor()
 
 
+class Advancing(Monitor):
+    """Calls a function for each item of the work, with the word on what became of it."""
+
+    def __init__(self, advance: Callable[[str], None]) -> None:
+        self._advance = advance
+
+    def advance(self, word: str = "") -> None:
+        """See `Monitor`."""
+        self._advance(word)
+
+
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], None]]:
     """Holds a first Ctrl-C back until the function that this yields is called, which raises it.

@@ -5,15 +5,14 @@ from __future__ import annotations
 import signal
 
 from engram.fleet.build import BuildOptions, JudgeOptions, build_map
-from engram.fleet.merge.gate import GateOptions
 from engram.monitor import QUIET, Monitor
-from engram.robot import MapOptions, Settings
+from engram.robot import RobotOptions, Settings
 
 from .robots import OPTIONS
 
 
 def options(**changes: object) -> BuildOptions:
-    mapping = MapOptions(relocaliser="exhaustive")
+    mapping = RobotOptions(relocaliser="exhaustive")
     values = {"workers": 2, "groups": 2, "mapping": mapping, "merging": OPTIONS} | changes
     return BuildOptions(**values)
 
@@ -25,7 +24,7 @@ def build(centre, logs, names="abc", monitor=QUIET, keep=False, **changes):
 
 
 def judge(*drives: str, **changes: object) -> JudgeOptions:
-    localising = GateOptions(relocaliser="exhaustive", lanes=1, rounds=8)
+    localising = RobotOptions(relocaliser="exhaustive", lanes=1, rounds=8)
     return JudgeOptions(list(drives), **({"judge_at_m": 3.0, "localising": localising} | changes))
 
 

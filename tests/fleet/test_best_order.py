@@ -11,10 +11,9 @@ import pytest
 
 from engram.errors import ConfigError, MapError
 from engram.fleet.build import Orders, best_order, building, find_best_order, orders
-from engram.fleet.merge import GateOptions
 from engram.maps import copy_map
 from engram.monitor import QUIET
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 from .builds import build, in_this_process, judge
 from .robots import OPTIONS
@@ -76,7 +75,7 @@ def test_verdicts_on_other_maps_or_by_other_judges_are_not_used(
     others = {
         "drives": (groups, judge(logs["other"])),
         "distance": (groups, replace(by, judge_at_m=4.0)),
-        "localising": (groups, replace(by, localising=GateOptions())),
+        "localising": (groups, replace(by, localising=RobotOptions())),
         "reported": (groups, replace(by, reported=[logs["other"]])),
         "groups": ([maps[0], maps[2]], by),
     }
@@ -93,7 +92,7 @@ def test_a_search_that_was_killed_counts_what_it_had_done(tmp_path, maps, logs, 
     def dies_over_the_second(*arguments):
         nonlocal calls
         calls += 1
-        return killed() if calls == 2 else best_order.localise_drive(*arguments)
+        return killed() if calls == 2 else best_order.measure(*arguments)
 
     with pytest.raises(KilledError):
         search(tmp_path, maps[:2], judge(logs["held-out"], localise=dies_over_the_second))
@@ -173,7 +172,7 @@ def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
 
 def test_the_name_of_the_robot_does_not_let_a_drive_judge(tmp_path, maps, logs):
     robot, renamed = tmp_path / "robot.engram", open_drive(logs["held-out"], robot="somebody")
-    map_drive(robot, renamed, Settings(), MapOptions(relocaliser="exhaustive"))
+    map_drive(robot, renamed, Settings(), RobotOptions(relocaliser="exhaustive"))
     with pytest.raises(ConfigError, match=r"held-out\.framelog judges .* of somebody"):
         search(tmp_path, [maps[0], robot], judge(logs["held-out"]))
 
@@ -205,7 +204,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
     copy_map(maps[2], centre)
 
     def meanwhile(*arguments):
-        found = best_order.localise_drive(*arguments)
+        found = best_order.measure(*arguments)
         building.merge(centre, [maps[1]], OPTIONS)
         return found
 
@@ -224,7 +223,7 @@ def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch)
     for other in (None, judge(logs["other"])):
         with pytest.raises(ConfigError, match="being merged already, in the order"):
             build(centre, logs, "ab", judge=other)
-    monkeypatch.setattr(best_order, "localise_drive", never)
+    monkeypatch.setattr(best_order, "measure", never)
     report = build(centre, logs, "ab", judge=judge(logs["held-out"]), keep=True)
     assert report.best.spent.judge_s > 0
     assert report.content_hash == report.best.results[0].content_hash

@@ -16,10 +16,9 @@ import pytest
 
 from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
 from engram.fleet.build import JudgeOptions, build_map, order_costs
-from engram.fleet.merge.gate import GateOptions
 from engram.maps import Map, check_file
 from engram.monitor import Monitor
-from engram.robot import MapOptions, Settings
+from engram.robot import RobotOptions, Settings
 
 from .builds import Interrupting, build, options
 
@@ -161,7 +160,7 @@ def test_a_drive_that_cannot_be_read_is_named(tmp_path, logs):
 def test_all_orders_are_tried_over_a_prefix_tree_and_the_best_is_kept(tmp_path, logs):
     centre = tmp_path / "centre.engram"
     judge = JudgeOptions(
-        [logs["held-out"]], 3.0, GateOptions(relocaliser="exhaustive", lanes=1, rounds=8)
+        [logs["held-out"]], 3.0, RobotOptions(relocaliser="exhaustive", lanes=1, rounds=8)
     )
     report = build(centre, logs, groups=3, judge=judge)
     best = report.best
@@ -186,7 +185,7 @@ def test_the_cost_model_gives_the_papers_figure():
 
 def test_what_cannot_be_built_is_refused(tmp_path, logs):
     with pytest.raises(ConfigError, match="budgets by count"):
-        options(mapping=MapOptions(deadline_ms=10.0))
+        options(mapping=RobotOptions(deadline_ms=10.0))
     with pytest.raises(ConfigError, match="validation"):
         JudgeOptions([])
     with pytest.raises(ConfigError, match="0 workers"):

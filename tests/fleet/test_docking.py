@@ -38,7 +38,7 @@ from engram.graph.model import Clock, NodeId, Omission, SessionId
 from engram.maps import BulkWriter, Map, check_file, copy_map
 from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
-from engram.robot import MapOptions, Settings, map_drive, open_drive, session_of_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive, session_of_drive
 
 from .robots import frame_log, merged, rewritten, robot_map
 
@@ -420,7 +420,7 @@ class TestGate:
     def test_a_drive_that_a_map_holds_is_not_held_out(self, tmp_path, centre, fleet):
         drive = frame_log(tmp_path / "drive.framelog", np.arange(0, 8, 0.8), 1, day=8)
         robot = tmp_path / "robot.engram"
-        map_drive(robot, open_drive(drive), Settings(), MapOptions(relocaliser="exhaustive"))
+        map_drive(robot, open_drive(drive), Settings(), RobotOptions(relocaliser="exhaustive"))
         before = centre.read_bytes()
         with pytest.raises(ConfigError, match=r"drive\.framelog is not held out: .*robot\.engram"):
             merged(centre, fleet["longer"][0], robot, require_better=[drive])
@@ -433,7 +433,7 @@ class TestGate:
         drive = frame_log(tmp_path / "drive.framelog", np.arange(0, 8, 0.8), 1, day=8)
         robot = tmp_path / "robot.engram"
         renamed = open_drive(drive, robot="somebody")
-        map_drive(robot, renamed, Settings(), MapOptions(relocaliser="exhaustive"))
+        map_drive(robot, renamed, Settings(), RobotOptions(relocaliser="exhaustive"))
         merged(centre, robot)
         with pytest.raises(ConfigError, match=r"not held out: .*centre\.engram .*somebody"):
             merged(centre, fleet["longer"][0], require_better=[drive])

@@ -14,7 +14,7 @@ from engram.fleet.merge import Reason, Seed
 from engram.fleet.merge.handed_in import HandedIn
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
 from engram.maps import Map, check_file, open_map
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 from .robots import OPTIONS, frame_log, merged, robot_map, truth_of
 
@@ -285,7 +285,7 @@ def test_nodes_that_a_revert_had_hidden_bring_back_what_joins_them_to_others(tmp
     # A robot drives on in a download, so that its nodes hang on those of `first`.
     download(centre, sent, DownloadOptions())
     drive = frame_log(tmp_path / "drive.framelog", np.arange(8, 40, 0.8), name="r5", day=5)
-    map_drive(sent, open_drive(drive), Settings(), MapOptions(relocaliser="exhaustive"))
+    map_drive(sent, open_drive(drive), Settings(), RobotOptions(relocaliser="exhaustive"))
     (before,) = merged(centre, sent)
     with Map.open(centre, writes=True) as store:
         store.revert(1, author="tests")

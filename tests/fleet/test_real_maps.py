@@ -13,12 +13,12 @@ from engram.fleet.merge import merge as merge_maps
 from engram.graph.model import NodeId, Omission
 from engram.maps import Map, check_file
 from engram.robot import (
-    LocaliseOptions,
-    LocaliseRun,
-    MapOptions,
+    RobotOptions,
     Settings,
+    localise_drive,
     map_drive,
     open_drive,
+    open_map,
     summarise,
 )
 from engram.sequences.trajectories import Trajectory, read_kitti_poses, read_matrix_truth
@@ -34,7 +34,7 @@ CAM0_FROM_CAM2_M = np.array([-0.0598, 0.0004, -0.0027])
 
 def robot_map(folder: Path, robot: str, drive: Path, **how: str) -> Path:
     path = folder / f"{robot}.engram"
-    map_drive(path, open_drive(drive, robot=robot, **how), Settings(), MapOptions())
+    map_drive(path, open_drive(drive, robot=robot, **how), Settings(), RobotOptions())
     return path
 
 
@@ -102,10 +102,10 @@ def test_a_robot_works_from_a_download_of_real_maps(street, data_dir, tmp_path):
     merge(centre, street["grey"], street["colour"])
     download(centre, part, DownloadOptions("copy"))
     red = open_drive(data_dir / DRIVE_0001, rig="colour", channel="red", robot="red")
-    with LocaliseRun(part, red, Settings(), LocaliseOptions()) as run:
-        results = [result for _, result in run]
+    with open_map(part) as opened:
+        results = localise_drive(opened, red)
     assert summarise(results)["share_localised"] >= 0.8
-    map_drive(part, red, Settings(), MapOptions())
+    map_drive(part, red, Settings(), RobotOptions())
     (report,) = merge(centre, part)
     assert (report.sessions, report.known) == (1, len(stamps_of(street["grey"])))
     assert check_file(centre).sound

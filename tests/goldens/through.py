@@ -18,21 +18,19 @@ from engram.fleet.build.building import BuildOptions, build_map
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import merge as merge_maps
 from engram.frontend import Frame, Frontend, StereoPair
-from engram.localiser import Budget, Localisation
+from engram.localiser import Localisation
 from engram.maps import Map, open_map
 from engram.maps.history import revert_revision
 from engram.odometry import Odometry
 from engram.robot import (
     DriveSequence,
-    LocaliseOptions,
-    LocaliseRun,
-    MapOptions,
+    RobotOptions,
     Settings,
+    localise_drive,
     map_drive,
     open_drive,
     session_of_drive,
 )
-from engram.robot.localisers import localiser_in
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.there_and_back import ThereAndBack
 from engram_lab.town.campaigns import campaign_named
@@ -114,27 +112,16 @@ def measured(sequence: DriveSequence) -> Iterator[Values]:
 
 def map_one(path: Path, sequence: DriveSequence, *, threads: bool, **how: Any) -> list[Values]:
     """Maps a drive; what was found of each frame."""
-    report = map_drive(path, sequence, Settings(), MapOptions(threads=threads, **how))
-    return [_found(one.localisation, one.prev_from_curr) for one in report.results]
+    report = map_drive(path, sequence, Settings(), RobotOptions(threads=threads, **how))
+    return [_found(one, one.motion.odometry.prev_from_curr) for one in report.results]
 
 
 def localise(path: Path, sequence: DriveSequence, *, policy: str, threads: bool) -> list[Values]:
     """Localises a drive by the budget of the command line; what was found of each frame."""
-    settings = Settings()
-    with LocaliseRun(path, sequence, settings, LocaliseOptions(policy=policy)) as run:
-        if not threads:
-            run.localiser.close()
-            run.localiser = localiser_in(
-                run.opened,
-                sequence.camera,
-                settings,
-                policy=policy,
-                budget=Budget(2, 2),
-                live=session_of_drive(sequence).id,
-                clock=sequence.info,
-                threads=False,
-            )
-        return [_found(one.localisation, one.prev_from_curr) for _, one in run]
+    options = RobotOptions(policy=policy, threads=threads)
+    with open_map(path) as opened:
+        found = localise_drive(opened, sequence, Settings(), options)
+    return [_found(one, one.motion.odometry.prev_from_curr) for one in found]
 
 
 def live(path: Path, sequence: DriveSequence) -> list[Values]:
@@ -165,7 +152,7 @@ def send(centre: Path, out: Path, **options: Any) -> Values:
 
 def build(centre: Path, drives: list[Path], *, groups: int, threads: bool) -> Values:
     """Builds a centre of drives."""
-    options = BuildOptions(workers=1, groups=groups, mapping=MapOptions(threads=threads))
+    options = BuildOptions(workers=1, groups=groups, mapping=RobotOptions(threads=threads))
     report = build_map(centre, [str(path) for path in drives], Settings(), options)
     return {"groups": [" ".join(names) for names in report.groups]}
 

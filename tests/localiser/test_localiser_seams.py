@@ -4,15 +4,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tests.mapping_rig import localised, map_simulated, moving
-from tests.synthetic_world import World, drive
+from tests.mapping_rig import localised, map_simulated
+from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
 from engram.errors import MapCorruptError
 from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
 from engram.maps import Map
 from engram.odometry import OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
-from engram.robot import Settings
+from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in
 
 WORLD = World(30.0)
@@ -68,7 +68,7 @@ def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candida
             matcher=matcher,
             search=search,
         ) as localiser:
-            localiser.start_at(Position.at(opened.graph.node(0).id))
+            localiser.place_at(Position.at(opened.graph.node(0).id))
             found = localised(localiser, live)
     assert all(one.node is not None for one in found)
     assert matcher.calls == sum(one.attempts for one in found) > 0
@@ -99,8 +99,13 @@ def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_
             relocaliser=None,
             search=search,
         ) as localiser:
-            localiser.start_at(Position.at(opened.graph.node(0).id))
-            gone = [replace(seen, odometry=blind) for seen in elsewhere[10:16] * 20]
+            localiser.place_at(Position.at(opened.graph.node(0).id))
+            last_ns = live[9].frame.stamp_ns
+            stamps_ns = range(last_ns + PERIOD_NS, last_ns + 121 * PERIOD_NS, PERIOD_NS)
+            gone = [
+                Seen(replace(seen.frame, stamp_ns=stamp_ns), blind, seen.world_from_live)
+                for seen, stamp_ns in zip(elsewhere[10:16] * 20, stamps_ns, strict=True)
+            ]
             found = localised(localiser, [*live[:10], *gone])
     known, lost = found[:10], found[10:]
     assert known[-1].status is LocalisationStatus.LOCALISED
@@ -130,10 +135,10 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
             relocaliser=None,
         ) as localiser,
     ):
-        localiser.start_at(Position.at(opened.graph.node(0).id))
-        for frame, motion in moving(live):
-            localiser.move(motion)
-            localiser.localise(frame)
+        localiser.place_at(Position.at(opened.graph.node(0).id))
+        robot = Robot(Front(Settings()), localiser)
+        for seen in live:
+            robot.step(seen.logged)
             foreseen, order, count = policy.seen[-1]
             assert foreseen.accepted.shape == foreseen.inliers.shape == (count,)
             made = localiser.outcomes
@@ -174,7 +179,7 @@ def test_what_is_damaged_is_foreseen_to_fail(tmp_path: Path, monkeypatch) -> Non
             matcher=_Damaged(opened),
         ) as localiser,
     ):
-        localiser.start_at(Position.at(opened.graph.node(0).id))
+        localiser.place_at(Position.at(opened.graph.node(0).id))
         found = localised(localiser, live)
         assert found[0].damaged == (opened.graph.node(0).id,)
     foreseen = policy.seen[0][0]
@@ -248,7 +253,7 @@ def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
         ) as localiser,
     ):
         nodes = sorted(opened.graph.nodes, key=lambda node: node.stamp_ns)
-        localiser.start_at(Position.at(nodes[4].id))  # some four metres too far on
+        localiser.place_at(Position.at(nodes[4].id))  # some four metres too far on
         found = localised(localiser, live)
     where = [k for k, one in enumerate(found) if one.node is not None]
     # Lost after ten metres; a second witness must be four metres on.

@@ -58,9 +58,8 @@ def test_a_drifted_lap_is_closed_and_then_localised_in(path: Path) -> None:
 
 def test_a_robot_that_knows_its_chain_asks_beside_the_drive_only(path: Path) -> None:
     mapped = map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
-    first_lap = [step.localisation for step in mapped.steps[1 : LAP_FRAMES - 5]]
-    # A relocaliser that is asked says how likely a new place is.
-    assert {one.new_place for one in first_lap} == {None}
+    first_lap = mapped.steps[1 : LAP_FRAMES - 5]
+    assert not any(one.looked_up for one in first_lap)
 
 
 def test_a_robot_that_came_from_nowhere_asks_on_every_frame_until_it_is_found(path: Path) -> None:
@@ -68,7 +67,7 @@ def test_a_robot_that_came_from_nowhere_asks_on_every_frame_until_it_is_found(pa
     other_look = np.where(np.arange(40) < 20, 1, 0)
     live = drive(RING, 10 + np.arange(40) * 0.7, other_look, start_ns=10**15, seed=1)
     mapped = map_simulated(path, live, name="r2", closes_loops=True)
-    assert all(step.localisation.attempts > 0 for step in mapped.steps[:20])
+    assert all(step.attempts > 0 for step in mapped.steps[:20])
     assert mapped.statuses[20] == "localised"
 
 

@@ -54,7 +54,7 @@ def test_while_localisation_succeeds_nothing_is_saved(path: Path) -> None:
     again = map_simulated(path, drive(WORLD, ROAD + 0.3, seed=1, start_ns=LATER_NS), "r2")
     assert again.statuses.count("localised") == len(ROAD)
     assert not again.saved
-    found = [step.localisation for step in again.steps]
+    found = again.steps
     errors = errors_m(found, again.drive, first.saved)
     # Pixel noise of 0.3 px on points 4 to 40 m away.
     assert np.median(errors) < 0.03

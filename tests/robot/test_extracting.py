@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from engram.errors import IncompatibleError, SequenceError
+from engram.monitor import Advancing
 from engram.robot.recording import extract_log
 from engram.robot.settings import Settings
 from engram.sequences import FrameLog, open_sequence
@@ -46,7 +47,7 @@ def test_an_interrupted_recording_equals_one_in_one_go(drive: Path, tmp_path: Pa
         if calls == 3:
             raise KeyboardInterrupt
 
-    first = extract_log(open_sequence(drive), parts, Settings(), interrupt)
+    first = extract_log(open_sequence(drive), parts, Settings(), Advancing(interrupt))
     assert first.interrupted
     assert not FrameLog(parts).complete
     second = extract_log(open_sequence(drive), parts, Settings())

@@ -6,6 +6,8 @@ import os
 import signal
 import threading
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -15,17 +17,16 @@ from engram.frontend import StereoPair
 from engram.graph.model import path_id
 from engram.mapper import MapperConfig
 from engram.maps import Map
-from engram.monitor import deferred_interrupt
+from engram.monitor import Advancing, deferred_interrupt
 from engram.robot import (
     DriveSequence,
-    LocaliseOptions,
-    MapOptions,
     MapReport,
+    RobotOptions,
     Settings,
     check_map,
-    live_frames,
     map_drive,
     open_drive,
+    open_map,
 )
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.there_and_back import ThereAndBack
@@ -35,7 +36,7 @@ SETTINGS = Settings(mapper=MapperConfig(checkpoint_every=CHECKPOINT_EVERY))
 
 
 def run(town: Path, drive: DriveSequence, stop_after: int | None = None) -> MapReport:
-    return map_drive(town, drive, SETTINGS, MapOptions(), interrupt_after(stop_after))
+    return map_drive(town, drive, SETTINGS, RobotOptions(), Advancing(interrupt_after(stop_after)))
 
 
 def interrupt_after(frames: int | None) -> Callable[[str], None]:
@@ -126,22 +127,24 @@ def test_a_handler_of_the_program_is_left_alone() -> None:
 class Endless:
     """Pairs for ever."""
 
-    def __init__(self) -> None:
-        self._pairs = synthetic_drive(frames=1)
+    def __init__(self, pair: StereoPair) -> None:
+        self._pair = pair
 
     def __iter__(self):
-        while True:
-            yield from self._pairs
+        for number in count():
+            yield replace(self._pair, stamp_ns=number)
 
 
-def test_ctrl_c_ends_live_frames_between_two_frames_and_its_thread_with_it() -> None:
-    seen: list[StereoPair | None] = []
+def test_ctrl_c_ends_a_drive_between_two_frames_and_its_thread_with_it(tmp_path: Path) -> None:
+    (pair,), seen = synthetic_drive(frames=1), []
 
     def watch() -> None:
-        for live in live_frames(Endless(), Settings()):  # type: ignore[arg-type]
-            seen.append(live.pair)
-            if len(seen) == 3:
-                os.kill(os.getpid(), signal.SIGINT)
+        town = open_map(tmp_path / "empty.engram", create=True)
+        with town, town.robot(pair.camera) as robot:
+            for found in robot.drive(Endless(pair)):
+                seen.append(found.stamp_ns)
+                if len(seen) == 3:
+                    os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         watch()
@@ -150,6 +153,9 @@ def test_ctrl_c_ends_live_frames_between_two_frames_and_its_thread_with_it() -> 
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan")])
-def test_a_rate_that_is_none_is_refused(rate_hz: float) -> None:
-    with pytest.raises(ConfigError, match="rate"):
-        LocaliseOptions(rate_hz=rate_hz)
+def test_a_rate_that_is_none_is_refused(rate_hz: float, tmp_path: Path) -> None:
+    pairs = synthetic_drive(frames=1)
+    with open_map(tmp_path / "empty.engram", create=True) as town:
+        robot = town.robot(pairs[0].camera)
+        with robot, pytest.raises(ConfigError, match="rate"):
+            next(robot.drive(pairs, rate_hz=rate_hz))

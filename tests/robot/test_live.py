@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from engram.robot.live import paced, read_ahead
+from engram.robot.front import paced, read_ahead
 
 
 def test_read_ahead_keeps_order() -> None:

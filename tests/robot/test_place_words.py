@@ -14,7 +14,7 @@ from engram.frontend import BRIEF, TEBLID
 from engram.maps import Map, open_map
 from engram.places import TrainingConfig, default_vocabulary, encode_vocabulary
 from engram.places.stored_words import keep_missing_words, stored_words, vocabulary_of
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram.robot.localisers import relocaliser_in
 from engram.robot.vocabularies import train_map_vocabulary, use_vocabulary
 
@@ -93,7 +93,7 @@ def test_mapping_keeps_the_words_of_what_it_saves_and_of_what_was_there(
     before = count_nodes(path)
     write_campaign(tmp_path / "elsewhere", looks=(1,))
     (log,) = (tmp_path / "elsewhere").glob("*.framelog")
-    map_drive(path, open_drive(log), Settings(), MapOptions())
+    map_drive(path, open_drive(log), Settings(), RobotOptions())
     with Map.open(path) as store:
         nodes = {node.id for node in store.load().nodes}
         assert len(nodes) >= before + 10

@@ -10,12 +10,12 @@ import pytest
 from engram.geometry import SE3
 from engram.maps import check_file
 from engram.robot import (
-    LocaliseOptions,
-    LocaliseRun,
-    MapOptions,
+    RobotOptions,
     Settings,
+    localise_drive,
     map_drive,
     open_drive,
+    open_map,
     summarise,
 )
 from engram.sequences.trajectories import read_kitti_poses
@@ -32,7 +32,7 @@ CAM0_FROM_CAM2_M = np.array([-0.0598, 0.0004, -0.0027])
 @pytest.fixture(scope="module")
 def grey_map(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("maps") / "grey.engram"
-    map_drive(path, open_drive(data_dir / DRIVE_0001), Settings(), MapOptions())
+    map_drive(path, open_drive(data_dir / DRIVE_0001), Settings(), RobotOptions())
     return path
 
 
@@ -41,12 +41,11 @@ def test_another_camera_is_localised_in_the_map_of_the_grey_rig(
     data_dir: Path, grey_map: Path, channel: str, share: float
 ) -> None:
     sequence = open_drive(data_dir / DRIVE_0001, rig="colour", channel=channel)
-    with LocaliseRun(grey_map, sequence, Settings(), LocaliseOptions()) as run:
-        results = [result for _, result in run]
+    with open_map(grey_map) as opened:
+        results = localise_drive(opened, sequence)
     assert summarise(results)["share_localised"] >= share
     errors = []
-    for result in results:
-        found = result.localisation
+    for found in results:
         # The rigs trigger within 6 ms of each other; frames come every 100 ms.
         same = found.node_stamp_ns and abs(found.node_stamp_ns - found.stamp_ns) < 40_000_000
         if same and found.node_from_live is not None:
@@ -57,16 +56,15 @@ def test_another_camera_is_localised_in_the_map_of_the_grey_rig(
 
 def test_odd_frames_are_localised_in_the_even_ones(data_dir: Path, tmp_path: Path) -> None:
     path = tmp_path / "even.engram"
-    map_drive(path, open_drive(data_dir / KITTI_06, frames="::2"), Settings(), MapOptions())
+    map_drive(path, open_drive(data_dir / KITTI_06, frames="::2"), Settings(), RobotOptions())
     whole = open_drive(data_dir / KITTI_06)
     truth = read_kitti_poses(data_dir / "kitti_odometry/poses/06.txt", whole.stamps_ns)
     odd = open_drive(data_dir / KITTI_06, frames="1::2")
-    with LocaliseRun(path, odd, Settings(), LocaliseOptions()) as run:
-        results = [result for _, result in run]
+    with open_map(path) as opened:
+        results = localise_drive(opened, odd)
     assert summarise(results)["share_localised"] == 1.0
     errors = []
-    for result in results:
-        found = result.localisation
+    for found in results:
         node_from_live = truth.at(found.node_stamp_ns).inverse() @ truth.at(found.stamp_ns)
         difference = node_from_live.translation - found.node_from_live.translation
         errors.append(np.linalg.norm(difference))
@@ -76,11 +74,11 @@ def test_odd_frames_are_localised_in_the_even_ones(data_dir: Path, tmp_path: Pat
 def test_the_chained_trajectory_follows_the_truth(data_dir: Path, tmp_path: Path) -> None:
     path = tmp_path / "kitti.engram"
     sequence = open_drive(data_dir / KITTI_06)
-    map_drive(path, sequence, Settings(), MapOptions())
+    map_drive(path, sequence, Settings(), RobotOptions())
     truth = read_kitti_poses(data_dir / "kitti_odometry/poses/06.txt", sequence.stamps_ns)
-    with LocaliseRun(path, sequence, Settings(), LocaliseOptions()) as run:
-        results = [result for _, result in run]
-        trajectory = chain_trajectory(run.opened.graph, results)
+    with open_map(path) as opened:
+        results = localise_drive(opened, sequence)
+        trajectory = chain_trajectory(opened.graph, results)
     (first_ns, _), (last_ns, first_from_last) = trajectory[0], trajectory[-1]
     true_motion: SE3 = truth.at(first_ns).inverse() @ truth.at(last_ns)
     # Drift of odometry over the 60 m between, at most 1 %.
@@ -91,11 +89,11 @@ def test_the_chained_trajectory_follows_the_truth(data_dir: Path, tmp_path: Path
 def test_a_room_walked_again_and_again_makes_a_sound_map(data_dir: Path, tmp_path: Path) -> None:
     path = tmp_path / "room.engram"
     sparse = open_drive(data_dir / "euroc/V1_01_easy_sparse")
-    map_drive(path, sparse, Settings(), MapOptions())
+    map_drive(path, sparse, Settings(), RobotOptions())
     assert check_file(path).sound
     # The robot at rest stands in that room, before the first frame of the other drive.
     rest = map_drive(
-        path, open_drive(data_dir / "euroc/V1_01_easy_at_rest"), Settings(), MapOptions()
+        path, open_drive(data_dir / "euroc/V1_01_easy_at_rest"), Settings(), RobotOptions()
     )
     assert summarise(rest.results)["share_localised"] == 1.0
     assert rest.saved == 0

@@ -9,14 +9,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from engram.frontend import Frame, FrameStatus
-from engram.graph.model import NodeId, node_id
-from engram.localiser import UNNAMED_LIVE_SESSION, Budget, FrameMatcher, Relocaliser
-from engram.localiser.attempts import Attempter, Candidate, best_success
-from engram.maps import Map, open_map
+from engram.graph.model import NodeId
+from engram.localiser import Budget, Localisation, Relocaliser
+from engram.maps import open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot.live import live_frames
-from engram.robot.localisers import relocaliser_in
+from engram.robot import Front, Robot, arriving
+from engram.robot.localisers import localiser_in, relocaliser_in
 from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
 
@@ -92,20 +90,21 @@ def relocalise_drive(
         ConfigError: there is no such relocaliser.
         MapError: the map cannot be read.
     """
-    budget = budget or Budget()
     with open_map(map_path, at) as opened:
         settings = settings.for_descriptor(opened.descriptor)
         finder = relocaliser_in(opened, relocaliser, settings.frontend.descriptor)
-        matcher = FrameMatcher(opened.frames, settings.localiser.lost_matcher)
+        localiser = localiser_in(
+            opened, sequence.camera, settings, budget=budget, relocaliser=finder
+        )
         with (
-            Attempter(matcher, matcher, budget.lanes, settings.localiser.acceptance) as attempter,
-            closing(live_frames(sequence, settings)) as frames,
+            Robot(Front(settings), localiser) as robot,
+            closing(arriving(sequence)) as frames,
             monitor.stage("relocalise", len(sequence)) as part,
         ):
             found = []
-            for live in frames:
-                finder.forget()
-                found.append(_cold_start(opened, live.frame, finder, attempter, budget))
+            for arrived in frames:
+                robot.lose()
+                found.append(_cold_start(robot.step(arrived), finder))
                 part.advance(found[-1].status.value)
     return found
 
@@ -121,31 +120,18 @@ def summarise_cold_starts(starts: list[ColdStart]) -> dict[str, Any]:
     }
 
 
-def _cold_start(
-    opened: Map, frame: Frame, finder: Relocaliser, attempter: Attempter, budget: Budget
-) -> ColdStart:
-    if frame.status is not FrameStatus.OK:
-        return ColdStart(frame.stamp_ns, PlaceStatus.UNUSABLE_FRAME, None, 0, 0, None)
-    proposed = finder.propose(frame, budget.lost_attempts, lambda _: True)
-    candidates = [
-        Candidate(index, opened.graph.node(index).id, None, guided=False, row=None)
-        for index in proposed
-    ]
-    live_id = node_id(UNNAMED_LIVE_SESSION, frame.stamp_ns)
-    outcomes = attempter.run(frame, live_id, candidates, None)
-    damaged = tuple(outcome.candidate.node for outcome in outcomes if outcome.damaged)
-    success = best_success(outcomes)
-    if success is None:
-        # Where nothing can be tried all is new. Elsewhere the probability does not decide: under
-        # another light it cannot tell known places from new ones (docs/places.md).
-        status = PlaceStatus.UNKNOWN if proposed else PlaceStatus.NEW_PLACE
-        return ColdStart(frame.stamp_ns, status, None, 0, len(outcomes), finder.new_place, damaged)
+def _cold_start(found: Localisation, finder: Relocaliser) -> ColdStart:
+    if not found.motion.usable:
+        return ColdStart(found.stamp_ns, PlaceStatus.UNUSABLE_FRAME, None, 0, 0, None)
+    # Where nothing can be tried all is new. Elsewhere the probability does not decide: under
+    # another light it cannot tell known places from new ones (docs/places.md).
+    status = PlaceStatus.UNKNOWN if found.attempts or found.damaged else PlaceStatus.NEW_PLACE
     return ColdStart(
-        frame.stamp_ns,
-        PlaceStatus.FOUND,
-        success.candidate.node,
-        success.match.inliers,
-        len(outcomes),
+        found.stamp_ns,
+        PlaceStatus.FOUND if found.localised else status,
+        found.node,
+        found.inliers,
+        found.attempts,
         finder.new_place,
-        damaged,
+        found.damaged,
     )

@@ -21,17 +21,16 @@ from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.merge.gate import check_held_out
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, Session
-from engram.localiser import Position
-from engram.maps import Map
+from engram.localiser import Localisation, Position
+from engram.maps import Map, open_map
 from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.robot import (
     DriveSequence,
-    FrameResult,
-    LocaliseOptions,
-    LocaliseRun,
+    RobotOptions,
     Settings,
     measured,
+    robot_on,
     session_of_drive,
 )
 
@@ -149,7 +148,7 @@ def try_downloads(
     wanted: Mapping[str, DownloadOptions],
     drives: Sequence[OpenDrive],
     settings: Settings,
-    localise: LocaliseOptions,
+    localise: RobotOptions,
     monitor: Monitor = QUIET,
     *,
     at: int | str | None = None,
@@ -197,12 +196,16 @@ def try_downloads(
                     left_out(LeftOut(name, str(session.id), hour, str(error)))
                     own = []
                     break
-                with LocaliseRun(out, open_drive(), settings, localise) as run:
-                    position = start(run.opened)
+                with (
+                    open_map(out) as opened_part,
+                    robot_on(opened_part, sequence, settings, localise) as robot,
+                    monitor.stage("localise", len(sequence)) as part,
+                ):
+                    position = start(opened_part)
                     if position is not None:
-                        run.localiser.start_at(position)
-                    results = _localised(run, len(sequence), monitor)
-                    nodes = list(run.opened.graph.nodes)
+                        robot.place_at(position)
+                    results = list(robot.drive(open_drive(), part))
+                    nodes = list(opened_part.graph.nodes)
                 own.append(_trial(name, session, report, results, nodes))
                 out.unlink()
             trials += own
@@ -213,7 +216,7 @@ def _trial(
     name: str,
     session: Session,
     report: DownloadReport,
-    results: Sequence[FrameResult],
+    results: Sequence[Localisation],
     nodes: Sequence[Node],
 ) -> Trial:
     """What came of a drive in a download."""
@@ -225,7 +228,7 @@ def _trial(
         name=name,
         drive=str(session.id),
         report=report,
-        steps=measured([one.localisation for one in results]),
+        steps=measured(results),
         ms_per_frame=sum(in_map_ms) / max(len(results), 1),
         lookup_ms_per_frame=sum(lookups_ms) / max(len(results), 1),
         lookups=len(lookups_ms),
@@ -263,12 +266,3 @@ def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
             )
         )
     return summaries
-
-
-def _localised(run: LocaliseRun, frames: int, monitor: Monitor) -> list[FrameResult]:
-    results = []
-    with monitor.stage("localise", frames) as part:
-        for _, result in run:
-            results.append(result)
-            part.advance(result.localisation.status.value)
-    return results

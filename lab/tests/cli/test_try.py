@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import engram
 
-from engram.robot import MapOptions, Settings, extract_log, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, extract_log, map_drive, open_drive
 
 __all__ = ["engram"]
 
@@ -17,7 +17,7 @@ __all__ = ["engram"]
 def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fleet") / "centre.engram"
     sequence = open_drive(street, start="2026-03-01T09:30:00", longitude_deg=0.0)
-    map_drive(path, sequence, Settings(), MapOptions())
+    map_drive(path, sequence, Settings(), RobotOptions())
     return path
 
 
@@ -54,7 +54,7 @@ def test_a_drive_that_the_centre_holds_is_refused(
     engram, centre: Path, morning: Path, tmp_path: Path, robot: str | None
 ) -> None:
     known = shutil.copy(centre, tmp_path / "centre.engram")
-    map_drive(known, open_drive(morning, robot=robot), Settings(), MapOptions())
+    map_drive(known, open_drive(morning, robot=robot), Settings(), RobotOptions())
     ran = engram("lab", "try", known, morning)
     assert ran.status == 2
     assert f"{morning} is not held out" in ran.err

@@ -8,7 +8,7 @@ import numpy as np
 from tests.synthetic_world import World, drive
 
 from engram.graph.model import Clock
-from engram.robot import MapOptions
+from engram.robot import RobotOptions
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame
 from engram.sequences.sequence import SequenceInfo
 from engram.sequences.trajectories import Trajectory, truth_path, write_tum
@@ -59,6 +59,6 @@ def few_options(**changes) -> RankingOptions:
         "live_folds": 0,
         "map_sizes": False,
         # One core and a second are enough on so short a road.
-        "build": MapOptions(policy="path-near", lanes=2, rounds=4, relocaliser="exhaustive"),
+        "build": RobotOptions(policy="path-near", lanes=2, rounds=4, relocaliser="exhaustive"),
     }
     return RankingOptions(**{**values, **changes})

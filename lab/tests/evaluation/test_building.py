@@ -7,13 +7,13 @@ import pytest
 from lab.tests.evaluation.campaigns import few_options, write_campaign
 
 from engram.graph.graph import ExperienceGraph
-from engram.robot import MapOptions, Settings, open_map
+from engram.robot import RobotOptions, Settings, open_map
 from engram_lab.studies import DriveSet
 from engram_lab.studies.building import build_map, true_nodes
 from engram_lab.studies.configurations import EVERYTHING, UNLIMITED, sweep
 from engram_lab.studies.starting import TrueNodes
 
-OPTIONS: MapOptions = few_options().build
+OPTIONS: RobotOptions = few_options().build
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from lab.tests.evaluation.campaigns import write_campaign
 from engram.errors import ConfigError, InputError
 from engram.maps import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot import LocaliseOptions, Settings
+from engram.robot import RobotOptions, Settings
 from engram_lab.studies import DriveSet
 from engram_lab.studies.fleet import (
     FleetOptions,
@@ -145,7 +145,7 @@ def test_merging_omits_what_the_other_group_saw_alike(plan: FleetPlan) -> None:
 
 def test_the_lost_are_timed_by_what_they_attempt_in_vain(plan: FleetPlan, monkeypatch) -> None:
     """Where every drive is found at once, too."""
-    (fold, *_), options = plan.folds, LocaliseOptions("distance", 1, 8, relocaliser="exhaustive")
+    (fold, *_), options = plan.folds, RobotOptions("distance", 1, 8, relocaliser="exhaustive")
     drives = [one.path for one in plan.held_out(fold)]
     about = drives, steps.map_path(plan, plan.arms[0], fold, "single"), plan.settings, options
     assert stages.medians(*about)["proposed_ms"] > 0

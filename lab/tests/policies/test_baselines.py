@@ -9,7 +9,7 @@ from tests.worlds import flat_graph, make_context, memory_of, run_of, session_uu
 from engram.errors import ConfigError
 from engram.graph.model import PathEntry, PathEntryKind, path_id
 from engram.ranking import Foreseen, policy_named, policy_names
-from engram.robot.localising import LocaliseOptions
+from engram.robot import RobotOptions
 from engram_lab.policies.bandit import session_tallies
 from engram_lab.policies.time_of_day import TimeOfDayPolicy
 
@@ -28,7 +28,7 @@ class TestOracle:
 
     def test_a_drive_is_refused(self) -> None:
         with pytest.raises(ConfigError, match="engram evaluate"):
-            LocaliseOptions(policy="oracle")
+            RobotOptions(policy="oracle")
 
     def test_a_context_without_foresight_is_refused(self) -> None:
         with pytest.raises(ConfigError, match="engram evaluate"):

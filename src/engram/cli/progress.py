@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from engram.monitor import Monitor
+from engram.monitor import Advancing, Monitor
 
 
 class Bars(Monitor):
@@ -15,15 +15,7 @@ class Bars(Monitor):
     def stage(self, what: str, total: int) -> Iterator[Monitor]:
         """One bar."""
         with progress(what, total) as advance:
-            yield _Bar(advance)
-
-
-class _Bar(Monitor):
-    def __init__(self, advance: Callable[[str], None]) -> None:
-        self._advance = advance
-
-    def advance(self, word: str = "") -> None:
-        self._advance(word)
+            yield Advancing(advance)
 
 
 @contextmanager

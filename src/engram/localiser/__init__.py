@@ -11,7 +11,14 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
-from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
+from engram.localiser.keeper import KEEPS_NOTHING, Hint, Keeper
+from engram.localiser.localisation import (
+    Budget,
+    Localisation,
+    LocalisationStatus,
+    Position,
+    StageClock,
+)
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
 from engram.localiser.place_book import PlaceBook, Searched
 from engram.localiser.relocalisation import (
@@ -23,9 +30,9 @@ from engram.localiser.relocalisation import (
     spread,
 )
 from engram.localiser.settings import METHOD_VERSION, LocaliserConfig
-from engram.localiser.walk import Walk
 
 __all__ = [
+    "KEEPS_NOTHING",
     "METHOD_VERSION",
     "RELOCALISERS",
     "UNNAMED_LIVE_SESSION",
@@ -35,6 +42,8 @@ __all__ = [
     "ByAppearance",
     "Exhaustive",
     "FrameMatcher",
+    "Hint",
+    "Keeper",
     "Localisation",
     "LocalisationStatus",
     "Localiser",
@@ -47,7 +56,7 @@ __all__ = [
     "Relocaliser",
     "Searched",
     "Spread",
-    "Walk",
+    "StageClock",
     "accept",
     "accept_lost",
     "agrees",

@@ -1,22 +1,21 @@
-"""Match attempts: lanes at once, rounds one after another (SPEC §3.2)."""
+"""Match attempts: whether the live frame matches with a node, and whether that is believed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from time import perf_counter
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.errors import MapCorruptError
 from engram.frontend import Frame
 from engram.frontend.matching import NO_MATCH, Match, MatcherConfig, match_frames, pair_seed
+from engram.geometry import SE3
 from engram.graph.model import LandmarkSource, NodeId
 from engram.localiser.acceptance import (
-    AcceptanceConfig,
     Prediction,
     Spread,
     accept,
@@ -24,6 +23,7 @@ from engram.localiser.acceptance import (
     inlier_spread,
     plausible,
 )
+from engram.localiser.settings import LocaliserConfig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,13 +91,13 @@ class Matcher(Protocol):
 
 
 class FrameMatcher:
-    """Matches with the landmarks that a source holds: what runs on a robot.
+    """Matches with the landmarks that a source holds, as an `Attempter` without a matcher does.
 
     Args:
         frames: the landmarks.
         config: settings.
-        threads: whether attempts run on threads of their own. Not where processes share the
-            cores anyway: every hand-over waits for its turn there.
+        threads: see `Matcher`. Not where processes share the cores anyway: every hand-over waits
+            for its turn there.
     """
 
     def __init__(
@@ -114,17 +114,8 @@ class FrameMatcher:
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
         """See `Matcher`; seeded by both UUIDs."""
-        covariance = None
-        if guide is not None:
-            covariance = np.diag([guide.sigma_m**2] * 3 + [guide.sigma_yaw_rad**2] * 3)
-        return match_frames(
-            self._frames.frame(node),
-            live,
-            self._config,
-            seed=pair_seed(live_id, node),
-            predicted=None if guide is None else guide.node_from_live,
-            predicted_covariance=covariance,
-        )
+        seed = pair_seed(live_id, node)
+        return match_frames(self._frames.frame(node), live, self._config, seed, *_expected(guide))
 
     def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
@@ -137,51 +128,31 @@ class FrameMatcher:
 
 
 class Attempter:
-    """Runs attempts on threads of its own; the core releases the GIL, so they are parallel.
+    """Makes one attempt: matches the live frame with a node, and judges the match.
+
+    Any thread may call `attempt`; the core releases the GIL, so that several run in parallel.
 
     Args:
-        matcher: the first half of an attempt.
-        lost_matcher: the same where nothing is expected, and most candidates are other places.
-        lanes: how many run at a time.
-        acceptance: the second half.
+        frames: where the landmarks of nodes come from.
+        config: settings of both halves.
+        matcher: the first half, for studies that keep matches; None matches with `frames`.
     """
 
     def __init__(
-        self, matcher: Matcher, lost_matcher: Matcher, lanes: int, acceptance: AcceptanceConfig
+        self, frames: LandmarkSource, config: LocaliserConfig, matcher: Matcher | None = None
     ) -> None:
+        self._frames = frames
+        self._config = config.matcher
+        self._lost_config = config.lost_matcher
+        self._acceptance = config.acceptance
         self._matcher = matcher
-        self._lost_matcher = lost_matcher
-        self._lanes = lanes
-        self._acceptance = acceptance
-        self._pool = (
-            ThreadPoolExecutor(lanes, thread_name_prefix="engram-lane")
-            if lanes > 1 and matcher.threads
-            else None
-        )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Ends the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
 
     def prefetch(self, nodes: list[NodeId]) -> None:
         """Hint that these are likely to be attempted next."""
-        self._matcher.prefetch(nodes)
+        (self._frames if self._matcher is None else self._matcher).prefetch(nodes)
 
-    def run(
-        self,
-        live: Frame,
-        live_id: NodeId,
-        candidates: Sequence[Candidate],
-        deadline: float | None,
-    ) -> list[Outcome]:
-        """Attempts in ranked order; stops after the first round with a success.
+    def attempt(self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate) -> Outcome:
+        """The outcome of matching one candidate.
 
         A node whose landmarks are damaged is passed over, and its outcome says so: a robot can do
         without one node of its map.
@@ -189,75 +160,50 @@ class Attempter:
         Args:
             live: the live frame.
             live_id: its UUID, which with the node's seeds the matcher.
-            candidates: best first, as many as the budget allows.
-            deadline: `time.perf_counter` value after which no attempt starts; None for none.
-
-        Returns:
-            One outcome per attempt made, in ranked order.
+            rank: place of the candidate in the order.
+            candidate: what to attempt.
         """
-        outcomes: list[Outcome] = []
-        for start in range(0, len(candidates), self._lanes):
-            if deadline is not None and perf_counter() >= deadline:
-                break
-            ranks = range(start, min(start + self._lanes, len(candidates)))
-            outcomes += self._round(live, live_id, candidates, ranks)
-            if any(outcome.accepted for outcome in outcomes):
-                break
-        return outcomes
-
-    def _round(
-        self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate], ranks: range
-    ) -> list[Outcome]:
-        def attempt(rank: int) -> Outcome:
-            return self._attempt(live, live_id, candidates[rank], rank)
-
-        if self._pool is None or len(ranks) == 1:
-            return [attempt(rank) for rank in ranks]
-        return list(self._pool.map(attempt, ranks))
-
-    def _attempt(self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int) -> Outcome:
+        guide = candidate.prediction if candidate.guided else None
         try:
-            return self._attempt_undamaged(live, live_id, candidate, rank)
+            if self._matcher is None:
+                config = self._lost_config if candidate.prediction is None else self._config
+                seed = pair_seed(live_id, candidate.node)
+                reference = self._frames.frame(candidate.node)
+                match = match_frames(reference, live, config, seed, *_expected(guide))
+            else:
+                match = self._matcher.match(live, live_id, candidate.node, guide)
+            return self._judged(live, live_id, rank, candidate, match)
         except MapCorruptError:
             return Outcome(candidate, rank, NO_MATCH, accepted=False, damaged=True)
 
-    def _attempt_undamaged(
-        self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int
+    def _judged(
+        self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match
     ) -> Outcome:
-        prediction = candidate.prediction
-        if prediction is None:
-            return self._attempt_lost(live, live_id, candidate, rank)
-        guide = prediction if candidate.guided else None
-        match = self._matcher.match(live, live_id, candidate.node, guide)
-        if accept(match, prediction, self._acceptance):
+        prediction, acceptance = candidate.prediction, self._acceptance
+        if prediction is not None and accept(match, prediction, acceptance):
             return Outcome(candidate, rank, match, accepted=True)
-        if not candidate.doubted:
+        if prediction is not None and not candidate.doubted:
             return Outcome(candidate, rank, match, accepted=False)
-        spread = partial(self._matcher.spread, live, live_id, candidate.node, match)
-        waits = plausible(match, spread, self._acceptance)
-        return Outcome(candidate, rank, match, accepted=False, plausible=waits)
-
-    def _attempt_lost(
-        self, live: Frame, live_id: NodeId, candidate: Candidate, rank: int
-    ) -> Outcome:
-        match = self._lost_matcher.match(live, live_id, candidate.node, None)
-        spread = partial(self._lost_matcher.spread, live, live_id, candidate.node, match)
+        spread = partial(self._spread, live, live_id, candidate.node, match)
         return Outcome(
             candidate,
             rank,
             match,
-            accept_lost(match, spread, self._acceptance),
-            plausible(match, spread, self._acceptance),
+            accepted=prediction is None and accept_lost(match, spread, acceptance),
+            plausible=plausible(match, spread, acceptance),
         )
 
-    def foresee(
-        self, live: Frame, live_id: NodeId, candidates: Iterable[Candidate]
-    ) -> list[Outcome]:
-        """What would become of these attempts; for the policy that knows it all (SPEC §4)."""
-        return [
-            self._attempt(live, live_id, candidate, rank)
-            for rank, candidate in enumerate(candidates)
-        ]
+    def _spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
+        if self._matcher is None:
+            return inlier_spread(match, self._frames.frame(node), live)
+        return self._matcher.spread(live, live_id, node, match)
+
+
+def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64] | None]:
+    """The pose by which matching is guided, and its (6, 6) covariance."""
+    if guide is None:
+        return None, None
+    return guide.node_from_live, np.diag([guide.sigma_m**2] * 3 + [guide.sigma_yaw_rad**2] * 3)
 
 
 def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:

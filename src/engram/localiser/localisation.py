@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,11 +116,14 @@ class Localisation:
         motion: how the robot moved since the usable frame before, as far as it is known.
         position: the best estimate, measured or carried on by odometry; None while `LOST` with
             no estimate.
-        new_place: probability, before matching, that the frame shows nothing of the map; None
-            where no relocaliser was asked, or it cannot tell. What a match says counts more.
+        looked_up: whether the relocaliser was asked which places look like the frame.
         damaged: nodes that were to be attempted and whose landmarks cannot be read, each told once;
             the localiser passes them over from then on. ``engram check`` tells more.
-        stage_ms: time of each stage of this call; "places" only where the relocaliser was asked.
+        saved: the node that the frame was saved as, where the robot maps.
+        resumed: whether an interrupted run had dealt with this frame already: nothing was
+            attempted, the robot was only carried on.
+        late: whether the answer came after the deadline.
+        stage_ms: time of each stage; "places" only where the relocaliser was asked.
     """
 
     stamp_ns: int
@@ -134,11 +139,55 @@ class Localisation:
     covariance: NDArray[np.float64] | None = None
     inliers: int = 0
     position: Position | None = None
-    new_place: float | None = None
+    looked_up: bool = False
     damaged: tuple[NodeId, ...] = ()
+    saved: NodeId | None = None
+    resumed: bool = False
+    late: bool = False
     stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def localised(self) -> bool:
+        """Whether the frame was matched with the map."""
+        return self.status is LocalisationStatus.LOCALISED
 
     @property
     def ms(self) -> float:
         """Time of all stages together."""
         return sum(self.stage_ms.values())
+
+    def to_dict(self) -> dict[str, Any]:
+        """The record that ``localise --json`` prints for a frame."""
+        pose = self.node_from_live
+        return {
+            "stamp_ns": self.stamp_ns,
+            "status": self.status.value,
+            "node": None if self.node is None else str(self.node),
+            "node_stamp_ns": self.node_stamp_ns,
+            "node_from_live": None if pose is None else pose.matrix().ravel().tolist(),
+            "inliers": self.inliers,
+            "attempts": self.attempts,
+            "candidates": self.candidates,
+            "open_loop_m": self.open_loop_m,
+            "damaged": [str(node) for node in self.damaged],
+            "ms": self.ms,
+        }
+
+
+class StageClock:
+    """Splits the time of one frame into stages.
+
+    Args:
+        started: `time.perf_counter` when its images arrived; None for now.
+    """
+
+    def __init__(self, started: float | None = None) -> None:
+        self._last = perf_counter()
+        self.started = self._last if started is None else started
+        self.stage_ms: dict[str, float] = {}
+
+    def lap(self, stage: str) -> None:
+        """The stage ends here."""
+        now = perf_counter()
+        self.stage_ms[stage] = (now - self._last) * 1e3
+        self._last = now

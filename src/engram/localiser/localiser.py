@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
@@ -13,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import Frame, FrameStatus
-from engram.geometry import SE3
 from engram.graph.basin import MatchBasin
 from engram.graph.clock import Clocked, day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
@@ -22,7 +22,7 @@ from engram.graph.model import (
     Attempt,
     LandmarkSource,
     NodeId,
-    PathEntryKind,
+    Session,
     SessionId,
     node_id,
     path_id,
@@ -30,19 +30,18 @@ from engram.graph.model import (
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.graph.paths import PathMemory
 from engram.localiser.acceptance import Prediction
-from engram.localiser.attempts import (
-    Attempter,
-    Candidate,
-    FrameMatcher,
-    Matcher,
-    Outcome,
-    best_success,
-)
+from engram.localiser.attempts import Attempter, Candidate, Matcher, Outcome, best_success
 from engram.localiser.hypotheses import Hypotheses
-from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
+from engram.localiser.keeper import KEEPS_NOTHING, Keeper
+from engram.localiser.localisation import (
+    Budget,
+    Localisation,
+    LocalisationStatus,
+    Position,
+    StageClock,
+)
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig
-from engram.localiser.walk import Walk
 from engram.odometry import UNMOVED, Motion, OdometryStatus
 from engram.ranking import (
     Background,
@@ -56,9 +55,6 @@ from engram.ranking import (
 _PREFETCH = 16
 # Nodes near each weak match of a lost robot that are tried first: they would confirm it.
 _CONFIRMING = 6
-# A resumed robot was matched with a node from somewhere within a wide match basin.
-_RESUMED_SIGMA_M = 3.0
-_RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
 # Stands for a drive that is not identified: equal input gives equal results there too.
 UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
 
@@ -114,6 +110,7 @@ class Localiser:
         self._background = background or Background()
         self._clock = clock
         self._own_session = live if saves else None
+        self._own_path = path_id(live)
         self._graph = graph
         self._paths = paths
         self._policy = policy
@@ -121,28 +118,26 @@ class Localiser:
         self._relocaliser = relocaliser
         self._basin = basin
         self._search = graph.neighbourhood if search is None else search
-        self._attempter = Attempter(
-            matcher or FrameMatcher(frames, self.config.matcher, threads=threads),
-            matcher or FrameMatcher(frames, self.config.lost_matcher, threads=threads),
-            budget.lanes,
-            self.config.acceptance,
+        self._attempter = Attempter(frames, self.config, matcher)
+        self._pool = (
+            ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")
+            if budget.lanes > 1 and (threads if matcher is None else matcher.threads)
+            else None
         )
-        self._hypotheses = Hypotheses(graph, self._near, self.config.acceptance)
+        self._hypotheses = Hypotheses(graph, self._nodes_near, self.config.acceptance)
         self._recent = RecentAttempts(self.config.recent)
         self._run = RunLog()
-        self.walk = Walk(path_id(self.live))
-        self.proposes_when_certain = True
-        self.proposes_own_when_certain = True
-        self.keeps_attempts = True
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
         self._motion = UNMOVED
         # Variance of the motion guessed since the robot last knew where it was, m².
         self._guessed_m2 = 0.0
-        self._attempts: list[Attempt] = []
         self._outcomes: list[Outcome] = []
-        self._new_place: float | None = None
+        # What the last frame's attempts were made from.
+        self._reference: NodeId | None = None
+        self._near: Neighbourhood | None = None
+        self._looked_up = False
         self._damaged: set[int] = set()
         self._new_damaged: tuple[NodeId, ...] = ()
 
@@ -153,13 +148,19 @@ class Localiser:
         self.close()
 
     @property
+    def graph(self) -> ExperienceGraph:
+        """The experience graph that it works on."""
+        return self._graph
+
+    @property
     def relocaliser(self) -> Relocaliser | None:
         """What finds a lost robot."""
         return self._relocaliser
 
     def close(self) -> None:
         """Ends the threads of the lanes."""
-        self._attempter.close()
+        if self._pool is not None:
+            self._pool.shutdown()
 
     @property
     def driven_m(self) -> float:
@@ -171,29 +172,65 @@ class Localiser:
         """What became of the attempts for the last frame, in ranked order."""
         return self._outcomes
 
-    def take_attempts(self) -> list[Attempt]:
-        """The attempts remembered since the last call."""
-        taken, self._attempts = self._attempts, []
-        return taken
+    def attempts(self) -> list[Attempt]:
+        """The attempts for the last frame that had a prediction, to be remembered (SPEC §3.5)."""
+        near, reference = self._near, self._reference
+        if near is None or reference is None:
+            return []
+        return [
+            Attempt(
+                iteration=self._recent.iteration,
+                reference=reference,
+                node=outcome.candidate.node,
+                along_m=float(near.along_m[row]),
+                across_m=float(near.across_m[row]),
+                yaw_rad=float(near.yaw_rad[row]),
+                sigma_m=float(near.sigma_m[row]),
+                sigma_yaw_rad=float(near.sigma_yaw_rad[row]),
+                accepted=outcome.accepted,
+                inliers=outcome.match.inliers,
+                rank=outcome.rank,
+                policy=self._policy.name,
+            )
+            for outcome in self._outcomes
+            if (row := outcome.candidate.row) is not None
+        ]
 
-    def start_at(self, position: Position, open_loop_m: float = 0.0) -> None:
+    def place_at(
+        self, position: Position, open_loop_m: float | None = 0.0, guessed_m: float = 0.0
+    ) -> None:
         """Tells a robot where it is, as an operator or another localiser would.
 
         Args:
             position: where it is.
-            open_loop_m: how far it has come since it last matched what the map knew before.
+            open_loop_m: how far it has come since it last matched what the map knew before; None
+                leaves it as it was counted.
+            guessed_m: standard deviation of the motion guessed since then.
         """
         self.position = position
-        self._open_loop_m = open_loop_m
-        self._guessed_m2 = 0.0
+        if open_loop_m is not None:
+            self._open_loop_m = open_loop_m
+        self._guessed_m2 = guessed_m**2
 
-    def resume_walk(self, node: NodeId, next_sequence: int, next_iteration: int) -> None:
-        """Goes on with the path and the attempts of a session that was interrupted in `node`."""
-        self.walk = Walk(self.walk.path, next_sequence, node)
-        self._recent = RecentAttempts(self.config.recent, next_iteration)
+    def lose(self) -> None:
+        """The robot was switched on anew or carried elsewhere: nothing is known of its place."""
+        self.position = None
+        self._hypotheses.forget()
+        if self._relocaliser is not None:
+            self._relocaliser.forget()
 
-    def replay_from(self, driven_m: float, next_iteration: int) -> None:
-        """The frames to come are nodes that the session saved from there on (SPEC §7 MERGE 3).
+    def begin(self, session: Session) -> None:
+        """The frames to come are of this session: a live robot knows it with its first frame."""
+        self._background = replace(
+            self._background, sessions={**self._background.sessions, session.id: session}
+        )
+        self._clock = session
+        self._own_session = session.id if self._own_session is not None else None
+        self._own_path = path_id(session.id)
+        self.live = session.id
+
+    def resume(self, driven_m: float, next_iteration: int) -> None:
+        """The frames to come are those of the session from there on (SPEC §7 MERGE 3).
 
         Args:
             driven_m: odometry distance from the session's start to the first of them.
@@ -207,58 +244,62 @@ class Localiser:
         """Number of the running iteration."""
         return self._recent.iteration
 
-    def resume_in(self, node: NodeId) -> None:
-        """The live frame had been saved as `node`."""
-        self.position = Position.at(node)
-        self._guessed_m2 = 0.0
-
-    def resume_near(self, node: NodeId) -> None:
-        """The live frame had been matched with `node`, nobody knows from where exactly."""
-        spread = np.diag([_RESUMED_SIGMA_M**2] * 3 + [_RESUMED_SIGMA_RAD**2] * 3)
-        self.start_at(Position(node, SE3.identity(), spread))
-        self._guessed_m2 = np.inf
-
-    def settle_in(self, node: NodeId, stamp_ns: int) -> None:
+    def settle_in(self, node: NodeId) -> None:
         """The live frame was saved as `node`: the robot is in it by construction (SPEC §4)."""
         self.position = Position.at(node)
         self._guessed_m2 = 0.0
-        self.walk.visit(node, PathEntryKind.SAVED, stamp_ns)
 
-    def localise(self, live: Frame, deadline: float | None = None) -> Localisation:
+    def localise(
+        self,
+        live: Frame,
+        deadline: float | None = None,
+        keeper: Keeper = KEEPS_NOTHING,
+        clock: StageClock | None = None,
+    ) -> Localisation:
         """One iteration of SPEC §3: gather candidates, rank, attempt, settle.
 
         Args:
             live: the live frame; `move` was told how the robot came there.
-            deadline: `time.perf_counter` value after which no attempt starts; by default that of
-                the budget, counted from this call.
+            deadline: `time.perf_counter` value after which no attempt starts; None for none.
+            keeper: says where a robot that knows its place may look beside it.
+            clock: takes the time of each stage.
 
         Raises:
             IncompatibleError: the map was made with another kind of descriptor.
         """
-        clock = _StageClock()
-        if deadline is None and self._budget.deadline_ms is not None:
-            deadline = clock.started + self._budget.deadline_ms / 1e3
-        self._new_place = None
-        self._new_damaged = ()
+        clock = clock or StageClock()
+        self._new_damaged, self._near, self._looked_up = (), None, False
         self._recent.begin_frame(self._driven_m)
         outcomes: list[Outcome] = []
-        neighbourhood: Neighbourhood | None = None
         if live.status is FrameStatus.OK:
-            neighbourhood = self._neighbourhood()
+            self._near = self._neighbourhood()
             clock.lap("neighbourhood")
-            order = self._rank(live, neighbourhood)
+            order = self._rank(live, self._near)
             clock.lap("rank")
-            candidates = self._candidates(live, neighbourhood, order, clock)
-            outcomes = self._attempter.run(
-                live, node_id(self.live, live.stamp_ns), candidates, deadline
-            )
+            candidates = self._candidates(live, self._near, order, keeper, clock)
+            attempt = partial(self._attempter.attempt, live, node_id(self.live, live.stamp_ns))
+            for start in range(0, len(candidates), self._budget.lanes):
+                if deadline is not None and perf_counter() >= deadline:
+                    break
+                lanes = candidates[start : start + self._budget.lanes]
+                at_once = map if self._pool is None or len(lanes) == 1 else self._pool.map
+                outcomes += at_once(attempt, range(start, start + len(lanes)), lanes)
+                if any(outcome.accepted for outcome in outcomes):
+                    break
             outcomes = self._hypotheses.judge(self._without_damaged(outcomes))
             clock.lap("attempts")
-            self._remember(live, neighbourhood, outcomes)
+            self._remember(live, self._near, outcomes)
+        success = self._conclude(outcomes)
+        clock.lap("remember")
+        return self._result(live, success, clock.stage_ms)
+
+    def _conclude(self, outcomes: list[Outcome]) -> Outcome | None:
+        """The robot is where the best match says, or nearer to being lost."""
         self._outcomes = outcomes
+        self._reference = None if self.position is None else self.position.node
         success = best_success(outcomes)
         if success is not None:
-            self._settle(success, live.stamp_ns)
+            self._settle(success)
         elif self._relocaliser is not None:
             self._relocaliser.failed(
                 [
@@ -267,8 +308,7 @@ class Localiser:
                     if one.candidate.prediction is None and not one.plausible
                 ]
             )
-        clock.lap("remember")
-        return self._result(live, success, neighbourhood, clock.stage_ms)
+        return success
 
     def move(self, motion: Motion) -> None:
         """Propagates the position by the motion that led to the next frame (SPEC §3).
@@ -302,12 +342,9 @@ class Localiser:
         return not self.certain or self._open_loop_m > self.config.lost_after_m
 
     def _neighbourhood(self) -> Neighbourhood | None:
-        position = self.position
-        if position is None:
-            return None
-        return self._near(position)
+        return None if self.position is None else self._nodes_near(self.position)
 
-    def _near(self, position: Position) -> Neighbourhood:
+    def _nodes_near(self, position: Position) -> Neighbourhood:
         radius_m = self._basin.search_radius_m(
             position.sigma_m, self.config.search_radius_m, self.config.max_search_radius_m
         )
@@ -334,7 +371,7 @@ class Localiser:
             basin=self._basin,
             observations=self._recent.observations,
             reference=self._graph.index(self.position.node),
-            own_path=self.walk.path,
+            own_path=self._own_path,
             stamp_ns=live.stamp_ns,
             seed=live.stamp_ns,
             foresee=lambda: self._foresee(live, neighbourhood),
@@ -348,8 +385,10 @@ class Localiser:
 
     def _foresee(self, live: Frame, neighbourhood: Neighbourhood) -> Foreseen:
         """The outcome of attempting each candidate, without attempting it for the record."""
-        candidates = (self._predicted(neighbourhood, row) for row in range(len(neighbourhood)))
-        outcomes = self._attempter.foresee(live, node_id(self.live, live.stamp_ns), candidates)
+        attempt = partial(self._attempter.attempt, live, node_id(self.live, live.stamp_ns))
+        outcomes = [
+            attempt(row, self._predicted(neighbourhood, row)) for row in range(len(neighbourhood))
+        ]
         return Foreseen(
             np.array([outcome.accepted for outcome in outcomes], dtype=np.bool_),
             np.array([outcome.match.inliers for outcome in outcomes], dtype=np.int64),
@@ -364,7 +403,8 @@ class Localiser:
         live: Frame,
         neighbourhood: Neighbourhood | None,
         order: NDArray[np.int64],
-        clock: _StageClock,
+        keeper: Keeper,
+        clock: StageClock,
     ) -> list[Candidate]:
         """What to attempt, best first.
 
@@ -382,12 +422,13 @@ class Localiser:
                 for row in order[: budget + len(self._damaged)]
                 if int(neighbourhood.nodes[row]) not in self._damaged
             ][:budget]
-        left_to_mapper = self.certain and not self.proposes_when_certain
-        if (ranked and not self._lost) or self._relocaliser is None or left_to_mapper:
+        if (ranked and not self._lost) or self._relocaliser is None:
+            return ranked
+        if not keeper.may_propose(certain=self.certain):
             return ranked
         known = {candidate.index for candidate in ranked}
         budget = self._budget.lost_attempts
-        indices = self._hypotheses.nodes_near(_CONFIRMING) + self._proposals(live, budget)
+        indices = self._hypotheses.nodes_near(_CONFIRMING) + self._proposals(live, budget, keeper)
         proposed = [
             Candidate(index, self._graph.node(index).id, None, guided=False, row=None)
             for index in dict.fromkeys(indices)
@@ -396,19 +437,18 @@ class Localiser:
         clock.lap("places")
         return _alternate(proposed, ranked)[:budget]
 
-    def _proposals(self, live: Frame, count: int) -> list[int]:
+    def _proposals(self, live: Frame, count: int, keeper: Keeper) -> list[int]:
         """The relocaliser's nodes, without those of this session that say nothing new."""
         assert self._relocaliser is not None
-        relocaliser = self._relocaliser
-        proposed = relocaliser.propose(
+        self._looked_up = True
+        own = keeper.may_propose_own(certain=self.certain)
+        return self._relocaliser.propose(
             live,
             count,
-            lambda index: index not in self._damaged and not self._is_known_own(index),
+            lambda index: index not in self._damaged and not self._is_known_own(index, own=own),
         )
-        self._new_place = relocaliser.new_place
-        return proposed
 
-    def _is_known_own(self, index: int) -> bool:
+    def _is_known_own(self, index: int, *, own: bool) -> bool:
         """Whether a node is this session's own, and was just saved or is for the mapper to find.
 
         Nodes saved a moment ago are no candidates (SPEC §3.1). While every motion is measured the
@@ -418,8 +458,7 @@ class Localiser:
         node = self._graph.node(index)
         if node.session != self._own_session:
             return False
-        left_to_mapper = self.certain and not self.proposes_own_when_certain
-        return left_to_mapper or node.driven_m > self._driven_m - self.config.own_exclusion_m
+        return not own or node.driven_m > self._driven_m - self.config.own_exclusion_m
 
     def _predicted(self, neighbourhood: Neighbourhood, row: int) -> Candidate:
         index = int(neighbourhood.nodes[row])
@@ -442,38 +481,11 @@ class Localiser:
     def _remember(
         self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
     ) -> None:
-        """Keeps the outcome of every attempt that had a prediction (SPEC §3.5)."""
+        """What policies learn from while driving."""
         self._recent.add(
             [outcome.candidate.index for outcome in outcomes],
             [outcome.accepted for outcome in outcomes],
         )
-        self._log(live, neighbourhood, outcomes)
-        if not self.keeps_attempts or neighbourhood is None or self.position is None:
-            return
-        for outcome in outcomes:
-            row = outcome.candidate.row
-            if row is None:
-                continue
-            attempt = Attempt(
-                iteration=self._recent.iteration,
-                reference=self.position.node,
-                node=outcome.candidate.node,
-                along_m=float(neighbourhood.along_m[row]),
-                across_m=float(neighbourhood.across_m[row]),
-                yaw_rad=float(neighbourhood.yaw_rad[row]),
-                sigma_m=float(neighbourhood.sigma_m[row]),
-                sigma_yaw_rad=float(neighbourhood.sigma_yaw_rad[row]),
-                accepted=outcome.accepted,
-                inliers=outcome.match.inliers,
-                rank=outcome.rank,
-                policy=self._policy.name,
-            )
-            self._attempts.append(attempt)
-
-    def _log(
-        self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
-    ) -> None:
-        """What policies learn from while driving."""
         distance_m, rates = np.full((2, len(outcomes)), np.nan)
         rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
         if neighbourhood is not None and (known := rows >= 0).any():
@@ -497,7 +509,7 @@ class Localiser:
             len(live.landmarks),
         )
 
-    def _settle(self, success: Outcome, stamp_ns: int) -> None:
+    def _settle(self, success: Outcome) -> None:
         """The position becomes (n, ``T_n_q``), the open loop 0 (SPEC §3.3)."""
         node_from_live, covariance = success.match.reference_from_live, success.match.covariance
         assert node_from_live is not None
@@ -508,13 +520,11 @@ class Localiser:
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
-        self.walk.visit(success.candidate.node, PathEntryKind.MATCHED, stamp_ns)
 
     def _result(
         self,
         live: Frame,
         success: Outcome | None,
-        neighbourhood: Neighbourhood | None,
         stage_ms: dict[str, float],
     ) -> Localisation:
         unmatched = Localisation(
@@ -522,11 +532,11 @@ class Localiser:
             status=self._status_without_match(),
             attempts=len(self._outcomes),
             proposed=sum(one.candidate.prediction is None for one in self._outcomes),
-            candidates=0 if neighbourhood is None else len(neighbourhood),
+            candidates=0 if self._near is None else len(self._near),
             motion=self._motion,
             open_loop_m=self._open_loop_m,
             position=self.position,
-            new_place=self._new_place,
+            looked_up=self._looked_up,
             damaged=self._new_damaged,
             stage_ms=stage_ms,
         )
@@ -547,19 +557,6 @@ class Localiser:
         if self._motion.odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:
             return LocalisationStatus.NO_ODOMETRY
         return LocalisationStatus.LOST if self._lost else LocalisationStatus.DEAD_RECKONING
-
-
-class _StageClock:
-    """Splits the time of one call into stages."""
-
-    def __init__(self) -> None:
-        self.started = self._last = perf_counter()
-        self.stage_ms: dict[str, float] = {}
-
-    def lap(self, stage: str) -> None:
-        now = perf_counter()
-        self.stage_ms[stage] = (now - self._last) * 1e3
-        self._last = now
 
 
 def _alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:

@@ -2,19 +2,22 @@
 
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopConfig, LoopSearch
-from engram.mapper.mapper import Mapper, MapperConfig, MappingStep
-from engram.mapper.saver import NodeWords, Records, RecordWriter, Saver
+from engram.mapper.mapper import Mapper, MapperConfig
+from engram.mapper.memory import Memory, Walk
+from engram.mapper.saver import FrameHolder, NodeWords, Records, RecordWriter, Saver
 
 __all__ = [
+    "FrameHolder",
     "LoopConfig",
     "LoopSearch",
     "Mapper",
     "MapperConfig",
-    "MappingStep",
+    "Memory",
     "NodeWords",
     "RecordWriter",
     "Records",
     "Saver",
+    "Walk",
     "edge_through_live",
     "match_edges",
 ]

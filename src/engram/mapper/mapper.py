@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from engram.errors import ConfigError
 from engram.frontend import Frame, FrameStatus
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import Edge, EdgeKind, Node, NodeId, Session, node_id
+from engram.graph.model import (
+    Edge,
+    EdgeKind,
+    Node,
+    NodeId,
+    PathEntryKind,
+    Session,
+    node_id,
+    path_id,
+)
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
-from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
+from engram.localiser import Hint, Localisation, Localiser, Position
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch
+from engram.mapper.memory import Memory
 from engram.mapper.saver import Records, Saver
+from engram.maps import StoredSession
 from engram.odometry import Motion
 
 
@@ -28,12 +39,15 @@ class MapperConfig:
         tie_within_m: a new experience is also tied to the session's last saved node within this
             distance; the search radius.
         checkpoint_every: live frames between two checkpoints of the map.
+        memory_bytes: how large the memory of a drive that saves no nodes may become before it is
+            committed; what comes later is not remembered. About a day at 20 frames a second.
     """
 
     save_every_m: float = 1.0
     save_every_rad: float = float(np.deg2rad(15.0))
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
+    memory_bytes: int = 256_000_000
 
     def __post_init__(self) -> None:
         for name in ("save_every_m", "save_every_rad", "tie_within_m"):
@@ -44,21 +58,11 @@ class MapperConfig:
             raise ConfigError(f"mapper: checkpoint_every is {self.checkpoint_every}, must be >= 1")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MappingStep:
-    """What became of one live frame.
-
-    Attributes:
-        localisation: how it was localised.
-        saved: the node that it was saved as, if it was.
-    """
-
-    localisation: Localisation
-    saved: NodeId | None
-
-
-class Mapper:
+class Mapper(Memory):
     """Maps one session: while localisation succeeds nothing is saved, else an experience grows.
+
+    It remembers the drive's path and attempts as well. Frames that an interrupted run had mapped
+    already are only followed; it goes on behind the last saved node or match, whichever is later.
 
     Args:
         graph: the experience graph; grows.
@@ -68,6 +72,7 @@ class Mapper:
         config: settings.
         loops: looks for the places of saved nodes beside the drive; None leaves that to the
             localiser's relocaliser.
+        stored: what an interrupted run had stored of the session; None for a new one.
     """
 
     def __init__(
@@ -78,15 +83,14 @@ class Mapper:
         session: Session,
         config: MapperConfig | None = None,
         loops: LoopSearch | None = None,
+        stored: StoredSession | None = None,
     ) -> None:
+        super().__init__(localiser, saver, path_id(session.id), stored)
         self.config = config or MapperConfig()
         self._loops = loops
         # Whether what is being saved hangs together with the rest of the map.
         self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
         self._graph = graph
-        self._localiser = localiser
-        localiser.proposes_own_when_certain = loops is None
-        self._saver = saver
         self._session = session
         # The last saved node and the motion since, while that is known.
         self._since_saved: Position | None = None
@@ -94,47 +98,61 @@ class Mapper:
         self._gap_m2 = 0.0
         # The experience being saved, first node first; empty while localisation succeeds.
         self._experience: list[NodeId] = []
+        # Edges of loops closed since the last frame.
+        self._closures: list[Edge] = []
 
-    def process(self, live: Frame, motion: Motion, deadline: float | None = None) -> MappingStep:
-        """Localises one frame, saves it if that failed, and ties experiences to their neighbours.
+    def hint(self, live: Frame, motion: Motion) -> Hint | None:
+        """See `Keeper`: loops that were found by now are closed before the frame is localised."""
+        self._move_on(motion)
+        followed = super().hint(live, motion)
+        if followed is not None:
+            return self._follow(followed, live)
+        self._closures = self._close_loops(self._loops.closed()) if self._loops else []
+        return None
+
+    def may_propose(self, *, certain: bool) -> bool:
+        """See `Keeper`.
+
+        A robot that hangs together with the map is not lost, however far it drifts: its loops are
+        looked for beside the drive.
+        """
+        return not certain or self._loops is None or not self._joined
+
+    def may_propose_own(self, *, certain: bool) -> bool:
+        """See `Keeper`."""
+        return not certain or self._loops is None
+
+    def keep(self, live: Frame, found: Localisation) -> Localisation:
+        """Saves a frame that was not localised, and ties experiences to their neighbours.
 
         Raises:
             MapError: an earlier frame could not be written.
         """
-        edges = self._close_loops(self._loops.closed()) if self._loops else []
-        # A robot that hangs together with the map is not lost, however far it drifts: its loops
-        # are looked for beside the drive.
-        self._localiser.proposes_when_certain = self._loops is None or not self._joined
-        self._localiser.move(motion)
-        localisation = self._localiser.localise(live, deadline)
-        self._move_on(motion)
+        if found.resumed:
+            return found
+        edges = self._closures
         saved: Node | None = None
-        if localisation.status is LocalisationStatus.LOCALISED:
+        if found.localised:
             self._joined = True
-            edges += self._end_experience(localisation)
+            edges += self._end_experience(found)
             matched = match_edges(
                 self._graph, self._localiser.outcomes, self._localiser.config.acceptance
             )
-            self._add_to_graph(matched)
+            self._graph.add_edges(matched)
             edges += matched
-        elif self._worth_saving(live, motion):
-            saved, laid = self._save(live, localisation.position)
+        elif self._worth_saving(live, found.motion):
+            saved, laid = self._save(live, found.position)
             edges += laid
-        records = Records(
-            node=saved,
-            frame=live if saved else None,
-            edges=edges,
-            path_entries=self._localiser.walk.take_new(),
-            attempts=self._localiser.take_attempts(),
-        )
-        if records:
-            self._saver.put(records)
-        if saved is not None and self._loops is not None:
+        self._visit_match(live, found)
+        self._put(Records(node=saved, frame=live if saved else None, edges=edges))
+        if saved is None:
+            return found
+        if self._loops is not None:
             self._loops.ask(saved, live)
-        return MappingStep(localisation, saved.id if saved else None)
+        return replace(found, saved=saved.id)
 
     def finish(self) -> None:
-        """The drive is over: waits for the places of the nodes saved last.
+        """See `Keeper`: waits for the places of the nodes saved last.
 
         Raises:
             MapError: an earlier frame could not be written.
@@ -143,21 +161,17 @@ class Mapper:
         if edges:
             self._saver.put(Records(edges=edges))
 
-    def follow(self, motion: Motion) -> None:
-        """Carries on over a frame that an interrupted run of this session had mapped already."""
-        self._localiser.move(motion)
-        self._move_on(motion)
-
-    def resume_in(self, saved: NodeId) -> None:
-        """The frame just followed is the last that this session had saved as a node."""
-        self._experience = [saved]
-        self._since_saved = Position.at(saved)
-        self._localiser.resume_in(saved)
-
-    def resume_near(self, matched: NodeId) -> None:
-        """The frame just followed is the last whose match with another node is remembered."""
-        self._experience = []
-        self._localiser.resume_near(matched)
+    def _follow(self, followed: Hint, live: Frame) -> Hint:
+        """Where the mapper stood after a frame that an interrupted run had mapped."""
+        assert self._stored is not None
+        if self._stored.nodes and live.stamp_ns == self._stored.nodes[-1].stamp_ns:
+            saved = self._stored.nodes[-1].id
+            self._experience = [saved]
+            self._since_saved = Position.at(saved)
+            return replace(followed, position=Position.at(saved), open_loop_m=None, guessed_m=0.0)
+        if followed.position is not None:
+            self._experience = []
+        return followed
 
     def _move_on(self, motion: Motion) -> None:
         """Carries the last saved node on as the robot moved; None after too long a gap."""
@@ -206,24 +220,22 @@ class Mapper:
         elif not self._experience and position is not None and self._localiser.certain:
             edges.append(_edge(position, node.id, EdgeKind.TIE))
             edges += self._edge_to_last_saved(position, node.id)
-        self._add_to_graph(edges)
+        self._graph.add_edges(edges)
         edges += lay_proximity_edges(self._graph, self._graph.index(node.id))
         self._experience.append(node.id)
         self._since_saved = Position.at(node.id)
-        self._localiser.settle_in(node.id, live.stamp_ns)
+        self._localiser.settle_in(node.id)
+        self.walk.visit(node.id, PathEntryKind.SAVED, live.stamp_ns)
         return node, edges
 
     def _close_loops(self, closures: list[Edge]) -> list[Edge]:
         """Edges to places that were found again; from now on their surroundings are candidates."""
         edges = list(closures)
-        self._add_to_graph(closures)
+        self._graph.add_edges(closures)
         for closure in closures:
             self._joined = True
             edges += lay_proximity_edges(self._graph, self._graph.index(closure.b))
         return edges
-
-    def _add_to_graph(self, edges: list[Edge]) -> None:
-        self._graph.add_edges(edges)
 
     def _edge_to_last_saved(self, position: Position, node: NodeId) -> list[Edge]:
         """Ties a new experience to this session's last one too, where that is still near.
@@ -245,7 +257,7 @@ class Mapper:
             return []
         assert localisation.position is not None
         tie = edge_through_live(self._since_saved, localisation.position, EdgeKind.TIE)
-        self._add_to_graph([tie])
+        self._graph.add_edge(tie)
         chain = [self._graph.index(node) for node in experience]
         return [tie, *tighten_chain(self._graph, chain)]
 

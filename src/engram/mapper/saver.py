@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from queue import Queue
+from queue import Full, Queue
 from threading import Thread
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.errors import MapError
 from engram.frontend import Frame
 from engram.graph.model import Attempt, Edge, Node, NodeId, PathEntry
 
@@ -98,12 +99,14 @@ class Saver:
         frames: keeps frames readable until they are written.
         checkpoint_every: live frames between two checkpoints; what a crash may lose.
         words: how the words of nodes are found; None keeps none.
+        waits: whether a full queue holds up the caller; else it is an error.
     """
 
     writer: RecordWriter
     frames: FrameHolder
     checkpoint_every: int = 20
     words: NodeWords | None = None
+    waits: bool = True
     _queue: Queue[Records | _Stop] = field(default_factory=lambda: Queue(_QUEUE_LENGTH))
     _error: BaseException | None = None
     _thread: Thread | None = None
@@ -115,13 +118,20 @@ class Saver:
     def put(self, records: Records) -> None:
         """Hands over what one frame adds; returns at once.
 
+        The frame of a node can be read from then on, also where it is not saved.
+
         Raises:
-            MapError: an earlier write failed.
+            MapError: an earlier write failed, or too many wait to be written.
         """
-        self._raise_error()
         if records.node is not None and records.frame is not None:
             self.frames.hold(records.node.id, records.frame)
-        self._queue.put(records)
+        self._raise_error()
+        try:
+            self._queue.put(records, block=self.waits)
+        except Full:
+            raise MapError(
+                f"{_QUEUE_LENGTH} frames wait to be saved: the disk is too slow for this drive"
+            ) from None
 
     def finish(self) -> None:
         """Writes what is left, checkpoints and ends the thread.

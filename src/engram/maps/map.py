@@ -87,7 +87,7 @@ from engram.maps.view import View, head
 from engram.maps.words import load_words, words_row, write_words
 
 if TYPE_CHECKING:
-    from engram.robot.live_robot import LiveRobot
+    from engram.robot.robot import Robot
     from engram.robot.settings import Settings
 
 
@@ -238,6 +238,11 @@ class Map:
     def location(self) -> str:
         """Where the map lies, for messages."""
         return self._database.name
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether it was opened as of a certain revision."""
+        return self._pinned
 
     @property
     def revision(self) -> int:
@@ -466,32 +471,39 @@ class Map:
         camera: StereoCamera,
         settings: Settings | None = None,
         *,
+        name: str | None = None,
+        maps: bool = False,
+        remembers: bool = False,
         policy: str = "recall",
         lanes: int = 2,
         rounds: int = 2,
         relocaliser: str | None = "fabmap",
-    ) -> LiveRobot:
-        """A robot that localises in this map; see `LiveRobot.localise`.
+    ) -> Robot:
+        """A robot that localises in this map; see `Robot.step`.
+
+        A robot that maps or remembers keeps its drive as a session, and closing it commits that as
+        a revision. It sees what it saves at once; others see it once it is committed.
 
         Args:
             camera: its rectified stereo camera.
             settings: the configuration; None for the defaults.
+            name: of the robot; needed where its drives are kept.
+            maps: whether it saves, on a thread of its own and with checkpoints, what it does not
+                localise. It is the map's only writer until it is closed. A crash leaves a session
+                that `engram check --seal` commits as far as it was saved.
+            remembers: whether the path of its drive and its match attempts are kept, which later
+                drives rank by; a robot that maps remembers anyway. They wait in a file beside the
+                map until the drive ends, and while another process writes to it.
             policy: key of `POLICIES`.
             lanes: attempts at the same time (Np).
             rounds: rounds of attempts for one frame (Nr).
             relocaliser: how it is found when lost; None for not at all.
         """
-        from engram.robot.live_robot import live_robot
+        from engram.robot.settings import RobotOptions
+        from engram.robot.starting import robot_in
 
-        return live_robot(
-            self,
-            camera,
-            settings,
-            policy=policy,
-            lanes=lanes,
-            rounds=rounds,
-            relocaliser=relocaliser,
-        )
+        asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser)
+        return robot_in(self, camera, settings, asked, name=name, maps=maps, remembers=remembers)
 
     @contextmanager
     def writing(self) -> Iterator[None]:

@@ -1,36 +1,36 @@
 """Whole drives: open, replay, record, map, localise, summarise."""
 
 from engram.maps import open_map
+from engram.robot.front import Front, arriving
 from engram.robot.inspecting import check_map, describe_map, seal_map
-from engram.robot.live import LiveFrame, live_frames
-from engram.robot.live_robot import LiveRobot
-from engram.robot.localising import LocaliseOptions, LocaliseRun
-from engram.robot.mapping import MapOptions, MapReport, map_drive
+from engram.robot.mapping import MapReport, map_drive
 from engram.robot.recording import ExtractReport, extract_log
-from engram.robot.results import FrameResult, measured, summarise
+from engram.robot.results import localise_drive, measure, measured, summarise
+from engram.robot.robot import Robot
 from engram.robot.session import DriveSequence, open_drive, session_of_drive
-from engram.robot.settings import Settings, load_settings
+from engram.robot.settings import RobotOptions, Settings, load_settings
+from engram.robot.starting import robot_on
 
 __all__ = [
     "DriveSequence",
     "ExtractReport",
-    "FrameResult",
-    "LiveFrame",
-    "LiveRobot",
-    "LocaliseOptions",
-    "LocaliseRun",
-    "MapOptions",
+    "Front",
     "MapReport",
+    "Robot",
+    "RobotOptions",
     "Settings",
+    "arriving",
     "check_map",
     "describe_map",
     "extract_log",
-    "live_frames",
     "load_settings",
+    "localise_drive",
     "map_drive",
+    "measure",
     "measured",
     "open_drive",
     "open_map",
+    "robot_on",
     "seal_map",
     "session_of_drive",
     "summarise",

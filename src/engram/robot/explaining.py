@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from engram.errors import ConfigError
 from engram.graph.model import Clock, NodeId, SessionId
-from engram.localiser import Budget, LocalisationStatus
+from engram.localiser import Localisation, LocalisationStatus
 from engram.maps import Map, open_map
 from engram.ranking import (
     Foreseen,
@@ -25,10 +25,10 @@ from engram.ranking import (
     policy_named,
     reasons_of,
 )
-from engram.robot.live import live_frames
-from engram.robot.localisers import localiser_in
-from engram.robot.session import DriveSequence, session_of_drive
-from engram.robot.settings import Settings
+from engram.robot.front import arriving
+from engram.robot.session import DriveSequence
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,40 +183,33 @@ def explain_frame(
         SequenceError: the drive's images cannot be used.
     """
     watching = _Watching(policy_named(options.policy))
-    with open_map(map_path, options.at) as opened:
-        settings = settings.for_descriptor(opened.descriptor)
-        localiser = localiser_in(
-            opened,
-            sequence.camera,
-            settings,
-            policy=watching,
-            budget=Budget(options.lanes, options.rounds),
-            relocaliser=options.relocaliser,
-            live=session_of_drive(sequence).id,
-            clock=sequence.info,
-        )
-        with localiser, closing(live_frames(sequence, settings)) as frames:
-            for number, live in enumerate(frames):
-                watching.watches = number == options.frame
-                localiser.move(live.motion)
-                found = localiser.localise(live.frame)
-                if number == options.frame:
-                    attempted = {outcome.candidate.index for outcome in localiser.outcomes}
-                    return _explained(opened, options, found.status, live.frame.stamp_ns, watching,
-                                      attempted)  # fmt: skip
+    asked = RobotOptions(
+        options.policy, options.lanes, options.rounds, relocaliser=options.relocaliser
+    )
+    with (
+        open_map(map_path, options.at) as opened,
+        robot_on(opened, sequence, settings, asked, watching) as robot,
+        closing(arriving(sequence)) as frames,
+    ):
+        for number, arrived in enumerate(frames):
+            watching.watches = number == options.frame
+            found = robot.step(arrived)
+            if number == options.frame:
+                assert robot.last is not None
+                attempted = {outcome.candidate.index for outcome in robot.last.outcomes}
+                return _explained(opened, options, found, watching, attempted)
     raise ConfigError(f"the drive has no frame {options.frame}; it has {len(sequence)}")
 
 
 def _explained(
     opened: Map,
     options: ExplainOptions,
-    status: LocalisationStatus,
-    stamp_ns: int,
+    found: Localisation,
     watching: _Watching,
     attempted: set[int],
 ) -> Explanation:
     if watching.asked is None:
-        return Explanation(options.frame, stamp_ns, options.policy, status)
+        return Explanation(options.frame, found.stamp_ns, options.policy, found.status)
     context, order, reasons, foreseen = watching.asked
     near, rates = context.neighbourhood, context.success_rates()
     drives = _drives(opened)
@@ -243,9 +236,9 @@ def _explained(
         )
     return Explanation(
         options.frame,
-        stamp_ns,
+        found.stamp_ns,
         options.policy,
-        status,
+        found.status,
         reasons.meaning,
         reasons.rule,
         tuple(candidates),

@@ -1,154 +1,310 @@
-"""From a drive to live frames: decoding ahead, pacing in real time, front-end and odometry."""
+"""Keeping while driving: a live robot's map or memory grows beside its loop, never at its cost."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing
+from contextlib import ExitStack
 from dataclasses import dataclass
-from queue import Queue
-from threading import Event, Thread
-from typing import TypeVar
+from enum import StrEnum
+from pathlib import Path
+from typing import Protocol
 
-from engram.frontend import Frame, Frontend, StereoPair
-from engram.monitor import deferred_interrupt
-from engram.odometry import GapFiller, Motion, Odometry
-from engram.robot.settings import Settings
-from engram.sequences import FrameSequence, LoggedFrame, StereoSequence
+from engram.errors import MapError, MapLockedError
+from engram.frontend import DescriptorKind, Frame, Frontend, StereoPair
+from engram.geometry import StereoCamera
+from engram.graph.model import Clock, Session, SessionId, path_id
+from engram.localiser import KEEPS_NOTHING, Hint, Keeper, Localisation, Localiser
+from engram.mapper import Memory, Saver
+from engram.maps import Map, SessionState
+from engram.odometry import Motion
+from engram.robot.front import Arrived
+from engram.robot.localisers import localiser_in
+from engram.robot.saving import SavedDrive, begin_or_resume, configuration_of, node_words
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.spool import Spool, commit_spools
+from engram.sequences import SequenceInfo, first_pair_hash, session_of
 
-T = TypeVar("T")
-
-# Decoded pairs that wait ahead of the front-end: about 8 MB at KITTI's size.
-_READ_AHEAD = 8
+# Stamps since 1973 in nanoseconds: those of a clock, not those since a robot was switched on.
+_CLOCK_FROM_NS = 10**17
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LiveFrame:
-    """One frame as it reaches the localiser.
+class SavingState(StrEnum):
+    """What becomes of what a robot finds."""
+
+    OFF = "off"
+    ON = "on"
+    FAILED = "failed"
+    SPOOLED = "spooled"
+    COMMITTED = "committed"
+
+
+@dataclass(slots=True)
+class Saving:
+    """Whether what a robot finds is saved.
 
     Attributes:
-        frame: the frame.
-        motion: how the camera moved since the usable frame before.
-        arrived: `time.perf_counter` when its images arrived.
-        pair: its images; None when read from a frame log.
-        stage_ms: time of each stage so far.
+        state: `FAILED` once something could not be written: the robot drives on and localises,
+            and what it had saved so far stays; `SPOOLED` where another process writes to the map,
+            so that the drive's memory waits in a file beside it.
+        reason: why saving failed, or where the memory waits.
+        session: the drive.
+        revision: number of the revision that it became.
+        nodes: nodes saved.
     """
 
-    frame: Frame
-    motion: Motion
-    arrived: float
-    pair: StereoPair | None
-    stage_ms: dict[str, float]
+    state: SavingState = SavingState.OFF
+    reason: str = ""
+    session: SessionId | None = None
+    revision: int | None = None
+    nodes: int = 0
 
 
-def live_frames(
-    sequence: StereoSequence | FrameSequence,
-    settings: Settings,
-    rate_hz: float | None = None,
-    preload: bool = False,
-) -> Generator[LiveFrame]:
-    """Runs a drive's images through front-end and odometry; a frame log brings both along.
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """Whose drive is kept.
+
+    Attributes:
+        name: of the robot.
+        camera: its camera.
+        settings: the resolved configuration.
+        options: how it localises.
+    """
+
+    name: str | None
+    camera: StereoCamera
+    settings: Settings
+    options: RobotOptions
+
+    @property
+    def made_by(self) -> tuple[DescriptorKind, str]:
+        """Kind of descriptors, and hash of the front-end."""
+        return self.settings.frontend.descriptor, Frontend(self.settings.frontend).hash
+
+    def localiser_in(self, opened: Map, *, saves: bool) -> Localiser:
+        """The localiser of the drive; its session begins with the first frame."""
+        return localiser_in(
+            opened,
+            self.camera,
+            self.settings,
+            policy=self.options.policy,
+            budget=self.options.budget,
+            relocaliser=self.options.relocaliser,
+            saves=saves,
+            threads=self.options.threads,
+        )
+
+    def session(self, first: Arrived) -> Session:
+        """The session that begins with this pair or logged frame."""
+        pair = first if isinstance(first, StereoPair) else first.frame
+        clock = Clock.UTC if pair.stamp_ns >= _CLOCK_FROM_NS else Clock.RELATIVE
+        info = SequenceInfo(self.name or "live", "live", clock, self.name)
+        pixels = first_pair_hash(first) if isinstance(first, StereoPair) else ""
+        return session_of(info, self.camera, pair.stamp_ns, pixels)
+
+
+class Into(Protocol):
+    """Where a live drive is kept."""
+
+    @property
+    def localiser(self) -> Localiser:
+        """The localiser of the drive."""
+        ...
+
+    def begin(self, session: Session) -> Keeper:
+        """The keeper of the drive.
+
+        Raises:
+            MapError: it cannot be begun.
+        """
+        ...
+
+    def end(self, saving: Saving, *, well: bool) -> None:
+        """Makes a revision of it; `well` says that all of it was written so far."""
+        ...
+
+    def close(self) -> None:
+        """Lets go of files and threads."""
+        ...
+
+
+class IntoMap:
+    """A drive that is mapped, through the robot's own view of the map, which grows.
 
     Args:
-        sequence: the drive.
-        settings: of front-end and odometry.
-        rate_hz: replay in real time at this rate; None for as fast as it goes.
-        preload: decode everything before the first frame.
-
-    Close the generator where it is left early: that ends the thread that reads ahead. While it is
-    open, Ctrl-C waits for the end of the frame (`deferred_interrupt`).
-
-    Raises:
-        KeyboardInterrupt: between two frames.
+        owner: whose drive it is.
+        opened: that view.
     """
-    frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
-    gaps = GapFiller()
-    # Closed by hand: after an error its traceback would keep the reading thread alive to the end
-    # of the process, and a thread that is in the midst of C++ then takes the process down with it.
-    with closing(_entries(sequence, preload)) as entries, deferred_interrupt() as raise_if_asked:
-        for arrived, entry in paced(entries, rate_hz):
-            raise_if_asked()
-            if isinstance(entry, LoggedFrame):
-                motion = gaps.motion(entry.odometry, entry.frame.stamp_ns)
-                yield LiveFrame(entry.frame, motion, arrived, None, {})
-            else:
-                yield _run(frontend, odometry, gaps, entry, arrived)
-            raise_if_asked()
 
+    def __init__(self, owner: Owner, opened: Map) -> None:
+        self._owner = owner
+        self._opened = opened
+        self._stack = ExitStack()
+        self._stack.enter_context(opened)
+        self._stack.enter_context(opened.writing())
+        self._words = node_words(opened, owner.settings, owner.options.relocaliser)
+        self.localiser: Localiser = owner.localiser_in(opened, saves=True)
+        self._drive: SavedDrive | None = None
 
-def _entries(
-    sequence: StereoSequence | FrameSequence, preload: bool
-) -> Generator[StereoPair | LoggedFrame]:
-    entries: Iterable[StereoPair | LoggedFrame] = sequence
-    yield from list(entries) if preload else read_ahead(entries, _READ_AHEAD)
+    def begin(self, session: Session) -> Keeper:
+        """See `Into`."""
+        opened, owner = self._opened, self._owner
+        if opened.session_state(session.id) is not SessionState.ABSENT:
+            raise MapError(
+                f"{opened.location} holds session {session.id} already; give what was recorded of "
+                "it to engram map, which goes on with an interrupted session"
+            )
+        configuration = configuration_of(owner.settings, owner.options)
+        writer = begin_or_resume(
+            opened, session, owner.camera, owner.made_by, configuration, f"map {session.robot}"
+        )
+        self._drive = SavedDrive(
+            opened, writer, self.localiser, owner.settings, self._words, waits=False
+        )
+        return self._drive.mapper
 
-
-def _run(
-    frontend: Frontend, odometry: Odometry, gaps: GapFiller, pair: StereoPair, arrived: float
-) -> LiveFrame:
-    started = time.perf_counter()
-    frame = frontend.extract(pair)
-    extracted = time.perf_counter()
-    motion = gaps.motion(odometry.step(frame), frame.stamp_ns)
-    finished = time.perf_counter()
-    stage_ms = {
-        "frontend": (extracted - started) * 1e3,
-        "odometry": (finished - extracted) * 1e3,
-    }
-    return LiveFrame(frame, motion, arrived, pair, stage_ms)
-
-
-def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]]:
-    """Each item with the time at which it arrives: at once, or at the given rate.
-
-    At a rate, items arrive on schedule whether or not the consumer is ready, as on a robot: one
-    that comes back late finds the next item already waiting.
-    """
-    first: float | None = None
-    for count, item in enumerate(items):
-        now = time.perf_counter()
-        if rate_hz is None:
-            yield now, item
-            continue
-        first = now if first is None else first
-        due = first + count / rate_hz
-        if due > now:
-            time.sleep(due - now)
-        yield due, item
-
-
-def read_ahead(items: Iterable[T], depth: int) -> Generator[T]:
-    """Iterates on a thread of its own, up to `depth` items ahead of the consumer.
-
-    An error of the iteration is raised where the item would have come.
-    """
-    queue: Queue[tuple[T | None, BaseException | None, bool]] = Queue(depth)
-    stopped = Event()
-
-    def produce() -> None:
-        try:
-            for item in items:
-                queue.put((item, None, False))
-                if stopped.is_set():
-                    return
-        except BaseException as error:  # raised again in the consumer's thread
-            queue.put((None, error, True))
+    def end(self, saving: Saving, *, well: bool) -> None:
+        """See `Into`; of a drive that was not all written, what was is committed."""
+        drive = self._drive
+        if drive is None:
             return
-        queue.put((None, None, True))
+        try:
+            if well:
+                drive.finish()
+            drive.close()
+        except MapError:
+            if well:
+                raise
+        saving.revision = drive.commit().number
+        saving.state = SavingState.COMMITTED if well else saving.state
 
-    producer = Thread(target=produce, name="engram-reader", daemon=True)
-    producer.start()
-    try:
-        while True:
-            item, error, last = queue.get()
-            if error is not None:
-                raise error
-            if last:
-                return
-            yield item  # type: ignore[misc]  # an item comes with neither error nor end
-    finally:
-        stopped.set()
-        while producer.is_alive():
-            while not queue.empty():
-                queue.get_nowait()
-            producer.join(timeout=0.05)
+    def close(self) -> None:
+        """See `Into`."""
+        self._stack.close()
+
+
+class IntoMemory:
+    """A drive of which only path and attempts are kept; see `engram.robot.spool`.
+
+    Args:
+        owner: whose drive it is.
+        opened: the map.
+    """
+
+    def __init__(self, owner: Owner, opened: Map) -> None:
+        self.localiser = owner.localiser_in(opened, saves=False)
+        self._owner = owner
+        self._map_path = Path(opened.location)
+        self._frames = opened.frames
+        self._spool: Spool | None = None
+        self._saver: Saver | None = None
+
+    def begin(self, session: Session) -> Keeper:
+        """See `Into`."""
+        owner, mapper = self._owner, self._owner.settings.mapper
+        configuration = configuration_of(owner.settings, owner.options)
+        self._spool = Spool(
+            self._map_path,
+            session,
+            owner.camera,
+            owner.made_by,
+            configuration,
+            mapper.memory_bytes,
+        )
+        self._saver = Saver(self._spool, self._frames, mapper.checkpoint_every, waits=False)
+        return Memory(self.localiser, self._saver, path_id(session.id))
+
+    def end(self, saving: Saving, *, well: bool) -> None:
+        """See `Into`."""
+        if self._saver is None or self._spool is None:
+            return
+        try:
+            self._saver.finish()
+        except MapError:
+            if well:
+                raise
+        finally:
+            self._spool.close()
+        try:
+            committed = commit_spools(self._map_path)
+        except MapLockedError:
+            saving.state, saving.reason = SavingState.SPOOLED, str(self._spool.path)
+            return
+        if committed:
+            saving.revision = committed[-1].number
+        saving.state = SavingState.COMMITTED if well else saving.state
+
+    def close(self) -> None:
+        """See `Into`."""
+
+
+class LiveKeeper(Keeper):
+    """Keeps a live drive by another keeper, and ends that where something cannot be written.
+
+    The session begins with the first frame: only then is it known which drive it is.
+
+    Args:
+        owner: whose drive it is.
+        into: where the session goes.
+    """
+
+    def __init__(self, owner: Owner, into: Into) -> None:
+        self.saving = Saving(SavingState.ON)
+        self._owner = owner
+        self._into = into
+        self._keeper = KEEPS_NOTHING
+
+    def begin(self, first: Arrived) -> None:
+        """The drive begins with this pair or logged frame."""
+        session = self._owner.session(first)
+        self._into.localiser.begin(session)
+        self.saving.session = session.id
+        try:
+            self._keeper = self._into.begin(session)
+        except MapError as error:
+            self._fail(error)
+
+    def close(self) -> None:
+        """The drive is over: what was kept becomes a revision.
+
+        Raises:
+            MapError: it cannot be written, though nothing failed while the robot drove.
+        """
+        failed = self.saving.state is SavingState.FAILED
+        try:
+            if self.saving.session is not None:
+                self._into.end(self.saving, well=not failed)
+        except MapError as error:
+            if not failed:
+                self._fail(error)
+                raise
+        finally:
+            self._into.close()
+
+    def hint(self, live: Frame, motion: Motion) -> Hint | None:
+        """See `Keeper`."""
+        return self._keeper.hint(live, motion)
+
+    def may_propose(self, *, certain: bool) -> bool:
+        """See `Keeper`."""
+        return self._keeper.may_propose(certain=certain)
+
+    def may_propose_own(self, *, certain: bool) -> bool:
+        """See `Keeper`."""
+        return self._keeper.may_propose_own(certain=certain)
+
+    def keep(self, live: Frame, found: Localisation) -> Localisation:
+        """See `Keeper`; what cannot be written ends the saving, not the drive."""
+        try:
+            found = self._keeper.keep(live, found)
+        except MapError as error:
+            self._fail(error)
+            return found
+        self.saving.nodes += found.saved is not None
+        return found
+
+    def withdrawn(self, found: Localisation) -> None:
+        """See `Keeper`."""
+        self._keeper.withdrawn(found)
+
+    def _fail(self, error: MapError) -> None:
+        self._keeper = KEEPS_NOTHING
+        self.saving.state, self.saving.reason = SavingState.FAILED, str(error)

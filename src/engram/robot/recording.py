@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import Any
 
 from engram.config import config_hash
 from engram.errors import SequenceError
-from engram.frontend import Frame, FrameStatus
-from engram.monitor import ignore
-from engram.odometry import OdometryStatus
-from engram.robot.live import live_frames
+from engram.frontend import Frame, FrameStatus, Frontend
+from engram.monitor import QUIET, Monitor, deferred_interrupt
+from engram.odometry import Odometry, OdometryStatus
+from engram.robot.front import arriving
 from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
 from engram.sequences import (
@@ -70,7 +69,7 @@ def extract_log(
     sequence: DriveSequence,
     out: Path,
     settings: Settings,
-    advance: Callable[[str], None] = ignore,
+    monitor: Monitor = QUIET,
 ) -> ExtractReport:
     """Runs a drive's images through front-end and odometry and records the result.
 
@@ -82,7 +81,7 @@ def extract_log(
         sequence: the drive; images.
         out: NAME.framelog.
         settings: of front-end and odometry.
-        advance: called once per frame with a word on how it went.
+        monitor: hears how each frame went, and may stop the recording.
 
     Raises:
         SequenceError: the drive is a frame log already, or its images cannot be used.
@@ -90,25 +89,28 @@ def extract_log(
         MapError: the log cannot be written; what was recorded is intact.
     """
     report = ExtractReport(str(out))
-    header: FrameLogHeader | None = None
+    frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
     writer: FrameLogWriter | None = None
     try:
-        with closing(live_frames(sequence, settings)) as frames:
-            for live in frames:
-                if live.pair is None:
+        with closing(arriving(sequence)) as pairs, deferred_interrupt() as raise_if_asked:
+            for pair in pairs:
+                raise_if_asked()
+                if isinstance(pair, LoggedFrame):
                     raise SequenceError(f"{sequence.info.name}: is a frame log already")
+                frame = frontend.extract(pair)
+                step = odometry.step(frame)
                 if writer is None:
-                    header = _header(sequence, live.frame, settings)
-                    writer = FrameLogWriter(out, header)
-                _count(report, live.frame.status, live.motion.odometry.status)
-                pair_hash = first_pair_hash(live.pair)
-                if writer.holds(live.frame.stamp_ns, pair_hash):
+                    writer = FrameLogWriter(out, _header(sequence, frame, settings))
+                _count(report, frame.status, step.status)
+                pair_hash = first_pair_hash(pair)
+                if writer.holds(frame.stamp_ns, pair_hash):
                     report.already_recorded += 1
-                    advance("recorded already")
-                    continue
-                writer.append(LoggedFrame(live.frame, live.motion.odometry), pair_hash)
-                report.frames += 1
-                advance(live.motion.odometry.status.value)
+                    monitor.advance("recorded already")
+                else:
+                    writer.append(LoggedFrame(frame, step), pair_hash)
+                    report.frames += 1
+                    monitor.advance(step.status.value)
+                monitor.check()
         if writer is None:
             raise SequenceError(f"{sequence.info.name}: no frame can be read")
         writer.close(complete=True)

@@ -9,9 +9,10 @@ from engram.config import load_toml
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
-from engram.localiser import LocaliserConfig
+from engram.localiser import Budget, LocaliserConfig
 from engram.mapper import MapperConfig
 from engram.odometry import OdometryConfig
+from engram.ranking import check_for_robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,38 @@ class Settings:
             odometry=replace(self.odometry, matcher=odometry),
             localiser=replace(self.localiser, matcher=localiser),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class RobotOptions:
+    """How a robot ranks and how much it may attempt.
+
+    Attributes:
+        policy: key of `POLICIES`.
+        lanes, rounds: the budget of each frame.
+        deadline_ms: no attempt starts later than this after its frame arrived. None counts alone,
+            so that the same input gives the same results.
+        relocaliser: key of `RELOCALISERS`, for a lost robot; None for none.
+        threads: whether the lanes run on threads; without a deadline the results are the same.
+        author: who maps; None for the robot.
+    """
+
+    policy: str = "recall"
+    lanes: int = 2
+    rounds: int = 2
+    deadline_ms: float | None = None
+    relocaliser: str | None = "fabmap"
+    threads: bool = True
+    author: str | None = None
+
+    def __post_init__(self) -> None:
+        check_for_robot(self.policy)
+        Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)  # refuses what is no budget
+
+    @property
+    def budget(self) -> Budget:
+        """What each frame may cost."""
+        return Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)
 
 
 def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:

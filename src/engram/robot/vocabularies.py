@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engram.config import to_dict
 from engram.errors import IncompatibleError, InputError, MapCorruptError
-from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus
+from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus, Frontend
 from engram.graph.model import NodeId
 from engram.maps import Map
 from engram.places import (
@@ -25,9 +25,10 @@ from engram.places import (
     train_vocabulary,
 )
 from engram.places.stored_words import keep_missing_words, vocabulary_or_default
-from engram.robot.live import live_frames
+from engram.robot.front import arriving
 from engram.robot.session import DriveSequence, open_drive
 from engram.robot.settings import Settings
+from engram.sequences import LoggedFrame
 
 MAP_SUFFIX = ".engram"
 
@@ -219,5 +220,9 @@ def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
             return [store.frames.frame(node.id) for node in store.load().nodes]
     sequence: DriveSequence = open_drive(source)
     settings = Settings().for_descriptor(kind)
-    with closing(live_frames(sequence, settings)) as live:
-        return [one.frame for one in live if one.frame.status is FrameStatus.OK]
+    frontend = Frontend(settings.frontend)
+    with closing(arriving(sequence)) as entries:
+        frames = [
+            one.frame if isinstance(one, LoggedFrame) else frontend.extract(one) for one in entries
+        ]
+    return [frame for frame in frames if frame.status is FrameStatus.OK]

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.localiser import Localiser
+from engram.frontend import Frame, StereoPair
+from engram.localiser import Localisation
 from engram.localiser.attempts import Outcome, best_success
 from engram.maps.frame_reader import FrameReader
-from engram.robot.live import LiveFrame
-from engram.robot.results import FrameResult
+from engram.robot.robot import Seen
 from engram.viewing import match_picture
 
 
@@ -23,17 +23,15 @@ class PictureWriter:
     Args:
         folder: made where there is none.
         every: frames from one picture to the next.
-        localiser: the localiser of the drive.
         frames: the map's frames.
 
     Raises:
         InputError: the folder cannot be made.
     """
 
-    def __init__(self, folder: Path, every: int, localiser: Localiser, frames: FrameReader) -> None:
+    def __init__(self, folder: Path, every: int, frames: FrameReader) -> None:
         self._folder = folder
         self._every = every
-        self._localiser = localiser
         self._frames = frames
         self._count = -1
         try:
@@ -41,8 +39,12 @@ class PictureWriter:
         except OSError as error:
             raise InputError(f"{folder}: cannot be made: {error.strerror}") from error
 
-    def offer(self, live: LiveFrame, result: FrameResult) -> None:
+    def offer(self, seen: Seen, found: Localisation) -> None:
         """Writes a picture of the frame just localised if it is its turn.
+
+        Args:
+            seen: `Robot.last`.
+            found: what was found of it.
 
         Raises:
             InputError: the picture cannot be written.
@@ -50,27 +52,25 @@ class PictureWriter:
         self._count += 1
         if self._count % self._every:
             return
-        image = live.frame.thumbnail if live.pair is None else live.pair.left
+        image = seen.arrived.left if isinstance(seen.arrived, StereoPair) else seen.frame.thumbnail
         if image is None:
             return
-        success = best_success(self._localiser.outcomes)
-        status = result.localisation.status.value
+        success = best_success(seen.outcomes)
+        status = found.status.value
         if success is None:
             nothing = np.zeros((0, 2), dtype=np.float32)
             picture = match_picture(np.zeros_like(image), image, nothing, nothing, status)
         else:
-            picture = self._match(live, success, image)
+            picture = self._match(seen.frame, success, image)
         path = self._folder / f"{self._count:06d}_{status}.png"
         if not cv2.imwrite(str(path), picture):
             raise InputError(f"{path}: the picture cannot be written; is there space?")
 
-    def _match(
-        self, live: LiveFrame, success: Outcome, image: NDArray[np.uint8]
-    ) -> NDArray[np.uint8]:
+    def _match(self, live: Frame, success: Outcome, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         node = self._frames.frame(success.candidate.node)
         thumbnail = self._frames.thumbnail(success.candidate.node)
         size = np.array([node.camera.width, node.camera.height], dtype=np.float32)
-        scale = image.shape[1] / live.frame.camera.width
+        scale = image.shape[1] / live.camera.width
         match = success.match
         caption = (
             f"{match.inliers} inliers, rank {success.rank}, node {str(success.candidate.node)[:8]}"
@@ -79,6 +79,6 @@ class PictureWriter:
             np.zeros((90, 160), dtype=np.uint8) if thumbnail is None else thumbnail,
             image,
             node.landmarks.pixels[match.reference_rows] / size,
-            live.frame.landmarks.pixels[match.live_rows] * np.float32(scale),
+            live.landmarks.pixels[match.live_rows] * np.float32(scale),
             caption,
         )

@@ -15,7 +15,7 @@ import numpy as np
 from engram.geometry import SE3
 from engram.graph.graph import ChainTree, ExperienceGraph
 from engram.graph.model import NodeId
-from engram.robot.results import FrameResult
+from engram.localiser import Localisation
 from engram.sequences.trajectories import Trajectory, write_tum
 
 HEADER = (
@@ -25,7 +25,7 @@ HEADER = (
 
 
 def chain_trajectory(
-    graph: ExperienceGraph, results: Sequence[FrameResult]
+    graph: ExperienceGraph, results: Sequence[Localisation]
 ) -> list[tuple[int, SE3]]:
     """Poses of the live camera in the frame of the first localised node.
 
@@ -38,17 +38,15 @@ def chain_trajectory(
     placed = _PlacedNodes(graph)
     trajectory: list[tuple[int, SE3]] = []
     first_from_live: SE3 | None = None
-    for result in results:
-        found = result.localisation
+    for found in results:
         if found.node is not None and found.node_from_live is not None:
             first_from_node = placed.place(found.node, first_from_live, found.node_from_live)
             first_from_live = (
                 None if first_from_node is None else first_from_node @ found.node_from_live
             )
         elif first_from_live is not None:
-            first_from_live = (
-                None if result.prev_from_curr is None else first_from_live @ result.prev_from_curr
-            )
+            moved = found.motion.odometry.prev_from_curr
+            first_from_live = None if moved is None else first_from_live @ moved
         if first_from_live is not None:
             trajectory.append((found.stamp_ns, first_from_live))
     return trajectory
@@ -79,7 +77,7 @@ class _PlacedNodes:
         return self._tree.pose(index) if index in self._tree.row_of else None
 
 
-def write_trajectory(path: Path, graph: ExperienceGraph, results: Sequence[FrameResult]) -> None:
+def write_trajectory(path: Path, graph: ExperienceGraph, results: Sequence[Localisation]) -> None:
     """Writes a localised drive in TUM format.
 
     Raises:

@@ -38,9 +38,10 @@ from engram.localiser import (
     Relocaliser,
 )
 from engram.maps import Map, open_map
+from engram.monitor import Advancing
 from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.ranking import POLICIES
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram.robot.localisers import relocaliser_in
 from engram.robot.session import session_of_drive
 from engram.sequences import LoggedFrame
@@ -59,7 +60,7 @@ NEAR_M = REACH_M + WRONG_M
 FINDABLE_INLIERS = 40
 LARGEST_TURN_RAD = float(np.deg2rad(90.0))
 # A generous budget, so that the map holds little twice.
-MAPPING = MapOptions(lanes=2, rounds=4)
+MAPPING = RobotOptions(lanes=2, rounds=4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +196,7 @@ def make_map(path: Path, logs: Sequence[Path], settings: Settings) -> None:
     for number, log in enumerate(logs):
         sequence = open_drive(log)
         with progress(f"map {number + 1} of {len(logs)}", len(sequence)) as advance:
-            report = map_drive(path, sequence, settings, MAPPING, advance)
+            report = map_drive(path, sequence, settings, MAPPING, Advancing(advance))
         if report.interrupted:
             raise SystemExit(130)
 

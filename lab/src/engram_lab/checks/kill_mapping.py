@@ -29,7 +29,8 @@ import sys
 from pathlib import Path
 from sqlalchemy import event
 from sqlalchemy.engine import Engine
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.monitor import Advancing
+from engram.robot import map_drive, open_drive
 from engram.maps.session_writer import SessionWriter
 
 @event.listens_for(Engine, "commit")
@@ -45,7 +46,7 @@ SessionWriter.checkpoint = checkpoint
 sequence = ThereAndBack(open_drive(Path(sys.argv[2])), int(sys.argv[3]))
 def tell(word):
     print("frame", flush=True)
-map_drive(Path(sys.argv[1]), sequence, Settings(), MapOptions(), tell)
+map_drive(Path(sys.argv[1]), sequence, monitor=Advancing(tell))
 print("finished", flush=True)
 """
 

@@ -26,7 +26,7 @@ from engram.graph.model import EdgeKind
 from engram.graph.neighbourhood import Search
 from engram.localiser import Position
 from engram.maps import Map
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram_lab.programs import command_line, numbers
 from engram_lab.studies.drives import EvaluatedDrive, drives_of
 from engram_lab.studies.starting import TrueNodes
@@ -40,7 +40,7 @@ STANDS, VIEW_GATE_RAD, CERTAIN = 150, float(np.deg2rad(60.0)), np.eye(6) * 0.1**
 def map_all(drives: list[EvaluatedDrive], path: Path) -> None:
     """Adds each drive to the map."""
     for drive in drives:
-        report = map_drive(path, open_drive(drive.path), Settings(), MapOptions())
+        report = map_drive(path, open_drive(drive.path), Settings(), RobotOptions())
         print(f"{drive.name:45} {report.text().splitlines()[0]}", flush=True)
 
 

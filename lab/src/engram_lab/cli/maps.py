@@ -20,10 +20,14 @@ def relocalise(
     relocaliser: Annotated[
         str, typer.Option("--relocaliser", help="fabmap, bag-of-words or exhaustive.")
     ] = "fabmap",
-    drive: options.Drive,
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 32,
     at: options.At = None,
+    format_: options.Format = None,
+    rig: options.Rig = "grey",
+    channel: options.Channel = "grey",
+    frames: options.Frames = None,
+    skip_bad: options.SkipBad = False,
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
@@ -38,11 +42,13 @@ def relocalise(
     """
     from engram.cli.progress import Bars
     from engram.localiser import Budget
-    from engram.robot import load_settings
+    from engram.robot import load_settings, open_drive
     from engram.robot.results import damage_warning
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
-    sequence = drive.open(path)
+    sequence = open_drive(
+        path, format=format_, rig=rig, channel=channel, frames=frames, skip_bad=skip_bad
+    )
     starts = relocalise_drive(
         map_path,
         sequence,
@@ -142,7 +148,7 @@ def try_(
     """
     from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
-    from engram.robot import LocaliseOptions, load_settings, open_drive, session_of_drive
+    from engram.robot import RobotOptions, load_settings, open_drive, session_of_drive
     from engram_lab.trial import (
         LeftOut,
         TrialSummary,
@@ -169,7 +175,7 @@ def try_(
         {asked.policy: asked, "copy": DownloadOptions()},
         [partial(open_drive, drive) for drive in drives],
         load_settings(config),
-        LocaliseOptions(lanes=lanes, rounds=rounds),
+        RobotOptions(lanes=lanes, rounds=rounds),
         Bars(),
         at=at,
         left_out=lambda one: left_out.append(replace(one, drive=str(named[one.drive]))),

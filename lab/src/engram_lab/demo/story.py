@@ -11,17 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.maps import Map
+from engram.localiser import Localisation
+from engram.maps import Map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot import (
-    FrameResult,
-    LocaliseOptions,
-    LocaliseRun,
-    MapOptions,
     MapReport,
+    RobotOptions,
     Settings,
     map_drive,
     open_drive,
+    robot_on,
     summarise,
 )
 from engram.viewing import Track, draw_attempts, draw_from_above
@@ -92,7 +91,7 @@ def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoRepor
     for log, condition in zip(logs[:-1], report.conditions, strict=False):
         sequence = open_drive(log)
         with monitor.stage(f"map: {condition}", len(sequence)) as part:
-            mapped = map_drive(map_path, sequence, Settings(), MapOptions(), part.advance)
+            mapped = map_drive(map_path, sequence, Settings(), RobotOptions(), part)
         report.mapped.append(mapped)
     thorough = {}
     for policy in _POLICIES:
@@ -112,33 +111,31 @@ def _condition(drive: SimulatedDrive) -> str:
 
 def _localise(
     map_path: Path, log: Path, policy: str, most: int, out: Path, monitor: Monitor
-) -> list[FrameResult]:
+) -> list[Localisation]:
     sequence = open_drive(log)
-    options = LocaliseOptions(policy=policy, lanes=1, rounds=most)
+    options = RobotOptions(policy=policy, lanes=1, rounds=most)
     with (
-        LocaliseRun(map_path, sequence, Settings(), options) as run,
+        open_map(map_path) as opened,
+        robot_on(opened, sequence, Settings(), options) as robot,
         monitor.stage(f"localise: {policy}, {most} a frame", len(sequence)) as part,
     ):
-        writer = PictureWriter(
-            out / f"matches_{policy}_{most}", 40, run.localiser, run.opened.frames
-        )
+        writer = PictureWriter(out / f"matches_{policy}_{most}", 40, opened.frames)
         results = []
-        for live, result in run:
-            results.append(result)
-            writer.offer(live, result)
-            part.advance(result.localisation.status.value)
+        for found in robot.drive(sequence, part):
+            results.append(found)
+            assert robot.last is not None
+            writer.offer(robot.last, found)
         return results
 
 
 def _draw(
     report: DemoReport,
     map_path: Path,
-    results: dict[str, list[FrameResult]],
+    results: dict[str, list[Localisation]],
     drives: list[SimulatedDrive],
 ) -> None:
     attempts = {
-        policy: np.array([one.localisation.attempts for one in found])
-        for policy, found in results.items()
+        policy: np.array([one.attempts for one in found]) for policy, found in results.items()
     }
     draw_attempts(attempts, report.out / "attempts.png", "Attempts per frame, last drive")
     draw_from_above(

@@ -134,7 +134,7 @@ def record(
         matcher=memo,
         clock=drive.session,
     ) as localiser:
-        localiser.start_at(start)
+        localiser.place_at(start)
         gaps = GapFiller()
         for number, one in enumerate(logged):
             odometry = one.odometry if number else OdometryStep(OdometryStatus.FIRST)

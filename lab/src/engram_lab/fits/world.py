@@ -23,7 +23,7 @@ from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.measures import Drive, route_not_localised
 from engram.monitor import QUIET, Monitor
-from engram.robot import MapOptions, Settings
+from engram.robot import RobotOptions, Settings
 from engram.sequences.opening import open_sequence
 from engram_lab.fits.calibration import (
     CLIP_FRAMES,
@@ -55,7 +55,7 @@ LAPS = 40
 _EARLY_LAPS = 25
 _EVERYTHING = Configuration("distance", UNLIMITED)
 # Counts only, more of them than there are candidates, one after another: the first success ends it.
-_EXHAUSTIVE = MapOptions(policy="distance", lanes=1, rounds=UNLIMITED, relocaliser="fabmap")
+_EXHAUSTIVE = RobotOptions(policy="distance", lanes=1, rounds=UNLIMITED, relocaliser="fabmap")
 # Of `village`: a clear morning, where its road runs straight between houses, as on the clip.
 _SESSION, _FIRST_FRAME = 1, 60
 

@@ -16,15 +16,14 @@ from engram.config import to_dict
 from engram.errors import InputError
 from engram.localiser import Position
 from engram.maps import Map
-from engram.monitor import ignore
-from engram.robot import MapOptions, MapReport, Settings, map_drive
+from engram.robot import MapReport, RobotOptions, Settings, map_drive
 from engram.sequences import FrameLog
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.starting import TrueNodes
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
 # Folds are built beside each other, one thread each.
-GENEROUS = MapOptions(policy="path-near", lanes=4, rounds=8, relocaliser="fabmap", threads=False)
+GENEROUS = RobotOptions(policy="path-near", lanes=4, rounds=8, relocaliser="fabmap", threads=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +73,7 @@ def build_map(
     path: Path,
     drives: Sequence[EvaluatedDrive],
     settings: Settings,
-    options: MapOptions,
+    options: RobotOptions,
     *,
     base: Path | None = None,
     known: Sequence[EvaluatedDrive] = (),
@@ -109,7 +108,7 @@ def build_map(
         start = partial(_start, drive=drive, drives=(*drives, *known))
         log = FrameLog(drive.path)
         try:
-            report = map_drive(draft, log, settings, options, ignore, start)
+            report = map_drive(draft, log, settings, options, start=start)
         finally:
             log.close()
         if report.interrupted or report.revision is None:
@@ -130,7 +129,7 @@ def _built_session(
     draft: Path, drive: EvaluatedDrive, report: MapReport, seconds: float
 ) -> BuiltSession:
     assert report.revision is not None
-    localisations = [one.localisation for one in report.results]
+    localisations = report.results
     with Map.open(draft) as store:
         nodes = store.node_count()
     return BuiltSession(

@@ -177,7 +177,7 @@ def run_in_step(
                 started, made = clock(), cost_so_far()
                 localiser.move(motions[number])
                 if number == situation.start[0]:
-                    localiser.start_at(situation.start[1])
+                    localiser.place_at(situation.start[1])
                 found = localiser.localise(logged.frame)
                 seconds = clock() - started - (cost_so_far() - made)
                 runs.step_ms[row] += 1e3 * seconds
@@ -254,7 +254,6 @@ def _localisers(
                 clock=situation.drive.session,
                 path_memory=memories[one.paths],
             )
-            localiser.keeps_attempts = False  # nothing is written
             localisers.append(stack.enter_context(localiser))
         yield localisers
 

@@ -17,7 +17,7 @@ from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
 from engram.maps import Map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.ranking import policy_named
-from engram.robot import MapOptions, Settings
+from engram.robot import RobotOptions, Settings
 from engram.sequences import LoggedFrame
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import (
@@ -76,7 +76,7 @@ class RankingOptions:
     map_sizes: bool = True
     live_folds: int = 1
     relocaliser: str | None = None
-    build: MapOptions = field(default_factory=lambda: GENEROUS)
+    build: RobotOptions = field(default_factory=lambda: GENEROUS)
     only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:

@@ -19,7 +19,7 @@ from engram.errors import (
     storage_full,
 )
 from engram.geometry import SE3
-from engram.monitor import QUIET, Monitor, write_whole
+from engram.monitor import QUIET, Advancing, Monitor, write_whole
 from engram.processes import run_in_processes
 from engram.robot.recording import extract_log
 from engram.robot.settings import Settings
@@ -183,7 +183,7 @@ def _render(task: _Task, monitor: Monitor) -> None:
     def count(_: str) -> None:
         monitor.advance(sequence.info.name)
 
-    report = extract_log(sequence, task.target, task.settings, count)
+    report = extract_log(sequence, task.target, task.settings, Advancing(count))
     if report.interrupted:
         raise KeyboardInterrupt
     plan = sequence.drive.plan

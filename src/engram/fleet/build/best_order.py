@@ -25,7 +25,6 @@ from engram.fleet.build.orders import (
     check_held_out,
 )
 from engram.fleet.build.scratch import keeping, read_kept, write_kept
-from engram.fleet.merge.gate import localise_drive
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.graph.model import Session
@@ -33,7 +32,7 @@ from engram.maps import Map, copy_map
 from engram.maps.drafts import remove_left_drafts
 from engram.measures import failure_curve, failure_route, route_not_localised
 from engram.monitor import Monitor
-from engram.robot import Settings, open_drive
+from engram.robot import Settings, measure, open_drive
 
 # [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
 _AREA_TO_M = 50.0
@@ -119,7 +118,7 @@ class _Search:
         self._merging = merging
         self._judge = judge
         self._root = root
-        self._localise = judge.localise or localise_drive
+        self._localise = judge.localise or measure
         mapped: list[tuple[Session, str]] = []
         hashes = []
         for path in (*maps, *([] if root is None else [root])):

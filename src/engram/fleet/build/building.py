@@ -32,7 +32,7 @@ from engram.maps import Map, copy_map
 from engram.maps.drafts import check_parent
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.processes import run_in_processes
-from engram.robot import MapOptions, Settings
+from engram.robot import RobotOptions, Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class BuildOptions:
     groups: int = 2
     grouping: str = "chronological"
     seed: int = 0
-    mapping: MapOptions = field(default_factory=MapOptions)
+    mapping: RobotOptions = field(default_factory=RobotOptions)
     merging: MergeOptions = field(default_factory=MergeOptions)
     scheduler: str | None = None
     judge: JudgeOptions | None = None
@@ -62,7 +62,7 @@ class BuildOptions:
     def __post_init__(self) -> None:
         if self.workers < 1:
             raise ConfigError(f"build: {self.workers} workers, must be 1 or more")
-        if self.mapping.deadline_ms is not None or self.mapping.rate_hz is not None:
+        if self.mapping.deadline_ms is not None:
             raise ConfigError("a build has budgets by count: a deadline would give chance maps")
 
 
@@ -373,7 +373,7 @@ def _settled_order(
             raise ConfigError(
                 f"the groups of {scratch.folder} are being merged already, in the order "
                 f"{' '.join(map(str, begun.order))}, which was found otherwise; finish it with the "
-                "same --order, --validate and build.max_gap_m, or delete the folder"
+                "same --best-order or --best-first, --validate and --judge-at, or delete the folder"
             )
         return begun
     if judge is None:

@@ -13,7 +13,7 @@ from typing import Any
 from engram.errors import MissingExtraError, SequenceError
 from engram.maps import Map, copy_map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot import MapOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class GroupTask:
     path: Path
     sources: Sequence[str]
     settings: Settings
-    options: MapOptions
+    options: RobotOptions
 
 
 @dataclass(slots=True)
@@ -78,7 +78,7 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
     for source in task.sources:
         with fetched(source) as drive:
             report = map_drive(
-                task.path, open_drive(drive), task.settings, task.options, monitor.advance
+                task.path, open_drive(drive), task.settings, task.options, monitor
             )
         if report.interrupted:
             raise KeyboardInterrupt

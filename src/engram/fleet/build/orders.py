@@ -16,11 +16,11 @@ import numpy as np
 
 from engram.config import config_hash, plain, to_dict
 from engram.errors import ConfigError
-from engram.fleet.merge.gate import GateOptions, held_as
+from engram.fleet.merge.gate import held_as
 from engram.graph.model import Session
 from engram.maps import Map
 from engram.measures import Drive
-from engram.robot import DriveSequence, Settings, open_drive, session_of_drive
+from engram.robot import DriveSequence, RobotOptions, Settings, open_drive, session_of_drive
 
 # 5,040 orders of 7 groups are a matter of days.
 _MOST_GROUPS = 6
@@ -42,7 +42,7 @@ class Orders(StrEnum):
         return math.factorial(groups) if self is Orders.ALL else groups
 
 
-Localise: TypeAlias = Callable[[Map, DriveSequence, Settings, GateOptions], Drive]
+Localise: TypeAlias = Callable[[Map, DriveSequence, Settings, RobotOptions], Drive]
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +56,14 @@ class JudgeOptions:
         localising: policy and budget of the validation.
         reported: further sessions, which choose nothing: how they fare tells how good the chosen
             order is.
-        localise: how a drive is localised in a map; None for `localise_drive`. Results that a
+        localise: how a drive is localised in a map; None for `measure`. Results that a
             search finds from earlier are taken to be by the same.
         orders: which are tried.
     """
 
     drives: Sequence[Path]
     judge_at_m: float = 10.0
-    localising: GateOptions = field(default_factory=GateOptions)
+    localising: RobotOptions = field(default_factory=RobotOptions)
     reported: Sequence[Path] = ()
     localise: Localise | None = None
     orders: Orders = Orders.ALL

@@ -1,6 +1,6 @@
 """Merging robots' maps into the fleet's."""
 
-from engram.fleet.merge.gate import Gate, GateOptions, what_is_worse
+from engram.fleet.merge.gate import Gate, what_is_worse
 from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
@@ -9,7 +9,6 @@ from engram.fleet.merge.segments import Segment, string_segments
 
 __all__ = [
     "Gate",
-    "GateOptions",
     "HandedIn",
     "MergeOptions",
     "MergeReport",

@@ -86,7 +86,7 @@ def look_along(
     first: FoundNode | None = None
     driven_m = first_at_m = 0.0
     attempts = 0
-    localiser.start_at(start)
+    localiser.place_at(start)
     for stored, frame, motion in frames:
         driven_m += motion.odometry.moved_m
         if driven_m > _LOOK_WITHIN_M:

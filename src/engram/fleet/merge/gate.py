@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +11,10 @@ from numpy.typing import NDArray
 from engram.errors import ConfigError, RefusedError
 from engram.fleet.merge.report import HeldOutFigures, HeldOutReport
 from engram.graph.model import Session, session_id
-from engram.localiser import Budget, Localisation
 from engram.maps import Map
 from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
-from engram.monitor import QUIET, Monitor
-from engram.robot import Settings, live_frames, measured, open_drive, session_of_drive
-from engram.robot.localisers import localiser_in
+from engram.monitor import Monitor
+from engram.robot import RobotOptions, Settings, measure, open_drive, session_of_drive
 from engram.robot.session import DriveSequence
 from engram.sequences import FrameLog, first_pair_hash
 
@@ -29,22 +25,6 @@ _LONGEST_GAP_RATIO = 1.5
 _TOLD_M = (5, 10, 20)
 # Sums of the same gaps in another order differ by this much.
 _ROUNDING = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class GateOptions:
-    """How held-out drives are localised.
-
-    Attributes:
-        policy: key of `POLICIES`.
-        lanes, rounds: the budget of each frame.
-        relocaliser: key of `RELOCALISERS`; drives begin lost.
-    """
-
-    policy: str = "recall"
-    lanes: int = 2
-    rounds: int = 2
-    relocaliser: str | None = "fabmap"
 
 
 def check_held_out(
@@ -116,12 +96,12 @@ class Gate:
     """
 
     def __init__(
-        self, drives: Sequence[Path], settings: Settings, options: GateOptions | None = None
+        self, drives: Sequence[Path], settings: Settings, options: RobotOptions | None = None
     ) -> None:
         self._paths = list(drives)
         self._sequences = [open_drive(path) for path in drives]
         self._settings = settings
-        self._options = options or GateOptions()
+        self._options = options or RobotOptions()
         self._before: list[Drive] | None = None
 
     def check_held_out(self, sessions: Iterable[Session], where: Path) -> None:
@@ -168,38 +148,8 @@ class Gate:
     def _localise(self, store: Map, monitor: Monitor) -> list[Drive]:
         store.forget()  # in the midst of a merge its graph is the merge's, not the file's
         return [
-            localise_drive(store, one, self._settings, self._options, monitor)
-            for one in self._sequences
+            measure(store, one, self._settings, self._options, monitor) for one in self._sequences
         ]
-
-
-def localise_drive(
-    opened: Map,
-    sequence: DriveSequence,
-    settings: Settings,
-    options: GateOptions,
-    monitor: Monitor = QUIET,
-) -> Drive:
-    """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
-    settings = settings.for_descriptor(opened.descriptor)
-    localiser = localiser_in(
-        opened,
-        sequence.camera,
-        settings,
-        policy=options.policy,
-        budget=Budget(options.lanes, options.rounds),
-        relocaliser=options.relocaliser,
-        live=session_of_drive(sequence).id,
-        clock=sequence.info,
-    )
-    found: list[Localisation] = []
-    with localiser, closing(live_frames(sequence, settings)) as frames:
-        for live in frames:
-            localiser.move(live.motion)
-            found.append(localiser.localise(live.frame))
-            monitor.advance(found[-1].status.value)
-            monitor.check()
-    return measured(found)
 
 
 def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:

@@ -29,6 +29,7 @@ from engram.graph.model import (
     PathEntryKind,
     Session,
     SessionId,
+    path_id,
 )
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
 from engram.localiser import (
@@ -41,7 +42,7 @@ from engram.localiser import (
     Relocaliser,
 )
 from engram.localiser.attempts import Outcome
-from engram.mapper import match_edges
+from engram.mapper import Walk, match_edges
 from engram.maps import StoredNode
 from engram.monitor import Monitor
 from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
@@ -127,6 +128,7 @@ class Replay:
         self._iterations: dict[SessionId, int] = {}
         # How far each drive had come when the centre last knew it.
         self._matched_at_m: dict[SessionId, float] = {}
+        self._walk: Walk  # of the segment being replayed
         self._last: Segment | None = None  # the one that was replayed last
         # Found behind gaps, before their turn came.
         self._looked_up: dict[NodeId, FoundNode] = {}
@@ -145,6 +147,7 @@ class Replay:
         if self._relocaliser is not None:
             self._relocaliser.forget()
         kept: list[KeptNode] = []
+        self._walk = Walk(path_id(session.id))
         with self._localiser(session, segment, self._relocaliser) as localiser:
             if start is not None:
                 self._start_at(localiser, start, segment.nodes[0])
@@ -186,7 +189,7 @@ class Replay:
         if session.id not in self._iterations:
             made = (one.last_iterations.get(session.id, -1) for one in (robot, centre))
             self._iterations[session.id] = max(made) + _ITERATION_GAP
-        localiser.replay_from(segment.nodes[0].driven_m, self._iterations[session.id])
+        localiser.resume(segment.nodes[0].driven_m, self._iterations[session.id])
         return localiser
 
     def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, Frame, Motion]]:
@@ -207,12 +210,15 @@ class Replay:
         if looked_up is not None:
             position = looked_up.localisation.position
             assert position is not None
-            localiser.start_at(position)
+            localiser.place_at(position)
             return looked_up.localisation, looked_up.outcomes
         known = self._known_neighbour(node.id, _MEASURED, self._run[0]) if self._run else None
         if known is not None:
             self._start_at(localiser, known, node)
         found = localiser.localise(frame)
+        self.attempts.setdefault(node.session, []).extend(localiser.attempts())
+        if found.node is not None:
+            self._walk.visit(found.node, PathEntryKind.MATCHED, frame.stamp_ns)
         return found, localiser.outcomes
 
     def _start_at(self, localiser: Localiser, position: Position, node: Node) -> None:
@@ -220,7 +226,7 @@ class Replay:
         open_loop_m = 0.0
         if self._merge.is_apart(position.node):
             open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
-        localiser.start_at(position, open_loop_m)
+        localiser.place_at(position, open_loop_m)
 
     def _look_behind_gap(self, session: Session, segment: Segment) -> bool:
         """Whether a segment is found from where the one before it ended; see `behind_gaps`."""
@@ -328,7 +334,8 @@ class Replay:
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
             self._merge.add_edge(match)
         self._merge.write_edges(lay_proximity_edges(self._merge.graph, index))
-        localiser.settle_in(node.id, node.stamp_ns)
+        localiser.settle_in(node.id)
+        self._walk.visit(node.id, PathEntryKind.SAVED, node.stamp_ns)
 
     def _matched(self, node: Node, outcomes: list[Outcome]) -> None:
         """The robot knows where it is: a run ends, and what one frame matched lies together."""
@@ -355,12 +362,11 @@ class Replay:
             self._merge.write_edges(tighten_chain(self._merge.graph, run))
 
     def _remember(self, session: Session, localiser: Localiser) -> None:
-        """Attempts and matches of a segment, for the session's attempts and its path."""
+        """Matches of a segment, for the session's path."""
         self._iterations[session.id] = localiser.iteration + _ITERATION_GAP
-        self.attempts[session.id] += localiser.take_attempts()
         self.entries[session.id] += (
             replace(entry, kind=PathEntryKind.REPLAYED)
-            for entry in localiser.walk.take_new()
+            for entry in self._walk.take_new()
             if entry.kind is PathEntryKind.MATCHED
         )
         if self._relocaliser is not None:

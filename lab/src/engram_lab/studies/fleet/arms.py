@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from engram.fleet.merge import GateOptions, MergeOptions
-from engram.robot import LocaliseOptions, MapOptions
+from engram.fleet.merge import MergeOptions
+from engram.robot import RobotOptions
 from engram_lab.studies.configurations import UNLIMITED, Configuration
 
 
@@ -28,9 +28,9 @@ class Arm:
     words: str
     sure_inliers: int = MergeOptions().sure_inliers
 
-    def mapping(self, relocaliser: str | None) -> MapOptions:
+    def mapping(self, relocaliser: str | None) -> RobotOptions:
         """How drives are mapped."""
-        return MapOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
+        return RobotOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
 
     def merging(self, relocaliser: str | None) -> MergeOptions:
         """How maps are merged."""
@@ -42,13 +42,13 @@ class Arm:
             sure_inliers=self.sure_inliers,
         )
 
-    def localising(self, relocaliser: str | None) -> LocaliseOptions:
+    def localising(self, relocaliser: str | None) -> RobotOptions:
         """How drives are localised as on a robot."""
-        return LocaliseOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
+        return RobotOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
 
-    def judging(self, relocaliser: str | None) -> GateOptions:
+    def judging(self, relocaliser: str | None) -> RobotOptions:
         """How orders of merging are judged."""
-        return GateOptions(self.policy, self.lanes, self.rounds, relocaliser)
+        return RobotOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
 
     @property
     def configuration(self) -> Configuration:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from engram.fleet.build import JudgeOptions, find_best_order
-from engram.fleet.merge import GateOptions
 from engram.frontend.matching import matcher_hash
 from engram.localiser import FrameMatcher
 from engram.maps import Map
 from engram.measures import Drive
 from engram.monitor import QUIET
-from engram.robot import DriveSequence, Settings, session_of_drive
+from engram.robot import DriveSequence, RobotOptions, Settings, session_of_drive
 from engram_lab.studies.configurations import Configuration
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm
@@ -33,7 +32,7 @@ class _Judge:
         self._drives = {one.session.id: one for one in plan.drives.drives}
 
     def __call__(
-        self, opened: Map, sequence: DriveSequence, settings: Settings, options: GateOptions
+        self, opened: Map, sequence: DriveSequence, settings: Settings, options: RobotOptions
     ) -> Drive:
         """See `JudgeOptions.localise`."""
         drive = self._drives[session_of_drive(sequence).id]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields
 from functools import partial
 from itertools import islice
@@ -13,8 +14,8 @@ import numpy as np
 
 from engram.graph.model import node_id
 from engram.localiser import FrameMatcher, Localisation, Relocaliser, accept_lost
-from engram.maps import Map
-from engram.robot import LocaliseOptions, LocaliseRun, Settings, session_of_drive
+from engram.maps import Map, open_map
+from engram.robot import RobotOptions, Settings, arriving, robot_on, session_of_drive
 from engram.robot.localisers import relocaliser_in
 from engram.sequences import FrameLog
 from engram_lab.studies.fleet.arms import Arm
@@ -102,7 +103,7 @@ def measure_stages(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> None:
     path = stages_path(plan, arm)
     if path.exists():
         return
-    options = LocaliseOptions(
+    options = RobotOptions(
         arm.policy, 1, min(arm.rounds * arm.lanes, _ROUNDS), relocaliser=plan.options.relocaliser
     )
     drives, centre = plan.held_out(fold), map_path(plan, arm, fold, name)
@@ -112,7 +113,7 @@ def measure_stages(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> None:
 
 
 def medians(
-    drives: Sequence[Path], centre: Path, settings: Settings, options: LocaliseOptions
+    drives: Sequence[Path], centre: Path, settings: Settings, options: RobotOptions
 ) -> dict[str, float]:
     """What each stage takes, in one pass.
 
@@ -128,15 +129,20 @@ def medians(
     taken_ms: dict[str, list[float]] = {one.name: [] for one in fields(StageTimes)}
     for drive in drives:
         log = FrameLog(drive)
-        with LocaliseRun(centre, log, settings, options) as run:
-            for number, (_, result) in enumerate(islice(run, _FRAMES)):
+        with (
+            open_map(centre) as opened,
+            robot_on(opened, log, settings, options) as robot,
+            closing(arriving(log)) as frames,
+        ):
+            for number, arrived in enumerate(islice(frames, _FRAMES)):
+                found = robot.step(arrived)
                 if number < _LOST_FRAMES:
-                    run.localiser.position = None  # lost again
-                for stage, ms in _stages_of(result.localisation):
+                    robot.lose()
+                for stage, ms in _stages_of(found):
                     taken_ms[stage].append(ms)
             if options.relocaliser is not None:
-                relocaliser = relocaliser_in(run.opened, options.relocaliser, log.header.descriptor)
-                taken_ms["proposed_ms"] += _in_vain_ms(run.opened, log, settings, relocaliser)
+                relocaliser = relocaliser_in(opened, options.relocaliser, log.header.descriptor)
+                taken_ms["proposed_ms"] += _in_vain_ms(opened, log, settings, relocaliser)
         log.close()
     return {name: float(np.median(some)) if some else 0.0 for name, some in taken_ms.items()}
 

@@ -78,7 +78,7 @@ def map_drives(
     path.parent.mkdir(parents=True, exist_ok=True)
 
     def look_at(drive: EvaluatedDrive, report: MapReport) -> None:
-        steps = measured([one.localisation for one in report.results])
+        steps = measured(report.results)
         frame_ms = [
             sum(ms for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP)
             for one in report.results

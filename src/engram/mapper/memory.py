@@ -1,0 +1,105 @@
+"""The memory of a drive: its path through the map, and its match attempts (SPEC §3)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from engram.frontend import Frame
+from engram.geometry import SE3
+from engram.graph.model import NodeId, PathEntry, PathEntryKind, PathId
+from engram.localiser import Hint, Keeper, Localisation, LocalisationStatus, Localiser, Position
+from engram.mapper.saver import Records, Saver
+from engram.maps import StoredSession
+from engram.odometry import Motion
+
+# A resumed robot was matched with a node from somewhere within a wide match basin.
+_RESUMED_SIGMA_M = 3.0
+_RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
+
+
+class Walk:
+    """Collects the entries of one session's path: one whenever its node changes (SPEC §3.3)."""
+
+    def __init__(self, path: PathId, first_sequence: int = 0, node: NodeId | None = None) -> None:
+        self.path = path
+        self._sequence = first_sequence
+        self._node = node
+        self._new: list[PathEntry] = []
+
+    def visit(self, node: NodeId, kind: PathEntryKind, stamp_ns: int) -> None:
+        """Adds an entry if the node is another one than before."""
+        if node == self._node:
+            return
+        self._new.append(PathEntry(self.path, self._sequence, node, kind, stamp_ns))
+        self._node = node
+        self._sequence += 1
+
+    def take_new(self) -> list[PathEntry]:
+        """The entries added since the last call."""
+        taken, self._new = self._new, []
+        return taken
+
+
+class Memory(Keeper):
+    """Remembers a drive without saving a node: its path and its attempts.
+
+    Later drives rank by them, as `path` and `recall` do. Where an interrupted run had remembered
+    a part of the drive, its frames are only followed, and the memory goes on behind them.
+
+    Args:
+        localiser: the drive's localiser.
+        saver: writes what is remembered.
+        path: the drive's path.
+        stored: what an interrupted run had stored of the drive; None for a new one.
+    """
+
+    def __init__(
+        self, localiser: Localiser, saver: Saver, path: PathId, stored: StoredSession | None = None
+    ) -> None:
+        self._localiser = localiser
+        self._saver = saver
+        self._stored = stored
+        self.walk = Walk(path)
+        if stored is not None and stored.last_entry is not None:
+            self.walk = Walk(path, stored.next_sequence, stored.last_entry.node)
+            localiser.resume(0.0, stored.next_iteration)
+
+    def hint(self, live: Frame, motion: Motion) -> Hint | None:
+        """See `Keeper`: frames that were dealt with already are not localised again."""
+        if not self._is_stored(live.stamp_ns):
+            return None
+        assert self._stored is not None
+        entry, position = self._stored.last_entry, None
+        if entry and entry.stamp_ns == live.stamp_ns and entry.kind is PathEntryKind.MATCHED:
+            spread = np.diag([_RESUMED_SIGMA_M**2] * 3 + [_RESUMED_SIGMA_RAD**2] * 3)
+            position = Position(entry.node, SE3.identity(), spread)
+        followed = Localisation(
+            live.stamp_ns, LocalisationStatus.DEAD_RECKONING, 0, 0, 0.0, motion, resumed=True
+        )
+        return Hint(position, guessed_m=np.inf, found=followed)
+
+    def keep(self, live: Frame, found: Localisation) -> Localisation:
+        """See `Keeper`."""
+        if not found.resumed:
+            self._visit_match(live, found)
+            self._put(Records())
+        return found
+
+    def _is_stored(self, stamp_ns: int) -> bool:
+        """Whether an interrupted run dealt with the frame."""
+        last_ns = None if self._stored is None else self._stored.last_stamp_ns
+        return last_ns is not None and stamp_ns <= last_ns
+
+    def _visit_match(self, live: Frame, found: Localisation) -> None:
+        if found.node is not None:
+            self.walk.visit(found.node, PathEntryKind.MATCHED, live.stamp_ns)
+
+    def _put(self, records: Records) -> None:
+        """Adds the frame's path entries and attempts, and hands all to the saver."""
+        records = replace(
+            records, path_entries=self.walk.take_new(), attempts=self._localiser.attempts()
+        )
+        if records:
+            self._saver.put(records)

@@ -1,0 +1,123 @@
+"""What reaches a robot: images or logged frames, decoded ahead, in real time or at once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Iterable, Iterator
+from queue import Queue
+from threading import Event, Thread
+from typing import TypeAlias, TypeVar
+
+from engram.frontend import Frame, Frontend, StereoPair
+from engram.localiser import StageClock
+from engram.odometry import GapFiller, Motion, Odometry
+from engram.robot.settings import Settings
+from engram.sequences import FrameSequence, LoggedFrame, StereoSequence
+
+T = TypeVar("T")
+Arrived: TypeAlias = StereoPair | LoggedFrame
+
+# Decoded pairs that wait ahead of the front-end: about 8 MB at KITTI's size.
+_READ_AHEAD = 8
+
+
+class Front:
+    """From images to a frame and its motion: front-end, odometry, gaps filled.
+
+    A frame log brings frame and odometry along.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._frontend = Frontend(settings.frontend)
+        self._odometry = Odometry(settings.odometry)
+        self._gaps = GapFiller()
+
+    def take(
+        self,
+        arrived: Arrived,
+        motion: Motion | None = None,
+        clock: StageClock | None = None,
+    ) -> tuple[Frame, Motion]:
+        """The frame and how the camera moved since the usable one before.
+
+        Args:
+            arrived: a pair of images, or a frame of a log.
+            motion: measured by something else; it takes the place of odometry. Then give it for
+                all frames of the drive.
+            clock: takes the time of front-end and odometry.
+        """
+        if isinstance(arrived, LoggedFrame):
+            if motion is None:
+                motion = self._gaps.motion(arrived.odometry, arrived.frame.stamp_ns)
+            return arrived.frame, motion
+        clock = clock or StageClock()
+        frame = self._frontend.extract(arrived)
+        clock.lap("frontend")
+        if motion is None:
+            motion = self._gaps.motion(self._odometry.step(frame), frame.stamp_ns)
+            clock.lap("odometry")
+        return frame, motion
+
+
+def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]]:
+    """Each item with the time at which it arrives: at once, or at the given rate.
+
+    At a rate, items arrive on schedule whether or not the consumer is ready, as on a robot: one
+    that comes back late finds the next item already waiting.
+    """
+    first: float | None = None
+    for count, item in enumerate(items):
+        now = time.perf_counter()
+        if rate_hz is None:
+            yield now, item
+            continue
+        first = now if first is None else first
+        due = first + count / rate_hz
+        if due > now:
+            time.sleep(due - now)
+        yield due, item
+
+
+def arriving(sequence: StereoSequence | FrameSequence) -> Generator[Arrived]:
+    """What a drive holds, decoded ahead of who takes it; see `read_ahead`."""
+    items: Iterable[Arrived] = sequence
+    return read_ahead(items, _READ_AHEAD)
+
+
+def read_ahead(items: Iterable[T], depth: int) -> Generator[T]:
+    """Iterates on a thread of its own, up to `depth` items ahead of the consumer.
+
+    An error of the iteration is raised where the item would have come. Close the generator where
+    it is left early: that ends the thread. After an error its traceback would keep the thread
+    alive to the end of the process, and one in the midst of C++ takes the process down with it.
+    """
+    queue: Queue[tuple[T | None, BaseException | None, bool]] = Queue(depth)
+    stopped = Event()
+
+    def produce() -> None:
+        try:
+            for item in items:
+                queue.put((item, None, False))
+                if stopped.is_set():
+                    return
+        except BaseException as error:  # raised again in the consumer's thread
+            queue.put((None, error, True))
+            return
+        queue.put((None, None, True))
+
+    producer = Thread(target=produce, name="engram-reader", daemon=True)
+    producer.start()
+    try:
+        while True:
+            item, error, last = queue.get()
+            if error is not None:
+                raise error
+            if last:
+                return
+            yield item  # type: ignore[misc]  # an item comes with neither error nor end
+    finally:
+        stopped.set()
+        while producer.is_alive():
+            while not queue.empty():
+                queue.get_nowait()
+            producer.join(timeout=0.05)

@@ -1,0 +1,158 @@
+"""A drive on its way into a map: begun or resumed, saved while it goes, committed at its end."""
+
+from __future__ import annotations
+
+import platform
+from contextlib import ExitStack, nullcontext
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import __version__
+from engram.config import to_dict
+from engram.frontend import DescriptorKind, Frame
+from engram.geometry import StereoCamera
+from engram.graph.model import Session
+from engram.localiser import ByAppearance, FrameMatcher, Localiser
+from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
+from engram.maps import Map, Revision, SessionState, SessionWriter
+from engram.places import RECOGNISERS, hash_of
+from engram.places.stored_words import keep_missing_words, vocabulary_or_default
+from engram.robot.localisers import drives_of
+from engram.robot.settings import RobotOptions, Settings
+
+
+class SavedDrive:
+    """Saves one drive with a mapper, on a thread of its own, and commits it.
+
+    Args:
+        opened: the map, open for writing; its graph grows.
+        writer: of the session.
+        localiser: of the drive, in the same map.
+        settings: of the mapper.
+        words: how the words of nodes are found, see `node_words`.
+        waits: whether a slow disk holds up the drive; else it ends the saving.
+
+    Attributes:
+        mapper: the drive's keeper.
+    """
+
+    def __init__(
+        self,
+        opened: Map,
+        writer: SessionWriter,
+        localiser: Localiser,
+        settings: Settings,
+        words: NodeWords | None,
+        *,
+        waits: bool = True,
+    ) -> None:
+        opened.derived(drives_of)[writer.session.id] = writer.session
+        self._writer = writer
+        every = settings.mapper.checkpoint_every
+        self._saver = Saver(writer, opened.frames, every, words, waits)
+        self._stack = ExitStack()
+        loops = self._stack.enter_context(loop_search(opened, localiser, settings))
+        self.mapper = Mapper(
+            localiser.graph,
+            localiser,
+            self._saver,
+            writer.session,
+            settings.mapper,
+            loops,
+            writer.stored,
+        )
+
+    def finish(self) -> None:
+        """The drive is over: what its last frames still bring is saved."""
+        self.mapper.finish()
+
+    def close(self) -> None:
+        """Writes what was handed over, and ends the threads. The session can be resumed.
+
+        Raises:
+            MapError: something could not be written.
+        """
+        with self._stack:
+            self._saver.finish()
+
+    def commit(self) -> Revision:
+        """Makes the session a revision of the map."""
+        return self._writer.commit()
+
+
+def begin_or_resume(
+    opened: Map,
+    session: Session,
+    camera: StereoCamera,
+    made_by: tuple[DescriptorKind, str],
+    configuration: dict[str, Any],
+    message: str,
+    author: str | None = None,
+) -> SessionWriter:
+    """The writer of a drive: of a new session, or of one that was interrupted.
+
+    Args:
+        opened: the map, open for writing.
+        session: the drive.
+        camera: its camera.
+        made_by: kind of its descriptors, and hash of the front-end that makes them.
+        configuration: see `configuration_of`.
+        message: what `log` shows.
+        author: who maps; None for the robot.
+
+    Raises:
+        MapError: the map holds the drive already, or cannot be written.
+    """
+    if opened.session_state(session.id) is SessionState.INTERRUPTED:
+        return opened.resume_session(session.id)
+    return opened.begin_session(
+        session,
+        camera,
+        descriptor=made_by[0],
+        frontend=made_by[1],
+        author=author or session.robot,
+        configuration=configuration,
+        message=message,
+    )
+
+
+def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any]:
+    """The resolved configuration, which every revision keeps (STYLE: reproducible)."""
+    return {
+        "settings": to_dict(settings),
+        "options": to_dict(options),
+        "machine": platform.machine(),
+        "engram": __version__,
+    }
+
+
+def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> NodeWords | None:
+    """How the words of saved nodes are found; those that older nodes lack are filled in first."""
+    if relocaliser not in RECOGNISERS:
+        return None
+    vocabulary = vocabulary_or_default(opened, settings.frontend.descriptor)
+    keep_missing_words(opened, vocabulary, [node.id for node in opened.graph.nodes])
+
+    def words_of(frame: Frame) -> NDArray[np.int32]:
+        return vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
+
+    return NodeWords(hash_of(vocabulary), words_of)
+
+
+def loop_search(
+    opened: Map, localiser: Localiser, settings: Settings
+) -> LoopSearch | nullcontext[None]:
+    """Looks for loops by the words that the relocaliser knows; None where it knows none."""
+    finder = localiser.relocaliser
+    if not isinstance(finder, ByAppearance):
+        return nullcontext()
+    matching = settings.localiser
+    return LoopSearch(
+        localiser.graph,
+        finder.book,
+        FrameMatcher(opened.frames, matching.matcher),
+        matching.acceptance,
+        LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
+    )

@@ -1,0 +1,248 @@
+"""A drive's memory in a file beside the map, until the map's writer is free.
+
+A robot that only remembers needs the map's writer for a moment at the end of its drive, not for
+all of it: others map meanwhile. So its path and attempts go into a file of their own, which also
+survives a crash, and whoever finds the writer free commits them as a session.
+
+The file is a row of chunks: length and CRC-32 of the body, each a little-endian uint32, then the
+body, compressed MessagePack. The first chunk is the header. A chunk torn by a crash ends the file.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import glob
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, astuple
+from pathlib import Path
+from typing import IO, Any
+from uuid import UUID
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import MapCorruptError, MapError, storage_full
+from engram.frontend import DescriptorKind, Frame
+from engram.geometry import StereoCamera
+from engram.graph.model import (
+    Attempt,
+    Clock,
+    Edge,
+    Node,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    Session,
+    SessionId,
+    path_id,
+)
+from engram.maps import Map, Revision, SessionState, open_map
+from engram.maps.rows import camera_from_row, camera_row
+
+_CHUNK = struct.Struct("<II")
+_VERSION = 1
+
+
+class Spool:
+    """Writes one drive's memory; a `RecordWriter` of a session without nodes.
+
+    Args:
+        map_path: the map beside which it lies.
+        session: the drive.
+        camera: its camera.
+        made_by: kind of its descriptors, and hash of the front-end that makes them.
+        configuration: kept with the revision.
+        most_bytes: how large it may become; what comes later is not remembered.
+
+    Raises:
+        MapError: the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        map_path: Path,
+        session: Session,
+        camera: StereoCamera,
+        made_by: tuple[DescriptorKind, str],
+        configuration: dict[str, Any],
+        most_bytes: int,
+    ) -> None:
+        self.path = map_path.with_name(f"{map_path.name}-memory-{session.id}")
+        self._most_bytes = most_bytes
+        self._entries: list[PathEntry] = []
+        self._attempts: list[Attempt] = []
+        with _as_map_errors(self.path):
+            self._file: IO[bytes] = _opened(self.path, os.O_CREAT | os.O_RDWR | os.O_TRUNC)
+        self._append(
+            {
+                "version": _VERSION,
+                "session": asdict(session),
+                "camera": camera_row(camera, 0),
+                "descriptor": made_by[0],
+                "frontend": made_by[1],
+                "configuration": configuration,
+            }
+        )
+
+    @property
+    def full(self) -> bool:
+        """Whether it has become so large that nothing more is remembered."""
+        return self._file.tell() >= self._most_bytes
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        """See `RecordWriter`."""
+        self._entries.append(entry)
+
+    def add_attempts(self, made: list[Attempt]) -> None:
+        """See `RecordWriter`."""
+        self._attempts += made
+
+    def checkpoint(self) -> None:
+        """See `RecordWriter`."""
+        if (self._entries or self._attempts) and not self.full:
+            entries, attempts = ([astuple(x) for x in y] for y in (self._entries, self._attempts))
+            self._append({"entries": entries, "attempts": attempts})
+        self._entries, self._attempts = [], []
+
+    def close(self) -> None:
+        """From now on it may be committed."""
+        self._file.close()
+
+    def add_node(self, node: Node, frame: Frame) -> None:
+        """See `RecordWriter`; a memory has none."""
+        raise NotImplementedError(f"node {node.id}: a memory saves no nodes")
+
+    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
+        """See `RecordWriter`; a memory has none."""
+        raise NotImplementedError(f"node {node}: a memory saves no words")
+
+    def add_edge(self, edge: Edge) -> None:
+        """See `RecordWriter`; a memory has none."""
+        raise NotImplementedError(f"edge {edge.a}–{edge.b}: a memory saves no edges")
+
+    def _append(self, content: dict[str, Any]) -> None:
+        body = zlib.compress(msgspec.msgpack.encode(content))
+        with _as_map_errors(self.path):
+            self._file.write(_CHUNK.pack(len(body), zlib.crc32(body)) + body)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+
+
+def commit_spools(map_path: Path) -> list[Revision]:
+    """Commits the memories that lie beside a map, each as a session without nodes.
+
+    Those of drives that still go on are left alone. Entries and attempts of nodes that the map no
+    longer shows are left out.
+
+    Raises:
+        MapLockedError: another process writes to the map; the memories wait.
+        MapError: the map cannot be written, or a memory not be read.
+    """
+    spools = sorted(map_path.parent.glob(f"{glob.escape(map_path.name)}-memory-*"))
+    if not spools:
+        return []
+    committed = []
+    with open_map(map_path) as opened, opened.writing():
+        for path in spools:
+            with suppress(BlockingIOError, FileNotFoundError), _opened(path, os.O_RDONLY) as file:
+                revision = _commit(opened, _chunks(file, path), path)
+                path.unlink()
+                if revision is not None:
+                    committed.append(revision)
+    return committed
+
+
+def _commit(opened: Map, chunks: Iterator[dict[str, Any]], path: Path) -> Revision | None:
+    """The revision; None where there is nothing to remember, or all of it is in the map."""
+    header = next(chunks, None)
+    if header is None:
+        return None  # killed before it was begun
+    if header["version"] != _VERSION:
+        raise MapError(f"{path} was written by a newer Engram; upgrade to commit it")
+    graph, session = opened.graph, _session(header["session"])
+    entries, attempts = list[PathEntry](), list[Attempt]()
+    for chunk in chunks:
+        found = (_entry(session, row) for row in chunk["entries"])
+        entries += [one for one in found if one.node in graph]
+        made = (_attempt(row) for row in chunk["attempts"])
+        attempts += [one for one in made if one.reference in graph and one.node in graph]
+    state = opened.session_state(session.id)
+    if state is SessionState.COMMITTED or not (entries or attempts):
+        return None
+    if state is SessionState.INTERRUPTED:
+        writer = opened.resume_session(session.id)
+    else:
+        writer = opened.begin_session(
+            session,
+            camera_from_row(header["camera"]),
+            descriptor=DescriptorKind(header["descriptor"]),
+            frontend=header["frontend"],
+            author=session.robot,
+            configuration=header["configuration"],
+            message=f"memory of {session.robot}",
+        )
+    for entry in entries:
+        if entry.sequence >= writer.stored.next_sequence:
+            writer.add_path_entry(entry)
+    first = writer.stored.next_iteration
+    writer.add_attempts([one for one in attempts if one.iteration >= first])
+    return writer.commit()
+
+
+def _entry(session: Session, row: list[Any]) -> PathEntry:
+    _, sequence, node, kind, stamp_ns = row
+    kind = PathEntryKind(kind)
+    return PathEntry(path_id(session.id), sequence, NodeId(UUID(node)), kind, stamp_ns)
+
+
+def _attempt(row: list[Any]) -> Attempt:
+    iteration, reference, node, *rest = row
+    return Attempt(iteration, NodeId(UUID(reference)), NodeId(UUID(node)), *rest)
+
+
+def _session(values: dict[str, Any]) -> Session:
+    fields = {**values, "id": SessionId(UUID(values["id"])), "clock": Clock(values["clock"])}
+    return Session(**fields)
+
+
+def _chunks(file: IO[bytes], path: Path) -> Iterator[dict[str, Any]]:
+    """What is whole of a memory."""
+    while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+        length, checksum = _CHUNK.unpack(head)
+        body = file.read(length)
+        if len(body) < length or zlib.crc32(body) != checksum:
+            return
+        try:
+            yield msgspec.msgpack.decode(zlib.decompress(body))
+        except (msgspec.DecodeError, zlib.error) as error:
+            raise MapCorruptError(f"{path} is no memory of a drive: {error}") from error
+
+
+def _opened(path: Path, flags: int) -> IO[bytes]:
+    """A regular file, locked for this process.
+
+    Raises:
+        BlockingIOError: another process holds it.
+    """
+    file = os.fdopen(os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666),
+                     "rb" if flags == os.O_RDONLY else "r+b")  # fmt: skip
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise
+    return file
+
+
+@contextmanager
+def _as_map_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        full = storage_full(error, path)
+        raise full or MapError(f"{path} cannot be written: {error.strerror}") from error

@@ -1,0 +1,77 @@
+"""Robots in a map: on a recorded drive, or live."""
+
+from __future__ import annotations
+
+from engram.errors import ConfigError, RevisionError
+from engram.geometry import StereoCamera
+from engram.maps import Map, open_map
+from engram.ranking import RankingPolicy
+from engram.robot.front import Front
+from engram.robot.live import IntoMap, IntoMemory, LiveKeeper, Owner
+from engram.robot.localisers import localiser_in
+from engram.robot.robot import Robot
+from engram.robot.session import DriveSequence, session_of_drive
+from engram.robot.settings import RobotOptions, Settings
+
+
+def robot_on(
+    opened: Map,
+    sequence: DriveSequence,
+    settings: Settings,
+    options: RobotOptions | None = None,
+    policy: RankingPolicy | None = None,
+) -> Robot:
+    """A robot that localises a drive in a map, and keeps nothing.
+
+    Args:
+        opened: the map.
+        sequence: the drive, for `Robot.drive`.
+        settings: the resolved configuration.
+        options: how; None for the defaults.
+        policy: in place of that of the options.
+
+    Raises:
+        ConfigError: there is no such policy or relocaliser.
+        SequenceError: the drive has no usable frame.
+    """
+    options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
+    localiser = localiser_in(
+        opened,
+        sequence.camera,
+        settings,
+        policy=policy or options.policy,
+        budget=options.budget,
+        relocaliser=options.relocaliser,
+        live=session_of_drive(sequence).id,
+        threads=options.threads,
+        clock=sequence.info,
+    )
+    return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
+
+
+def robot_in(
+    opened: Map,
+    camera: StereoCamera,
+    settings: Settings | None,
+    options: RobotOptions,
+    *,
+    name: str | None = None,
+    maps: bool = False,
+    remembers: bool = False,
+) -> Robot:
+    """A live robot; see `Map.robot`."""
+    settings = (settings or Settings()).for_descriptor(opened.descriptor)
+    owner = Owner(name, camera, settings, options)
+    if not (maps or remembers):
+        localiser = owner.localiser_in(opened, saves=False)
+        return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
+    if name is None:
+        raise ConfigError("a robot whose drives are kept needs a name: give name=")
+    if opened.is_pinned:
+        raise RevisionError(
+            f"{opened.location} is open as of revision {opened.revision}; to keep drives, open it "
+            "without naming a revision"
+        )
+    into = IntoMap(owner, open_map(opened.location)) if maps else IntoMemory(owner, opened)
+    keeper = LiveKeeper(owner, into)
+    return Robot(Front(settings), into.localiser, keeper, deadline_ms=options.deadline_ms)
