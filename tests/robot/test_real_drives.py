@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,3 +98,19 @@ def test_a_room_walked_again_and_again_makes_a_sound_map(data_dir: Path, tmp_pat
     )
     assert summarise(rest.results)["share_localised"] == 1.0
     assert rest.saved == 0
+
+
+def test_a_robot_that_mapped_live_is_localised_when_it_comes_again(
+    data_dir: Path, tmp_path: Path
+) -> None:
+    path, pairs = tmp_path / "live.engram", open_drive(data_dir / KITTI_06)
+    with open_map(path, create=True) as town:
+        with town.robot(pairs.camera, name="r1", maps=True) as robot:
+            saved = [robot.step(pair).saved for pair in pairs]
+        assert robot.saving.nodes == sum(node is not None for node in saved) > 20
+    assert check_file(path).sound
+    with open_map(path) as town, town.robot(pairs.camera, name="r1", maps=True) as robot:
+        again = [
+            robot.step(replace(pair, stamp_ns=pair.stamp_ns + 3_600_000_000_000)) for pair in pairs
+        ]
+    assert np.mean([one.localised for one in again]) >= 0.95

@@ -74,10 +74,11 @@ class Owner:
     settings: Settings
     options: RobotOptions
 
-    @property
-    def made_by(self) -> tuple[DescriptorKind, str]:
-        """Kind of descriptors, and hash of the front-end."""
-        return self.settings.frontend.descriptor, Frontend(self.settings.frontend).hash
+    def made_by(self, first: Arrived) -> tuple[DescriptorKind, str]:
+        """Kind of descriptors, and hash of the front-end; a logged frame brings its own along."""
+        if isinstance(first, StereoPair):
+            return self.settings.frontend.descriptor, Frontend(self.settings.frontend).hash
+        return first.frame.descriptor, first.frame.frontend
 
     def localiser_in(self, opened: Map, *, saves: bool) -> Localiser:
         """The localiser of the drive; its session begins with the first frame."""
@@ -109,8 +110,8 @@ class Into(Protocol):
         """The localiser of the drive."""
         ...
 
-    def begin(self, session: Session) -> Keeper:
-        """The keeper of the drive.
+    def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
+        """The keeper of the drive, whose frames have these descriptors by this front-end.
 
         Raises:
             MapError: it cannot be begun.
@@ -144,7 +145,7 @@ class IntoMap:
         self.localiser: Localiser = owner.localiser_in(opened, saves=True)
         self._drive: SavedDrive | None = None
 
-    def begin(self, session: Session) -> Keeper:
+    def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
         """See `Into`."""
         opened, owner = self._opened, self._owner
         if opened.session_state(session.id) is not SessionState.ABSENT:
@@ -154,7 +155,7 @@ class IntoMap:
             )
         configuration = configuration_of(owner.settings, owner.options)
         writer = begin_or_resume(
-            opened, session, owner.camera, owner.made_by, configuration, f"map {session.robot}"
+            opened, session, owner.camera, made_by, configuration, f"map {session.robot}"
         )
         self._drive = SavedDrive(
             opened, writer, self.localiser, owner.settings, self._words, waits=False
@@ -197,7 +198,7 @@ class IntoMemory:
         self._spool: Spool | None = None
         self._saver: Saver | None = None
 
-    def begin(self, session: Session) -> Keeper:
+    def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
         """See `Into`."""
         owner, mapper = self._owner, self._owner.settings.mapper
         configuration = configuration_of(owner.settings, owner.options)
@@ -205,7 +206,7 @@ class IntoMemory:
             self._map_path,
             session,
             owner.camera,
-            owner.made_by,
+            made_by,
             configuration,
             mapper.memory_bytes,
         )
@@ -258,7 +259,7 @@ class LiveKeeper(Keeper):
         self._into.localiser.begin(session)
         self.saving.session = session.id
         try:
-            self._keeper = self._into.begin(session)
+            self._keeper = self._into.begin(session, self._owner.made_by(first))
         except MapError as error:
             self._fail(error)
 

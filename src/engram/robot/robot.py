@@ -202,6 +202,20 @@ class Robot:
         """The robot was carried elsewhere: it knows nothing of its place."""
         self._localiser.lose()
 
+    def withdraw(self, found: Localisation) -> None:
+        """A later frame disproved what was found: the keeper hears of it, and no pose rests on it.
+
+        Nothing in the loop withdraws yet; it is for whoever knows better.
+        """
+        self._track = deque(
+            (
+                (at, replace(one, position=None) if one is found else one)
+                for at, one in self._track
+            ),
+            _REMEMBERED,
+        )
+        self._keeper.withdrawn(found)
+
     def pose_at(self, stamp_ns: int) -> Position | None:
         """Where the robot was at a time between its last frames, as when an image was taken.
 

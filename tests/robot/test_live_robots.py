@@ -1,0 +1,214 @@
+"""Robots that map or remember while they drive."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.synthetic_world import Seen, World, drive
+
+from engram.errors import ConfigError, StorageFullError
+from engram.fleet.merge import merge
+from engram.maps import Map, check_file, open_map
+from engram.maps.session_writer import SessionWriter
+from engram.robot import Robot, Settings
+from engram.robot.live import SavingState
+
+WORLD = World(30.0)
+ROAD = np.arange(0.0, 25.0, 0.7)
+FIRST = drive(WORLD, ROAD)
+AGAIN = drive(WORLD, ROAD + 0.3, seed=1, start_ns=10**15)
+CAMERA = FIRST[0].frame.camera
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "town.engram"
+
+
+@pytest.fixture
+def town(path: Path) -> Iterator[Map]:
+    with open_map(path, create=True) as opened:
+        yield opened
+
+
+def run(robot: Robot, frames: list[Seen]) -> list[str]:
+    found = [robot.step(seen.logged) for seen in frames]
+    return ["saved" if one.saved else one.status.value for one in found]
+
+
+def mapped(path: Path) -> None:
+    with (
+        open_map(path, create=True) as opened,
+        opened.robot(CAMERA, Settings(), name="r1", maps=True) as robot,
+    ):
+        run(robot, FIRST)
+
+
+def test_what_a_robot_maps_becomes_a_revision_and_the_next_one_is_localised(path: Path) -> None:
+    mapped(path)
+    assert check_file(path).sound
+    with open_map(path) as town:
+        assert town.revision == 1
+        assert [one.robot for one in town.sessions.values()] == ["r1"]
+        assert town.node_count() > 15
+        with town.robot(CAMERA) as robot:
+            words = run(robot, AGAIN)
+    assert words.count("localised") > 0.9 * len(AGAIN)
+
+
+def test_others_see_committed_revisions_only(path: Path, town: Map) -> None:
+    with town.robot(CAMERA, name="r1", maps=True) as robot:
+        words = run(robot, FIRST)
+        assert words.count("saved") == robot.saving.nodes > 15
+        with open_map(path) as other:
+            assert other.node_count() == 0
+            with other.robot(CAMERA) as stranger:
+                assert run(stranger, AGAIN[:3]) == ["lost", "lost", "lost"]
+        assert robot.saving.state is SavingState.ON
+    assert robot.saving.state is SavingState.COMMITTED
+    assert robot.saving.revision == 1
+    with open_map(path) as other:
+        assert other.node_count() == robot.saving.nodes
+
+
+def test_the_same_drive_gives_the_nodes_that_map_gives_wherever_it_comes_from(path: Path) -> None:
+    """A robot sees what it saves: a lap that comes back is localised in its own nodes."""
+    lap = World(2 * np.pi * 12.0, radius_m=12.0, seed=5)
+    round_and_round = drive(lap, np.arange(0.0, 1.4 * 2 * np.pi * 12.0, 0.7))
+    with open_map(path, create=True) as town, town.robot(CAMERA, name="r1", maps=True) as robot:
+        words = run(robot, round_and_round)
+    assert words[: len(words) // 2].count("localised") == 0
+    assert words[-10:].count("localised") > 5
+
+
+def test_a_full_disk_ends_saving_and_not_localising(
+    path: Path, town: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, made = SessionWriter.checkpoint, []
+
+    def full(writer: SessionWriter) -> None:
+        made.append(1)
+        if len(made) > 1:
+            raise StorageFullError("no space is left")
+        checkpoint(writer)
+
+    monkeypatch.setattr(SessionWriter, "checkpoint", full)
+    road = drive(World(90.0), np.arange(0.0, 80.0, 0.7))
+    with town.robot(CAMERA, name="r1", maps=True) as robot:
+        words = run(robot, road)
+        words += run(robot, drive(World(90.0), np.arange(0.0, 80.0, 0.7), seed=1, start_ns=10**15))
+        assert robot.saving.state is SavingState.FAILED
+        assert "no space" in robot.saving.reason
+        monkeypatch.undo()
+    assert 0 < words.count("saved") < 80
+    # What was written before is a revision, and the robot went on in what it had in memory.
+    assert robot.saving.revision == 1
+    with open_map(path) as town_again:
+        assert 0 < town_again.node_count() <= words.count("saved")
+    assert words.count("localised") > 0
+
+
+def test_a_crash_leaves_a_session_that_can_be_sealed(path: Path, town: Map) -> None:
+    robot = town.robot(CAMERA, Settings(), name="r1", maps=True)
+    run(robot, FIRST)
+    keeper = robot._keeper
+    keeper._into._drive.close()  # all was written; the process dies before it commits
+    keeper._into._stack.close()
+    robot._live = None
+    robot.close()
+    with open_map(path) as after:
+        assert after.node_count() == 0
+        (interrupted,) = after.interrupted()
+        with after.writing():
+            after.seal(interrupted.session.id)
+        assert after.node_count() == robot.saving.nodes
+
+
+def test_a_drive_is_remembered_without_nodes(path: Path) -> None:
+    mapped(path)
+    with open_map(path) as town:
+        before = town.info()
+        with town.robot(CAMERA, name="r2", remembers=True) as robot:
+            words = run(robot, AGAIN)
+    assert words.count("saved") == 0
+    assert robot.saving.state is SavingState.COMMITTED
+    assert robot.saving.revision == 2
+    assert sorted(one.name for one in path.parent.glob("*memory*")) == []
+    with open_map(path) as town:
+        after = town.info()
+        assert {one.robot for one in town.sessions.values()} == {"r1", "r2"}
+        assert after.nodes == before.nodes
+        assert after.path_entries > before.path_entries
+        assert after.attempts > before.attempts
+        remembered = next(one for one in town.sessions.values() if one.robot == "r2")
+        assert remembered.id == robot.saving.session
+    assert check_file(path).sound
+
+
+def test_a_memory_waits_while_another_writes_and_is_committed_by_the_next(path: Path) -> None:
+    mapped(path)
+    with open_map(path) as town, open_map(path) as writer:
+        with writer.writing(), town.robot(CAMERA, name="r2", remembers=True) as robot:
+            run(robot, AGAIN)
+            robot.close()
+        assert robot.saving.state is SavingState.SPOOLED
+        assert Path(robot.saving.reason).exists()
+        later = drive(WORLD, ROAD + 0.1, seed=2, start_ns=2 * 10**15)
+        with open_map(path) as again, again.robot(CAMERA, name="r3", remembers=True) as other:
+            run(other, later)
+    assert not Path(robot.saving.reason).exists()
+    with open_map(path) as town:
+        assert town.revision == 3
+        assert {one.robot for one in town.sessions.values()} == {"r1", "r2", "r3"}
+
+
+def test_a_torn_memory_is_committed_as_far_as_it_is_whole(path: Path) -> None:
+    mapped(path)
+    with (
+        open_map(path) as town,
+        open_map(path) as writer,
+        writer.writing(),
+        town.robot(CAMERA, name="r2", remembers=True) as robot,
+    ):
+        run(robot, AGAIN)
+    spool = Path(robot.saving.reason)
+    spool.write_bytes(spool.read_bytes()[:-7])
+    with open_map(path) as town, town.robot(CAMERA, name="r3", remembers=True) as other:
+        run(other, drive(WORLD, ROAD + 0.1, seed=2, start_ns=2 * 10**15))
+    assert not spool.exists()
+    with open_map(path) as town:
+        assert {one.robot for one in town.sessions.values()} == {"r1", "r2", "r3"}
+    assert check_file(path).sound
+
+
+def test_a_memory_is_merged_like_any_other_session(path: Path, tmp_path: Path) -> None:
+    mapped(path)
+    centre = tmp_path / "centre.engram"
+    merge(centre, [path])
+    with open_map(path) as town, town.robot(CAMERA, name="r2", remembers=True) as robot:
+        run(robot, AGAIN)
+    with open_map(centre) as town:
+        before = town.info()
+    merge(centre, [path])
+    with open_map(centre) as town:
+        after = town.info()
+        assert robot.saving.session in town.sessions
+    assert after.nodes == before.nodes
+    assert after.path_entries > before.path_entries
+    assert after.attempts > before.attempts
+
+
+def test_a_robot_whose_drives_are_kept_needs_a_name(town: Map) -> None:
+    for how in ({"maps": True}, {"remembers": True}):
+        with pytest.raises(ConfigError, match="needs a name"):
+            town.robot(CAMERA, **how)
+
+
+def test_a_closed_robot_leaves_no_threads(path: Path) -> None:
+    before = threading.active_count()
+    mapped(path)
+    assert threading.active_count() == before

@@ -1,0 +1,167 @@
+"""The one loop: its way to the kernel, its time, and what it keeps."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive
+
+from engram import _core
+from engram.errors import InputError
+from engram.localiser import Budget, Hint, Keeper, Localisation, Localiser, Position
+from engram.maps import open_map
+from engram.robot import Front, Robot, RobotOptions, Settings, map_drive, open_drive, robot_on
+from engram.robot.localisers import localiser_in
+
+ROAD = np.arange(0.0, 20.0, 0.7)
+PACKAGE = str(Path(_core.__file__).parent)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("robot") / "town.engram"
+    map_simulated(path, drive(World(30.0), ROAD))
+    return path
+
+
+@pytest.fixture
+def localiser(town: Path) -> Iterator[Localiser]:
+    with open_map(town) as opened:
+        first = opened.graph.node(0)
+        camera = opened.load().cameras[first.camera]
+        budget = Budget(1, 4)
+        with localiser_in(opened, camera, Settings(), budget=budget, relocaliser=None) as made:
+            made.place_at(Position.at(first.id))
+            yield made
+
+
+LIVE = drive(World(30.0), ROAD, seed=1, start_ns=10**15)
+
+
+def frames_of_the_package() -> list[str]:
+    """The Python functions of Engram on the stack, innermost last."""
+    frame, names = sys._getframe(), []
+    while frame is not None:
+        if frame.f_code.co_filename.startswith(PACKAGE):
+            names.append(frame.f_code.co_name)
+        frame = frame.f_back
+    return names[::-1]
+
+
+def test_four_hops_from_the_loop_to_the_kernel(
+    street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, kernel, stacks = tmp_path / "street.engram", _core.attempt, []
+    map_drive(path, open_drive(street, frames="::2"))
+
+    def attempt(*given):
+        return kernel(*given)
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code is attempt.__code__:
+            stacks.append(frames_of_the_package())
+
+    monkeypatch.setattr(_core, "attempt", attempt)
+    sequence = open_drive(street, frames="1::2")
+    with (
+        open_map(path) as opened,
+        robot_on(opened, sequence, Settings(), RobotOptions(lanes=1, rounds=4)) as robot,
+    ):
+        sys.setprofile(watch)
+        try:
+            list(robot.drive(sequence))
+        finally:
+            sys.setprofile(None)
+    attempts = [stack for stack in stacks if "localise" in stack]  # odometry matches frames, too
+    assert len(attempts) > 5
+    for stack in attempts:
+        # The kernel itself is the fourth hop; lambdas and wrappers would stand between.
+        assert stack == ["drive", "step", "localise", "attempt", "match_frames"]
+
+
+def test_a_stamp_that_goes_back_is_refused(localiser: Localiser) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    for seen in LIVE[:4]:
+        robot.step(seen.logged)
+    for earlier in (LIVE[3], LIVE[2]):
+        with pytest.raises(InputError, match="is not later than"):
+            robot.step(earlier.logged)
+    assert robot.step(LIVE[4].logged).localised
+
+
+def test_a_pose_between_two_frames_lies_between_them(localiser: Localiser) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    found = [robot.step(seen.logged) for seen in LIVE[:8]]
+    before, after = found[5], found[6]
+    assert robot.pose_at(before.stamp_ns) is before.position
+    between = robot.pose_at((before.stamp_ns + after.stamp_ns) // 2)
+    assert between is not None
+    assert between.node == before.position.node
+    ahead_m = between.node_from_live.translation - before.position.node_from_live.translation
+    np.testing.assert_allclose(ahead_m, [0.0, 0.0, 0.35], atol=0.02)
+    assert between.sigma_m >= before.position.sigma_m
+    assert robot.pose_at(after.stamp_ns + 10**9) is None
+    assert robot.pose_at(found[0].stamp_ns - 1) is None
+
+
+def test_a_robot_is_placed_and_lost_again(localiser: Localiser) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    known = robot.step(LIVE[0].logged)
+    assert known.localised
+    robot.lose()
+    lost = robot.step(LIVE[1].logged)
+    assert lost.position is None
+    assert not lost.localised
+    moved = LIVE[1].odometry
+    robot.place_at(known.position.carried_on(moved.prev_from_curr, moved.covariance))
+    assert robot.step(LIVE[2].logged).localised
+
+
+class Recording(Keeper):
+    """Notes what it hears; holds back what may still be withdrawn."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[str, int]] = []
+
+    def hint(self, live, motion) -> Hint | None:
+        self.heard.append(("hint", live.stamp_ns))
+        return None
+
+    def keep(self, live, found: Localisation) -> Localisation:
+        self.heard.append(("keep", found.stamp_ns))
+        return replace(found, saved=None)
+
+    def withdrawn(self, found: Localisation) -> None:
+        self.heard.append(("withdrawn", found.stamp_ns))
+
+
+def test_a_keeper_hears_what_was_found_and_later_what_was_withdrawn(localiser: Localiser) -> None:
+    keeper = Recording()
+    robot = Robot(Front(Settings()), localiser, keeper)
+    found = [robot.step(seen.logged) for seen in LIVE[:3]]
+    robot.withdraw(found[1])
+    stamps_ns = [one.stamp_ns for one in found]
+    told = [(what, stamp) for stamp in stamps_ns for what in ("hint", "keep")]
+    assert keeper.heard == [*told, ("withdrawn", stamps_ns[1])]
+    assert robot.pose_at(stamps_ns[1]) is None
+    assert robot.pose_at(stamps_ns[2]) is not None
+
+
+def test_what_a_keeper_knows_is_not_localised_again(localiser: Localiser) -> None:
+    known = Robot(Front(Settings()), localiser).step(LIVE[0].logged)
+
+    class Knowing(Keeper):
+        def hint(self, live, motion) -> Hint:
+            return Hint(known.position, found=replace(known, stamp_ns=live.stamp_ns))
+
+    found = Robot(Front(Settings()), localiser, Knowing()).step(LIVE[1].logged)
+    assert found.node == known.node
+    assert found.stamp_ns == LIVE[1].frame.stamp_ns
+    assert localiser.position is known.position
