@@ -1,10 +1,12 @@
 """Small experience graphs, path memories and ranking contexts for tests."""
 
+from dataclasses import replace
 from uuid import UUID
 
 import numpy as np
 
 from engram.geometry import SE3, CameraId
+from engram.graph.attempts import Attempts
 from engram.graph.basin import MatchBasin
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
@@ -29,7 +31,6 @@ from engram.ranking import (
     Background,
     Lessons,
     Observations,
-    PastAttempts,
     RankingContext,
     RunAttempts,
 )
@@ -144,19 +145,15 @@ def lessons_of(graph, attempts) -> Lessons:
         return Lessons.none()
     count = max([int(graph.sessions.max()), *(attempt[0] for attempt in attempts)]) + 1
     viewers = [path_id(session_uuid(number)) for number in range(count)]
-    columns = zip(*attempts, strict=True) if attempts else ([], [], [], [])
-    drives, nodes, rates, accepted = columns
-    return Lessons.learnt(
-        graph,
-        PathMemory(graph),
-        viewers,
-        PastAttempts(
-            np.array(drives, np.int32),
-            np.array(nodes, np.int32),
-            np.array(rates, np.float64),
-            np.array(accepted, np.bool_),
-        ),
-    )
+    made = [
+        Attempt(drive, graph.node(node).id, graph.node(node).id, 0, 0, 0, 0, 0, accepted, 0, 0, "")
+        for drive, node, _, accepted in attempts
+    ]
+    columns, ids = Attempts.of(made)
+    index = np.array([graph.index(node) for node in ids], np.int32)
+    columns = replace(columns, session=columns.iteration.astype(np.int32), node=index[columns.node])
+    rates = np.array([rate for _, _, rate, _ in attempts], np.float64)
+    return Lessons.learnt(graph, PathMemory(graph), viewers, columns, rates)
 
 
 def make_context(

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from tests.worlds import attempts_of
 
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge.attempts import lacking
+from engram.graph.attempts import Attempts
 from engram.graph.model import SessionId
-from engram.maps import AttemptArrays, Map
+from engram.maps import Map
 
 from .robots import merged, rewritten, robot_map
 
@@ -32,7 +32,7 @@ IDENTITIES = st.tuples(
 )
 
 
-def arrays_of(identities: list[tuple], nodes: int = 0) -> AttemptArrays:
+def arrays_of(identities: list[tuple], nodes: int = 0) -> Attempts:
     """Attempts of these identities, told from some node; nodes and offsets do not name them."""
     columns = list(zip(*identities, strict=True)) or [()] * 8
     policies = tuple(dict.fromkeys(columns[7]))
@@ -53,13 +53,13 @@ def arrays_of(identities: list[tuple], nodes: int = 0) -> AttemptArrays:
         "yaw_rad": number * 0,
     }
     floats = {"along_m", "across_m", "yaw_rad", "sigma_m", "sigma_yaw_rad"}
-    return AttemptArrays(
+    return Attempts(
         **{
             one.name: np.array(
                 values[one.name],
                 np.float32 if one.name in floats else bool if one.name == "accepted" else np.int64,
             )
-            for one in fields(AttemptArrays)
+            for one in fields(Attempts)
             if one.name != "policies"
         },
         policies=policies,
@@ -68,7 +68,7 @@ def arrays_of(identities: list[tuple], nodes: int = 0) -> AttemptArrays:
 
 @given(st.lists(IDENTITIES, max_size=12), st.lists(IDENTITIES, max_size=12))
 def test_what_is_lacking_makes_the_union_of_both(made, remembered):
-    found = lacking(arrays_of(made), arrays_of(remembered, nodes=5)).tolist()
+    found = arrays_of(made).lacking(arrays_of(remembered, nodes=5)).tolist()
     assert found == sorted(set(found))
     together = Counter(remembered) + Counter(made[at] for at in found)
     assert together == Counter(made) | Counter(remembered)

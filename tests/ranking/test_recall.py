@@ -19,10 +19,11 @@ from tests.worlds import (
 )
 
 from engram import _core
+from engram.graph.attempts import Attempts
 from engram.graph.basin import prior_basin_m
 from engram.graph.model import PathEntry, PathEntryKind, path_id
 from engram.graph.paths import PathMemory
-from engram.ranking import Lessons, PastAttempts
+from engram.ranking import Lessons
 from engram.ranking.lessons import UNKNOWN_BASE
 from engram.ranking.recall import RECALL, RecallPolicy
 from engram.ranking.run import RunLog
@@ -178,7 +179,7 @@ class TestLearning:
         memory = PathMemory(graph)
         walker = path_id(session_uuid(7))
         memory.add(PathEntry(walker, 0, graph.node(1).id, PathEntryKind.MATCHED, 0))
-        base = Lessons.learnt(graph, memory, [walker], PastAttempts.none()).base
+        base = Lessons.learnt(graph, memory, [walker], Attempts.none(), np.zeros(0)).base
         assert base[1] > base[0] == base[2] == base[3] == pytest.approx(UNKNOWN_BASE)
 
     def test_of_nodes_saved_since_the_map_was_opened_nothing_is_known(self) -> None:

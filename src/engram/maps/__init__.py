@@ -17,7 +17,6 @@ from engram.maps.history import (
 from engram.maps.map import Map, check_file, compact_map, copy_map, open_map, publish_map
 from engram.maps.provenance import Origin
 from engram.maps.records import (
-    AttemptArrays,
     CheckReport,
     InterruptedSession,
     MapContents,
@@ -34,7 +33,6 @@ from engram.maps.tags import Tag
 
 __all__ = [
     "FORMAT_VERSION",
-    "AttemptArrays",
     "BulkWriter",
     "CheckReport",
     "InterruptedSession",

@@ -14,6 +14,7 @@ from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.frontend import DescriptorKind, Frame
 from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera
+from engram.graph.attempts import Attempts
 from engram.graph.model import (
     Edge,
     NodeId,
@@ -33,7 +34,7 @@ from engram.maps.edge_checks import check_edge
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.maps.keys import KeyBook
-from engram.maps.records import AttemptArrays, Revision, RevisionStatus, StoredNode
+from engram.maps.records import Revision, RevisionStatus, StoredNode
 from engram.maps.rows import (
     Row,
     checked_int,
@@ -247,9 +248,7 @@ class BulkWriter:
         }
         self._put(path_entries, row)
 
-    def add_attempts(
-        self, session: SessionId, made: AttemptArrays, node_ids: Sequence[NodeId]
-    ) -> None:
+    def add_attempts(self, session: SessionId, made: Attempts, node_ids: Sequence[NodeId]) -> None:
         """Remember attempts of one session, in the order of their iterations.
 
         Args:

@@ -20,6 +20,7 @@ from engram.errors import IncompatibleError, InputError, MapCorruptError, Revisi
 from engram.frontend import DescriptorKind
 from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera
+from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
@@ -53,7 +54,6 @@ from engram.maps.lock import Holder
 from engram.maps.postgresql import PostgresDatabase
 from engram.maps.provenance import Origin, origin_of
 from engram.maps.records import (
-    AttemptArrays,
     CheckReport,
     InterruptedSession,
     MapContents,
@@ -136,7 +136,7 @@ class _Contents:
 
     graph: ExperienceGraph
     path_memory: PathMemory
-    attempts: AttemptArrays
+    attempts: Attempts
     basin_counts: BasinCounts
     last_iterations: Mapping[SessionId, int]
 
@@ -265,7 +265,7 @@ class Map:
         return self._read_contents().path_memory
 
     @property
-    def attempts(self) -> AttemptArrays:
+    def attempts(self) -> Attempts:
         """The attempts that it remembered when the graph was read.
 
         Sessions are places in `sessions`, nodes are indices of `graph`.

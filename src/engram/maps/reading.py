@@ -13,6 +13,7 @@ from engram.errors import MapCorruptError
 from engram.frontend import DescriptorKind, feature_kind
 from engram.frontend.blobs import content_digest
 from engram.geometry import CameraId, StereoCamera
+from engram.graph.attempts import Attempts
 from engram.graph.model import (
     Edge,
     EdgeKind,
@@ -25,7 +26,7 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.maps.attempts import AttemptTable, concatenate, unpack
-from engram.maps.records import AttemptArrays, MapContents, MapInfo, Revision
+from engram.maps.records import MapContents, MapInfo, Revision
 from engram.maps.rows import (
     Row,
     camera_from_row,
@@ -336,7 +337,7 @@ def _entry_places(view: View) -> Select[Any]:
 
 def _attempts(
     connection: Connection, view: View, session_keys: list[int], node_keys: list[int]
-) -> AttemptArrays:
+) -> Attempts:
     """All attempts between nodes that are seen, with keys turned into dense indices."""
     by_session = attempt_tables(connection, view)
     order = [key for key in session_keys if key in by_session]
@@ -350,7 +351,7 @@ def _attempts(
     node, node_seen = _dense(table.columns["node"], node_keys)
     seen = reference_seen & node_seen
     columns: dict[str, Any] = {**table.columns, "reference": reference, "node": node}
-    return AttemptArrays(
+    return Attempts(
         session=session[seen],
         policy=table.policy[seen],
         policies=table.policies,

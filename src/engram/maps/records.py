@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from engram.frontend import DescriptorKind, FrameStatus
 from engram.geometry import CameraId, StereoCamera
+from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts, count_attempts
 from engram.graph.model import Edge, Node, PathEntry, Session, SessionId
 
@@ -108,50 +109,6 @@ class StoredSession:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AttemptArrays:
-    """Remembered attempts (SPEC §3.5) as a struct of arrays, in order of session and iteration.
-
-    Attributes:
-        session: (A,) int32, index into `MapContents.sessions`.
-        iteration: (A,) int64.
-        reference, node: (A,) int32, indices into `MapContents.nodes`.
-        along_m, across_m, yaw_rad, sigma_m, sigma_yaw_rad: (A,) float32, as in `Attempt`.
-        accepted: (A,) bool.
-        inliers: (A,) int32.
-        rank: (A,) int32, 255 stands for all above.
-        policy: (A,) int32, index into `policies`.
-        policies: names of the ranking policies.
-    """
-
-    session: NDArray[np.int32]
-    iteration: NDArray[np.int64]
-    reference: NDArray[np.int32]
-    node: NDArray[np.int32]
-    along_m: NDArray[np.float32]
-    across_m: NDArray[np.float32]
-    yaw_rad: NDArray[np.float32]
-    sigma_m: NDArray[np.float32]
-    sigma_yaw_rad: NDArray[np.float32]
-    accepted: NDArray[np.bool_]
-    inliers: NDArray[np.int32]
-    rank: NDArray[np.int32]
-    policy: NDArray[np.int32]
-    policies: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.node)
-
-    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> AttemptArrays:
-        """Some of the attempts: a mask, or their places in the order wanted."""
-        columns = {
-            field.name: getattr(self, field.name)[rows]
-            for field in fields(self)
-            if field.name != "policies"
-        }
-        return AttemptArrays(**columns, policies=self.policies)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class StoredNode:
     """A node with its landmarks as they lie in the map: to be copied, not to be looked at.
 
@@ -191,7 +148,7 @@ class MapContents:
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
     path_entries: tuple[PathEntry, ...]
-    attempts: AttemptArrays
+    attempts: Attempts
 
     def basin_counts(self, experiences: NDArray[np.int32]) -> BasinCounts:
         """From which match basins are learnt: all remembered attempts.

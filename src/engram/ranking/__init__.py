@@ -14,7 +14,7 @@ from engram.errors import ConfigError
 from engram.ranking.background import Background
 from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, looks_ahead, uses_words
 from engram.ranking.distance import DistancePolicy
-from engram.ranking.lessons import Lessons, PastAttempts
+from engram.ranking.lessons import Lessons
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_near import PathNearPolicy
 from engram.ranking.reasons import Reasons, reasons_of
@@ -77,7 +77,6 @@ __all__ = [
     "IterationUnit",
     "Lessons",
     "Observations",
-    "PastAttempts",
     "QuantisedWords",
     "RankingContext",
     "RankingPolicy",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 
+from engram.graph.attempts import Attempts
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import PathId, path_id
 from engram.graph.paths import PathMemory
@@ -22,29 +23,6 @@ _SAVING_COUNTS = 2.0
 # How likely anybody matches a node of which nothing is known, and how many attempts that is worth.
 UNKNOWN_BASE = 0.4
 _BASE_ATTEMPTS = 2.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PastAttempts:
-    """Remembered attempts of all past drives (SPEC §3.5), as a struct of arrays.
-
-    Attributes:
-        viewers: (A,) int32, number of the drive that made each.
-        nodes: (A,) int32, dense indices of the nodes attempted.
-        rates: (A,) float64, g at the predicted offset.
-        accepted: (A,) bool.
-    """
-
-    viewers: NDArray[np.int32]
-    nodes: NDArray[np.int32]
-    rates: NDArray[np.float64]
-    accepted: NDArray[np.bool_]
-
-    @staticmethod
-    def none() -> PastAttempts:
-        """Nothing remembered."""
-        nothing = np.zeros(0, np.int32)
-        return PastAttempts(nothing, nothing, np.zeros(0), np.zeros(0, np.bool_))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +53,8 @@ class Lessons:
         graph: ExperienceGraph,
         path_memory: PathMemory,
         viewers: Sequence[PathId],
-        attempts: PastAttempts,
+        attempts: Attempts,
+        rates: NDArray[np.float64],
     ) -> Lessons:
         """What the drives of a map teach.
 
@@ -87,10 +66,13 @@ class Lessons:
             graph: the nodes.
             path_memory: the paths.
             viewers: (V,) the drives.
-            attempts: what they attempted.
+            attempts: what they attempted; sessions are places in `viewers`.
+            rates: (A,) g at the predicted offset of each.
         """
         sharing = _sharing(graph)
-        good, bad = (sharing @ counts for counts in _counts(graph, path_memory, viewers, attempts))
+        good, bad = (
+            sharing @ counts for counts in _counts(graph, path_memory, viewers, attempts, rates)
+        )
         return Lessons((good + _BASE_ATTEMPTS * UNKNOWN_BASE) / (good + bad + _BASE_ATTEMPTS))
 
 
@@ -98,14 +80,15 @@ def _counts(
     graph: ExperienceGraph,
     path_memory: PathMemory,
     viewers: Sequence[PathId],
-    attempts: PastAttempts,
+    attempts: Attempts,
+    rates: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(N,) successes and weighted failures of each node."""
     count = len(graph)
     good, bad = np.zeros((2, count))
-    np.add.at(good, attempts.nodes, attempts.accepted)
-    np.add.at(bad, attempts.nodes, np.where(attempts.accepted, 0.0, attempts.rates))
-    spoke = set(np.unique(attempts.viewers).tolist())
+    np.add.at(good, attempts.node, attempts.accepted)
+    np.add.at(bad, attempts.node, np.where(attempts.accepted, 0.0, rates))
+    spoke = set(np.unique(attempts.session).tolist())
     silent = [viewer for number, viewer in enumerate(viewers) if number not in spoke]
     walked = [graph.index(one.node) for path in silent for one in path_memory.entries(path)]
     np.add.at(good, np.array(walked, np.int64), 1.0)

@@ -28,7 +28,6 @@ from engram.places.stored_words import stored_words, vocabulary_or_default
 from engram.ranking import (
     Background,
     Lessons,
-    PastAttempts,
     QuantisedWords,
     RankingPolicy,
     policy_named,
@@ -142,8 +141,6 @@ def lessons_of(opened: Map, focal_px: float) -> Lessons:
     """What its drives learnt, for a live camera of this focal length, px: for `Map.derived`."""
     made, basin = opened.attempts, MatchBasin.of(focal_px, opened.basin_counts)
     along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
-    attempts = PastAttempts(
-        made.session, made.node, basin.success_rate(along_m, across_m), made.accepted
-    )
+    rates = basin.success_rate(along_m, across_m)
     viewers = [path_id(session) for session in opened.sessions]
-    return Lessons.learnt(opened.graph, opened.path_memory, viewers, attempts)
+    return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.geometry import CameraId
+from engram.graph.attempts import Attempts
 from engram.graph.basin import MatchBasin
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
@@ -22,7 +23,7 @@ from engram.graph.neighbourhood import Neighbourhood
 from engram.graph.paths import PathMemory
 from engram.ranking.background import Background
 from engram.ranking.context import RankingContext
-from engram.ranking.lessons import Lessons, PastAttempts
+from engram.ranking.lessons import Lessons
 from engram.ranking.recent import Observations
 from engram.ranking.run import RunAttempts
 
@@ -56,7 +57,7 @@ class SyntheticPlace:
         paths = [PathId(UUID(int=(1 << 100) + path)) for path in range(path_count)]
         for path in paths:
             self._add_path(path)
-        lessons = Lessons.learnt(self.graph, self.memory, paths, PastAttempts.none())
+        lessons = Lessons.learnt(self.graph, self.memory, paths, Attempts.none(), np.zeros(0))
         self._basin = MatchBasin.of(_FOCAL_PX)
         self._background = Background(lessons=lessons)
 

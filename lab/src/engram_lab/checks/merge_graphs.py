@@ -39,8 +39,8 @@ import numpy as np
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import MergeOptions, MergeReport, merge
-from engram.fleet.merge.attempts import from_records
 from engram.geometry import SE3
+from engram.graph.attempts import Attempts
 from engram.graph.model import (
     Attempt,
     Clock,
@@ -206,7 +206,7 @@ def write(made: RandomMap, path: Path, order: int) -> None:
         for entry in shuffled(made.entries, rng):
             writer.add_path_entry(entry)
         for session, tried in shuffled(made.attempts.items(), rng):
-            writer.add_attempts(session, *from_records(tried))
+            writer.add_attempts(session, *Attempts.of(tried))
         writer.commit()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -9,11 +10,12 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.fleet.merge.words import CentreWords
+from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
-from engram.maps import AttemptArrays, Map
+from engram.maps import Map
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -116,17 +118,18 @@ class Stock:
         return sorted(self.contents.path_entries, key=lambda entry: (entry.path, entry.sequence))
 
     @cached_property
-    def attempts(self) -> AttemptArrays:
+    def attempts(self) -> Attempts:
         """Remembered attempts; sessions and nodes are places in `sessions` and `nodes`."""
         made = self.contents.attempts
         place = {one.id: at for at, one in enumerate(self.sessions)}
         session = np.array([place[one.id] for one in self.contents.sessions], np.int32)
         node = np.array([self.index[one.id] for one in self.contents.nodes], np.int32)
-        columns = {name: getattr(made, name) for name in AttemptArrays.__slots__}
-        columns["session"] = session[made.session] if len(made) else made.session
-        for name in ("reference", "node"):
-            columns[name] = node[columns[name]] if len(made) else columns[name]
-        found = AttemptArrays(**columns)
+        found = replace(
+            made,
+            session=session[made.session],
+            reference=node[made.reference],
+            node=node[made.node],
+        )
         return found.rows(np.argsort(found.session, kind="stable"))
 
     @cached_property

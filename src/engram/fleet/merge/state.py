@@ -9,11 +9,11 @@ from typing import TypeAlias
 import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 
-from engram.fleet.merge.attempts import at_equivalents, lacking
 from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.positions import uncertainty_m2
 from engram.fleet.merge.report import MergeReport
 from engram.frontend import Frame
+from engram.graph.attempts import Attempts
 from engram.graph.model import (
     Edge,
     EdgeKind,
@@ -25,7 +25,7 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.localiser import Position
-from engram.maps import AttemptArrays, BulkWriter, Map, StoredNode
+from engram.maps import BulkWriter, Map, StoredNode
 
 # Entries that a merge adds itself stand behind all that robots wrote (docs/format.md).
 FIRST_REPLAYED = 2**32
@@ -141,9 +141,7 @@ class Merge:
             return replace(new, sequence=max([FIRST_REPLAYED, *last]))
         return new
 
-    def new_attempts(
-        self, sessions: Iterable[SessionId], remembered: AttemptArrays
-    ) -> AttemptArrays:
+    def new_attempts(self, sessions: Iterable[SessionId], remembered: Attempts) -> Attempts:
         """The robot's attempts between known nodes that the centre lacks, from the equivalents.
 
         Args:
@@ -162,8 +160,8 @@ class Merge:
         for session in (*sessions, *(one.id for one in contents.sessions)):
             place.setdefault(session, len(place))
         named = np.array([place[one.id] for one in contents.sessions], np.int32)
-        new = made.rows(lacking(replace(made, session=named[made.session]), remembered))
-        return at_equivalents(new, positions)
+        new = made.rows(replace(made, session=named[made.session]).lacking(remembered))
+        return new.moved_to([None if one is None else one.node_from_live for one in positions])
 
     # -- what it learns
 

@@ -12,7 +12,6 @@ from scipy.cluster.hierarchy import DisjointSet
 
 from engram import __version__
 from engram.config import to_dict
-from engram.fleet.merge.attempts import from_records
 from engram.fleet.merge.checks import check_fits, check_readable, notes
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.handed_in import HandedIn
@@ -22,6 +21,7 @@ from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.segments import Segment, string_segments
 from engram.fleet.merge.state import Merge
 from engram.fleet.merge.words import keep_words
+from engram.graph.attempts import Attempts
 from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
 from engram.maps import Map
 from engram.monitor import Monitor
@@ -216,7 +216,7 @@ def _carry_attempts(merge: Merge, replay: Replay) -> None:
     for session in merge.robot.sessions:
         own = new.rows(new.session == place[session.id])
         merge.writer.add_attempts(session.id, own, ids)
-        replayed, nodes = from_records(replay.attempts.get(session.id, []))
+        replayed, nodes = Attempts.of(replay.attempts.get(session.id, []))
         merge.writer.add_attempts(session.id, replayed, nodes)
 
 

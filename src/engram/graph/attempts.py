@@ -1,0 +1,176 @@
+"""Remembered attempts (SPEC §3.5): one struct of columns for all that handles them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.geometry import SE3
+from engram.graph.model import Attempt, NodeId
+
+_FLOATS = ("along_m", "across_m", "yaw_rad", "sigma_m", "sigma_yaw_rad")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempts:
+    """Remembered attempts as a struct of arrays, in order of session and iteration.
+
+    Attributes:
+        session: (A,) int32, a place in a list of sessions.
+        iteration: (A,) int64.
+        reference, node: (A,) int32, places in a list of nodes: of a map, its graph's indices.
+        along_m, across_m, yaw_rad, sigma_m, sigma_yaw_rad: (A,) float32, as in `Attempt`.
+        accepted: (A,) bool.
+        inliers: (A,) int32.
+        rank: (A,) int32, 255 stands for all above.
+        policy: (A,) int32, index into `policies`.
+        policies: names of the ranking policies.
+    """
+
+    session: NDArray[np.int32]
+    iteration: NDArray[np.int64]
+    reference: NDArray[np.int32]
+    node: NDArray[np.int32]
+    along_m: NDArray[np.float32]
+    across_m: NDArray[np.float32]
+    yaw_rad: NDArray[np.float32]
+    sigma_m: NDArray[np.float32]
+    sigma_yaw_rad: NDArray[np.float32]
+    accepted: NDArray[np.bool_]
+    inliers: NDArray[np.int32]
+    rank: NDArray[np.int32]
+    policy: NDArray[np.int32]
+    policies: tuple[str, ...]
+
+    @staticmethod
+    def of(made: Sequence[Attempt]) -> tuple[Attempts, list[NodeId]]:
+        """One session's records as columns, and the nodes that they are places in."""
+        ids = list(dict.fromkeys(node for one in made for node in (one.reference, one.node)))
+        place = {node: at for at, node in enumerate(ids)}
+        policies = tuple(dict.fromkeys(one.policy for one in made))
+
+        def column(name: str, kind: Any) -> NDArray[Any]:
+            return np.array([getattr(one, name) for one in made], kind)
+
+        attempts = Attempts(
+            session=np.zeros(len(made), np.int32),
+            iteration=column("iteration", np.int64),
+            reference=np.array([place[one.reference] for one in made], np.int32),
+            node=np.array([place[one.node] for one in made], np.int32),
+            **{name: column(name, np.float32) for name in _FLOATS},
+            accepted=column("accepted", np.bool_),
+            inliers=column("inliers", np.int32),
+            rank=column("rank", np.int32),
+            policy=np.array([policies.index(one.policy) for one in made], np.int32),
+            policies=policies,
+        )
+        return attempts, ids
+
+    @staticmethod
+    def none() -> Attempts:
+        """Nothing remembered."""
+        return Attempts.of([])[0]
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Attempts:
+        """Some of the attempts: a mask, or their places in the order wanted."""
+        columns = {
+            field.name: getattr(self, field.name)[rows]
+            for field in fields(self)
+            if field.name != "policies"
+        }
+        return Attempts(**columns, policies=self.policies)
+
+    def moved_to(self, equivalent_from_node: Sequence[SE3 | None]) -> Attempts:
+        """The attempts as if they had been made on the equivalents of the attempted nodes.
+
+        An equivalent shows the place as the node does: what is known of one is known of the other.
+        The predicted offset is that from the equivalent; heights are ignored.
+
+        Args:
+            equivalent_from_node: of each node its camera in its equivalent's camera frame; None for
+                one that has no equivalent.
+
+        Returns:
+            The attempts between nodes that have equivalents, their places unchanged.
+        """
+        known = np.array([one is not None for one in equivalent_from_node], np.bool_)
+        made = self.rows(known[self.reference] & known[self.node])
+        moves = [one or SE3.identity() for one in equivalent_from_node]
+        rotations = np.array([one.rotation for one in moves]).reshape(-1, 3, 3)
+        offsets = np.array([one.translation for one in moves]).reshape(-1, 3)
+        rotation, offset = rotations[made.node], offsets[made.node]
+        x_m, z_m = made.across_m.astype(np.float64), made.along_m.astype(np.float64)
+        turn = np.arctan2(rotation[:, 0, 2], rotation[:, 2, 2])
+        across_m = rotation[:, 0, 0] * x_m + rotation[:, 0, 2] * z_m + offset[:, 0]
+        along_m = rotation[:, 2, 0] * x_m + rotation[:, 2, 2] * z_m + offset[:, 2]
+        return replace(
+            made,
+            across_m=across_m.astype(np.float32),
+            along_m=along_m.astype(np.float32),
+            yaw_rad=_wrapped(made.yaw_rad + turn).astype(np.float32),
+        )
+
+    def lacking(self, remembered: Attempts) -> NDArray[np.intp]:
+        """Places of the attempts that are not among the remembered ones.
+
+        Two attempts are one when they agree in all that `moved_to` leaves alone: session,
+        iteration, rank, the uncertainty of the prediction, outcome and policy. Iteration and rank
+        alone would not do: ranks above 255 are stored as 255, and two centres that replay one drive
+        number their iterations alike. Of equal attempts as many are lacking as there are more of.
+
+        Args:
+            remembered: those that are known; sessions are places in the same list.
+        """
+        known = remembered._by_session()
+        found = [np.empty(0, np.intp)]
+        # One session at a time: a centre remembers millions.
+        for session, rows in self._by_session().items():
+            ours = remembered.rows(known.get(session, np.empty(0, np.intp)))
+            found.append(rows[_lacking_in_session(self.rows(rows), ours)])
+        return np.sort(np.concatenate(found))
+
+    def _by_session(self) -> dict[int, NDArray[np.intp]]:
+        """The places of each session's attempts, in their order."""
+        order = np.argsort(self.session, kind="stable")
+        ends = np.flatnonzero(np.diff(self.session[order])) + 1
+        return {int(self.session[rows[0]]): rows for rows in np.split(order, ends) if len(rows)}
+
+    def _identities(self, policies: Sequence[str]) -> NDArray[np.int64]:
+        """(A, 7) what names each attempt of a session, whatever node it is told from."""
+        policy = np.array([policies.index(name) for name in self.policies], np.int64)
+        columns: list[NDArray[Any]] = [
+            self.iteration,
+            self.rank,
+            self.sigma_m.view(np.int32),  # to the bit
+            self.sigma_yaw_rad.view(np.int32),
+            self.accepted,
+            self.inliers,
+            policy[self.policy],
+        ]
+        return np.stack(columns, axis=1, dtype=np.int64)
+
+
+def _lacking_in_session(made: Attempts, remembered: Attempts) -> NDArray[np.intp]:
+    policies = list(dict.fromkeys((*remembered.policies, *made.policies)))
+    keys = np.concatenate([one._identities(policies) for one in (remembered, made)])
+    _, named = np.unique(keys, axis=0, return_inverse=True)
+    named = named.reshape(-1)
+    known, new = named[: len(remembered)], named[len(remembered) :]
+    order = np.argsort(new, kind="stable")
+    ranked = new[order]
+    # How many equals came before each: they take what is remembered one by one.
+    before = np.arange(len(ranked)) - np.searchsorted(ranked, ranked)
+    counts = np.bincount(known, minlength=int(named.max()) + 1)
+    return order[before >= counts[ranked]]
+
+
+def _wrapped(angle_rad: NDArray[Any]) -> NDArray[np.float64]:
+    """In (-π, π]."""
+    return np.asarray(np.pi - (np.pi - angle_rad.astype(np.float64)) % (2 * np.pi))
