@@ -25,16 +25,16 @@ def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_it_writes_a_map_and_says_what_it_promises(engram, centre: Path, tmp_path: Path) -> None:
     out = tmp_path / "r1.engram"
-    told = engram("download", centre, out, "--policy", "tod", "--start", "9:00", "--json").json
+    told = engram("download", centre, out, "--select", "tod", "--depart", "9:00", "--json").json
     assert set(told) == KEYS
     assert told["nodes"] == told["of_nodes"] > 0
     assert engram("info", out, "--json").json["content_hash"] == told["content_hash"]
-    text = engram("download", centre, tmp_path / "r2.engram", "--policy", "copy").out
+    text = engram("download", centre, tmp_path / "r2.engram", "--select", "copy").out
     assert "expected share of the way without a match" in text
 
 
 def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: Path) -> None:
-    asked = ("--policy", "budget", "--budget", "80%", "--json")
+    asked = ("--select", "budget", "--budget", "80%", "--json")
     told = engram("download", centre, tmp_path / "r1.engram", *asked).json
     assert 0 < told["nodes"] < told["of_nodes"]
     assert (tmp_path / "r1.engram").stat().st_size == told["size_bytes"]
@@ -44,21 +44,21 @@ def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (("--policy", "best"), "known: copy, tod"),
-        (("--policy", "tod"), "needs --start"),
-        (("--policy", "tod", "--start", "25:00"), "start is '25:00'"),
-        (("--policy", "tod", "--start", "9h"), "start is '9h'"),
-        (("--policy", "tod", "--start", "21:00"), "widen the --window"),
-        (("--policy", "paths", "--start", "3:00", "--end", "4:00"), "there is some from 9:00"),
-        (("--policy", "budget", "--budget", "much"), "budget is 'much'"),
-        (("--policy", "budget", "--budget", "0%"), "budget_percent is 0.0"),
-        (("--policy", "budget", "--budget", "1e2%"), "budget is '1e2%'"),
-        (("--policy", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
-        (("--policy", "region", "--near", "xyz"), "no UUID"),
-        (("--policy", "route", "--route", "00"), "0 sessions begin with '00'"),
-        (("--route", "zzzz"), "does not go by --route"),
-        (("--policy", "tod", "--start", "9:30", "--budget", "10kB"), "does not go by --budget"),
-        (("--policy", "budget", "--budget", "1MB", "--near", "ffffffffff"), "begins with"),
+        (("--select", "best"), "known: copy, tod"),
+        (("--select", "tod"), "needs --depart"),
+        (("--select", "tod", "--depart", "25:00"), "depart is '25:00'"),
+        (("--select", "tod", "--depart", "9h"), "depart is '9h'"),
+        (("--select", "tod", "--depart", "21:00"), "window_min"),
+        (("--select", "paths", "--depart", "3:00", "--arrive", "4:00"), "there is some from 9:00"),
+        (("--select", "budget", "--budget", "much"), "budget is 'much'"),
+        (("--select", "budget", "--budget", "0%"), "budget_percent is 0.0"),
+        (("--select", "budget", "--budget", "1e2%"), "budget is '1e2%'"),
+        (("--select", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
+        (("--select", "region", "--near", "xyz"), "no UUID"),
+        (("--select", "route", "--route", "00"), "0 sessions begin with '00'"),
+        (("--route", "zzzz"), "does not use --route"),
+        (("--select", "tod", "--depart", "9:30", "--budget", "10kB"), "does not use --budget"),
+        (("--select", "budget", "--budget", "1MB", "--near", "ffffffffff"), "begins with"),
         (("--at", "summer"), "it has no tags"),
     ],
 )

@@ -86,13 +86,13 @@ def test_build_maps_and_merges(engram, street, tmp_path):
 @pytest.mark.parametrize(
     ("asked", "says"),
     [
-        (("--validate", "held-out.framelog"), "--validate judges orders of merging"),
-        (("--judge-at", 10), "--judge-at judges orders of merging"),
-        (("--seed", 0), "--seed is of random grouping"),
-        (("--seed", 7, "--grouping", "by-condition"), "--seed is of random grouping"),
-        (("--best-order",), "name some"),
-        (("--best-first",), "name some"),
-        (("--best-order", "--best-first", "--validate", "held-out.framelog"), "give one of them"),
+        (("--validate", "held-out.framelog"), "--validate compares orders of merging"),
+        (("--grouping", "random:x"), "must be a whole number"),
+        (("--order", "best"), "name some"),
+        (("--order", "best-first"), "name some"),
+        (("--order", "worst", "--validate", "held-out.framelog"), "known: best, best-first"),
+        (("--set", "build.max_gap_m=-1"), "max_gap_m"),
+        (("--set", "merge.rounds=0"), "rounds"),
     ],
 )
 def test_build_refuses_options_that_mean_nothing(engram, street, tmp_path, asked, says):

@@ -1,4 +1,4 @@
-"""The history of a map as its users see it: log, show, diff, tag, revert, blame."""
+"""The history of a map as its users see it: log, show, diff, tag, revert."""
 
 from __future__ import annotations
 
@@ -69,13 +69,15 @@ def test_show_and_diff_tell_the_same_change(engram, town: Path, tmp_path: Path) 
     assert picture.stat().st_size > 1000
 
 
-def test_revert_and_its_undoing(engram, town: Path) -> None:
+def test_revert_and_its_undoing(engram, town: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = engram("info", town, "--json").json
     dry = engram("revert", town, 1, "--dry-run", "--json").json
     assert dry["revision"] is None
     assert engram("info", town, "--json").json == before
-    done = engram("revert", town, 1, "-m", "loose camera", "--author", "me", "--json").json
+    monkeypatch.setenv("ENGRAM_AUTHOR", "me")
+    done = engram("revert", town, 1, "-m", "loose camera", "--json").json
     assert (done["reverted"], done["revision"]) == (1, 3)
+    assert engram("log", town, "--json").json[0]["author"] == "me"
     assert (
         done["difference"]["nodes"]["after"]
         == before["nodes"] - (dry["difference"]["nodes"]["removed"])
@@ -90,16 +92,16 @@ def test_revert_and_its_undoing(engram, town: Path) -> None:
     assert engram("log", town, "--json").json[1]["message"] == "revert revision 1: loose camera"
 
 
-def test_blame_names_robot_session_and_revision(engram, town: Path) -> None:
+def test_show_of_a_node_names_robot_session_and_revision(engram, town: Path) -> None:
     session = engram("show", town, 1, "--json").json["sessions"][0]
     with Map.open(town) as store:
         node = store.load().nodes[0]
-    (found,) = engram("blame", town, str(node.id)[:10], "--json").json
+    found = engram("show", town, str(node.id)[:10], "--json").json
     assert (found["robot"], found["session"]) == ("r1", session["session"])
     assert (found["revision"], found["visible"], found["told"]) == (1, True, [])
     assert found["hour"] == pytest.approx(9.5, abs=0.01)
     engram("revert", town, 1)
-    text = engram("blame", town, node.id).out
+    text = engram("show", town, node.id).out
     assert "saved by r1" in text
     assert "taken back by revision 3" in text
 
@@ -124,8 +126,8 @@ def test_blame_names_robot_session_and_revision(engram, town: Path) -> None:
         (("tag", "TOWN", "-m", "why"), "--message needs the NAME of a tag"),
         (("revert", "TOWN", 0), "no revision 0"),
         (("revert", "TOWN", "11"), "not 11"),
-        (("blame", "TOWN", "zz"), "no UUID"),
-        (("blame", "TOWN", "00000000"), "begins with"),
+        (("show", "TOWN", "zz"), "'zz'"),
+        (("show", "TOWN", "00000000"), "begins with"),
         (("info", "TOWN", "--at", "head~9"), "not -7"),
         (("log", "absent.engram"), "absent.engram"),
         (("revert", "absent.engram", 1), "absent.engram"),

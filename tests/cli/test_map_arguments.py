@@ -1,26 +1,12 @@
-"""How maps are named on the command line: files, and as of which revision."""
+"""How maps are named on the command line: by files."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
-import typer
 
-from engram.cli.app import app
-
-HISTORY = Path(__file__).parents[2] / "docs" / "history.md"
 ADDRESS = "postgresql://somebody:secret@localhost/fleet"
-
-
-def test_the_verbs_that_take_a_revision_are_those_that_the_documents_name() -> None:
-    verbs = typer.main.get_command(app).commands
-    taking = {name for name, verb in verbs.items() if any(p.name == "at" for p in verb.params)}
-    sentence = r"`--at` shows a map as of a\s+revision:(.*?)take it"
-    named = re.search(sentence, HISTORY.read_text(), re.S)
-    assert named is not None
-    assert {words.split()[0] for words in re.findall(r"`([^`]+)`", named[1])} == taking
 
 
 @pytest.mark.parametrize(

@@ -69,14 +69,14 @@ def test_localise_gives_the_documented_json(engram, street: Path, town: Path) ->
 
 
 def test_budget_bounds_the_attempts(engram, street: Path, town: Path) -> None:
-    arguments = ("--lanes", 1, "--rounds", 1, "--policy", "random", "--json")
+    arguments = ("--lanes", 1, "--rounds", 1, "--ranking", "random", "--json")
     result = engram("localise", town, street, *arguments).json
     assert all(frame["attempts"] <= 1 for frame in result["frames"])
 
 
 @pytest.mark.parametrize("policy", ["distance", "path", "path-near", "random"])
 def test_every_policy_localises(engram, street: Path, town: Path, policy: str) -> None:
-    result = engram("localise", town, street, "--policy", policy, "--json").json
+    result = engram("localise", town, street, "--ranking", policy, "--json").json
     assert result["summary"]["share_localised"] > 0.5
 
 
@@ -84,7 +84,7 @@ def test_a_frame_log_localises_exactly_as_its_images(
     engram, street: Path, town: Path, tmp_path: Path
 ) -> None:
     log = tmp_path / "street.framelog"
-    assert engram("extract", street, log, "--json").json["frames"] == 12
+    assert engram("record", street, log, "--json").json["frames"] == 12
     from_images = engram("localise", town, street, "--json").json["frames"]
     from_log = engram("localise", town, log, "--json").json["frames"]
     for one, other in zip(from_images, from_log, strict=True):
@@ -104,17 +104,19 @@ def test_trajectory_is_tum_and_close_to_the_drive(
     assert np.linalg.norm(rows[-1, 1:4]) == pytest.approx(8.8, rel=0.05)
 
 
-def test_pictures_show_chosen_frames(engram, street: Path, town: Path, tmp_path: Path) -> None:
+def test_pictures_show_every_frame_of_a_short_drive(
+    engram, street: Path, town: Path, tmp_path: Path
+) -> None:
     folder = tmp_path / "pictures"
-    engram("localise", town, street, "--pictures", folder, "--every", 5)
+    engram("localise", town, street, "--pictures", folder)
     assert [path.name for path in sorted(folder.iterdir())] == [
-        "000000_localised.png", "000005_localised.png", "000010_localised.png",
-    ]  # fmt: skip
+        f"{frame:06d}_localised.png" for frame in range(12)
+    ]
 
 
 def test_replay_in_real_time_counts_late_frames(engram, street: Path, town: Path) -> None:
     # At 2,000 Hz nothing can be in time but what waits for no one.
-    ran = engram("localise", town, street, "--rate", 2000, "--preload", "--json").json
+    ran = engram("localise", town, street, "--rate", 2000, "--json").json
     assert ran["summary"]["late_frames"] > 0
     # Without a rate there is no schedule to be late for.
     assert engram("localise", town, street, "--json").json["summary"]["late_frames"] == 0
@@ -139,7 +141,7 @@ def test_check_finds_a_flipped_byte_and_ends_with_one(engram, town: Path) -> Non
 
 
 def test_nothing_to_seal(engram, town: Path) -> None:
-    assert "no session was interrupted" in engram("seal", town).out
+    assert "no session was interrupted" in engram("check", town, "--seal").out
 
 
 def test_a_teblid_map_is_localised_in_with_teblid(engram, street: Path, tmp_path: Path) -> None:
@@ -152,7 +154,7 @@ def test_a_teblid_map_is_localised_in_with_teblid(engram, street: Path, tmp_path
 
 def test_two_kinds_of_descriptor_do_not_mix(engram, street: Path, town: Path, tmp_path) -> None:
     log = tmp_path / "teblid.framelog"
-    assert engram("extract", street, log, "--descriptor", "teblid").status == 0
+    assert engram("record", street, log, "--descriptor", "teblid").status == 0
     for verb in ("localise", "map"):
         ran = engram(verb, town, log, "--robot", "r2", "--json")
         assert ran.status == 2
@@ -164,11 +166,11 @@ def test_a_kind_of_descriptor_that_is_insisted_on_is_not_passed_over(
     engram, street: Path, town: Path, tmp_path: Path
 ) -> None:
     log, new = tmp_path / "brief.framelog", tmp_path / "new.engram"
-    assert engram("extract", street, log).status == 0
+    assert engram("record", street, log).status == 0
     ran = engram("map", new, log, "--descriptor", "teblid")
     assert ran.status == 2
     assert "has brief descriptors, not teblid" in ran.err
-    assert "extract it again with --descriptor teblid" in ran.err
+    assert "record it again with --descriptor teblid" in ran.err
     assert not new.exists()
     ran = engram("map", town, street, "--robot", "r2", "--descriptor", "teblid", "--json")
     assert ran.json["error"]["kind"] == "ConfigError"
@@ -189,7 +191,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
     [
         (("localise", "absent.engram", "STREET"), "absent.engram"),
         (("localise", "TOWN", "nowhere"), "nowhere"),
-        (("localise", "TOWN", "STREET", "--policy", "best"), "there are: "),
+        (("localise", "TOWN", "STREET", "--ranking", "best"), "there are: "),
         (("localise", "TOWN", "STREET", "--relocaliser", "gps"), "known: "),
         (("localise", "TOWN", "STREET", "--at", 7), "not 7"),
         (("localise", "TOWN", "STREET", "--frames", "1:x"), "1:x"),
@@ -197,9 +199,9 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("localise", "CALIBRATION", "STREET"), "calibration.toml"),
         (("map", "CALIBRATION", "STREET"), "calibration.toml"),
         (("map", "no/such/folder/a.engram", "STREET"), "no/such/folder"),
-        (("map", "TOWN", "STREET", "--start", "yesterday"), "yesterday"),
+        (("map", "TOWN", "STREET", "--recorded-at", "yesterday"), "yesterday"),
         (("map", "TOWN", "STREET", "--longitude", 400), "400"),
-        (("extract", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
+        (("record", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
         (("info", "STREET"), "street"),
         (("map", "TOWN", "STREET", "--descriptor", "sift"), "sift"),
     ],

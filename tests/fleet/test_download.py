@@ -340,8 +340,8 @@ class TestMistakes:
         ("options", "says"),
         [
             ({"policy": "best"}, "known: copy, tod"),
-            ({"policy": "tod"}, "needs --start"),
-            ({"policy": "tod+paths"}, "needs --start"),
+            ({"policy": "tod"}, "needs --depart"),
+            ({"policy": "tod+paths"}, "needs --depart"),
             ({"policy": "budget"}, "needs --budget"),
             ({"policy": "region"}, "needs --near"),
             ({"policy": "route"}, "needs --route"),
@@ -383,21 +383,15 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "says"),
         [
-            ({"policy": "copy", "route": "zzzz"}, "copy does not go by --route"),
-            ({"policy": "copy", "near": ("ffff",)}, "does not go by --near"),
-            ({"policy": "tod", "start_h": 9.0, "budget_bytes": 10_000}, "choose --policy budget"),
-            ({"policy": "tod", "start_h": 9.0, "route": "0"}, "choose --policy route or budget"),
-            ({"policy": "tod", "start_h": 9.0, "epoch_min": 30.0}, "does not go by --epoch"),
-            ({"policy": "paths", "window_min": 60.0}, r"choose --policy tod or tod\+paths"),
-            ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "go by --budget"),
-            ({"policy": "region", "near": ("0",), "budget_percent": 50.0}, "go by --budget"),
-            ({"policy": "route", "route": "0", "best_percent": 20.0}, "go by --best"),
-            ({"policy": "copy", "radius_m": 5.0}, "does not go by --radius"),
-            ({"policy": "budget", "budget_bytes": 9, "radius_m": 5.0}, "with it"),
-            ({"policy": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "one of the"),
-            ({"policy": "copy", "end_h": 9.0}, "needs --start with --end"),
-            ({"policy": "copy", "day": "2026-11-17"}, "at --start"),
-            ({"policy": "copy", "latitude_deg": 50.0}, "at --start"),
+            ({"policy": "copy", "route": "zzzz"}, "copy does not use --route"),
+            ({"policy": "copy", "near": ("ffff",)}, "does not use --near"),
+            ({"policy": "tod", "start_h": 9.0, "budget_bytes": 10_000}, "choose --select budget"),
+            ({"policy": "tod", "start_h": 9.0, "route": "0"}, "choose --select route or budget"),
+            ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "use --budget"),
+            ({"policy": "region", "near": ("0",), "budget_percent": 50.0}, "use --budget"),
+            ({"policy": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "only one of"),
+            ({"policy": "copy", "end_h": 9.0}, "needs --depart with --arrive"),
+            ({"policy": "copy", "day": "2026-11-17"}, "at --depart"),
         ],
     )
     def test_options_that_a_policy_would_pass_over(self, centre, tmp_path, options, says):
@@ -408,8 +402,9 @@ class TestMistakes:
     def test_every_option_has_a_policy_that_goes_by_it(self):
         assert UNDERSTOOD.keys() == SELECTIONS.keys()
         mission = {"start_h", "end_h", "day", "latitude_deg"}
+        settings = {"window_min", "epoch_min", "best_percent", "buffer_min", "radius_m"}
         fields = {one.name for one in dataclasses.fields(DownloadOptions)}
-        assert frozenset().union(*UNDERSTOOD.values()) == fields - mission - {
+        assert frozenset().union(*UNDERSTOOD.values()) == fields - mission - settings - {
             "policy",
             "thumbnails",
         }
@@ -439,7 +434,7 @@ class TestMistakes:
         timeless = tmp_path / "timeless.engram"
         map_simulated(timeless, steps_of(9.0, 0, 5, 5, day=1), "r1")
         options = {"budget_bytes": 10**6} if policy == "budget" else {}
-        with pytest.raises(InputError, match=r"1 of 1 sessions \(r1 .*--longitude or --zone"):
+        with pytest.raises(InputError, match=r"1 of 1 sessions \(r1 .*engram amend"):
             sent(timeless, tmp_path / "out.engram", policy, start_h=9.0, **options)
         # Without a time it can be chosen by what promises most.
         assert sent(timeless, tmp_path / "out.engram", "budget", budget_bytes=10**6).nodes > 0

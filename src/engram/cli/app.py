@@ -5,23 +5,45 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import typer
 
+from engram import __version__
 from engram.cli.endings import PartlyDoneError, VerbInterruptedError
-from engram.cli.verbs import register
-from engram.errors import EngramError
+from engram.cli.moved import moved_option
+from engram.cli.verbs import Program, register
+from engram.errors import EngramError, InputError
 
 app = typer.Typer(
     name="engram",
+    cls=Program,
     help="Lifelong visual localisation for fleets of robots with stereo cameras.",
-    epilog="Start with: engram demo --out demo",
+    epilog="Start with: engram map street.engram DRIVE, or engram demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        print(f"engram {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _program(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    del version  # printed by its callback
+
 
 register(app)
 
@@ -37,6 +59,9 @@ def main() -> None:
     try:
         code = app(prog_name="engram", standalone_mode=False)
     except _UsageError as error:  # a verb or option that is mistyped
+        if answer := _moved(error):
+            _complain(InputError(answer))
+            sys.exit(EXIT_BAD_INPUT)
         _tell_machines(error.format_message(), type(error).__name__)
         error.show()
         sys.exit(error.exit_code)
@@ -54,12 +79,20 @@ def main() -> None:
             raise
         _complain(
             EngramError(
-                f"the compiled core is older than the program: it has no {error.name}; build it "
-                "again: make setup, or pip install ."
+                f"the compiled core is older than the program: it has no {error.name}. Build it "
+                "again with make setup or pip install ."
             )
         )
         sys.exit(EXIT_BAD_INPUT)
     sys.exit(code)
+
+
+def _moved(error: Any) -> str | None:
+    """What an option that is not known is called now; None if it never was one."""
+    option = getattr(error, "option_name", None)
+    if option is None or error.ctx is None:
+        return None
+    return moved_option(error.ctx.command.name, option)
 
 
 def _status_of(error: EngramError | VerbInterruptedError) -> int:

@@ -1,9 +1,11 @@
-"""`engram log`, `show`, `diff`, `tag`, `revert`, `blame`: the history of a map."""
+"""`engram log`, `show`, `diff`, `tag`, `revert`: the history of a map."""
 
 from __future__ import annotations
 
 import getpass
 import json
+import os
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -13,23 +15,24 @@ from engram.cli import options
 from engram.errors import ConfigError
 
 Revision = Annotated[str, typer.Argument(metavar="REV", help="A revision: 7, a tag, head, head~2.")]
-Author = Annotated[
-    str | None, typer.Option("--author", help="Who does it [default: the user's name].")
-]
-Message = Annotated[str, typer.Option("--message", "-m", help="Why; `log` shows it.")]
+Message = Annotated[str, typer.Option("--message", "-m", help="Why, for the log.")]
+# Takes the place of the user's name as the author of tags, reverts and vocabularies.
+AUTHOR = "ENGRAM_AUTHOR"
+# What a revision is called; all else is the beginning of a node's UUID.
+_A_REVISION = re.compile(r"head(~\d+)?|\d{1,7}")
 
 
 def log(
     map_path: options.MapPath,
     *,
-    oneline: Annotated[bool, typer.Option("--oneline", help="One line for each.")] = False,
+    oneline: Annotated[bool, typer.Option("--oneline", help="Print one line each.")] = False,
     limit: Annotated[
-        int | None, typer.Option("--limit", "-n", min=1, help="Only so many, the newest.")
+        int | None, typer.Option("--limit", "-n", min=1, help="Only the newest.")
     ] = None,
     at: options.At = None,
     as_json: options.Json = False,
 ) -> None:
-    """List the revisions of a map, newest first: when, who, what, and their tags.
+    """List a map's revisions, newest first.
 
     \b
     Examples:
@@ -48,25 +51,42 @@ def log(
 
 
 def show(
-    map_path: options.MapPath, revision: Revision = "head", *, as_json: options.Json = False
+    map_path: options.MapPath,
+    what: Annotated[
+        str, typer.Argument(metavar="[REV|NODE]", help="A revision, or the id of a node.")
+    ] = "head",
+    *,
+    as_json: options.Json = False,
 ) -> None:
-    """Show one revision: who, when, with which settings, and what it changed.
+    """Show a revision or a node.
+
+    A revision: who made it, when, with which settings, and what it changed. A node: which robot,
+    session and revision it comes from. The first characters of its id suffice.
 
     \b
     Examples:
       engram show town.engram
       engram show town.engram 3 --json
+      engram show town.engram 5f3a91c2
     """
-    from engram.maps.history import log_text, show_revision
+    from engram.maps.history import blame_node, blame_text, log_text, map_tags, show_revision
 
-    shown, changed = show_revision(map_path, revision)
+    if _is_node(what) and what not in {one["name"] for one in map_tags(map_path)}:
+        found = blame_node(map_path, what)
+        typer.echo(json.dumps(found) if as_json else blame_text(found))
+        return
+    shown, changed = show_revision(map_path, what)
     if as_json:
         print(json.dumps({**shown, "difference": changed.to_dict()}))
         return
     if shown["number"]:
         typer.echo(log_text(shown))
-    typer.echo(f"content hash {shown['content_hash']}")
     typer.echo(changed.text())
+
+
+def _is_node(text: str) -> bool:
+    """Whether it can only be the beginning of a node's UUID, or a tag that looks like one."""
+    return _A_REVISION.fullmatch(text) is None and set(text.lower()) <= set("0123456789abcdef-")
 
 
 def diff(
@@ -75,16 +95,16 @@ def diff(
     after: Revision = "head",
     *,
     stretch: Annotated[
-        float, typer.Option("--stretch", metavar="M", help="List changes by stretches so long.")
+        float, typer.Option("--stretch", metavar="M", help="Length of the listed stretches.")
     ] = 50.0,
     picture: Annotated[
         Path | None, typer.Option("--picture", metavar="FILE", help="Draw what changed.")
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Compare two revisions: nodes, sessions, metres, hours of day, stretch by stretch.
+    """Compare two revisions.
 
-    A stretch is so many metres of the oldest session of each component of the map.
+    Lists nodes, sessions, metres and hours of day, then every stretch of road that changed.
 
     \b
     Examples:
@@ -103,17 +123,18 @@ def diff(
 def tag(
     map_path: options.MapPath,
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="The tag; without one, list all.")
+        str | None, typer.Argument(metavar="[NAME]", help="The tag; lists all if omitted.")
     ] = None,
     revision: Revision = "head",
     *,
-    move: Annotated[bool, typer.Option("--move", help="Take the name from another.")] = False,
-    delete: Annotated[bool, typer.Option("--delete", help="Take the name away.")] = False,
+    move: Annotated[bool, typer.Option("--move", help="Move the tag here.")] = False,
+    delete: Annotated[bool, typer.Option("--delete", help="Delete the tag.")] = False,
     message: Message = "",
-    author: Author = None,
     as_json: options.Json = False,
 ) -> None:
-    """Give a revision a name, by which every `--at` finds it.
+    """Name a revision.
+
+    Every --at takes the name.
 
     \b
     Examples:
@@ -132,7 +153,7 @@ def tag(
         for one in tags:
             typer.echo(f"{one['name']:20s} revision {one['revision']}  {one['message']}")
         return
-    who = author or _user()
+    who = user()
     if delete:
         done = tag_dict(delete_tag(map_path, name, author=who))
     else:
@@ -147,7 +168,7 @@ def tag(
 
 
 def _check_only_listing(given: dict[str, bool]) -> None:
-    """Without a name tags are listed: what would change one is not passed over in silence.
+    """Refuses options that change a tag if none is named.
 
     Raises:
         ConfigError: an option is given that needs a name.
@@ -160,15 +181,16 @@ def revert(
     map_path: options.MapPath,
     revision: Revision,
     *,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would go.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only report what would be hidden.")
+    ] = False,
     message: Message = "",
-    author: Author = None,
     as_json: options.Json = False,
 ) -> None:
-    """Take a revision back, by a new one that hides what it brought.
+    """Undo a revision by a new one.
 
-    Nothing is deleted: older revisions read as before, and reverting the new revision brings all
-    of it back.
+    The new revision hides what the old one added. Nothing is deleted: earlier revisions stay
+    readable, and reverting the new revision restores everything.
 
     \b
     Examples:
@@ -177,39 +199,14 @@ def revert(
     """
     from engram.maps.history import revert_revision
 
-    report = revert_revision(
-        map_path, revision, author=author or _user(), message=message, dry_run=dry_run
-    )
+    report = revert_revision(map_path, revision, author=user(), message=message, dry_run=dry_run)
     typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
 
 
-def blame(
-    map_path: options.MapPath,
-    nodes: Annotated[
-        list[str], typer.Argument(metavar="NODE...", help="UUIDs of nodes, or their beginnings.")
-    ],
-    *,
-    at: options.At = None,
-    as_json: options.Json = False,
-) -> None:
-    """Say which robot, session and revision a node comes from.
-
-    \b
-    Examples:
-      engram blame town.engram 5f3a
-      engram blame town.engram 5f3a91c2 --json
-    """
-    from engram.maps.history import blame_node, blame_text
-
-    found = [blame_node(map_path, node, at) for node in nodes]
-    if as_json:
-        print(json.dumps(found))
-        return
-    for one in found:
-        typer.echo(blame_text(one))
-
-
-def _user() -> str:
+def user() -> str:
+    """Author of what a person does to a map: $ENGRAM_AUTHOR, or the user's name."""
+    if named := os.environ.get(AUTHOR):
+        return named
     try:
         return getpass.getuser()
     except (KeyError, OSError):  # a process without a name, as in some containers

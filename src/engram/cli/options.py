@@ -1,11 +1,21 @@
-"""Options that several verbs share, and the sequence they describe."""
+"""Options that several verbs share, and how a verb takes a group of them."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import inspect
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
+
+if TYPE_CHECKING:
+    from engram.cli.settings import AllSettings
+    from engram.sequences import FrameLog, ImageSequence
 
 
 def map_file(text: str) -> Path:
@@ -19,84 +29,176 @@ def map_file(text: str) -> Path:
     if is_address(text):
         raise typer.BadParameter(
             "this is the address of a map in PostgreSQL; the program works on map files. From "
-            "Python, engram.fleet.download writes what is there to a file"
+            "Python, engram.fleet.download writes such a map to a file"
         )
     return Path(text)
+
+
+def _british(word: str) -> str:
+    """Both spellings of a rig's or a channel's name."""
+    return {"color": "colour", "gray": "grey"}.get(word, word)
 
 
 MapPath: TypeAlias = Annotated[
     Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.", parser=map_file)
 ]
+FleetMap: TypeAlias = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FLEET", help="The fleet map; created if it does not exist.", parser=map_file
+    ),
+]
 DrivePath: TypeAlias = Annotated[
-    Path, typer.Argument(metavar="PATH", help="A drive: a folder of stereo images or a frame log.")
+    Path, typer.Argument(metavar="DRIVE", help="A folder of stereo images, or a frame log.")
 ]
 Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 At: TypeAlias = Annotated[
     str | None,
-    typer.Option(
-        "--at", metavar="REV|TAG", help="Read the map as of this revision: 7, a tag, head~2."
-    ),
+    typer.Option("--at", metavar="REV", help="Read this revision: 7, a tag, head~2."),
 ]
-Format: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--format", help="kitti, kitti-raw, euroc, folder or framelog [default: seen]."),
-]
-Rig: TypeAlias = Annotated[str, typer.Option("--rig", help="Of several rigs: grey or colour.")]
-Channel: TypeAlias = Annotated[
-    str, typer.Option("--channel", help="Of colour images: grey, red, green or blue.")
-]
-Frames: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--frames", metavar="START:STOP:STEP", help="Only these frames, as in 0:100:2."),
-]
-SkipBad: TypeAlias = Annotated[
-    bool, typer.Option("--skip-bad", help="Go on past images that cannot be used, and count them.")
-]
-Robot: TypeAlias = Annotated[
-    str | None, typer.Option("--robot", help="Name of the robot [default: from the drive].")
-]
-Start: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--start", metavar="TIME", help="When the drive began, ISO 8601 in UTC."),
-]
-Longitude: TypeAlias = Annotated[
-    float | None, typer.Option("--longitude", help="Where the drive was, degrees east.")
-]
-Zone: TypeAlias = Annotated[
-    str | None, typer.Option("--zone", help="Time zone of the drive, as in Europe/London.")
-]
-Settings: TypeAlias = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Settings in TOML.")
+Ranking: TypeAlias = Annotated[
+    str,
+    typer.Option("--ranking", help="Which nodes to try first: recall, path, distance, …"),
 ]
 Lanes: TypeAlias = Annotated[
-    int, typer.Option("--lanes", min=1, help="Match attempts at the same time (Np).")
+    int, typer.Option("--lanes", min=1, help="Match attempts in parallel (Np).")
 ]
 Rounds: TypeAlias = Annotated[
-    int, typer.Option("--rounds", min=1, help="Rounds of attempts for one frame (Nr).")
+    int, typer.Option("--rounds", min=1, help="Rounds of attempts per frame (Nr); 32 when lost.")
 ]
-SureInliers: TypeAlias = Annotated[
-    int,
-    typer.Option(
-        "--sure-inliers",
-        min=0,
-        help="Leave out a node that other drives rely on only for a match of so many inliers; "
-        "0 for every match, as in the paper.",
-    ),
-]
-Deadline: TypeAlias = Annotated[
-    float | None,
-    typer.Option("--deadline", metavar="MS", help="No attempt starts later after its frame."),
-]
-Policy: TypeAlias = Annotated[
+Relocaliser: TypeAlias = Annotated[
     str,
     typer.Option(
-        "--policy",
-        help="Ranking: recall, path, path-near, distance, or one that an installed package brings.",
+        "--relocaliser", help="Finds a lost robot: fabmap, bag-of-words, exhaustive, none."
     ),
 ]
 Descriptor: TypeAlias = Annotated[
     str | None,
-    typer.Option(
-        "--descriptor", help="brief or teblid, for a new map or log [default: the map's, or brief]."
-    ),
+    typer.Option("--descriptor", help="brief or teblid, for a new map or log [default: brief]."),
 ]
+NoThumbnails: TypeAlias = Annotated[
+    bool, typer.Option("--no-thumbnails", help="Store no small pictures for people.")
+]
+Settings: TypeAlias = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Settings in TOML: engram settings show."),
+]
+Author: TypeAlias = Annotated[
+    str | None, typer.Option("--author", help="Author of the revision [default: the robots].")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """How a drive is read."""
+
+    format: Annotated[
+        str | None,
+        typer.Option(
+            "--format", help="kitti, kitti-raw, euroc, folder, framelog [default: detected]."
+        ),
+    ] = None
+    rig: Annotated[
+        str, typer.Option("--rig", metavar="RIG", help="grey or colour cameras.", parser=_british)
+    ] = "grey"
+    channel: Annotated[
+        str,
+        typer.Option(
+            "--channel",
+            metavar="CHANNEL",
+            help="Of colour images: grey, red, green, blue.",
+            parser=_british,
+        ),
+    ] = "grey"
+    frames: Annotated[
+        str | None,
+        typer.Option("--frames", metavar="START:STOP:STEP", help="Use only these, as in 0:100:2."),
+    ] = None
+    skip_bad: Annotated[
+        bool, typer.Option("--skip-bad", help="Skip and count images that cannot be used.")
+    ] = False
+    robot: Annotated[
+        str | None, typer.Option("--robot", help="Name of the robot [default: the drive's].")
+    ] = None
+    recorded_at: Annotated[
+        str | None,
+        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive, ISO 8601, UTC."),
+    ] = None
+    longitude: Annotated[
+        float | None, typer.Option("--longitude", help="Of the drive, degrees east.")
+    ] = None
+    zone: Annotated[
+        str | None, typer.Option("--zone", help="Time zone of the drive: Europe/London.")
+    ] = None
+
+    def open(self, path: Path) -> ImageSequence | FrameLog:
+        """The drive; see `engram.sequences.open_sequence` for the errors."""
+        from engram.robot import open_drive
+
+        return open_drive(
+            path,
+            format=self.format,
+            rig=self.rig,
+            channel=self.channel,
+            frames=self.frames,
+            skip_bad=self.skip_bad,
+            robot=self.robot,
+            start=self.recorded_at,
+            longitude_deg=self.longitude,
+            zone=self.zone,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsGiven:
+    """Where settings differ from the defaults."""
+
+    config: Settings = None
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change one setting; repeatable."),
+    ] = None
+
+    def read(self) -> AllSettings:
+        """The resolved settings; see `read_settings` for the errors."""
+        from engram.cli.settings import read_settings
+
+        return read_settings(self.config, self.changes or ())
+
+
+def spread(verb: Callable[..., None]) -> Callable[..., None]:
+    """Replaces each dataclass among a verb's parameters by its fields, one option each."""
+    kinds = typing.get_type_hints(verb, include_extras=True)
+    groups: dict[str, Any] = {
+        name: kind for name, kind in kinds.items() if dataclasses.is_dataclass(kind)
+    }
+    parameters: list[inspect.Parameter] = []
+    for one in inspect.signature(verb).parameters.values():
+        if one.name in groups:
+            parameters += _options_of(groups[one.name])
+        else:
+            parameters.append(one.replace(annotation=kinds[one.name]))
+
+    @functools.wraps(verb)
+    def run(*arguments: Any, **given: Any) -> None:
+        for name, kind in groups.items():
+            names = [one.name for one in dataclasses.fields(kind)]
+            given[name] = kind(**{option: given.pop(option) for option in names})
+        verb(*arguments, **given)
+
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return run
+
+
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    kinds = typing.get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(
+            one.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if one.default is dataclasses.MISSING else one.default,
+            annotation=kinds[one.name],
+        )
+        for one in dataclasses.fields(group)
+    ]

@@ -1,4 +1,4 @@
-"""The table of verbs."""
+"""The verbs in their groups, and those that other installed packages bring."""
 
 from __future__ import annotations
 
@@ -8,72 +8,100 @@ from importlib.metadata import entry_points
 from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
-from engram.cli.building import build
-from engram.cli.downloading import download
+from engram.cli import moved
+from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
-from engram.cli.explanation import explain
-from engram.cli.extraction import extract
-from engram.cli.history import blame, diff, log, revert, show, tag
-from engram.cli.inspection import check, info, seal
-from engram.cli.localisation import localise
-from engram.cli.mapping import map_
-from engram.cli.merging import merge
-from engram.cli.vocabulary import vocabulary
+from engram.cli.fleet import build, download, merge
+from engram.cli.history import diff, log, revert, show, tag
+from engram.cli.maps import check, info, plot, vocabulary
+from engram.cli.options import spread
+from engram.cli.showing import settings
+from engram.errors import InputError
 
-VERBS: dict[str, Callable[..., None]] = {
-    "extract": extract,
-    "map": map_,
-    "localise": localise,
-    "explain": explain,
-    "info": info,
-    "log": log,
-    "show": show,
-    "diff": diff,
-    "tag": tag,
-    "revert": revert,
-    "blame": blame,
-    "check": check,
-    "merge": merge,
-    "build": build,
-    "download": download,
-    "seal": seal,
-    "vocabulary": vocabulary,
+GROUPS: dict[str, dict[str, Callable[..., None]]] = {
+    "Drives": {"map": map_, "localise": localise, "record": record},
+    "Maps": {"info": info, "plot": plot, "check": check, "vocabulary": vocabulary},
+    "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
+    "Fleet": {"merge": merge, "download": download, "build": build},
+    "Settings": {"settings": settings},
 }
+VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}
 
 # Where installed packages name verbs of their own: functions, or Typer groups of them.
 ENTRY_POINTS = "engram.verbs"
-# What is done is kept as it is done there.
-_GOES_ON = "interrupted; what was done is kept, and the same command goes on"
+_BROUGHT = "Lab"
+# Characters of a summary: a line of 80 holds it beside the name.
+_SUMMARY = 62
+_RESUMABLE = "interrupted; finished parts are kept, and the same command continues"
+
+
+class Program(TyperGroup):
+    """Lists verbs by group, knows other spellings, and answers to old names with the new."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """One section of the help for each group."""
+        del ctx
+        width = max(len(name) for name in self.commands)
+        for title in dict.fromkeys(_group(verb) for verb in self.commands.values()):
+            with formatter.section(title):
+                formatter.write_dl(
+                    [
+                        (f"{name:{width}}", verb.get_short_help_str(_SUMMARY))
+                        for name, verb in self.commands.items()
+                        if _group(verb) == title
+                    ]
+                )
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The verb of this name, in either spelling."""
+        return super().get_command(ctx, moved.SPELLINGS.get(cmd_name, cmd_name))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The verb that the arguments begin with.
+
+        Raises:
+            InputError: it has another name now.
+        """
+        if answer := moved.moved_verb(args[0], self.commands):
+            raise InputError(answer)
+        return super().resolve_command(ctx, args)
+
+
+def _group(verb: Any) -> str:
+    return str(getattr(verb, "rich_help_panel", None) or _BROUGHT)
 
 
 def register(app: typer.Typer) -> None:
     """Gives the program its verbs, and those that other installed packages bring."""
-    for name, verb in VERBS.items():
-        app.command(name)(_tells_of_interruption(verb))
+    for title, verbs in GROUPS.items():
+        for name, verb in verbs.items():
+            app.command(name, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
     for entry in sorted(entry_points(group=ENTRY_POINTS)):
         brought = entry.load()
         if not isinstance(brought, typer.Typer):
-            app.command(entry.name)(_tells_of_interruption(brought))
+            verb = _tells_of_interruption(spread(brought))
+            app.command(entry.name, rich_help_panel=_BROUGHT)(verb)
             continue
         _all_tell_of_interruption(brought)
-        app.add_typer(brought, name=entry.name)
+        app.add_typer(brought, name=entry.name, rich_help_panel=_BROUGHT)
 
 
 def _all_tell_of_interruption(group: typer.Typer) -> None:
     """The same for every verb of a group, and of the groups in it."""
     for command in group.registered_commands:
         assert command.callback is not None
-        command.callback = _tells_of_interruption(command.callback, _GOES_ON)
+        command.callback = _tells_of_interruption(spread(command.callback), _RESUMABLE)
     for inner in group.registered_groups:
         assert inner.typer_instance is not None
         _all_tell_of_interruption(inner.typer_instance)
 
 
 def _tells_of_interruption(
-    verb: Callable[..., None], told: str = "interrupted before there was anything to save"
+    verb: Callable[..., None], told: str = "interrupted; nothing had been saved yet"
 ) -> Callable[..., None]:
-    """Ctrl-C where the verb itself has nothing more to save: said like any other end."""
+    """Reports Ctrl-C like any other end, if the verb itself has nothing more to save."""
 
     @functools.wraps(verb)
     def run(*arguments: Any, **options: Any) -> None:

@@ -73,7 +73,7 @@ def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDiff
             "number": number,
             "content_hash": store.content_hash(),
             "configuration": dict(store.log()[-1].configuration) if number else {},
-            "sessions": _sessions(new),
+            "sessions": sessions_of(new),
             "hours": hours_of_nodes(new),
         }
     with open_map(path, at=max(number - 1, 0)) as store:
@@ -299,7 +299,8 @@ def _contents_text(contents: Mapping[str, float]) -> str:
     return ", ".join(told) or "nothing"
 
 
-def _sessions(contents: MapContents) -> list[dict[str, Any]]:
+def sessions_of(contents: MapContents) -> list[dict[str, Any]]:
+    """The sessions of a map as plain values."""
     nodes = Counter(node.session for node in contents.nodes)
     return [
         {

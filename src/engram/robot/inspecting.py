@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from engram.maps import Map, check_file
+from engram.maps.history import sessions_of
 
 
 def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
@@ -38,6 +39,34 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
             "size_bytes": info.size_bytes,
             "interrupted": [str(one.session.id) for one in store.interrupted()],
         }
+
+
+def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
+    """The sessions of a map, for ``engram info --sessions``.
+
+    Raises:
+        MapError: the map cannot be read.
+    """
+    with Map.open(path, at=at) as store:
+        return sessions_of(store.load())
+
+
+def list_nodes(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
+    """The nodes of a map, for ``engram info --nodes``.
+
+    Raises:
+        MapError: the map cannot be read.
+    """
+    with Map.open(path, at=at) as store:
+        return [
+            {
+                "node": str(node.id),
+                "session": str(node.session),
+                "stamp_ns": node.stamp_ns,
+                "driven_m": node.driven_m,
+            }
+            for node in store.load().nodes
+        ]
 
 
 def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def map_drive(
     """
     settings, options = settings or Settings(), options or RobotOptions()
     if descriptor is not None and isinstance(sequence, FrameLog):
-        mend = f"extract it again with --descriptor {descriptor}"
+        mend = f"record it again with --descriptor {descriptor}"
         _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
     session = session_of_drive(sequence)
     report = MapReport(session)

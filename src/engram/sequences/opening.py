@@ -80,7 +80,7 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             _images(find_folder),
         ),
         "framelog": SequenceFormat(
-            "frame log, a file NAME.framelog that `engram extract` made",
+            "frame log, a file NAME.framelog that `engram record` made",
             is_framelog,
             open_framelog,
         ),

@@ -20,14 +20,10 @@ def relocalise(
     relocaliser: Annotated[
         str, typer.Option("--relocaliser", help="fabmap, bag-of-words or exhaustive.")
     ] = "fabmap",
+    drive: options.Drive,
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 32,
     at: options.At = None,
-    format_: options.Format = None,
-    rig: options.Rig = "grey",
-    channel: options.Channel = "grey",
-    frames: options.Frames = None,
-    skip_bad: options.SkipBad = False,
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
@@ -42,13 +38,11 @@ def relocalise(
     """
     from engram.cli.progress import Bars
     from engram.localiser import Budget
-    from engram.robot import load_settings, open_drive
+    from engram.robot import load_settings
     from engram.robot.results import damage_warning
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
-    sequence = open_drive(
-        path, format=format_, rig=rig, channel=channel, frames=frames, skip_bad=skip_bad
-    )
+    sequence = drive.open(path)
     starts = relocalise_drive(
         map_path,
         sequence,

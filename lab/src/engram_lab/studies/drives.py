@@ -179,7 +179,7 @@ def drives_of(paths: Sequence[Path]) -> tuple[EvaluatedDrive, ...]:
 
 def _drive(path: Path) -> EvaluatedDrive:
     if path.suffix != ".framelog":
-        raise SequenceError(f"{path}: is no frame log; make one with: engram extract {path}")
+        raise SequenceError(f"{path}: is no frame log; make one with: engram record {path}")
     log = FrameLog(path)
     try:
         if not log.complete:

@@ -373,7 +373,7 @@ def _settled_order(
             raise ConfigError(
                 f"the groups of {scratch.folder} are being merged already, in the order "
                 f"{' '.join(map(str, begun.order))}, which was found otherwise; finish it with the "
-                "same --best-order or --best-first, --validate and --judge-at, or delete the folder"
+                "same --order, --validate and build.max_gap_m, or delete the folder"
             )
         return begun
     if judge is None:

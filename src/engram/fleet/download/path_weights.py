@@ -113,15 +113,15 @@ def mission_epochs(
     if not len(filled):
         raise InputError(
             "no path has a node with a known hour of day: nothing tells which paths matter when; "
-            "use --policy copy, region or route"
+            "use --select copy, region or route"
         )
     epochs = _between(start_h, end_h, buffer_min, counts.epoch_min, filled)
     found = [epoch for epoch in epochs if epoch in set(filled.tolist())]
     if not found:
         raise InputError(
             f"no epoch from {_told(start_h, 'first')} to {_told(end_h, 'last')} has data; there "
-            f"is some from {_spans(filled.tolist(), counts.epoch_min)}: give other times or a "
-            "--buffer in minutes"
+            f"is some from {_spans(filled.tolist(), counts.epoch_min)}: choose other times, "
+            "or widen them with --set download.buffer_min=MINUTES"
         )
     return found
 

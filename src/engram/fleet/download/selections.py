@@ -117,23 +117,18 @@ SELECTIONS: dict[str, Policy] = {
 # whether thumbnails go along.
 UNDERSTOOD: dict[str, frozenset[str]] = {
     "copy": frozenset(),
-    "tod": frozenset({"window_min"}),
-    "paths": frozenset({"epoch_min", "best_percent", "buffer_min"}),
-    "tod+paths": frozenset({"window_min", "epoch_min", "best_percent", "buffer_min"}),
-    "region": frozenset({"near", "radius_m"}),
-    "route": frozenset({"route", "radius_m"}),
-    "budget": frozenset({"budget_bytes", "budget_percent", "near", "route", "radius_m"}),
+    "tod": frozenset(),
+    "paths": frozenset(),
+    "tod+paths": frozenset(),
+    "region": frozenset({"near"}),
+    "route": frozenset({"route"}),
+    "budget": frozenset({"budget_bytes", "budget_percent", "near", "route"}),
 }
 _FLAGS = {
-    "window_min": "--window",
-    "epoch_min": "--epoch",
-    "best_percent": "--best",
-    "buffer_min": "--buffer",
     "budget_bytes": "--budget",
     "budget_percent": "--budget",
     "near": "--near",
     "route": "--route",
-    "radius_m": "--radius",
 }
 # Where a mission may have an end and no beginning: it begins with the first epoch that has data.
 _OPEN_START = frozenset({"paths", "tod+paths"})
@@ -148,13 +143,13 @@ def check_options(options: DownloadOptions) -> None:
     """
     policy = options.policy
     if policy not in SELECTIONS:
-        raise ConfigError(f"policy {policy!r} is unknown; known: {', '.join(SELECTIONS)}")
+        raise ConfigError(f"selection {policy!r} is unknown; known: {', '.join(SELECTIONS)}")
     for name, flag in _FLAGS.items():
         if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[policy]:
             continue
         takers = [one for one, understood in UNDERSTOOD.items() if name in understood]
         raise ConfigError(
-            f"policy {policy} does not go by {flag}; leave it out, or choose --policy "
+            f"selection {policy} does not use {flag}; leave it out, or choose --select "
             f"{' or '.join(takers)}"
         )
     if policy == "budget":
@@ -165,19 +160,15 @@ def check_options(options: DownloadOptions) -> None:
 
 def _check_where(options: DownloadOptions) -> None:
     if options.near and options.route is not None:
-        raise ConfigError("the mission is along --route or around --near; give one of the two")
-    if options.radius_m != _DEFAULTS["radius_m"] and not options.near and options.route is None:
-        raise ConfigError("--radius is of --near or --route; give one of the two with it")
+        raise ConfigError("a mission is along --route or around --near; give only one of them")
 
 
 def _check_no_mission(options: DownloadOptions) -> None:
     """What tells more of a mission's time says nothing where it has none."""
     if options.end_h is not None and options.policy not in _OPEN_START:
-        raise ConfigError(f"policy {options.policy} needs --start with --end")
-    if options.day is not None or options.latitude_deg is not None:
-        raise ConfigError(
-            "--date and --latitude tell how high the sun stands at --start; give it too"
-        )
+        raise ConfigError(f"selection {options.policy} needs --depart with --arrive")
+    if options.day is not None:
+        raise ConfigError("--date gives the height of the sun at --depart; give that, too")
 
 
 def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
@@ -213,7 +204,7 @@ def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
 
 def _near_start(stock: Stock, options: DownloadOptions) -> tuple[Mask, int]:
     if options.start_h is None:
-        raise ConfigError(f"policy {options.policy} needs --start, the mission's time of day")
+        raise ConfigError(f"selection {options.policy} needs --depart, the mission's time of day")
     hours = stock.known_hours()
     apart = np.abs(hours - options.start_h)
     apart = np.minimum(apart, _HOURS - apart)
@@ -223,7 +214,7 @@ def _near_start(stock: Stock, options: DownloadOptions) -> tuple[Mask, int]:
         minutes = round(60 * options.start_h) % (24 * 60)
         raise InputError(
             f"no node was saved within {allowed_h * 60:.0f} minutes of "
-            f"{minutes // 60}:{minutes % 60:02d}; widen the --window"
+            f"{minutes // 60}:{minutes % 60:02d}; widen it with --set download.window_min=MINUTES"
         )
     return sent, int(np.isnan(hours).sum())
 

@@ -99,7 +99,7 @@ class Stock:
             raise InputError(
                 f"no node of {self.store.location} has a known hour of day: {len(without)} of "
                 f"{len(self.sessions)} sessions ({listed}…) have no UTC clock or neither longitude "
-                "nor time zone; map drives with --start and --longitude or --zone, or use --policy "
+                "nor time zone; set it with engram amend, or choose --select "
                 "copy, region or route"
             )
         return self.hours

@@ -1,0 +1,175 @@
+"""`engram map`, `localise`, `record`: what is done with one drive."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from engram.cli import options
+from engram.errors import ConfigError
+
+if TYPE_CHECKING:
+    from engram.robot.settings import Settings
+
+
+def map_(
+    map_path: options.MapPath,
+    path: options.DrivePath,
+    *,
+    drive: options.Drive,
+    ranking: options.Ranking = "recall",
+    lanes: options.Lanes = 2,
+    rounds: options.Rounds = 2,
+    descriptor: options.Descriptor = None,
+    no_thumbnails: options.NoThumbnails = False,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Add a drive to a map.
+
+    Creates the map if it does not exist. Where the drive localises in the map, nothing is saved;
+    elsewhere it becomes a new experience. The same command resumes an interrupted drive.
+
+    \b
+    Examples:
+      engram map town.engram drives/monday
+      engram map town.engram drives/tuesday --robot r2 --zone Europe/London
+      engram map town.engram drives/tuesday --recorded-at 2026-03-01T09:30:00Z
+      engram map town.engram sequences/06 --frames 0:50:2
+    """
+    from engram.cli.progress import Bars
+    from engram.cli.wording import mapped_text, warnings
+    from engram.robot import RobotOptions, map_drive
+
+    sequence = drive.open(path)
+    asked = RobotOptions(policy=ranking, lanes=lanes, rounds=rounds)
+    resolved = _for_people(settings.read().of_robot(descriptor), no_thumbnails)
+    with Bars().stage("map", len(sequence)) as monitor:
+        report = map_drive(map_path, sequence, resolved, asked, monitor, descriptor=descriptor)
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        for warning in warnings(report.to_dict()):
+            typer.echo(warning, err=True)
+        typer.echo(mapped_text(report.to_dict(), map_path))
+    if report.interrupted:
+        raise typer.Exit(130)
+
+
+def localise(
+    map_path: options.MapPath,
+    path: options.DrivePath,
+    *,
+    drive: options.Drive,
+    ranking: options.Ranking = "recall",
+    lanes: options.Lanes = 2,
+    rounds: options.Rounds = 2,
+    deadline: Annotated[
+        float | None,
+        typer.Option(
+            "--deadline", metavar="MS", help="Start no attempt later than this after the frame."
+        ),
+    ] = None,
+    relocaliser: options.Relocaliser = "fabmap",
+    at: options.At = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option("--trajectory", metavar="FILE", help="Write the trajectory in TUM format."),
+    ] = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option("--pictures", metavar="DIR", help="Write about 20 pictures of matches."),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", metavar="HZ", help="Replay in real time; count late frames."),
+    ] = None,
+    explain: Annotated[
+        int | None,
+        typer.Option("--explain", metavar="FRAME", min=0, help="Explain this frame's candidates."),
+    ] = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Find a drive in a map.
+
+    The map is not changed. --explain lists why the candidates of one frame have their order and
+    which of them match; the drive is localised up to that frame first.
+
+    \b
+    Examples:
+      engram localise town.engram drives/tuesday
+      engram localise town.engram drives/tuesday --ranking distance --lanes 1 --json
+      engram localise town.engram drives/tuesday --rate 20 --deadline 40
+      engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures matches
+      engram localise town.engram drives/tuesday --explain 120
+    """
+    from engram.cli.explaining import explain_and_print
+    from engram.cli.localising import Outputs, localise_and_print
+    from engram.robot import RobotOptions, open_map
+    from engram.robot.explaining import ExplainOptions
+
+    found_by = None if relocaliser == "none" else relocaliser
+    sequence, resolved = drive.open(path), settings.read().of_robot()
+    if explain is None:
+        asked = RobotOptions(
+            policy=ranking,
+            lanes=lanes,
+            rounds=rounds,
+            deadline_ms=deadline,
+            relocaliser=found_by,
+        )
+        outputs = Outputs(trajectory, pictures, rate, as_json)
+        with open_map(map_path, at) as opened:
+            localise_and_print(opened, sequence, resolved, asked, outputs)
+        return
+    given = {
+        "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
+    }  # fmt: skip
+    for option in (option for option, value in given.items() if value is not None):
+        raise ConfigError(f"--explain is about one frame and takes no {option}")
+    frame = ExplainOptions(explain, ranking, lanes, rounds, found_by, at)
+    explain_and_print(map_path, sequence, resolved, frame, as_json=as_json)
+
+
+def record(
+    path: options.DrivePath,
+    out: Annotated[Path, typer.Argument(metavar="LOG", help="The frame log, NAME.framelog.")],
+    *,
+    drive: options.Drive,
+    descriptor: options.Descriptor = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Store a drive compactly, as a frame log.
+
+    A frame log keeps what the front-end and odometry found, in a sixteenth of the space of the
+    images. Every verb reads it like the drive. The same command resumes an interrupted recording.
+
+    \b
+    Examples:
+      engram record drives/monday monday.framelog
+      engram record 2011_09_26_drive_0001_sync colour.framelog --rig colour --channel blue
+    """
+    from engram.cli.progress import Bars
+    from engram.robot import extract_log
+
+    sequence, resolved = drive.open(path), settings.read().of_robot(descriptor)
+    with Bars().stage("record", len(sequence)) as monitor:
+        report = extract_log(sequence, out, resolved, monitor)
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        typer.echo(report.text())
+    if report.interrupted:
+        raise typer.Exit(130)
+
+
+def _for_people(settings: Settings, no_thumbnails: bool) -> Settings:
+    if not no_thumbnails:
+        return settings
+    return replace(settings, frontend=replace(settings.frontend, thumbnails=False))

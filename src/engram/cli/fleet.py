@@ -1,0 +1,317 @@
+"""`engram merge`, `download`, `build`: the fleet map."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from engram.cli import options
+from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.errors import ConfigError, EngramError
+
+if TYPE_CHECKING:
+    from engram.cli.settings import AllSettings
+    from engram.fleet.build import JudgeOptions
+    from engram.fleet.merge import MergeOptions, MergeReport
+
+
+def merge(
+    centre: options.FleetMap,
+    robots: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="ROBOT...", help="Robots' maps, merged in this order.", parser=options.map_file
+        ),
+    ],
+    *,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Merge into a copy and discard it.")
+    ] = False,
+    require_better: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--require-better",
+            metavar="DRIVE",
+            help="Refuse a merge after which this held-out drive localises worse; repeatable.",
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="FILE", help="Draw the fleet map before and after."),
+    ] = None,
+    author: options.Author = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Add robots' maps to the fleet map.
+
+    Each map becomes one revision, complete or not at all. Nodes that the fleet map has are not
+    added again. The others are replayed like a live drive. Those that localise are already covered
+    and dropped; the rest are added. Merging the same map again changes nothing. If a later map
+    fails, earlier merges are kept and reported.
+
+    \b
+    Examples:
+      engram merge fleet.engram r1.engram r2.engram
+      engram merge fleet.engram r1.engram --dry-run --picture merge.png
+      engram merge fleet.engram r1.engram --require-better held-out.framelog
+    """
+    from engram.cli.progress import Bars
+    from engram.fleet.merge import merge as merge_maps
+
+    reports: list[MergeReport] = []
+
+    class Heard(Bars):
+        def hear(self, report: MergeReport) -> None:
+            reports.append(report)
+            if not as_json:
+                typer.echo(report.text())
+
+    resolved = settings.read()
+    try:
+        merge_maps(
+            centre,
+            robots,
+            _merging(resolved, author),
+            Heard(),
+            settings=resolved.of_robot(),
+            dry_run=dry_run,
+            require_better=require_better or (),
+            picture=picture,
+        )
+    except EngramError as error:
+        raise PartlyDoneError(error, _merges(reports)) from error
+    except KeyboardInterrupt:
+        if not reports:
+            raise
+        stopped = VerbInterruptedError("interrupted; the reported merges are kept")
+        raise PartlyDoneError(stopped, _merges(reports)) from None
+    if as_json:
+        print(json.dumps(_merges(reports)))
+    if any(report.interrupted for report in reports):
+        raise typer.Exit(130)
+
+
+def _merges(reports: list[MergeReport]) -> dict[str, Any]:
+    """What ``merge --json`` prints."""
+    return {"merges": [report.to_dict() for report in reports]}
+
+
+def _merging(settings: AllSettings, author: str | None) -> MergeOptions:
+    from engram.fleet.merge import MergeOptions
+
+    given = settings.merge
+    return MergeOptions(
+        policy=given.ranking,
+        lanes=given.lanes,
+        rounds=given.rounds,
+        relocaliser=None if given.relocaliser == "none" else given.relocaliser,
+        author=author,
+        sure_inliers=given.sure_inliers,
+    )
+
+
+def download(
+    centre: Annotated[
+        Path, typer.Argument(metavar="FLEET", help="The fleet map.", parser=options.map_file)
+    ],
+    out: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", help="The robot's map, a new file.", parser=options.map_file),
+    ],
+    *,
+    select: Annotated[
+        str,
+        typer.Option("--select", help="copy, tod, paths, tod+paths, region, route or budget."),
+    ] = "copy",
+    depart: Annotated[
+        str | None, typer.Option("--depart", metavar="H:MM", help="When the mission begins.")
+    ] = None,
+    arrive: Annotated[
+        str | None, typer.Option("--arrive", metavar="H:MM", help="When the mission ends.")
+    ] = None,
+    date: Annotated[
+        str | None,
+        typer.Option("--date", metavar="DAY", help="2026-11-17 [default: the newest drive's]."),
+    ] = None,
+    budget: Annotated[
+        str | None,
+        typer.Option("--budget", metavar="SIZE", help="200MB, 1.5GiB, or 25% of a full download."),
+    ] = None,
+    near: Annotated[
+        list[str] | None,
+        typer.Option("--near", metavar="NODE", help="region, budget: around a node; repeatable."),
+    ] = None,
+    route: Annotated[
+        str | None,
+        typer.Option("--route", metavar="SESSION", help="route, budget: along this session."),
+    ] = None,
+    thumbnails: Annotated[
+        bool | None,
+        typer.Option(
+            "--thumbnails/--no-thumbnails", help="Pictures for people [default: not with budget]."
+        ),
+    ] = None,
+    at: options.At = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Write what one mission needs.
+
+    The download is a map of its own: the robot drives with it, adds to it, and hands it back to
+    merge. Times are hours of day at the place: mean solar time if longitudes are known, else civil
+    time.
+
+    \b
+    Examples:
+      engram download fleet.engram r1.engram
+      engram download fleet.engram r1.engram --select tod --depart 9:30
+      engram download fleet.engram r1.engram --select tod+paths --depart 9:30 --arrive 11:00
+      engram download fleet.engram r1.engram --select budget --budget 25% --depart 17:00
+    """
+    from engram.cli.progress import Bars
+    from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
+    from engram.fleet.download import download as send
+
+    budget_bytes, budget_percent = budget_from_text(budget)
+    given = settings.read().download
+    asked = DownloadOptions(
+        policy=select,
+        start_h=hour_from_text(depart, "depart"),
+        end_h=hour_from_text(arrive, "arrive"),
+        day=date,
+        latitude_deg=given.latitude_deg,
+        window_min=given.window_min,
+        epoch_min=given.epoch_min,
+        best_percent=given.best_percent,
+        buffer_min=given.buffer_min,
+        budget_bytes=budget_bytes,
+        budget_percent=budget_percent,
+        near=tuple(near or ()),
+        route=route,
+        radius_m=given.radius_m,
+        thumbnails=thumbnails,
+    )
+    report = send(centre, out, asked, at=at, monitor=Bars())
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        typer.echo(report.text())
+
+
+def build(
+    centre: options.FleetMap,
+    drives: Annotated[
+        list[str], typer.Argument(metavar="DRIVE...", help="Frame logs or drives; paths or URLs.")
+    ],
+    *,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, help="Processes on this machine.")
+    ] = 2,
+    groups: Annotated[int, typer.Option("--groups", min=1, help="Groups of drives.")] = 2,
+    grouping: Annotated[
+        str,
+        typer.Option(
+            "--grouping",
+            metavar="HOW",
+            help="chronological, random:SEED, by-condition, or a file with one group a line.",
+        ),
+    ] = "chronological",
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Map on a Dask cluster instead."),
+    ] = None,
+    order: Annotated[
+        str | None,
+        typer.Option(
+            "--order", help="Order of merging to search for: best (all), best-first (each first)."
+        ),
+    ] = None,
+    validate: Annotated[
+        list[Path] | None,
+        typer.Option("--validate", metavar="DRIVE", help="Held-out drive for --order; repeatable."),
+    ] = None,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep the groups' maps in FLEET.build.")
+    ] = False,
+    author: options.Author = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Map many drives in parallel.
+
+    Groups of drives are mapped side by side, then merged. Progress is kept in FLEET.build until
+    the build is complete; the same command continues after an interruption. The same drives and
+    options give the same map. Drives that FLEET already contains are left out.
+
+    \b
+    Examples:
+      engram build town.engram logs/*.framelog --workers 4 --groups 4
+      engram build town.engram logs/*.framelog --groups 4 --grouping random:7
+      engram build town.engram logs/*.framelog --groups 3 --order best --validate held-out.framelog
+    """
+    from engram.cli.progress import Bars
+    from engram.fleet.build import BuildOptions, build_map
+    from engram.robot import RobotOptions
+
+    resolved = settings.read()
+    merging = _merging(resolved, author)
+    how, seed = _grouping(grouping)
+    asked = BuildOptions(
+        workers=workers,
+        groups=groups,
+        grouping=how,
+        seed=seed,
+        mapping=RobotOptions(
+            policy=merging.policy,
+            lanes=merging.lanes,
+            rounds=merging.rounds,
+            relocaliser=merging.relocaliser,
+            author=author,
+        ),
+        merging=merging,
+        scheduler=scheduler,
+        judge=_judge(order, validate or [], resolved.build.max_gap_m),
+    )
+    report = build_map(centre, drives, resolved.of_robot(), asked, keep=keep, monitor=Bars())
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        typer.echo(report.text())
+    if report.interrupted:
+        raise typer.Exit(130)
+
+
+def _grouping(text: str) -> tuple[str, int]:
+    """Way of grouping and seed.
+
+    Raises:
+        ConfigError: the seed is not a whole number.
+    """
+    how, colon, seed = text.partition(":")
+    if how != "random" or not colon:
+        return text, 0
+    if not seed.isdecimal():
+        raise ConfigError(f"--grouping {text!r}: the seed must be a whole number, as in random:7")
+    return how, int(seed)
+
+
+def _judge(order: str | None, drives: list[Path], max_gap_m: float) -> JudgeOptions | None:
+    """How orders are compared; None if the groups are merged as they come.
+
+    Raises:
+        ConfigError: there is no such order, or drives are given and no order is searched for.
+    """
+    from engram.fleet.build import JudgeOptions, Orders
+
+    known = {"best": Orders.ALL, "best-first": Orders.FIRST}
+    if order is None:
+        if drives:
+            raise ConfigError("--validate compares orders of merging: add --order best, or drop it")
+        return None
+    if order not in known:
+        raise ConfigError(f"--order {order!r} is unknown; known: {', '.join(known)}")
+    return JudgeOptions(drives, judge_at_m=max_gap_m, orders=known[order])

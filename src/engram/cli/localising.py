@@ -1,0 +1,88 @@
+"""The loop of `engram localise`: progress, pictures, trajectory, summary."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from engram.localiser import Localisation
+    from engram.maps import Map
+    from engram.robot import RobotOptions, Settings
+    from engram.sequences import FrameLog, ImageSequence
+
+# So many match pictures are spread over a drive: enough to leaf through.
+_PICTURES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """Where the results go.
+
+    Attributes:
+        trajectory: file in TUM format; None for none.
+        pictures: folder of match pictures; None for none.
+        rate_hz: replay in real time; None for as fast as it goes.
+        as_json: JSON on stdout, in place of text.
+    """
+
+    trajectory: Path | None
+    pictures: Path | None
+    rate_hz: float | None
+    as_json: bool
+
+
+def localise_and_print(
+    opened: Map,
+    sequence: ImageSequence | FrameLog,
+    settings: Settings,
+    asked: RobotOptions,
+    outputs: Outputs,
+) -> None:
+    """Localises a drive; Ctrl-C ends it with a summary of the frames so far.
+
+    Raises:
+        Exit: it was interrupted.
+    """
+    from engram.cli.progress import Bars
+    from engram.cli.wording import localised_text, warnings
+    from engram.robot import robot_on, summarise
+    from engram.viewing.pictures import PictureWriter
+    from engram.viewing.trajectory import write_trajectory
+
+    results: list[Localisation] = []
+    interrupted = False
+    with robot_on(opened, sequence, settings, asked) as robot:
+        writer = None
+        if outputs.pictures is not None:
+            every = max(1, len(sequence) // _PICTURES)
+            writer = PictureWriter(outputs.pictures, every, opened.frames)
+        with Bars().stage("localise", len(sequence)) as monitor:
+            try:
+                for found in robot.drive(sequence, monitor, outputs.rate_hz):
+                    results.append(found)
+                    if writer is not None and robot.last is not None:
+                        writer.offer(robot.last, found)
+            except KeyboardInterrupt:
+                interrupted = True
+                typer.echo("interrupted: the summary covers the frames so far", err=True)
+        if outputs.trajectory is not None:
+            write_trajectory(outputs.trajectory, opened.graph, results)
+    summary = {
+        **summarise(results),
+        "skipped_pairs": sequence.skipped,
+        "interrupted": interrupted,
+    }
+    frames = [result.to_dict() for result in results]
+    if outputs.as_json:
+        print(json.dumps({"summary": summary, "frames": frames}))
+    else:
+        for warning in warnings(summary):
+            typer.echo(warning, err=True)
+        typer.echo(localised_text(summary, frames, opened.location))
+    if interrupted:
+        raise typer.Exit(130)

@@ -1,0 +1,225 @@
+"""`engram info`, `plot`, `check`, `vocabulary`: what a map holds, and whether it is sound."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from engram.cli import options
+
+
+class VocabularyAction(StrEnum):
+    """What to do with a vocabulary."""
+
+    TRAIN = "train"
+    USE = "use"
+    SHOW = "show"
+
+
+class PlotBy(StrEnum):
+    """What the colours of a plot tell apart."""
+
+    EXPERIENCE = "experience"
+    HOUR = "hour"
+    REVISION = "revision"
+    ROBOT = "robot"
+
+
+def info(
+    map_path: options.MapPath,
+    *,
+    sessions: Annotated[bool, typer.Option("--sessions", help="List the sessions.")] = False,
+    nodes: Annotated[bool, typer.Option("--nodes", help="List the nodes.")] = False,
+    at: options.At = None,
+    as_json: options.Json = False,
+) -> None:
+    """Summarise a map.
+
+    The ids that --sessions and --nodes list are what --near, --route, show and amend take; their
+    first characters suffice.
+
+    \b
+    Examples:
+      engram info town.engram
+      engram info town.engram --sessions
+      engram info town.engram --at 3 --json
+    """
+    from engram.robot.inspecting import describe_map, list_nodes, list_sessions
+
+    found = describe_map(map_path, at)
+    listed: dict[str, list[dict[str, Any]]] = {}
+    if sessions:
+        listed["session_list"] = list_sessions(map_path, at)
+    if nodes:
+        listed["node_list"] = list_nodes(map_path, at)
+    if as_json:
+        print(json.dumps({**found, **listed}))
+        return
+    if not listed:
+        for key, value in found.items():
+            typer.echo(f"{key.replace('_', ' '):22s} {_plain(value)}")
+    for one in listed.get("session_list", []):
+        hour = "hour unknown" if one["hour"] is None else f"hour {one['hour']:.2f}"
+        typer.echo(
+            f"{one['session']}  {one['robot']:12s}  {one['start']}  {hour}  {one['nodes']} nodes"
+        )
+    for one in listed.get("node_list", []):
+        typer.echo(f"{one['node']}  session {one['session'][:8]}  {one['driven_m']:8.1f} m")
+
+
+def plot(
+    map_path: options.MapPath,
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="The picture: .png, .svg, .pdf.")],
+    *,
+    by: Annotated[PlotBy, typer.Option("--by", help="What colours mean.")] = PlotBy.EXPERIENCE,
+    at: options.At = None,
+) -> None:
+    """Draw a map from above.
+
+    Distances are true nearby. Over long distances the layout drifts, because a map has no global
+    frame.
+
+    \b
+    Examples:
+      engram plot town.engram town.png
+      engram plot town.engram hours.svg --by hour
+      engram plot town.engram before.png --at 3 --by robot
+    """
+    from engram.viewing.map_from_above import plot_map
+
+    drawn = plot_map(map_path, out, by.value, at)
+    typer.echo(f"{out}: {drawn} nodes by {by.value}")
+
+
+def check(
+    map_path: options.MapPath,
+    *,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Remove what abandoned revisions left.")
+    ] = False,
+    seal: Annotated[
+        bool, typer.Option("--seal", help="Commit what interrupted sessions had saved.")
+    ] = False,
+    as_json: options.Json = False,
+) -> None:
+    """Verify a map.
+
+    Compares every byte with its hash, and every edge and path with its nodes. Exits with status 1
+    if anything is wrong.
+
+    \b
+    Examples:
+      engram check town.engram
+      engram check town.engram --seal
+      engram check town.engram --clean
+    """
+    from engram.robot import check_map, seal_map
+
+    sealed = seal_map(map_path) if seal else []
+    report = check_map(map_path, clean=clean)
+    if as_json:
+        print(json.dumps({**report, "sealed": sealed} if seal else report))
+    else:
+        for one in sealed:
+            typer.echo(f"sealed session {one['session']}: {one['nodes']} nodes, "
+                       f"revision {one['revision']}")  # fmt: skip
+        if seal and not sealed:
+            typer.echo("no session was interrupted")
+        _print_check(report)
+    if report["problems"]:
+        raise typer.Exit(1)
+
+
+def _print_check(report: dict[str, Any]) -> None:
+    for problem in report["problems"]:
+        typer.echo(f"{problem['table']} {problem['record']}: {problem['fact']}")
+    for session in report["interrupted"]:
+        typer.echo(
+            f"session {session} was interrupted: map its drive again to resume it, or keep what "
+            "it has with --seal"
+        )
+    typer.echo(
+        f"{len(report['problems'])} problems in {report['rows']} rows and {report['blobs']} blobs; "
+        f"{report['abandoned_rows']} abandoned rows, {report['removed_rows']} removed"
+    )
+
+
+def vocabulary(
+    action: Annotated[VocabularyAction, typer.Argument(help="train, use or show.")],
+    map_path: options.MapPath,
+    sources: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[SOURCE]...",
+            help="train: maps and drives [default: MAP]; use: the map to copy from.",
+        ),
+    ] = None,
+    *,
+    words: Annotated[int, typer.Option("--words", help="train: number of words.")] = 10_000,
+    at: Annotated[
+        str | None, typer.Option("--at", metavar="REV", help="show: read this revision.")
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Train, copy or show a map's visual words.
+
+    Visual words find lost robots. A map without its own uses the small vocabulary that Engram
+    ships, which was trained on simulated drives.
+
+    \b
+    Examples:
+      engram vocabulary train town.engram
+      engram vocabulary train town.engram monday.framelog --words 20000
+      engram vocabulary use robot.engram town.engram
+      engram vocabulary show town.engram --json
+    """
+    from engram.cli.history import user
+    from engram.cli.progress import progress
+    from engram.errors import InputError
+    from engram.places import TrainingConfig
+    from engram.robot.vocabularies import describe_vocabulary, train_map_vocabulary, use_vocabulary
+
+    if action is VocabularyAction.SHOW:
+        report = describe_vocabulary(map_path, at)
+    else:
+        steps: tuple[str, ...] = ("read", "cluster", "quantise", "relate", "words")
+        if action is VocabularyAction.USE:
+            steps = ("words",)
+            if not sources or len(sources) != 1:
+                raise InputError(
+                    "use needs one map, or one vocabulary file, to copy from: "
+                    "engram vocabulary use MAP SOURCE"
+                )
+        with progress(action.value, 100 * len(steps)) as advance:  # of 100 % each
+            done = dict.fromkeys(steps, 0)
+
+            def advance_to(what: str, share: float) -> None:
+                for _ in range(done[what], int(100 * share)):
+                    advance(what)
+                done[what] = max(done[what], int(100 * share))
+
+            if action is VocabularyAction.USE and sources:
+                report = use_vocabulary(map_path, sources[0], author=user(), advance=advance_to)
+            else:
+                config = TrainingConfig(words=words)
+                report = train_map_vocabulary(
+                    map_path, sources or [], config, author=user(), advance=advance_to
+                )
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        typer.echo(report.text())
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.1f}"
+    if isinstance(value, list):
+        return ", ".join(str(item) for item in value) or "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {item}" for key, item in value.items()) or "none"
+    return "none" if value is None else str(value)

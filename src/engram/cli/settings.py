@@ -1,0 +1,211 @@
+"""All settings of a command: the defaults, a TOML file over them, `--set` over both."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+import typing
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from msgspec import Meta
+
+from engram.config import check_bounds, from_dict, to_dict
+from engram.errors import ConfigError
+from engram.frontend import DescriptorKind
+from engram.robot.settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class MergeSettings:
+    """How `merge` and `build` replay what robots hand in."""
+
+    ranking: Annotated[str, Meta(description="key of POLICIES")] = "recall"
+    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np")] = 2
+    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr")] = 4
+    relocaliser: Annotated[
+        str, Meta(description="places segments without a known neighbour: key of RELOCALISERS")
+    ] = "fabmap"
+    sure_inliers: Annotated[
+        int,
+        Meta(ge=0, description="inliers needed to drop a node that other drives use; 0: any match"),
+    ] = 40
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(frozen=True, slots=True)
+class BuildSettings:
+    """How `build` judges orders of merging."""
+
+    max_gap_m: Annotated[
+        float,
+        Meta(ge=0, description="m; the best order has the fewest longer gaps. Source: [G16] §VI"),
+    ] = 10.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(frozen=True, slots=True)
+class DownloadSettings:
+    """What the selections of `download` go by."""
+
+    window_min: Annotated[
+        float, Meta(ge=0, le=720, description="tod: minutes around departure. Source: [G16] §VI-D")
+    ] = 180.0
+    epoch_min: Annotated[
+        float, Meta(ge=1, le=1440, description="paths: length of an epoch, minutes")
+    ] = 60.0
+    best_percent: Annotated[
+        float, Meta(ge=0, le=100, description="paths: share of each epoch's paths. [G16] §VI-D")
+    ] = 50.0
+    buffer_min: Annotated[
+        float, Meta(ge=0, le=720, description="paths: minutes added before and after the mission")
+    ] = 0.0
+    latitude_deg: (
+        Annotated[
+            float,
+            Meta(ge=-90, le=90, description="degrees north, for the sun; none: estimated"),
+        ]
+        | None
+    ) = None
+    radius_m: Annotated[
+        float, Meta(ge=0, description="m along the edges around --near and --route")
+    ] = 20.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(frozen=True, slots=True)
+class AllSettings(Settings):
+    """What a settings file may contain: the robot's settings, then those of the fleet's verbs."""
+
+    merge: MergeSettings = field(default_factory=MergeSettings)
+    build: BuildSettings = field(default_factory=BuildSettings)
+    download: DownloadSettings = field(default_factory=DownloadSettings)
+
+    def of_robot(self, descriptor: str | None = None) -> Settings:
+        """The part that maps and results keep.
+
+        Args:
+            descriptor: kind of descriptor that replaces the file's; None leaves it.
+
+        Raises:
+            ConfigError: there is no such kind.
+        """
+        names = [one.name for one in dataclasses.fields(Settings)]
+        settings = Settings(**{name: getattr(self, name) for name in names})
+        return settings.for_descriptor(None if descriptor is None else DescriptorKind(descriptor))
+
+
+def read_settings(path: Path | None, changes: Sequence[str] = ()) -> AllSettings:
+    """The defaults, changed by a file and then by `KEY=VALUE` texts.
+
+    Raises:
+        ConfigError: the file cannot be read, or a setting is unknown or out of range.
+    """
+    values = {} if path is None else _toml(path)
+    try:
+        from_file = from_dict(values, AllSettings)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+    if not changes:
+        return from_file
+    for change in changes:
+        _change(values, change)
+    return from_dict(values, AllSettings)
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as settings: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+
+
+def _change(values: dict[str, Any], change: str) -> None:
+    key, equals, text = change.partition("=")
+    tables = key.strip().split(".")
+    if not equals or not all(tables):
+        raise ConfigError(
+            f"--set {change!r}: expected KEY=VALUE, such as mapper.save_every_m=2; "
+            "engram settings show lists the keys"
+        )
+    for table in tables[:-1]:
+        values = values.setdefault(table, {})
+        if not isinstance(values, dict):
+            raise ConfigError(f"--set {change!r}: {table} is a setting, not a table")
+    values[tables[-1]] = _value(text.strip())
+
+
+def _value(text: str) -> Any:
+    """A TOML value; what is not valid TOML is a word, so that nobody quotes for two shells."""
+    try:
+        return tomllib.loads(f"x = {text}")["x"]
+    except ValueError:
+        return text
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting, as `engram settings show` lists it.
+
+    Attributes:
+        key: with its tables, "mapper.save_every_m".
+        value: as resolved.
+        description: unit, meaning and source; empty where none is declared.
+        bounds: such as ">= 0"; empty where none are declared.
+    """
+
+    key: str
+    value: Any
+    description: str
+    bounds: str
+
+
+def every_setting(settings: Any, tables: str = "") -> Iterator[Setting]:
+    """All settings of a dataclass at any depth, in the order of their declaration."""
+    hints = typing.get_type_hints(type(settings), include_extras=True)
+    for one in dataclasses.fields(settings):
+        value, key = getattr(settings, one.name), f"{tables}{one.name}"
+        if dataclasses.is_dataclass(value):
+            yield from every_setting(value, f"{key}.")
+            continue
+        metas = [meta for meta in _annotations(hints[one.name]) if isinstance(meta, Meta)]
+        words = "; ".join(m.description for m in metas if m.description)
+        yield Setting(key, to_dict({"": value})[""], words, ", ".join(map(_bounds, metas)))
+
+
+def _annotations(kind: Any) -> list[Any]:
+    """What is declared with a type, or with what it may be beside None."""
+    within = [one for arm in typing.get_args(kind) for one in getattr(arm, "__metadata__", ())]
+    return [*getattr(kind, "__metadata__", ()), *within]
+
+
+def _bounds(meta: Meta) -> str:
+    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+    given = [(sign, getattr(meta, name)) for name, sign in signs.items()]
+    return ", ".join(f"{sign} {limit:g}" for sign, limit in given if limit is not None)
+
+
+def settings_toml(settings: Any) -> str:
+    """The settings as a file that `--config` reads; a setting that is not given is a comment."""
+    lines: list[str] = []
+    table = None
+    for one in every_setting(settings):
+        above, _, name = one.key.rpartition(".")
+        if above != table:
+            lines += ["", f"[{above}]"]
+            table = above
+        words = "; ".join(text for text in (one.description, one.bounds) if text)
+        value = f"{name} = {json.dumps(one.value)}" if one.value is not None else f"# {name} ="
+        lines.append(f"{value}  # {words}" if words else value)
+    return "\n".join(lines[1:])

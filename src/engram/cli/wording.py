@@ -1,0 +1,117 @@
+"""What `map` and `localise` print: what became of every frame, and what to try next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+# A drive is known, or its area new, from these shares of localised frames on.
+_KNOWN, _NEW = 0.9, 0.1
+
+_FATES = {
+    "localised": "localised",
+    "dead_reckoning": "dead reckoning",
+    "lost": "lost",
+    "no_odometry": "no odometry",
+}
+
+
+def mapped_text(report: Mapping[str, Any], map_path: Path | str) -> str:
+    """What `engram map` prints of the values that ``--json`` prints."""
+    if report["known"]:
+        return (
+            f"nothing to do: the map already contains this drive (session {report['session']}). "
+            f"To change its zone, start or robot: engram amend {map_path} {report['session'][:8]}"
+        )
+    share, saved = report["share_localised"], report["nodes_saved"]
+    area = "known area" if share >= _KNOWN else "new area" if share <= _NEW else "partly new area"
+    head = f"{area}: {_count(saved, 'node')} saved"
+    if report["resumed"]:
+        head = f"resumed; {head}"
+    if report["revision"] is not None:
+        head += f", revision {report['revision']}"
+    lines = [head, *_frames(report)]
+    if report["interrupted"]:
+        return _lines(*lines, "interrupted: what was done is saved; the same command resumes it")
+    return _lines(*lines, f"next: {_after_mapping(report, map_path)}")
+
+
+def localised_text(
+    summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], map_path: Path | str
+) -> str:
+    """What `engram localise` prints of the values that ``--json`` prints."""
+    lines = [
+        f"{summary['frames']} frames over {summary['driven_m']:.1f} m: "
+        f"{summary['share_localised']:.1%} localised, "
+        f"{summary['attempts_per_frame']:.2f} attempts per frame",
+        *_frames(summary),
+        f"  longest stretch without a match {summary['longest_gap_m']:.1f} m"
+        + (f"; {summary['late_frames']} frames late" if summary["late_frames"] else ""),
+        *_stages(summary["stages_ms"]),
+    ]
+    return _lines(*lines, f"next: {_after_localising(frames, map_path)}")
+
+
+def _lines(*lines: str) -> str:
+    return "\n".join(lines)
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
+
+
+def _frames(summary: Mapping[str, Any]) -> list[str]:
+    """What became of every frame."""
+    statuses = summary["statuses"]
+    fates = [f"{statuses.get(status, 0)} {words}" for status, words in _FATES.items()]
+    if unusable := summary.get("unusable_frames", 0):
+        fates.append(f"{unusable} of them unusable")
+    if skipped := summary["skipped_pairs"]:
+        fates.append(f"{_count(skipped, 'bad pair')} skipped")
+    return [f"  {_count(summary['frames'], 'frame')}: {', '.join(fates)}"]
+
+
+def warnings(summary: Mapping[str, Any]) -> list[str]:
+    """What people should look into before they trust a summary; for stderr."""
+    lines = []
+    if damaged := summary["damaged_nodes"]:
+        lines.append(
+            f"warning: {_count(len(damaged), 'damaged node')} of the map "
+            f"{'was' if len(damaged) == 1 else 'were'} skipped, such as {damaged[0]}; "
+            "engram check lists them"
+        )
+    frames = summary["frames"]
+    if frames > 1 and summary["statuses"]["no_odometry"] > frames / 2:
+        lines.append(
+            "warning: most frames have no odometry. Are left and right swapped? Are the pairs "
+            "synchronised and rectified, and is the baseline in metres?"
+        )
+    return lines
+
+
+def _stages(stages_ms: Mapping[str, Mapping[str, float]]) -> list[str]:
+    if "total" not in stages_ms:
+        return []
+    parts = ", ".join(
+        f"{stage} {ms['median']:.1f}" for stage, ms in stages_ms.items() if stage != "total"
+    )
+    total = stages_ms["total"]
+    return [f"  {total['median']:.1f} ms per frame (median), {total['p99']:.1f} (p99): {parts}"]
+
+
+def _after_mapping(report: Mapping[str, Any], map_path: Path | str) -> str:
+    if report["statuses"]["no_odometry"] > report["frames"] / 2:
+        return f"correct the drive, then engram revert {map_path} {report['revision']}"
+    return f"engram localise {map_path} ANOTHER_DRIVE, or engram plot {map_path} map.png"
+
+
+def _after_localising(frames: Sequence[Mapping[str, Any]], map_path: Path | str) -> str:
+    missed = [
+        number
+        for number, frame in enumerate(frames)
+        if frame["status"] in {"dead_reckoning", "lost"}
+    ]
+    if missed:
+        return f"engram localise {map_path} DRIVE --explain {missed[len(missed) // 2]}"
+    return f"engram plot {map_path} map.png"

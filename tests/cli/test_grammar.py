@@ -1,0 +1,194 @@
+"""The command line as a whole: its groups, names, spellings and size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import typer
+
+from engram import __version__
+from engram.cli import moved
+from engram.cli.app import app
+from engram.cli.verbs import GROUPS, VERBS
+
+COMMANDS = typer.main.get_command(app).commands
+
+
+def test_help_lists_the_verbs_in_their_groups(engram) -> None:
+    lines = engram("--help").out.splitlines()
+    places = {line.split()[0]: number for number, line in enumerate(lines) if line.strip()}
+    for title, verbs in GROUPS.items():
+        for verb in verbs:
+            assert places[f"{title}:"] < places[verb]
+    assert len(lines) <= 45, "one screen"
+
+
+def test_the_products_verbs_take_at_most_150_arguments_and_options() -> None:
+    taken = {name: sum(one.name != "help" for one in COMMANDS[name].params) for name in VERBS}
+    assert sum(taken.values()) <= 150, taken
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_help_fits_a_screen_and_begins_with_a_short_summary(engram, verb: str) -> None:
+    ran = engram(verb, "--help")
+    assert len(ran.out.splitlines()) <= 60
+    summary = COMMANDS[verb].get_short_help_str(200)
+    assert len(summary) <= 50, summary
+    assert summary.endswith(".")
+
+
+def test_no_verb_takes_an_option_that_meant_two_things() -> None:
+    taken = {option for name in VERBS for one in COMMANDS[name].params for option in one.opts}
+    assert not taken & {"--start", "--policy", "--every", "--preload"}
+
+
+def test_every_drive_verb_takes_the_nine_options_of_a_drive() -> None:
+    nine = {
+        "format", "rig", "channel", "frames", "skip_bad", "robot", "recorded_at", "longitude",
+        "zone",
+    }  # fmt: skip
+    for name in ("map", "localise", "record"):
+        assert nine <= {one.name for one in COMMANDS[name].params}
+
+
+def test_version(engram) -> None:
+    ran = engram("--version")
+    assert ran.status == 0
+    assert ran.out.strip() == f"engram {__version__}"
+
+
+@pytest.mark.parametrize("old", sorted(moved.VERBS))
+def test_a_verb_that_moved_answers_with_its_new_name(engram, old: str) -> None:
+    ran = engram(old, "anything")
+    assert ran.status == 2
+    assert f"`engram {old}` is now `{moved.VERBS[old]}`" in ran.err
+    verb = moved.VERBS[old].split()[1]
+    assert verb == "lab" or verb in VERBS
+
+
+@pytest.mark.parametrize(
+    ("verb", "old"),
+    [(verb, old) for table in (moved.OPTIONS, moved.GONE) for verb in table for old in table[verb]],
+)
+def test_an_option_that_moved_answers_with_its_new_name(engram, verb: str, old: str) -> None:
+    ran = engram(verb, "a.engram", "b", old, "1", "--json")
+    assert ran.status == 2
+    answer = moved.moved_option(verb, old)
+    assert answer is not None
+    assert ran.json["error"]["message"] == answer
+    new = moved.OPTIONS.get(verb, {}).get(old, "").split("=")[0].split()
+    taken = {option for one in COMMANDS[verb].params for option in one.opts}
+    assert not new or new[0] in taken
+
+
+def test_other_spellings_work(engram, street: Path, tmp_path: Path) -> None:
+    town = tmp_path / "town.engram"
+    assert engram("map", town, street, "--channel", "gray").status == 0
+    assert engram("localize", town, street).status == 0
+    # The plain layout has one rig; that it is refused by its name shows that it was understood.
+    assert "'colour'" in engram("localise", town, street, "--rig", "color").err
+
+
+def test_settings_show_what_a_file_and_set_change(engram, tmp_path: Path) -> None:
+    file = tmp_path / "engram.toml"
+    file.write_text("[mapper]\nsave_every_m = 2.0\n[merge]\nrounds = 8\n")
+    asked = ("--config", file, "--set", "merge.rounds=6", "--set", "frontend.descriptor=teblid")
+    shown = engram("settings", "show", *asked, "--json").json
+    assert shown["mapper"]["save_every_m"] == 2.0
+    assert shown["merge"]["rounds"] == 6
+    assert shown["frontend"]["descriptor"] == "teblid"
+    text = engram("settings", "show", *asked).out
+    assert "merge.rounds = 6  # >= 1" in text
+
+
+def test_settings_as_toml_are_a_settings_file(engram, tmp_path: Path) -> None:
+    file = tmp_path / "engram.toml"
+    file.write_text(engram("settings", "show", "--set", "mapper.save_every_m=2", "--toml").out)
+    again = engram("settings", "show", "--config", file, "--json").json
+    assert again == engram("settings", "show", "--set", "mapper.save_every_m=2", "--json").json
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("mapper", "expected KEY=VALUE"),
+        ("mapper.save_evry_m=2", "unknown setting 'mapper.save_evry_m'; known here: "),
+        ("mapper.save_every_m.x=2", "save_every_m"),
+        ("mapper.save_every_m=-2", "save_every_m"),
+        ("download.latitude_deg=91", "<= 90"),
+    ],
+)
+def test_a_setting_that_does_not_exist_or_fit_is_refused(engram, change: str, says: str) -> None:
+    ran = engram("settings", "show", "--set", change)
+    assert ran.status == 2
+    assert says in ran.err
+
+
+def test_info_lists_sessions_and_nodes_by_ids_that_other_verbs_take(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street, "--robot", "r1", "--recorded-at", "2026-03-01T09:30:00Z")
+    found = engram("info", town, "--sessions", "--nodes", "--json").json
+    (session,) = found["session_list"]
+    assert session["robot"] == "r1"
+    assert len(found["node_list"]) == found["nodes"] == session["nodes"]
+    node = found["node_list"][0]["node"]
+    assert session["session"] in engram("info", town, "--sessions").out
+    assert node in engram("info", town, "--nodes").out
+    assert engram("show", town, node[:10], "--json").json["node"] == node
+    out = tmp_path / "out.engram"
+    asked = ("--select", "route", "--route", session["session"][:8])
+    assert engram("download", town, out, *asked).status == 0
+
+
+@pytest.mark.parametrize("by", ["experience", "hour", "revision", "robot"])
+def test_plot_draws_a_map(engram, street: Path, tmp_path: Path, by: str) -> None:
+    town, picture = tmp_path / "town.engram", tmp_path / "town.svg"
+    engram("map", town, street, "--robot", "r1", "--recorded-at", "2026-03-01T09:30:00Z")
+    ran = engram("plot", town, picture, "--by", by)
+    assert ran.status == 0
+    nodes = engram("info", town, "--json").json["nodes"]
+    assert f"{nodes} nodes by {by}" in ran.out
+    assert picture.stat().st_size > 5000
+
+
+def test_plot_refuses_what_it_cannot_write(engram, street: Path, tmp_path: Path) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street)
+    for picture in ("no/folder/a.png", "a.xyz"):
+        ran = engram("plot", town, picture)
+        assert ran.status == 2
+        assert picture in ran.err
+
+
+def test_map_says_what_became_of_every_frame_and_what_to_try_next(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    town = tmp_path / "town.engram"
+    first = engram("map", town, street, "--robot", "r1")
+    assert first.out.startswith("new area: ")
+    assert "revision 1" in first.out
+    assert "12 frames: " in first.out
+    assert "next: engram localise" in first.out
+    again = engram("map", town, street, "--robot", "r1")
+    assert "nothing to do" in again.out
+    second = engram("map", town, street, "--robot", "r2")
+    assert second.out.startswith("known area: 0 nodes saved")
+    found = engram("localise", town, street)
+    assert "12 frames: 12 localised, 0 dead reckoning, 0 lost, 0 no odometry" in found.out
+    assert "ms per frame" in found.out
+
+
+def test_swapped_cameras_are_suspected_when_odometry_fails(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    swapped = tmp_path / "swapped"
+    swapped.mkdir()
+    for old, new in (("left", "right"), ("right", "left")):
+        (swapped / new).symlink_to(street / old)
+    for name in ("times.txt", "calibration.toml"):
+        (swapped / name).symlink_to(street / name)
+    ran = engram("map", tmp_path / "town.engram", swapped)
+    assert "left and right swapped?" in ran.err
