@@ -1,0 +1,95 @@
+"""The localising loop asks a map by neighbourhood and by id: nothing enumerates it.
+
+A map may be larger than memory: a loop that touches every node, edge or path could not run on one
+that is read page by page. What still looks at the whole map, and when:
+
+* opening a map for ranking: `Lessons.learnt` and the counts of match basins, over all attempts;
+* a lost robot: place recognition compares with every node, `PlaceBelief` spreads over all edges;
+* a mapper: loops are looked for among all nodes, and a tie that closes a chain masks all edges;
+* the centre and pictures: components, regions, lay-out, downloads, differences and checks.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mapping_rig import localised, map_simulated
+from tests.synthetic_world import World, drive
+
+from engram.graph.graph import ExperienceGraph
+from engram.graph.paths import PathMemory
+from engram.localiser import Position
+from engram.maps import Map
+from engram.ranking import POLICIES
+from engram.robot import Settings
+from engram.robot.localisers import localiser_in
+
+WORLD = World(30.0)
+ROAD = np.arange(0.0, 25.0, 0.7)
+
+
+class EnumeratedError(AssertionError):
+    """Somebody asked for all of a map."""
+
+
+def _refuse(name: str) -> property:
+    def asked(_self: object) -> None:
+        raise EnumeratedError(f"{name}: the loop must ask by neighbourhood or id")
+
+    return property(asked)
+
+
+class AskedGraph(ExperienceGraph):
+    """A graph that answers questions about nodes and their surroundings only."""
+
+    nodes = _refuse("nodes")
+    edges = _refuse("edges")
+    edge_ends = _refuse("edge_ends")
+    sessions = _refuse("sessions")
+    driven_m = _refuse("driven_m")
+    experiences = _refuse("experiences")
+    components = _refuse("components")
+    half_edges = _refuse("half_edges")
+    lightest = _refuse("lightest")
+
+
+class AskedPaths(PathMemory):
+    """A path memory that does not say which paths there are."""
+
+    paths = _refuse("paths")
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("town") / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    return path
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES))
+def test_the_localising_loop_enumerates_nothing(town: Path, policy: str) -> None:
+    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
+    with (
+        Map.open(town) as opened,
+        localiser_in(
+            opened, live[0].frame.camera, Settings(), policy=policy, relocaliser=None
+        ) as localiser,
+    ):
+        localiser.place_at(Position.at(opened.graph.node(0).id))
+        opened.graph.__class__, opened.path_memory.__class__ = AskedGraph, AskedPaths
+        found = localised(localiser, live)
+    assert all(one.node is not None for one in found)
+
+
+def test_the_doubles_do_refuse(town: Path) -> None:
+    with Map.open(town) as opened:
+        opened.graph.__class__, opened.path_memory.__class__ = AskedGraph, AskedPaths
+        for asks in (
+            lambda: opened.graph.nodes,
+            lambda: opened.graph.components,
+            lambda: opened.graph.edges,
+            lambda: opened.graph.half_edges(2.0),
+            lambda: opened.path_memory.paths,
+        ):
+            with pytest.raises(EnumeratedError):
+                asks()
