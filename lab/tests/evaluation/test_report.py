@@ -27,8 +27,9 @@ from engram_lab.studies import (
     write_report,
 )
 from engram_lab.studies.configurations import map_sizes, sweep
-from engram_lab.studies.figures import POLICY_COLOURS, draw_figures
 from engram_lab.studies.lockstep import Runs
+from engram_lab.studies.ranking_figures import POLICY_COLOURS, draw_figures
+from engram_lab.studies.ranking_rows import summary_rows
 from engram_lab.studies.store import only, read_runs, write_runs
 from engram_lab.studies.summary import collect
 
@@ -191,7 +192,8 @@ def test_a_policy_has_one_colour_in_all_figures(
         pyplot.close(figure)
 
     monkeypatch.setattr("engram.viewing.curves.save", keep)
-    draw_figures(tmp_path, [collect(plan)])
+    found = collect(plan)
+    draw_figures(tmp_path, [found], summary_rows(found))
     assert looks["recall"] == {("black", "-")}
     assert looks["path-near, matched only"] == {(POLICY_COLOURS["path-near"], "--")}
     for policy in MISSES:
@@ -203,63 +205,66 @@ def test_every_policy_has_a_colour_of_its_own() -> None:
     assert len(set(POLICY_COLOURS.values())) == len(STUDIED)
 
 
-def test_claims_stand_beside_what_was_measured(out: Path) -> None:
-    text = (out / "claims.md").read_text()
-    lines = {line.split(" | ")[0].lstrip("| "): line for line in text.splitlines()}
-    # distance misses 3 blocks, path 1, the oracle none: 3 times the excess.
-    excess = lines[
-        "`distance` ÷ `path-near`, Np = 2: excess over the oracle of route not localised"
-    ]
-    assert "| 5× | 3×, low end > 1.5× | 5× | 3.00× (3.00 … 3.00)" in excess
-    assert (
-        "90.00 %"
-        in lines["nodes truly within 8 m and 60° of a localised robot that are candidates"]
-    )
-    to_bound = lines["`recall`: (route not localised + 0.5 %) ÷ (oracle's + 0.5 %)"]
+@pytest.fixture(scope="module")
+def comparisons(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "comparisons.csv").open() as file:
+        return {row["what"]: row for row in csv.DictReader(file)}
+
+
+def test_what_the_paper_claims_is_compared_on_the_same_sessions(comparisons) -> None:
+    # distance misses 3 blocks of 20, path-near 1, the oracle none: 3 times the excess.
+    excess = comparisons["`distance` ÷ `path-near`, Np = 2: excess over the oracle"]
+    assert [float(excess[one]) for one in ("ratio", "ratio_low", "ratio_high")] == [3.0] * 3
+    near = comparisons["nodes truly within 8 m and 60° of a localised robot that are candidates"]
+    assert float(near["share_a"]) == pytest.approx(0.9)
     # One of 20 blocks against none: 5.5 ÷ 0.5.
-    assert "11.00×" in to_bound
-    for policy in MISSES:
-        assert f"| {policy} | " in text
+    to_bound = comparisons["`recall` ÷ `oracle`: route not localised, 0.5 % added to both"]
+    assert float(to_bound["ratio"]) == pytest.approx(11.0)
+    beaten = comparisons["`recall` against `distance`"]
+    assert float(beaten["share_a"]) == pytest.approx(0.05)
+    assert float(beaten["share_b"]) == pytest.approx(0.15)
+    for end in ("minus_b", "minus_b_low", "minus_b_high"):
+        assert float(beaten[end]) == pytest.approx(-0.1)
+
+
+def test_runs_as_on_a_robot_stand_beside_the_unguided_ones_of_the_same_sessions(
+    comparisons,
+) -> None:
+    assert not [what for what in comparisons if what.startswith("`oracle` as on a robot")]
+    for policy, live, memo in (("distance", 0.15, 0.15), ("path-near", 0.0, 0.05)):
+        row = comparisons[f"`{policy}` as on a robot against unguided, 2 sessions"]
+        assert float(row["share_a"]) == pytest.approx(live)
+        assert float(row["share_b"]) == pytest.approx(memo)
 
 
 def test_several_campaigns_are_pooled(plan: Plan, out: Path, tmp_path: Path) -> None:
-    assert "pooled\n" not in (out / "claims.md").read_text()
-    write_report(tmp_path, [plan, plan])
-    text = (tmp_path / "claims.md").read_text()
-    pooled = text[text.index("## All sessions pooled") :]
+    assert "pooled\n" not in (out / "report.md").read_text()
+    other = replace(plan, drives=replace(plan.drives, name="made-up again"))
+    write_report(tmp_path, [plan, other])
+    with (tmp_path / "comparisons.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["campaign"] == "pooled"]
     # One block of 20 against 3, in every session of both.
-    ten = "\N{MINUS SIGN}10.00"
-    told = f"5.00 % against 15.00 %, difference {ten} ({ten} … {ten}) points"
-    assert f"| `recall` against `distance` | {told} |" in pooled
+    (row,) = [row for row in rows if row["what"] == "`recall` against `distance`"]
+    assert float(row["minus_b"]) == pytest.approx(-0.1)
+    assert "## All sessions pooled" in (tmp_path / "report.md").read_text()
 
 
-def test_sweeps_are_told_as_tables(out: Path) -> None:
-    text = (out / "claims.md").read_text()
-    budgets = text[text.index("Route not localised by the number of lanes") :].splitlines()
-    assert budgets[2] == "| Np | 1 | 2 | 3 | 4 | 6 | 8 | 12 | 16 | unlimited |"
+def test_the_page_shows_every_policy_and_the_sweeps(out: Path) -> None:
+    lines = (out / "report.md").read_text().splitlines()
+    for policy in MISSES:
+        assert any(line.startswith(f"| {policy} | ") for line in lines)
+    at = lines.index("Route not localised by the number of lanes")
+    (distance,) = [line for line in lines[:at] if line.startswith("| distance | ")]
+    assert " | 15.00 % (15.00 … 15.00) | " in distance
+    assert lines[at + 2] == "| label | 1 | 2 | 3 | 4 | 6 | 8 | 12 | 16 | unlimited |"
+    swept = lines[at : lines.index("", at + 2)]
     # 5, 3, 3, 2 … of 20 blocks.
-    distance = "| 25.00 | 15.00 | 15.00 | 10.00 | 10.00 | 10.00 | 10.00 | 10.00 |"
-    rows = budgets[: budgets.index("", 3)]
-    assert f"| distance {distance} 10.00 |" in rows
-    assert f"| distance, Nr = 2 {distance} – |" in rows
-    assert any(row.startswith("| path-near, matched only |") for row in rows)
-    sizes = text[text.index("P(> 10 m) as the map grows, Np = 2") :].splitlines()
-    assert sizes[2].startswith("| sessions in the map (nodes) | 1 (100) | 2 (200) | ")
-    assert sizes[2].endswith(" | all (800) |")
-    assert {row.split(" | ")[0] for row in sizes[4:9]} == {f"| {policy}" for policy in MISSES}
-
-
-def test_guided_runs_stand_beside_the_unguided_ones_of_the_same_sessions(out: Path) -> None:
-    text = (out / "claims.md").read_text()
-    guided = text[text.index("Guided and without memo, as on a robot: 2 sessions") :]
-    rows = {line.split(" | ")[0].lstrip("| "): line for line in guided.splitlines()}
-    assert set(MISSES) - {"oracle"} < set(rows)
-    assert "oracle" not in rows
-    share = "15.00 % (15.00 … 15.00)"
-    assert rows["distance"].startswith(f"| distance | {share} | {share} | ")
-    assert rows["path-near"].startswith(
-        "| path-near | 0.00 % (0.00 … 0.00) | 5.00 % (5.00 … 5.00) | "
-    )
+    shares = "25.00 % | 15.00 % | 15.00 % | 10.00 % | 10.00 % | 10.00 % | 10.00 % | 10.00 % |"
+    assert f"| distance, Nr = 1 | {shares} 10.00 % |" in swept
+    assert any(line.startswith("| path-near, matched only, Nr = 1 |") for line in swept)
+    at = lines.index("P(> 10 m) as the map grows: sessions in the map (nodes)")
+    assert lines[at + 2].startswith("| policy | 1 (100) | 2 (200) | ")
+    assert lines[at + 2].endswith(" | all (800) |")
 
 
 def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path) -> None:
@@ -292,7 +297,7 @@ def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Pat
     assert {len(one.sessions) for one in found.memo.values()} == {SESSIONS}
     assert found.left_out == {unfinished: SESSIONS - 1}
     write_report(tmp_path / "out", [begun])
-    told = (tmp_path / "out" / "claims.md").read_text()
+    told = (tmp_path / "out" / "report.md").read_text()
     assert f"not run on the same {SESSIONS} sessions: distance (Np = 4) on {SESSIONS - 1}." in told
     # Only the folds that have it: there it is shown.
     other = replace(begun, options=replace(begun.options, only_folds=(1,)))
@@ -397,6 +402,6 @@ def test_more_rounds_alone_are_reported_too(plan: Plan, tmp_path: Path) -> None:
             runs = made_up_runs(session, sweep(options.policies, options.lanes, options.rounds))
             write_runs(twice.runs_path(session, "memo"), runs)
     write_report(tmp_path / "out", [twice])
-    text = (tmp_path / "out" / "claims.md").read_text()
+    text = (tmp_path / "out" / "report.md").read_text()
     assert "Np = 2, Nr = 2, T = 10" in text
     assert "| distance | " in text

@@ -232,7 +232,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
     whole = replace(plan, options=options, work=work)
     run(whole)
     files = {path.name for path in write_report(tmp_path / "out", [whole])}
-    assert {"summary.csv", "sessions.csv", "configuration.json", "claims.md"} <= files
+    assert {"summary.csv", "sessions.csv", "configuration.json", "report.md"} <= files
     assert {name.split("_")[0] for name in files if name.endswith(".png")} == {
         "fig09",
         "fig10",
@@ -270,7 +270,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
     )
     assert missed / whole_way == pytest.approx(pooled["oracle"], abs=1e-5)
     assert all(row["ms_per_frame"] for row in rows if row["mode"] == "live")
-    text = (tmp_path / "out" / "claims.md").read_text()
+    text = (tmp_path / "out" / "report.md").read_text()
     assert "`distance` ÷ `path-near`, Np = 2" in text
 
 
@@ -286,7 +286,7 @@ def test_logs_without_truth_are_localised_and_have_no_errors(tmp_path: Path) -> 
         rows = [row for row in csv.DictReader(file) if row["fold"] == "all"]
     assert all(row["median_error_m"] == row["false_successes"] == "" for row in rows)
     assert all(0 < float(row["share_not_localised"]) < 0.6 for row in rows if row["lanes"] == "2")
-    assert "no truth" in (tmp_path / "out" / "claims.md").read_text()
+    assert "no truth" in (tmp_path / "out" / "report.md").read_text()
 
 
 def test_a_drive_with_truth_among_others_without_is_localised(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from engram.viewing import Line as Curve
 from engram.viewing import Panel, draw_curves
 from engram_lab.bench.data import scale_and_crop
 from engram_lab.programs import command_line
-from engram_lab.studies.tables import write_csv
+from engram_lab.studies.pages import write_csv
 from engram_lab.town import SimulatedDrive, campaign_named
 
 MIN_INLIERS = 20

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from engram.frontend.matching import matcher_hash
-from engram.localiser import Budget, FrameMatcher
+from engram.localiser import Budget
 from engram.maps import Map, open_map
 from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.ranking import (
@@ -111,12 +110,7 @@ def record(
     settings = dataclasses.replace(
         settings, localiser=dataclasses.replace(settings.localiser, guide_below_m=0.0)
     )
-    matcher = settings.localiser.matcher
-    memo = MatchMemo(
-        FrameMatcher(opened.frames, matcher),
-        work / f"memo-{drive.name}.npz",
-        matcher_hash(matcher),
-    )
+    memo = MatchMemo.of(opened, drive, settings, work)
     recording, truth, logged = Recording(), drive.truth(), drive.frames()
     first = None if truth is None else truth.at(logged[0].frame.stamp_ns)
     start = None if first is None else true_nodes(opened, known).start(first)

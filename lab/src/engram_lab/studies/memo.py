@@ -17,10 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import Frame
-from engram.frontend.matching import Match
+from engram.frontend.matching import Match, matcher_hash
 from engram.geometry import SE3
 from engram.graph.model import NodeId
-from engram.localiser import Matcher, Prediction, Spread
+from engram.localiser import FrameMatcher, Matcher, Prediction, Spread
+from engram.maps import Map
+from engram.robot import Settings
+from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.store import UNREADABLE
 
 _VERSION = 1
@@ -51,6 +54,13 @@ class MatchMemo:
         self.made = 0
         self.seconds = 0.0
         self._read()
+
+    @staticmethod
+    def of(opened: Map, drive: EvaluatedDrive, settings: Settings, folder: Path) -> MatchMemo:
+        """The memo that is kept in a folder of one drive in maps of the same nodes."""
+        config = settings.localiser.matcher
+        path = folder / f"memo-{drive.key}.matches.npz"
+        return MatchMemo(FrameMatcher(opened.frames, config), path, matcher_hash(config))
 
     @property
     def known(self) -> int:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from engram import __version__
-from engram.config import config_hash, to_dict
+from engram.config import to_dict
 from engram.errors import ConfigError
-from engram.frontend.matching import matcher_hash
-from engram.localiser import METHOD_VERSION, RELOCALISERS, FrameMatcher, Matcher
+from engram.localiser import Matcher
 from engram.maps import Map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.ranking import policy_named
@@ -26,7 +22,6 @@ from engram_lab.studies.building import (
     build_map,
     read_built_map,
     read_record,
-    write_json,
 )
 from engram_lab.studies.configurations import (
     DEFAULT_LANES,
@@ -36,14 +31,14 @@ from engram_lab.studies.configurations import (
     sweep,
 )
 from engram_lab.studies.drives import DriveSet
-from engram_lab.studies.folds import Fold, check_only, chosen, split
+from engram_lab.studies.folds import Fold
 from engram_lab.studies.held_out import localise_held_out
 from engram_lab.studies.kept_maps import KeptMaps
 from engram_lab.studies.lockstep import Runs
 from engram_lab.studies.memo import MatchMemo
+from engram_lab.studies.plan import StudyOptions, StudyPlan, study_folder
 from engram_lab.studies.store import joined, missing, only, read_runs, write_runs
-from engram_lab.studies.tasks import Task, run_tasks
-from engram_lab.studies.writing import alone_in, writing
+from engram_lab.studies.tasks import Task
 
 # Policies that cannot run without knowing the outcomes.
 _BOUNDS = ("oracle",)
@@ -51,48 +46,35 @@ _SMALL_CACHE_BYTES = 4 * 2**20
 
 
 @dataclass(frozen=True, slots=True)
-class RankingOptions:
+class RankingOptions(StudyOptions):
     """What an evaluation of ranking policies runs.
 
     Attributes:
         policies: names of ranking policies.
         lanes, rounds: Np and Nr.
-        folds: of the cross-validation.
-        seed: of the shuffle of sessions and of the bootstrap.
         map_sizes: whether earlier revisions are run too ([L15] Fig. 9).
         live_folds: folds whose sessions are also run guided and without memo, at Np = 2: that
             confirms the order of policies and gives milliseconds per frame.
-        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near (SPEC §8).
         build: how the maps are built.
-        only_folds: numbers of the folds that are run; empty for all. What is run of the others
-            later joins it.
     """
 
     policies: tuple[str, ...] = STUDIED
     lanes: tuple[int, ...] = DEFAULT_LANES
     rounds: tuple[int, ...] = (1, 2)
-    folds: int = 5
-    seed: int = 0
     map_sizes: bool = True
     live_folds: int = 1
-    relocaliser: str | None = None
     build: RobotOptions = field(default_factory=lambda: GENEROUS)
-    only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
+        StudyOptions.__post_init__(self)
         for name in ("policies", "lanes", "rounds", "only_folds"):
             once = tuple(dict.fromkeys(getattr(self, name)))
             object.__setattr__(self, name, once)  # what is named twice is run once
         for policy in self.policies:
             policy_named(policy)  # refuses what is none
-        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
-            raise ConfigError(
-                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
-            )
         for name, values in (("lanes", self.lanes), ("rounds", self.rounds)):
             if not values or min(values) < 1:
                 raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")
-        check_only(self.only_folds, self.folds)
 
     @property
     def few_lanes(self) -> int:
@@ -101,30 +83,8 @@ class RankingOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """All that a worker needs to know.
-
-    Attributes:
-        drives: what is evaluated.
-        settings: the resolved configuration.
-        options: what is run.
-        work: folder of maps, memos and results.
-    """
-
-    drives: DriveSet
-    settings: Settings
-    options: RankingOptions
-    work: Path
-
-    @property
-    def folds(self) -> tuple[Fold, ...]:
-        """The divisions of the drives."""
-        return split(len(self.drives.drives), self.options.folds, self.options.seed)
-
-    @property
-    def run_folds(self) -> tuple[Fold, ...]:
-        """Those that are run now."""
-        return chosen(self.folds, self.options.only_folds)
+class Plan(StudyPlan[RankingOptions]):
+    """All that a worker needs to know."""
 
     def map_path(self, fold: Fold) -> Path:
         """The map built from a fold's training sessions."""
@@ -138,21 +98,6 @@ class Plan:
         with_it = "" if self.options.relocaliser is None else f"-{self.options.relocaliser}"
         return self.work / f"{mode}{with_it}-{self.drives.drives[session].key}.npz"
 
-    def configuration(self) -> dict[str, Any]:
-        """The resolved configuration, kept with the results."""
-        return {
-            "campaign": self.drives.name,
-            "drives": [one.name for one in self.drives.drives],
-            "drives_hash": self.drives.hash,
-            "with_truth": self.drives.has_truth,
-            "folds": [to_dict(one) for one in self.folds],
-            "settings": to_dict(self.settings),
-            "options": to_dict(self.options),
-            "matcher": matcher_hash(self.settings.localiser.matcher),
-            "machine": platform.machine(),
-            "engram": __version__,
-        }
-
 
 def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, work: Path) -> Plan:
     """A plan; its folder below `work` depends on all that its maps and results depend on.
@@ -160,21 +105,9 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
     More policies, lanes or relocalisers may be run later, and find there what was done.
     """
     settings = settings.for_descriptor(drives.drives[0].descriptor)
-    depends = (
-        drives.hash,
-        to_dict(settings),
-        to_dict(options.build),
-        options.folds,
-        options.seed,
-        matcher_hash(settings.localiser.matcher),
-        METHOD_VERSION,
-        __version__,
-    )
-    folder = work / f"{file_name(drives.name)}-{config_hash(depends)}"
-    plan = Plan(drives, settings, options, folder)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "configuration.json", plan.configuration())
+    depends = (drives.hash, to_dict(options.build), options.folds, options.seed)
+    plan = Plan(drives, settings, options, study_folder(work, drives.name, depends, settings))
+    plan.begin()
     return plan
 
 
@@ -194,13 +127,7 @@ def run(plan: Plan, workers: int = 1, monitor: Monitor = QUIET) -> None:
         MapLockedError: another run works in the same folder.
         InputError: a drive cannot be read, or results cannot be written.
     """
-    try:
-        with writing(plan.work), alone_in(plan.work):
-            tasks = _tasks(plan)
-            with monitor.stage(f"evaluate {plan.drives.name}", len(tasks)) as part:
-                run_tasks(tasks, workers, part)
-    finally:
-        _earlier_maps.close()
+    plan.run(_tasks(plan), workers, monitor, _earlier_maps.close)
 
 
 def _tasks(plan: Plan) -> list[Task]:
@@ -235,8 +162,7 @@ def forget(plan: Plan, policies: Sequence[str]) -> None:
 
 
 def _build(plan: Plan, fold: Fold) -> None:
-    drives = [plan.drives.drives[number] for number in fold.training]
-    build_map(plan.map_path(fold), drives, plan.settings, plan.options.build)
+    build_map(plan.map_path(fold), plan.training(fold), plan.settings, plan.options.build)
 
 
 def _run_session(plan: Plan, fold: Fold, session: int) -> None:
@@ -257,12 +183,7 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
     built = read_built_map(plan.map_path(fold))
     # The newest map's landmarks: earlier revisions have no others.
     with open_map(built.path) as newest:
-        config = plan.settings.localiser.matcher
-        memo = MatchMemo(
-            FrameMatcher(newest.frames, config),
-            plan.work / f"memo-{drive.key}.matches.npz",
-            matcher_hash(config),
-        )
+        memo = MatchMemo.of(newest, drive, plan.settings, plan.work)
         frames = drive.frames()
         run_one = partial(_run_in, plan, fold, session, frames, memo)
         if whole:
@@ -314,17 +235,12 @@ def _run_in(
         opened,
         plan.drives.drives[session],
         frames,
-        [plan.drives.drives[number] for number in fold.training],
+        plan.training(fold),
         configurations,
         plan.settings,
         matcher,
         plan.options.relocaliser,
     )
-
-
-def file_name(name: str) -> str:
-    """A name without what file systems do not like."""
-    return "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
 
 
 def built_map(plan: Plan, fold: Fold) -> BuiltMap:

@@ -20,7 +20,6 @@ from engram_lab.intervals import (
     SessionSums,
     failure_sums,
     not_localised_sums,
-    product,
 )
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import BuiltMap
@@ -36,9 +35,6 @@ from engram_lab.studies.running import Plan, built_map
 from engram_lab.studies.store import read_runs
 
 Array = NDArray[np.float64]
-
-# Where failure curves are drawn.
-CURVE_AT_M = np.arange(0.0, 50.5, 0.5)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,34 +98,6 @@ class ConfigurationResult:
         parts = [failure_sums(one, np.array([at_m]), estimator) for one in self.drives]
         return SessionSums(np.array([p[0][0] for p in parts]), np.array([p[1] for p in parts]))
 
-    def curve(
-        self,
-        resamples: Resamples,
-        estimator: Estimator = Estimator.ROUTE,
-        *,
-        scaled: bool = False,
-    ) -> tuple[Array, Array, Array]:
-        """P(X ≥ x) at `CURVE_AT_M` with the ends of its interval, (X,) each.
-
-        Args:
-            resamples: draws of sessions.
-            estimator: of P.
-            scaled: times the share of the route that is not localised (SPEC §8).
-        """
-        parts = [failure_sums(one, CURVE_AT_M, estimator) for one in self.drives]
-        below = np.array([part[1] for part in parts])
-        sums = [
-            SessionSums(np.array([part[0][k] for part in parts]), below)
-            for k in range(len(CURVE_AT_M))
-        ]
-        missed = self.not_localised
-        bands = [resamples.interval(product(one, missed) if scaled else one) for one in sums]
-        return (
-            np.array([band.estimate for band in bands]),
-            np.array([band.low for band in bands]),
-            np.array([band.high for band in bands]),
-        )
-
     @property
     def attempts_per_frame(self) -> float:
         """Match attempts ÷ frames."""
@@ -158,12 +126,6 @@ class ConfigurationResult:
         """Successes more than 1 m or 5° off; None where truth is not known."""
         errors = self.errors
         return int(errors.false.sum()) if len(errors.offset_m) else None
-
-    @property
-    def false_share(self) -> float | None:
-        """False successes ÷ successes with known truth; None where there are none."""
-        errors = self.errors
-        return float(errors.false.mean()) if len(errors.offset_m) else None
 
     @property
     def step_ms(self) -> float:

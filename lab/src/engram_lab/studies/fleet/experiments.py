@@ -28,8 +28,7 @@ from engram_lab.studies.fleet.steps import (
 )
 from engram_lab.studies.fleet.trials import try_downloads_for
 from engram_lab.studies.folds import Fold
-from engram_lab.studies.tasks import Task, run_tasks
-from engram_lab.studies.writing import alone_in, writing
+from engram_lab.studies.tasks import Task
 
 SINGLE = "single"
 DOCKED = "docked"
@@ -57,13 +56,7 @@ def run_fleet(plan: FleetPlan, workers: int = 1, monitor: Monitor = QUIET) -> No
         MapLockedError: another run works in the same folder.
         InputError: a drive cannot be read, or results cannot be written.
     """
-    try:
-        with writing(plan.work), alone_in(plan.work):
-            tasks = fleet_tasks(plan)
-            with monitor.stage(f"evaluate {plan.drives.name}", len(tasks)) as part:
-                run_tasks(tasks, workers, part)
-    finally:
-        kept_maps.close()
+    plan.run(fleet_tasks(plan), workers, monitor, kept_maps.close)
 
 
 def fleet_tasks(plan: FleetPlan) -> list[Task]:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from engram.measures import Drive, route_not_localised
 from engram.viewing import Line, Panel, draw_bars, draw_curves
-from engram_lab.intervals import Resamples, SessionSums, failure_sums
+from engram_lab.intervals import Resamples
+from engram_lab.studies.curves import CURVE_AT_M, failure_line
 from engram_lab.studies.fleet.experiments import SHARED, SINGLE, merged_name
 from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS
 from engram_lab.studies.fleet.results import ArmResult, FoldResult, Time
 from engram_lab.studies.fleet.trials import TriedDownload
 
 Array = NDArray[np.float64]
-_CURVE_AT_M = np.arange(0.0, 50.5, 0.5)
 _LEAST_PERCENT = 0.01
 _P = "P(X ≥ x), %"
 
@@ -103,19 +103,7 @@ def _held_out_panel(arm: ArmResult, names: dict[str, str]) -> Panel:
 
 
 def _curve(label: str, drives: Sequence[Drive], seed: int) -> Line:
-    """P(X ≥ x) with a 90 % band over sessions."""
-    resamples = Resamples.of(len(drives), seed=seed)
-    parts = [failure_sums(one, _CURVE_AT_M) for one in drives]
-    below = np.array([part[1] for part in parts])
-    bands = [
-        resamples.interval(SessionSums(np.array([part[0][k] for part in parts]), below))
-        for k in range(len(_CURVE_AT_M))
-    ]
-    y, low, high = (
-        100 * np.array([getattr(band, end) for band in bands])
-        for end in ("estimate", "low", "high")
-    )
-    return Line(label, _CURVE_AT_M, y, low, high, marks=False)
+    return failure_line(label, drives, Resamples.of(len(drives), seed=seed))
 
 
 def _robots(arm: ArmResult) -> Panel:
@@ -170,7 +158,7 @@ def _in_field(arm: ArmResult) -> Panel:
 def _downloads(arm: ArmResult) -> Panel:
     """Held-out drives in downloads for their own hours; not every policy has one for every drive.
 
-    Without bands: of seven curves they would hide each other. Paired intervals are in `claims.md`.
+    Without bands: of seven curves they would hide each other. Paired intervals are in `report.md`.
     """
     trials = arm.trials()
     most = max((len(tried) for tried in trials.values()), default=0)
@@ -193,7 +181,7 @@ def _orders(arm: ArmResult) -> Panel:
             y = 100 * np.array(one["reported"])
             last = place == len(found["orders"]) - 1
             label = "chosen on validation" if last else "other orders"
-            lines.append(Line(label, _CURVE_AT_M, y, marks=False))
+            lines.append(Line(label, CURVE_AT_M, y, marks=False))
     return Panel(_title(arm), "x, m", _P, lines, least_y=_LEAST_PERCENT)
 
 

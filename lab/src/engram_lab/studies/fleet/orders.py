@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from engram.fleet.build import JudgeOptions, find_best_order
-from engram.frontend.matching import matcher_hash
-from engram.localiser import FrameMatcher
 from engram.maps import Map
 from engram.measures import Drive
 from engram.monitor import QUIET
 from engram.robot import DriveSequence, RobotOptions, Settings, session_of_drive
 from engram_lab.studies.configurations import Configuration
-from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm
 from engram_lab.studies.fleet.plan import FleetPlan
 from engram_lab.studies.fleet.records import write_record
@@ -36,7 +33,8 @@ class _Judge:
     ) -> Drive:
         """See `JudgeOptions.localise`."""
         drive = self._drives[session_of_drive(sequence).id]
-        memo = self._memo(opened, drive, settings)
+        folder = self._plan.folder(self._arm, self._fold)
+        memo = MatchMemo.of(opened, drive, settings, folder)
         configuration = Configuration(options.policy, options.lanes, options.rounds)
         runs = localise_held_out(
             opened, drive, drive.frames(), self._plan.training(self._fold), [configuration],
@@ -44,14 +42,6 @@ class _Judge:
         )  # fmt: skip
         memo.save()
         return Drive(runs.step_m, runs.matched[0])
-
-    def _memo(self, opened: Map, drive: EvaluatedDrive, settings: Settings) -> MatchMemo:
-        config = settings.localiser.matcher
-        return MatchMemo(
-            FrameMatcher(opened.frames, config),
-            self._plan.folder(self._arm, self._fold) / f"memo-{drive.key}.matches.npz",
-            matcher_hash(config),
-        )
 
 
 def try_orders(plan: FleetPlan, arm: Arm, fold: Fold, names: Sequence[str]) -> None:

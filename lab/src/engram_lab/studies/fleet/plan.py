@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from engram import __version__
-from engram.config import config_hash, to_dict
+from engram.config import to_dict
 from engram.errors import ConfigError
-from engram.frontend.matching import matcher_hash
-from engram.localiser import METHOD_VERSION, RELOCALISERS
 from engram.robot import Settings
-from engram_lab.studies.building import write_json
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 from engram_lab.studies.fleet.arms import ARMS, Arm
-from engram_lab.studies.folds import Fold, check_only, chosen, split
-from engram_lab.studies.running import file_name
-from engram_lab.studies.writing import writing
+from engram_lab.studies.folds import Fold
+from engram_lab.studies.plan import StudyOptions, StudyPlan, study_folder
 
 EXPERIMENTS = (7, 8, 9, 10)
 # Raise it whenever maps are merged otherwise, or more is recorded of maps and merges: studies of
@@ -36,35 +30,29 @@ FORAY_POLICIES = ("copy", "tod", "tod+paths")
 
 
 @dataclass(frozen=True, slots=True)
-class FleetOptions:
+class FleetOptions(StudyOptions):
     """What a fleet study runs.
 
     Attributes:
         arms: keys of `ARMS`.
         experiments: numbers of [G16]'s figures.
-        folds: of the cross-validation.
-        seed: of the shuffle of sessions and of the bootstrap.
         groups: k of the parallel build.
         more_groups: further k, on the first fold, to see how far more of them go.
         order_groups: how many groups are merged in all orders. 4: [G16] §VI-E.
         tried: held-out drives of each fold that downloads are tried out on; None for all.
-        relocaliser: key of `RELOCALISERS`; None for none.
-        only_folds: numbers of the folds that are run; empty for all. What is run of the others
-            later joins it.
+        relocaliser: as of every study, but by default lost robots are found.
     """
 
     arms: tuple[str, ...] = ("A", "B", "C")
     experiments: tuple[int, ...] = EXPERIMENTS
-    folds: int = 5
-    seed: int = 0
     groups: int = 4
     more_groups: tuple[int, ...] = (2, 8)
     order_groups: int = 4
     tried: int | None = None
-    relocaliser: str | None = "fabmap"
-    only_folds: tuple[int, ...] = ()
+    relocaliser: str | None = field(default="fabmap", kw_only=True)
 
     def __post_init__(self) -> None:
+        StudyOptions.__post_init__(self)
         for name, given, known in (
             ("arms", self.arms, tuple(ARMS)),
             ("experiments", self.experiments, EXPERIMENTS),
@@ -74,11 +62,6 @@ class FleetOptions:
                 raise ConfigError(
                     f"{name} are {given}, must be some of {', '.join(map(str, known))}"
                 )
-        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
-            raise ConfigError(
-                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
-            )
-        check_only(self.only_folds, self.folds)
         if min(self.groups, *self.more_groups, self.order_groups) < 2:
             raise ConfigError(
                 f"groups are {self.groups}, {self.more_groups} and {self.order_groups} for the "
@@ -122,30 +105,8 @@ class Protocol:
 
 
 @dataclass(frozen=True, slots=True)
-class FleetPlan:
-    """All that a worker needs to know.
-
-    Attributes:
-        drives: what is evaluated.
-        settings: the resolved configuration.
-        options: what is run.
-        work: folder of maps and results.
-    """
-
-    drives: DriveSet
-    settings: Settings
-    options: FleetOptions
-    work: Path
-
-    @property
-    def folds(self) -> tuple[Fold, ...]:
-        """The divisions of the drives."""
-        return split(len(self.drives.drives), self.options.folds, self.options.seed)
-
-    @property
-    def run_folds(self) -> tuple[Fold, ...]:
-        """Those that are run now."""
-        return chosen(self.folds, self.options.only_folds)
+class FleetPlan(StudyPlan[FleetOptions]):
+    """All that a worker needs to know."""
 
     @property
     def arms(self) -> tuple[Arm, ...]:
@@ -155,14 +116,6 @@ class FleetPlan:
     def folder(self, arm: Arm, fold: Fold) -> Path:
         """Where one arm's maps and results of one fold lie."""
         return self.work / f"arm-{arm.letter}" / f"fold{fold.number}"
-
-    def training(self, fold: Fold) -> list[EvaluatedDrive]:
-        """In the order of time."""
-        return [self.drives.drives[number] for number in fold.training]
-
-    def held_out(self, fold: Fold) -> list[EvaluatedDrive]:
-        """In the order of time."""
-        return [self.drives.drives[number] for number in fold.held_out]
 
     def protocol(self, fold: Fold) -> Protocol:
         """Numbers of logs."""
@@ -203,17 +156,9 @@ class FleetPlan:
     def configuration(self) -> dict[str, Any]:
         """The resolved configuration, kept with the results."""
         return {
-            "campaign": self.drives.name,
-            "drives": [one.name for one in self.drives.drives],
-            "drives_hash": self.drives.hash,
-            "folds": [to_dict(one) for one in self.folds],
+            **StudyPlan.configuration(self),
             "protocol": [to_dict(self.protocol(one)) for one in self.folds],
-            "settings": to_dict(self.settings),
-            "options": to_dict(self.options),
             "arms": [to_dict(one) for one in self.arms],
-            "matcher": matcher_hash(self.settings.localiser.matcher),
-            "machine": platform.machine(),
-            "engram": __version__,
         }
 
 
@@ -228,25 +173,12 @@ def make_fleet_plan(
         ConfigError: too few drives for the protocols.
     """
     settings = settings.for_descriptor(drives.drives[0].descriptor)
-    depends = (
-        drives.hash,
-        to_dict(settings),
-        options.folds,
-        options.seed,
-        options.relocaliser,
-        matcher_hash(settings.localiser.matcher),
-        METHOD_VERSION,
-        _MERGING_VERSION,
-        __version__,
-    )
-    plan = FleetPlan(
-        drives, settings, options, work / f"fleet-{file_name(drives.name)}-{config_hash(depends)}"
-    )
+    depends = (drives.hash, options.folds, options.seed, options.relocaliser, _MERGING_VERSION)
+    folder = study_folder(work, f"fleet-{drives.name}", depends, settings)
+    plan = FleetPlan(drives, settings, options, folder)
     for fold in plan.folds:
         plan.protocol(fold)  # raises where there are too few
-    with writing(plan.work):
-        plan.work.mkdir(parents=True, exist_ok=True)
-        write_json(plan.work / "configuration.json", plan.configuration())
+    plan.begin()
     return plan
 
 

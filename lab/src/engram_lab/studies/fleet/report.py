@@ -2,23 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from engram_lab.studies.building import write_json
-from engram_lab.studies.fleet.claims import fleet_claims_page
+from engram_lab.studies.fleet.comparisons import comparison_rows
 from engram_lab.studies.fleet.figures import draw_fleet_figures
 from engram_lab.studies.fleet.plan import FleetPlan
 from engram_lab.studies.fleet.records import read_json
 from engram_lab.studies.fleet.results import ArmResult
 from engram_lab.studies.fleet.stages import stages_path
 from engram_lab.studies.fleet.tables import fleet_rows, order_rows, session_rows
-from engram_lab.studies.tables import write_csv
-from engram_lab.studies.writing import writing
+from engram_lab.studies.pages import COMPARED, Row, chosen, table, write_study
+
+_TITLES = {
+    7: "Building side by side (Fig. 7)",
+    8: "Sharing (Fig. 8)",
+    9: "Taking a part (Fig. 9)",
+    10: "Orders of merging (Fig. 10)",
+}
+_COLUMNS = {
+    "arm": "arm",
+    "map": "map",
+    "nodes": "nodes",
+    "share_of_nodes": "of all nodes",
+    "united_share_of_nodes": "united with the robot's own",
+    "share_not_localised": "route not localised",
+    "expected_missed": "forecast",
+    "p_gt_5m": "P(> 5 m)",
+    "p_gt_10m": "P(> 10 m)",
+    "ms_per_frame": "ms per frame",
+    "sessions": "drives",
+}
 
 
 def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
-    """Tables, figures, claims and the resolved configuration, from what was run so far.
+    """Tables, comparisons, figures, the page and the resolved configuration, of what was run.
 
     Args:
         out: the folder; made if need be, files in it are replaced.
@@ -32,15 +50,66 @@ def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
         MissingExtraError: Matplotlib is not installed; the tables are written by then.
     """
     arms = [ArmResult(plan, arm) for plan in plans for arm in plan.arms]
-    names = ("summary.csv", "sessions.csv", "orders.csv", "configuration.json", "claims.md")
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        write_csv(out / "summary.csv", [row for arm in arms for row in fleet_rows(arm)])
-        write_csv(out / "sessions.csv", [row for arm in arms for row in session_rows(arm)])
-        write_csv(out / "orders.csv", [row for arm in arms for row in order_rows(arm)])
-        write_json(out / "configuration.json", [_configuration(plan) for plan in plans])
-        (out / "claims.md").write_text(fleet_claims_page(arms), encoding="utf-8")
-        return [out / name for name in names] + draw_fleet_figures(out, arms)
+    tables = {
+        "summary": [row for arm in arms for row in fleet_rows(arm)],
+        "sessions": [row for arm in arms for row in session_rows(arm)],
+        "orders": [row for arm in arms for row in order_rows(arm)],
+        "comparisons": [row for arm in arms for row in comparison_rows(arm)],
+    }
+    return write_study(
+        out,
+        tables,
+        _page(arms, tables["summary"], tables["comparisons"]),
+        [_configuration(plan) for plan in plans],
+        lambda folder: draw_fleet_figures(folder, arms),
+    )
+
+
+def _page(
+    arms: Sequence[ArmResult], rows: Sequence[Row], comparisons: Sequence[Row]
+) -> Iterator[str]:
+    for name in dict.fromkeys(arm.plan.drives.name for arm in arms):
+        own = [arm for arm in arms if arm.plan.drives.name == name]
+        yield from (f"## {name}", "", _protocol(own[0]), "")
+        yield from (_medians(arm) for arm in own if arm.stages is not None)
+        for number, title in _TITLES.items():
+            # The orders are tried on one fold; all else is pooled.
+            fold = "0" if number == 10 else "all"
+            shown = chosen(rows, campaign=name, experiment=number, fold=fold)
+            claims = chosen(comparisons, campaign=name, experiment=number)
+            if shown or claims:
+                yield from ("", f"### {title}", "")
+                columns = {
+                    key: words
+                    for key, words in _COLUMNS.items()
+                    if any(row.get(key) is not None for row in shown)
+                }
+                yield from table(shown, columns)
+                yield from table(claims, {"arm": "arm", **COMPARED, "drives": "drives"})
+
+
+def _protocol(arm: ArmResult) -> str:
+    """How many logs there were: [G16]'s protocols are scaled to them."""
+    fold = arm.plan.folds[0]
+    protocol, groups = arm.plan.protocol(fold), arm.plan.groups(fold, arm.plan.options.groups)
+    return (
+        f"{len(arm.plan.drives.drives)} drives, {arm.plan.options.folds} folds, "
+        f"{len(fold.training)} training drives in the first; {len(groups)} groups of "
+        f"{len(groups[-1])} to {len(groups[0])} (Fig. 7); forays of {protocol.foray} (7 in the "
+        f"paper; Figs. 8 and 9); groups of {protocol.group} (9 in the paper) for the orders, "
+        f"chosen on {protocol.validation} validation drives (Fig. 10). Saving, front-end and "
+        "odometry are not counted: every drive passes through them once whichever way a map is "
+        "built. Shares are of the route that is not localised; intervals are 90 % over sessions."
+    )
+
+
+def _medians(arm: ArmResult) -> str:
+    assert arm.stages is not None
+    return (
+        f"- Arm {arm.arm.letter}, {arm.arm.words}: medians on one core {arm.stages.frame_ms:.2f} "
+        f"ms a frame, {arm.stages.attempt_ms:.2f} ms an attempt, {arm.stages.proposed_ms:.2f} ms "
+        f"one of a lost robot at a proposed node, {arm.stages.lookup_ms:.2f} ms a look-up."
+    )
 
 
 def _configuration(plan: FleetPlan) -> dict[str, object]:

@@ -12,10 +12,8 @@ from pathlib import Path
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, DownloadReport, download
 from engram.fleet.merge import merge as merge_maps
-from engram.frontend.matching import matcher_hash
 from engram.graph.clock import hour_of_day
 from engram.graph.model import path_id
-from engram.localiser import FrameMatcher
 from engram.maps import Map, copy_map
 from engram.robot import MapReport, measured
 from engram_lab.studies.building import build_map
@@ -189,7 +187,6 @@ def localise_in(
     plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive, names: Sequence[str]
 ) -> None:
     """Localises a held-out drive in several maps; what they have in common is matched once."""
-    config = plan.settings.localiser.matcher
     frames = None
     for name in names:
         path = runs_path(plan, arm, fold, name, drive)
@@ -198,11 +195,7 @@ def localise_in(
             continue
         frames = frames or drive.frames()
         opened = kept_maps.open(map_path(plan, arm, fold, name))
-        memo = MatchMemo(
-            FrameMatcher(opened.frames, config),
-            plan.folder(arm, fold) / f"memo-{drive.key}.matches.npz",
-            matcher_hash(config),
-        )
+        memo = MatchMemo.of(opened, drive, plan.settings, plan.folder(arm, fold))
         runs = localise_held_out(
             opened, drive, frames, plan.training(fold), wanted, plan.settings, memo,
             plan.options.relocaliser,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import Any
 
 import numpy as np
 
@@ -21,9 +20,9 @@ from engram_lab.studies.fleet.results import (
     total,
 )
 from engram_lab.studies.fleet.trials import TriedDownload
+from engram_lab.studies.pages import Row
 from engram_lab.studies.summary import ConfigurationResult, SessionResult
 
-Row = dict[str, Any]
 _AT_M = (5.0, 10.0, 20.0)
 
 

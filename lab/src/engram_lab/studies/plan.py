@@ -1,0 +1,137 @@
+"""What both studies are: drives in folds, settings, options, and a folder of what was made."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from engram import __version__
+from engram.config import config_hash, to_dict
+from engram.errors import ConfigError
+from engram.frontend.matching import matcher_hash
+from engram.localiser import METHOD_VERSION, RELOCALISERS
+from engram.monitor import Monitor
+from engram.robot import Settings
+from engram_lab.studies.building import write_json
+from engram_lab.studies.drives import DriveSet, EvaluatedDrive
+from engram_lab.studies.folds import Fold, check_only, chosen, split
+from engram_lab.studies.tasks import Task, run_tasks
+from engram_lab.studies.writing import alone_in, writing
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyOptions:
+    """What every study is asked.
+
+    Attributes:
+        folds: of the cross-validation.
+        seed: of the shuffle of sessions and of the bootstrap.
+        relocaliser: key of `RELOCALISERS`; None for none.
+        only_folds: numbers of the folds that are run; empty for all. What is run of the others
+            later joins it.
+    """
+
+    folds: int = 5
+    seed: int = 0
+    relocaliser: str | None = None
+    only_folds: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
+            raise ConfigError(
+                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+            )
+        check_only(self.only_folds, self.folds)
+
+
+Options = TypeVar("Options", bound=StudyOptions)
+
+
+@dataclass(frozen=True, slots=True)
+class StudyPlan(Generic[Options]):
+    """All that a worker needs to know.
+
+    Attributes:
+        drives: what is evaluated.
+        settings: the resolved configuration.
+        options: what is run.
+        work: folder of maps and results.
+    """
+
+    drives: DriveSet
+    settings: Settings
+    options: Options
+    work: Path
+
+    @property
+    def folds(self) -> tuple[Fold, ...]:
+        """The divisions of the drives."""
+        return split(len(self.drives.drives), self.options.folds, self.options.seed)
+
+    @property
+    def run_folds(self) -> tuple[Fold, ...]:
+        """Those that are run now."""
+        return chosen(self.folds, self.options.only_folds)
+
+    def training(self, fold: Fold) -> list[EvaluatedDrive]:
+        """In the order of time."""
+        return [self.drives.drives[number] for number in fold.training]
+
+    def held_out(self, fold: Fold) -> list[EvaluatedDrive]:
+        """In the order of time."""
+        return [self.drives.drives[number] for number in fold.held_out]
+
+    def configuration(self) -> dict[str, Any]:
+        """The resolved configuration, kept with the results."""
+        return {
+            "campaign": self.drives.name,
+            "drives": [one.name for one in self.drives.drives],
+            "drives_hash": self.drives.hash,
+            "with_truth": self.drives.has_truth,
+            "folds": [to_dict(one) for one in self.folds],
+            "settings": to_dict(self.settings),
+            "options": to_dict(self.options),
+            "matcher": matcher_hash(self.settings.localiser.matcher),
+            "machine": platform.machine(),
+            "engram": __version__,
+        }
+
+    def begin(self) -> None:
+        """Makes the folder, and notes there what it is for."""
+        with writing(self.work):
+            self.work.mkdir(parents=True, exist_ok=True)
+            write_json(self.work / "configuration.json", self.configuration())
+
+    def run(
+        self,
+        tasks: Sequence[Task],
+        workers: int,
+        monitor: Monitor,
+        close: Callable[[], None],
+    ) -> None:
+        """Runs the tasks of a study, alone in its folder; `close` is called at the end."""
+        try:
+            with (
+                writing(self.work),
+                alone_in(self.work),
+                monitor.stage(f"evaluate {self.drives.name}", len(tasks)) as part,
+            ):
+                run_tasks(tasks, workers, part)
+        finally:
+            close()
+
+
+def study_folder(work: Path, name: str, depends: Sequence[Any], settings: Settings) -> Path:
+    """A folder that depends on all that a study's maps and results depend on."""
+    everything = (
+        *depends,
+        to_dict(settings),
+        matcher_hash(settings.localiser.matcher),
+        METHOD_VERSION,
+        __version__,
+    )
+    plain = "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)
+    return work / f"{plain}-{config_hash(everything)}"
