@@ -1,4 +1,4 @@
-"""What `engram evaluate` refuses, and how it takes its arguments."""
+"""What `engram lab evaluate` refuses, and how it takes its arguments."""
 
 from pathlib import Path
 

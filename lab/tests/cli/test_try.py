@@ -1,4 +1,4 @@
-"""`engram try` as its users meet it."""
+"""`engram lab try` as its users meet it."""
 
 from __future__ import annotations
 

@@ -317,11 +317,11 @@ def test_what_cannot_be_evaluated_is_refused(tmp_path: Path) -> None:
         few_options(policies=("nearest",))
     with pytest.raises(ConfigError, match="lanes are"):
         few_options(lanes=())
-    with pytest.raises(SequenceError, match=r"engram simulate hamlet --seed 2"):
+    with pytest.raises(SequenceError, match=r"engram lab simulate hamlet --seed 2"):
         open_campaign("hamlet@2", tmp_path)
     with pytest.raises(ConfigError, match="must be a whole number"):
         open_campaign("hamlet@second", tmp_path)
-    with pytest.raises(SequenceError, match="engram extract"):
+    with pytest.raises(SequenceError, match="engram record"):
         drives_of([tmp_path / "images"])
     one = write_campaign(tmp_path / "logs", (0,)).drives[0]
     with pytest.raises(SequenceError, match="same drive"):

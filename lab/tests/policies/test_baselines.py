@@ -27,11 +27,11 @@ class TestOracle:
         assert order_of("oracle", context) == [4, 2, 1, 0, 3]
 
     def test_a_drive_is_refused(self) -> None:
-        with pytest.raises(ConfigError, match="engram evaluate"):
+        with pytest.raises(ConfigError, match="engram lab evaluate"):
             RobotOptions(policy="oracle")
 
     def test_a_context_without_foresight_is_refused(self) -> None:
-        with pytest.raises(ConfigError, match="engram evaluate"):
+        with pytest.raises(ConfigError, match="engram lab evaluate"):
             policy_named("oracle").rank(make_context(candidates=[0]))
 
 

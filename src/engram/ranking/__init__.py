@@ -66,7 +66,7 @@ def check_for_robot(name: str) -> None:
     if looks_ahead(policy_named(name)):
         raise ConfigError(
             f"the policy {name} knows what will match, which only an evaluation can tell; use it "
-            "in engram evaluate, and another policy for a drive"
+            "in engram lab evaluate, and another policy for a drive"
         )
 
 

@@ -1,4 +1,4 @@
-"""What `engram bench` measured."""
+"""What `engram lab bench` measured."""
 
 from __future__ import annotations
 

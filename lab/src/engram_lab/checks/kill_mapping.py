@@ -32,6 +32,7 @@ from sqlalchemy.engine import Engine
 from engram.monitor import Advancing
 from engram.robot import map_drive, open_drive
 from engram.maps.session_writer import SessionWriter
+from engram_lab.there_and_back import ThereAndBack
 
 @event.listens_for(Engine, "commit")
 def about_to_commit(connection):

@@ -17,6 +17,7 @@ from engram.cli import options
 from engram_lab.cli.lists import numbers
 
 if TYPE_CHECKING:
+    from engram.robot import Settings
     from engram_lab.studies import DriveSet
 
 evaluate = typer.Typer(
@@ -62,7 +63,7 @@ class _Study:
     config: options.Settings = None
     as_json: options.Json = False
 
-    def drive_sets(self) -> list[DriveSet]:
+    def drive_sets(self, settings: Settings) -> list[DriveSet]:
         """Each name of a campaign is one; all frame logs together are one."""
         from engram.errors import ConfigError
         from engram_lab.studies import DriveSet, drives_of, open_campaign
@@ -74,7 +75,7 @@ class _Study:
             raise ConfigError(f"campaign {twice[0]!r} is given twice; give it once")
         logs = [Path(one) for one in self.drives if one not in names]
         folder = self.campaigns or campaigns_folder()
-        sets = [open_campaign(name, folder, Size.named(self.size)) for name in names]
+        sets = [open_campaign(name, folder, Size.named(self.size), settings) for name in names]
         if logs:
             sets.append(DriveSet(logs[0].resolve().parent.name or "logs", drives_of(logs)))
         return sets
@@ -200,7 +201,7 @@ def ranking(
     )
     again = _redone(redo, asked.policies, report_only=study.report_only)
     started, settings = time.perf_counter(), load_settings(study.config)
-    plans = [make_plan(one, settings, asked, study.folder) for one in study.drive_sets()]
+    plans = [make_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)]
     for plan in [] if study.report_only else plans:
         forget(plan, again)
         run(plan, study.workers, Bars())
@@ -275,7 +276,9 @@ def fleet(
         only_folds=study.chosen_folds,
     )
     started, settings = time.perf_counter(), load_settings(study.config)
-    plans = [make_fleet_plan(one, settings, asked, study.folder) for one in study.drive_sets()]
+    plans = [
+        make_fleet_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)
+    ]
     for plan in [] if study.report_only else plans:
         run_fleet(plan, study.workers, Bars())
     study.tell(write_fleet_report(out, plans), started)

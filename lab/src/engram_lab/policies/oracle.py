@@ -24,7 +24,7 @@ class OraclePolicy:
         if context.foresee is None:
             raise ConfigError(
                 "the policy oracle must be told what would match, and this context cannot tell; "
-                "use it in engram evaluate, and another policy for a drive"
+                "use it in engram lab evaluate, and another policy for a drive"
             )
         known = context.foresee()
         return order_by(context, ~known.accepted, -known.inliers)

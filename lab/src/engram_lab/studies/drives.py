@@ -11,14 +11,15 @@ from shlex import quote
 
 from engram.config import config_hash
 from engram.errors import ConfigError, SequenceError
-from engram.frontend import DescriptorKind
+from engram.frontend import DescriptorKind, Frontend
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Session
-from engram.robot import session_of_drive
+from engram.robot import Settings, session_of_drive
 from engram.sequences import FrameLog, LoggedFrame
 from engram.sequences.trajectories import Trajectory, read_truth, truth_path
 from engram_lab.town import Campaign, Size, campaign_named
 from engram_lab.town.simulating import campaign_folder
+from engram_lab.town.upkeep import bring_up_to_date
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,13 +120,16 @@ class DriveSet:
         )
 
 
-def open_campaign(text: str, campaigns: Path, size: Size = Size.STANDARD) -> DriveSet:
+def open_campaign(
+    text: str, campaigns: Path, size: Size = Size.STANDARD, settings: Settings | None = None
+) -> DriveSet:
     """A rendered campaign, by ``NAME`` or ``NAME@SEED`` of its town.
 
     Args:
         text: such as ``begbroke`` or ``village@2``.
         campaigns: folder below which campaigns were rendered.
         size: of the campaign.
+        settings: of front-end and odometry; sessions of the same front-end get this odometry.
 
     Raises:
         ConfigError: there is no such campaign.
@@ -142,10 +146,15 @@ def open_campaign(text: str, campaigns: Path, size: Size = Size.STANDARD) -> Dri
     if missing:
         raise SequenceError(
             f"campaign {text!r}: {len(missing)} of {len(paths)} sessions are not rendered (the "
-            f"first is {missing[0]}); run: engram simulate {campaign.home} --seed "
+            f"first is {missing[0]}); run: engram lab simulate {campaign.home} --seed "
             f"{campaign.seed} --size {size.value} --out {quote(str(campaigns))}"
         )
-    return DriveSet(text, drives_of(paths))
+    settings = settings or Settings()
+    drives, frontend = drives_of(paths), Frontend(settings.frontend).hash
+    same = [one.path for one in drives if one.frontend == frontend]
+    if sum(bring_up_to_date(path, settings) for path in same):
+        drives = drives_of(paths)
+    return DriveSet(text, drives)
 
 
 def campaign_logs(campaign: Campaign, campaigns: Path) -> list[Path]:
@@ -183,9 +192,7 @@ def _drive(path: Path) -> EvaluatedDrive:
     log = FrameLog(path)
     try:
         if not log.complete:
-            raise SequenceError(
-                f"{path}: was not recorded to its end; give the same extract or simulate again"
-            )
+            raise SequenceError(f"{path}: was not recorded to its end; give the same command again")
         drive = EvaluatedDrive(
             path,
             session_of_drive(log),
