@@ -86,14 +86,15 @@ def session_record(number: int, hour: float | None = None, day: int = 0) -> Sess
 class MadeUpWords:
     """Words of nodes and frames as a test says; nodes that it leaves out show none."""
 
-    def __init__(self, of_nodes: dict[int, list[int]], count: int = 50) -> None:
+    def __init__(self, graph, of_nodes: dict[int, list[int]], count: int = 50) -> None:
         self.idf = np.linspace(1.0, 2.0, count)
-        self._of_nodes = of_nodes
+        known = {node: shown for node, shown in of_nodes.items() if node < len(graph)}
+        self._of_nodes = {graph.node(node).id: shown for node, shown in known.items()}
 
     def of_frame(self, frame: object) -> np.ndarray:
         raise NotImplementedError("contexts hold the live words themselves")
 
-    def of_node(self, node: int) -> np.ndarray:
+    def of_node(self, node: NodeId) -> np.ndarray:
         return np.array(self._of_nodes.get(node, []), np.int32)
 
 
@@ -206,7 +207,7 @@ def make_context(
         background=Background(
             {record.id: record for record in records},
             lessons_of(graph, lessons),
-            None if words is None else MadeUpWords(words),
+            None if words is None else MadeUpWords(graph, words),
         ),
         live_words=None if live_words is None else lambda: np.array(sorted(live_words), np.int32),
     )

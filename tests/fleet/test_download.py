@@ -22,7 +22,7 @@ from engram.frontend import BRIEF
 from engram.graph.model import EdgeKind, path_id
 from engram.maps import Map, check_file, copy_map
 from engram.places import default_vocabulary
-from engram.places.stored_words import keep_missing_words, stored_words
+from engram.places.words import NodeWords
 
 from .robots import DAY_NS, WORLD, merged
 
@@ -142,12 +142,13 @@ def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
     copy_map(centre, keeping)
     with Map.open(keeping, writes=True) as store:
         nodes = [node.id for node in store.load().nodes]
-        assert not stored_words(store, vocabulary)
-        keep_missing_words(store, vocabulary, nodes)
-        kept = stored_words(store, vocabulary)
+        words = NodeWords.of_map(store, vocabulary)
+        assert not words.kept
+        words.keep_missing(nodes)
+        kept = NodeWords.of_map(store, vocabulary).kept
     sent(keeping, tmp_path / "after.engram", "tod", start_h=9.0)
     with Map.open(tmp_path / "after.engram") as store:
-        went = stored_words(store, vocabulary)
+        went = NodeWords.of_map(store, vocabulary).kept
     assert set(went) == node_ids(tmp_path / "after.engram")
     assert all(np.array_equal(words, kept[node]) for node, words in went.items())
     assert (tmp_path / "before.engram").read_bytes() == (tmp_path / "after.engram").read_bytes()

@@ -45,7 +45,7 @@ def test_mutual_information_is_that_of_the_entropies() -> None:
 def test_the_tree_has_the_greatest_information_of_all_trees(seed: int) -> None:
     images = drawn_images(seed)
     shown = table(images, 14)
-    found = learn_statistics(images, 14, lambda share: None)
+    found = learn_statistics(images, 14)
     total = sum(
         information(shown[:, q], shown[:, p]) for q, p in enumerate(found.parents) if p >= 0
     )
@@ -62,15 +62,15 @@ def test_the_tree_has_the_greatest_information_of_all_trees(seed: int) -> None:
 
 def test_blocks_make_no_difference(monkeypatch) -> None:
     images = drawn_images(3)
-    whole = learn_statistics(images, 14, lambda share: None)
+    whole = learn_statistics(images, 14)
     monkeypatch.setattr(chow_liu, "_BLOCK", 4)
-    assert np.array_equal(whole.parents, learn_statistics(images, 14, lambda share: None).parents)
+    assert np.array_equal(whole.parents, learn_statistics(images, 14).parents)
 
 
 def test_counts_are_counts() -> None:
     images = drawn_images(4)
     shown = table(images, 14)
-    found = learn_statistics(images, 14, lambda share: None)
+    found = learn_statistics(images, 14)
     assert found.images == 40
     assert np.array_equal(found.seen, shown.sum(axis=0))
     for q, p in enumerate(found.parents):
@@ -80,4 +80,4 @@ def test_counts_are_counts() -> None:
 
 def test_words_never_seen_and_words_always_seen_are_roots() -> None:
     images = [np.array([0, 2], np.int32), np.array([2], np.int32)]
-    assert learn_statistics(images, 4, lambda share: None).parents.tolist() == [-1] * 4
+    assert learn_statistics(images, 4).parents.tolist() == [-1] * 4

@@ -28,9 +28,7 @@ def distances(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def grown(descriptors: np.ndarray, words: int, depth: int, seed: int = 1) -> TreeArrays:
-    return grow_tree(
-        descriptors, words, depth, iterations=20, seed=seed, advance=lambda share: None
-    )
+    return grow_tree(descriptors, words, depth, iterations=20, seed=seed)
 
 
 def test_groups_that_lie_apart_do_not_share_a_word() -> None:

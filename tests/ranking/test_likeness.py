@@ -12,7 +12,7 @@ from engram.errors import MapCorruptError
 from engram.frontend import BRIEF, Frame
 from engram.graph.model import NodeId
 from engram.places import default_vocabulary
-from engram.ranking import QuantisedWords
+from engram.places.words import NodeWords
 from engram.ranking.likeness import likenesses, standard_likenesses
 from engram.ranking.recall import RECALL, RecallPolicy
 
@@ -29,9 +29,10 @@ def cosine(idf: np.ndarray, a: list[int], b: list[int]) -> float:
 
 @given(WORDS, st.lists(WORDS, max_size=6))
 def test_it_is_the_cosine_with_each_node(live: list[int], shown: list[list[int]]) -> None:
-    words = MadeUpWords({node: sorted(one) for node, one in enumerate(shown)})
+    graph = flat_graph(max(len(shown), 1))
+    words = MadeUpWords(graph, {node: sorted(one) for node, one in enumerate(shown)})
     expected = [cosine(words.idf, live, one) for one in shown]
-    nodes = np.arange(len(shown), dtype=np.int32)
+    nodes = [graph.node(node).id for node in range(len(shown))]
     found = likenesses(words, np.array(sorted(live), np.int32), nodes)
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
@@ -81,6 +82,8 @@ class _Unreadable:
 
 
 def test_a_node_that_cannot_be_read_shows_nothing() -> None:
-    words = QuantisedWords(flat_graph(2), _Unreadable(), lambda: default_vocabulary(BRIEF))
+    words = NodeWords(_Unreadable(), lambda: default_vocabulary(BRIEF))
     words.prepare()
-    assert len(words.of_node(1)) == 0
+    node = flat_graph(2).node(1).id
+    assert words.of_node(node) is None
+    assert likenesses(words, np.array([3], np.int32), [node]).tolist() == [0.0]

@@ -12,8 +12,9 @@ from tests.synthetic_world import World, drive
 from engram.errors import IncompatibleError, InputError
 from engram.frontend import BRIEF, TEBLID
 from engram.maps import Map, open_map
+from engram.monitor import Monitor
 from engram.places import TrainingConfig, default_vocabulary, encode_vocabulary
-from engram.places.stored_words import keep_missing_words, stored_words, vocabulary_of
+from engram.places.words import NodeWords, vocabulary_of
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram.robot.localisers import relocaliser_in
 from engram.robot.vocabularies import train_map_vocabulary, use_vocabulary
@@ -33,7 +34,7 @@ def path(tmp_path: Path) -> Path:
 def fill(path: Path) -> int:
     with Map.open(path, writes=True) as store:
         nodes = [node.id for node in store.load().nodes]
-        return keep_missing_words(store, VOCABULARY, nodes)
+        return NodeWords.of_map(store, VOCABULARY).keep_missing(nodes)
 
 
 def count_nodes(path: Path) -> int:
@@ -59,7 +60,7 @@ def test_words_are_worked_out_once(path: Path) -> None:
 def test_they_are_those_of_the_landmarks(path: Path) -> None:
     fill(path)
     with Map.open(path) as store:
-        kept = stored_words(store, VOCABULARY)
+        kept = NodeWords.of_map(store, VOCABULARY).kept
         for node in store.load().nodes:
             frame = store.frames.frame(node.id)
             assert (
@@ -97,27 +98,29 @@ def test_mapping_keeps_the_words_of_what_it_saves_and_of_what_was_there(
     with Map.open(path) as store:
         nodes = {node.id for node in store.load().nodes}
         assert len(nodes) >= before + 10
-        assert stored_words(store, VOCABULARY).keys() == nodes
+        assert NodeWords.of_map(store, VOCABULARY).kept.keys() == nodes
 
 
 def test_training_and_taking_a_vocabulary_fill_in_words(path: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.engram"
     map_simulated(other, drive(ROAD, np.arange(0, 10, 1.0)), name="r2")
-    told: list[str] = []
+    stages: list[str] = []
 
-    def advance(what: str, share: float) -> None:
-        told.append(what)
+    class Heard(Monitor):
+        def stage(self, what: str, total: int):
+            stages.append(what)
+            return super().stage(what, total)
 
     config = TrainingConfig(words=50, iterations=2)
-    trained = train_map_vocabulary(path, [], config, author="a", advance=advance)
-    taken = use_vocabulary(other, path, author="a", advance=advance)
+    trained = train_map_vocabulary(path, [], config, author="a", monitor=Heard())
+    taken = use_vocabulary(other, path, author="a", monitor=Heard())
     assert trained.hash == taken.hash
-    assert told[-1] == "words"
+    assert stages == ["read", "cluster", "quantise", "relate", "words", "words"]
     for one in (path, other):
         with Map.open(one) as opened:
             assert opened.vocabulary is not None
-            assert len(stored_words(opened, vocabulary_of(opened))) == count_nodes(one)
-    again = use_vocabulary(other, path, author="a", advance=advance)
+            assert len(NodeWords.of_map(opened, vocabulary_of(opened)).kept) == count_nodes(one)
+    again = use_vocabulary(other, path, author="a", monitor=Heard())
     assert again.revision is None
 
 
@@ -125,15 +128,15 @@ def test_a_vocabulary_that_cannot_be_used_is_refused(path: Path, tmp_path: Path)
     teblid = tmp_path / "teblid.safetensors"
     teblid.write_bytes(encode_vocabulary(default_vocabulary(TEBLID)))
     with pytest.raises(IncompatibleError, match="teblid"):
-        use_vocabulary(path, teblid, author="a", advance=lambda *_: None)
+        use_vocabulary(path, teblid, author="a")
     with pytest.raises(InputError, match="no vocabulary of its own"):
-        use_vocabulary(path, path, author="a", advance=lambda *_: None)
+        use_vocabulary(path, path, author="a")
     junk = tmp_path / "junk"
     junk.write_bytes(b"junk")
     with pytest.raises(InputError, match="junk"):
-        use_vocabulary(path, junk, author="a", advance=lambda *_: None)
+        use_vocabulary(path, junk, author="a")
     with pytest.raises(InputError, match="absent"):
-        use_vocabulary(path, tmp_path / "absent", author="a", advance=lambda *_: None)
+        use_vocabulary(path, tmp_path / "absent", author="a")
 
 
 def test_lost_robots_are_found_by_kept_words_as_by_fresh_ones(path: Path) -> None:

@@ -16,7 +16,7 @@ from engram.graph.model import NodeId
 from engram.maps import Map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.places import BagOfWords
-from engram.places.stored_words import stored_words, vocabulary_or_default
+from engram.places.words import vocabulary_or_default, words_of
 
 # Edges are about a metre long; what is within so many of them may well look alike.
 _SURROUNDINGS_EDGES = 15
@@ -112,16 +112,10 @@ def write_confusion_picture(file: Path, confusion: Confusion) -> None:
 
 def _words(opened: Map) -> list[NDArray[np.int32]]:
     """Of each node, kept in the map or worked out from its landmarks."""
-    vocabulary = vocabulary_or_default(opened, BRIEF)
-    kept = stored_words(opened, vocabulary)
-    found = []
-    for node in opened.graph.nodes:
-        words = kept.get(node.id)
-        if words is None:
-            frame = opened.frames.frame(node.id)
-            words = vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
-        found.append(words)
-    return found
+    words = opened.derived(words_of, BRIEF)
+    nothing = np.zeros(0, np.int32)
+    found = [words.of_node(node.id) for node in opened.graph.nodes]
+    return [nothing if one is None else one for one in found]
 
 
 def _surroundings(graph: ExperienceGraph, index: int) -> list[int]:

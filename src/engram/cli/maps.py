@@ -178,37 +178,25 @@ def vocabulary(
       engram vocabulary show town.engram --json
     """
     from engram.cli.history import user
-    from engram.cli.progress import progress
+    from engram.cli.progress import Bars
     from engram.errors import InputError
     from engram.places import TrainingConfig
     from engram.robot.vocabularies import describe_vocabulary, train_map_vocabulary, use_vocabulary
 
     if action is VocabularyAction.SHOW:
         report = describe_vocabulary(map_path, at)
+    elif action is VocabularyAction.USE:
+        if not sources or len(sources) != 1:
+            raise InputError(
+                "use needs one map, or one vocabulary file, to copy from: "
+                "engram vocabulary use MAP SOURCE"
+            )
+        report = use_vocabulary(map_path, sources[0], author=user(), monitor=Bars())
     else:
-        steps: tuple[str, ...] = ("read", "cluster", "quantise", "relate", "words")
-        if action is VocabularyAction.USE:
-            steps = ("words",)
-            if not sources or len(sources) != 1:
-                raise InputError(
-                    "use needs one map, or one vocabulary file, to copy from: "
-                    "engram vocabulary use MAP SOURCE"
-                )
-        with progress(action.value, 100 * len(steps)) as advance:  # of 100 % each
-            done = dict.fromkeys(steps, 0)
-
-            def advance_to(what: str, share: float) -> None:
-                for _ in range(done[what], int(100 * share)):
-                    advance(what)
-                done[what] = max(done[what], int(100 * share))
-
-            if action is VocabularyAction.USE and sources:
-                report = use_vocabulary(map_path, sources[0], author=user(), advance=advance_to)
-            else:
-                config = TrainingConfig(words=words)
-                report = train_map_vocabulary(
-                    map_path, sources or [], config, author=user(), advance=advance_to
-                )
+        config = TrainingConfig(words=words)
+        report = train_map_vocabulary(
+            map_path, sources or [], config, author=user(), monitor=Bars()
+        )
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

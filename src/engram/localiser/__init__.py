@@ -20,7 +20,6 @@ from engram.localiser.localisation import (
     StageClock,
 )
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
-from engram.localiser.place_book import PlaceBook, Searched
 from engram.localiser.relocalisation import (
     RELOCALISERS,
     ByAppearance,
@@ -50,11 +49,9 @@ __all__ = [
     "LocaliserConfig",
     "Matcher",
     "PlaceBelief",
-    "PlaceBook",
     "Position",
     "Prediction",
     "Relocaliser",
-    "Searched",
     "Spread",
     "StageClock",
     "accept",

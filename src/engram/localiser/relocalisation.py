@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.frontend import Frame
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
 from engram.localiser.belief import PlaceBelief
-from engram.localiser.place_book import PlaceBook, Searched
 from engram.places import RECOGNISERS, PlaceRecogniser, Vocabulary
+from engram.places.book import PlaceBook
+from engram.places.words import NodeWords
 
 # Neighbours in the order of saving show the same place: where one was not matched, others of that
 # place mostly are not either. Source: nodes are saved every metre, and matched up to 3 to 4 m away.
@@ -76,8 +78,9 @@ class Exhaustive:
     name = "exhaustive"
     new_place = None
 
-    def __init__(self, searched: Searched) -> None:
-        self._graph = searched.graph
+    def __init__(self, graph: ExperienceGraph, words: NodeWords) -> None:
+        del words  # it does without
+        self._graph = graph
         self._order: list[int] = []
         self._next = 0
 
@@ -109,21 +112,23 @@ class ByAppearance:
     not the whole budget.
 
     Args:
-        searched: the map; its words are read when this is made.
+        graph: the nodes; may grow.
+        words: their words, read when this is made.
         name: key in `RELOCALISERS`.
         recogniser: makes the recogniser for a vocabulary.
     """
 
     def __init__(
         self,
-        searched: Searched,
+        graph: ExperienceGraph,
+        words: NodeWords,
         name: str,
         recogniser: Callable[[Vocabulary], PlaceRecogniser],
     ) -> None:
         self.name = name
-        self.book = PlaceBook(searched, recogniser)
+        self.book = PlaceBook(graph, words, recogniser)
         self.new_place: float | None = None
-        self._belief = PlaceBelief(searched.graph)
+        self._belief = PlaceBelief(graph)
         self._frames_seen = 0
         self._tried: dict[int, int] = {}
 
@@ -189,7 +194,7 @@ def van_der_corput_order(count: int) -> list[int]:
     return [number for number in reversed_numbers if number < count]
 
 
-RELOCALISERS: dict[str, Callable[[Searched], Relocaliser]] = {
+RELOCALISERS: dict[str, Callable[[ExperienceGraph, NodeWords], Relocaliser]] = {
     Exhaustive.name: Exhaustive,
     **{
         name: partial(ByAppearance, name=name, recogniser=recogniser)

@@ -30,7 +30,6 @@ from engram.graph.neighbourhood import Search
 from engram.localiser import (
     AcceptanceConfig,
     Matcher,
-    PlaceBook,
     Position,
     Prediction,
     accept_lost,
@@ -38,6 +37,7 @@ from engram.localiser import (
     best_places,
     spread,
 )
+from engram.places.book import PlaceBook
 
 # Places of which those to attempt are chosen, apart from each other.
 _SHORTLIST = 256

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from queue import Full, Queue
 from threading import Thread
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from engram.errors import MapError
 from engram.frontend import Frame
 from engram.graph.model import Attempt, Edge, Node, NodeId, PathEntry
+from engram.places.words import NodeWords
 
 # Frames that may wait to be written, about 40 MB of them: past that a slow disk slows the drive.
 _QUEUE_LENGTH = 1000
@@ -25,19 +26,6 @@ class FrameHolder(Protocol):
     def hold(self, node: NodeId, frame: Frame) -> None:
         """Keeps a frame readable until its node has been written."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class NodeWords:
-    """How the words of saved nodes are found, which are kept with them.
-
-    Attributes:
-        vocabulary: hash of the vocabulary.
-        words_of: the distinct words (n,) of a frame, rising.
-    """
-
-    vocabulary: bytes
-    words_of: Callable[[Frame], NDArray[np.int32]]
 
 
 class RecordWriter(Protocol):
@@ -98,7 +86,7 @@ class Saver:
         writer: where the records go.
         frames: keeps frames readable until they are written.
         checkpoint_every: live frames between two checkpoints; what a crash may lose.
-        words: how the words of nodes are found; None keeps none.
+        words: those of saved nodes, which are kept with them; None keeps none.
         waits: whether a full queue holds up the caller; else it is an error.
     """
 
@@ -171,8 +159,8 @@ class Saver:
         if records.node is not None and records.frame is not None:
             self.writer.add_node(records.node, records.frame)
             if self.words is not None:
-                found = self.words.words_of(records.frame)
-                self.writer.add_words(records.node.id, self.words.vocabulary, found)
+                found = self.words.of_frame(records.frame)
+                self.writer.add_words(records.node.id, self.words.hash, found)
         for edge in records.edges:
             self.writer.add_edge(edge)
         for entry in records.path_entries:

@@ -7,13 +7,14 @@ IJRR 27(6), 2008, §4.3.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+from engram.monitor import QUIET, Monitor
 
 # Words whose rows of the mutual information are held at a time: 40 MB at 10,000 words.
 _BLOCK = 512
@@ -41,7 +42,7 @@ class WordStatistics:
 
 
 def learn_statistics(
-    images: list[NDArray[np.int32]], words: int, advance: Callable[[float], None]
+    images: list[NDArray[np.int32]], words: int, monitor: Monitor = QUIET
 ) -> WordStatistics:
     """Counts words and grows the tree of the greatest total mutual information.
 
@@ -52,19 +53,21 @@ def learn_statistics(
     Args:
         images: the distinct words (n,) of each training image.
         words: size of the vocabulary, W.
-        advance: called now and then with the share of the work that is done, 0…1.
+        monitor: sees the stage `relate`, one item a block of rows.
     """
     shown = _occurrences(images, words)
     seen = np.asarray(shown.sum(axis=0), dtype=np.int32)
     by_word = shown.T.tocsr()
     forest: csr_array = csr_array((words, words))
-    for first in range(0, words, _BLOCK):
-        rows = np.arange(first, min(first + _BLOCK, words))
-        both = (by_word[rows] @ shown).toarray()
-        information = mutual_information(both, seen[rows, None], seen[None, :], len(images))
-        information[np.arange(words) <= rows[:, None]] = 0  # each pair once
-        forest = _strongest(forest, information, first)
-        advance((rows[-1] + 1) / words)
+    blocks = range(0, words, _BLOCK)
+    with monitor.stage("relate", len(blocks)) as stage:
+        for first in blocks:
+            rows = np.arange(first, min(first + _BLOCK, words))
+            both = (by_word[rows] @ shown).toarray()
+            information = mutual_information(both, seen[rows, None], seen[None, :], len(images))
+            information[np.arange(words) <= rows[:, None]] = 0  # each pair once
+            forest = _strongest(forest, information, first)
+            stage.advance()
     parents = _rooted(forest, seen)
     return WordStatistics(len(images), seen, parents, _with_parent(by_word, parents))
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.errors import ConfigError, InputError
+from engram.config import check_bounds
+from engram.errors import InputError
 from engram.frontend import DescriptorKind
+from engram.monitor import QUIET, Monitor
 from engram.places.chow_liu import learn_statistics
 from engram.places.tree import grow_tree
 from engram.places.vocabulary import Vocabulary
-
-Advance = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,29 +34,16 @@ class TrainingConfig:
         seed: of all that is drawn.
     """
 
-    words: int = 10_000
-    depth: int = 3
-    beam: int = 2
-    iterations: int = 10
-    descriptors: int = 1_000_000
-    samples: int = 100
-    seed: int = 0
+    words: Annotated[int, Meta(ge=2, le=65_536)] = 10_000
+    depth: Annotated[int, Meta(ge=1, le=6)] = 3
+    beam: Annotated[int, Meta(ge=1, le=8)] = 2
+    iterations: Annotated[int, Meta(ge=1, le=1000)] = 10
+    descriptors: Annotated[int, Meta(ge=2, le=100_000_000)] = 1_000_000
+    samples: Annotated[int, Meta(ge=1, le=10_000)] = 100
+    seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
 
     def __post_init__(self) -> None:
-        limits = {
-            "words": (2, 65_536),
-            "depth": (1, 6),
-            "beam": (1, 8),
-            "iterations": (1, 1000),
-            "descriptors": (2, 100_000_000),
-            "samples": (1, 10_000),
-            "seed": (0, 2**31 - 1),
-        }
-        for name, (least, most) in limits.items():
-            if not least <= getattr(self, name) <= most:
-                raise ConfigError(
-                    f"vocabulary: {name} is {getattr(self, name)}, must be {least} to {most}"
-                )
+        check_bounds(self)
 
 
 def train_vocabulary(
@@ -63,7 +52,7 @@ def train_vocabulary(
     config: TrainingConfig | None = None,
     *,
     trained_on: str = "",
-    advance: Advance | None = None,
+    monitor: Monitor = QUIET,
 ) -> Vocabulary:
     """Clusters descriptors to words and learns which words come together.
 
@@ -75,13 +64,12 @@ def train_vocabulary(
         kind: their kind.
         config: settings.
         trained_on: kept in the vocabulary, for people.
-        advance: called now and then with what is done and the share of it, 0…1.
+        monitor: sees the stages cluster, quantise and relate.
 
     Raises:
         InputError: fewer descriptors than words.
     """
     config = config or TrainingConfig()
-    advance = advance or _ignore
     total = sum(len(frame) for frame in frames)
     if total < config.words:
         raise InputError(
@@ -98,20 +86,16 @@ def train_vocabulary(
         config.depth,
         iterations=config.iterations,
         seed=config.seed,
-        advance=lambda share: advance("cluster", share),
+        monitor=monitor,
     )
     search = tree.searchable()
     images = []
-    for at, frame in enumerate(frames):
-        images.append(np.unique(search.quantise(frame, config.beam)))
-        advance("quantise", (at + 1) / len(frames))
-    statistics = learn_statistics(images, tree.words, lambda share: advance("relate", share))
+    with monitor.stage("quantise", len(frames)) as stage:
+        for frame in frames:
+            images.append(np.unique(search.quantise(frame, config.beam)))
+            stage.advance()
+    statistics = learn_statistics(images, tree.words, monitor)
     usable = [at for at, image in enumerate(images) if len(image)]
     drawn = rng.choice(usable, min(config.samples, len(usable)), replace=False)
     samples = tuple(images[at] for at in np.sort(drawn))
     return Vocabulary(kind, tree, statistics, samples, config.beam, trained_on)
-
-
-def _ignore(what: str, share: float) -> None:
-    """For callers that do not want to know."""
-    del what, share

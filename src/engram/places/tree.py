@@ -7,7 +7,6 @@ model, 2013 (k-majority).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.errors import InputError
+from engram.monitor import QUIET, Monitor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ def grow_tree(
     *,
     iterations: int,
     seed: int,
-    advance: Callable[[float], None],
+    monitor: Monitor = QUIET,
 ) -> TreeArrays:
     """Clusters descriptors level by level until there are as many leaves as words are wanted.
 
@@ -73,31 +73,28 @@ def grow_tree(
         depth: levels below the root.
         iterations: at most so many of Lloyd's iterations for each cluster.
         seed: of the first centres.
-        advance: called now and then with the share of the work that is done, 0…1.
+        monitor: sees the stage `cluster`, one item a cluster.
     """
     branching = round(words ** (1 / depth))
     # Clusters of the level above, each the rows of its members, in the order of its siblings.
     clusters = [np.arange(len(descriptors))]
     levels: list[NDArray[np.uint8]] = [np.zeros((1, descriptors.shape[1]), np.uint8)]
     children: list[NDArray[np.int64]] = []
-    for level in range(depth):
-        sizes = np.array([len(cluster) for cluster in clusters])
-        last = level == depth - 1
-        wanted = _shared_out(words, sizes) if last else np.full(len(sizes), branching)
-        found: list[NDArray[np.uint8]] = []
-        counts = np.zeros(len(clusters), np.int64)
-        below: list[NDArray[np.int64]] = []
-        done = 0
-        for at, (cluster, k) in enumerate(zip(clusters, wanted, strict=True)):
-            centres, parts = _split(descriptors, cluster, int(k), iterations, seed + len(children))
-            found.append(centres)
-            counts[at] = len(centres)
-            below += parts
-            done += len(cluster)
-            advance((level + done / len(descriptors)) / depth)
-        levels.append(np.concatenate(found))
-        children.append(counts)
-        clusters = below
+    with monitor.stage("cluster", sum(branching**level for level in range(depth))) as stage:
+        for level in range(depth):
+            sizes = np.array([len(cluster) for cluster in clusters])
+            last = level == depth - 1
+            wanted = _shared_out(words, sizes) if last else np.full(len(sizes), branching)
+            found: list[NDArray[np.uint8]] = []
+            below: list[NDArray[np.int64]] = []
+            for cluster, k in zip(clusters, wanted, strict=True):
+                centres, parts = _split(descriptors, cluster, int(k), iterations, seed + level)
+                found.append(centres)
+                below += parts
+                stage.advance()
+            levels.append(np.concatenate(found))
+            children.append(np.array([len(centres) for centres in found]))
+            clusters = below
     children.append(np.zeros(len(clusters), np.int64))
     bounds = np.concatenate([[1], 1 + np.cumsum(np.concatenate(children))])
     return TreeArrays(np.concatenate(levels), bounds.astype(np.int32))

@@ -21,7 +21,6 @@ from engram.ranking.reasons import Reasons, reasons_of
 from engram.ranking.recall import RecallPolicy
 from engram.ranking.recent import IterationUnit, Observations, RecentAttempts, RecentConfig
 from engram.ranking.run import RunAttempts, RunLog
-from engram.ranking.words import QuantisedWords, WordSource
 
 POLICIES: dict[str, Callable[[], RankingPolicy]] = {
     PathPolicy.name: PathPolicy,
@@ -77,7 +76,6 @@ __all__ = [
     "IterationUnit",
     "Lessons",
     "Observations",
-    "QuantisedWords",
     "RankingContext",
     "RankingPolicy",
     "Reasons",
@@ -85,7 +83,6 @@ __all__ = [
     "RecentConfig",
     "RunAttempts",
     "RunLog",
-    "WordSource",
     "check_for_robot",
     "policy_named",
     "policy_names",

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from engram.graph.model import Session, SessionId
+from engram.places.words import NodeWords
 from engram.ranking.lessons import Lessons
-from engram.ranking.words import WordSource
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,4 +22,4 @@ class Background:
 
     sessions: Mapping[SessionId, Session] = field(default_factory=dict)
     lessons: Lessons = field(default_factory=Lessons.none)
-    words: WordSource | None = None
+    words: NodeWords | None = None

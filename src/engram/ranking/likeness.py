@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.graph.model import NodeId
+from engram.places.words import NodeWords
 from engram.ranking.context import RankingContext
-from engram.ranking.words import WordSource
 
 
 def likenesses(
-    words: WordSource, live: NDArray[np.int32], nodes: NDArray[np.int32]
+    words: NodeWords, live: NDArray[np.int32], nodes: Sequence[NodeId]
 ) -> NDArray[np.float64]:
     """(Y,) cosine, 0…1, of the idf-weighted set of words of a frame with that of each node.
 
     Args:
         words: knows the nodes' words.
         live: (n,) int32, the distinct words of the frame.
-        nodes: (Y,) int32, dense node indices.
+        nodes: Y nodes; damaged ones show nothing.
     """
     weights = words.idf**2
     seen = np.zeros(len(weights))
     seen[live] = weights[live]
-    sets = [words.of_node(node) for node in nodes.tolist()]
-    met = np.concatenate([*sets, np.zeros(0, np.int32)])
+    nothing = np.zeros(0, np.int32)
+    found = [words.of_node(node) for node in nodes]
+    sets = [nothing if one is None else one for one in found]
+    met = np.concatenate([*sets, nothing])
     place = np.repeat(np.arange(len(sets)), [len(one) for one in sets])
     shared, whole = (
         np.bincount(place, values[met], minlength=len(sets)) for values in (seen, weights)
@@ -40,7 +45,8 @@ def standard_likenesses(context: RankingContext) -> NDArray[np.float64]:
     words, nodes = context.background.words, context.neighbourhood.nodes
     if words is None or context.live_words is None or len(nodes) == 0:
         return np.zeros(len(nodes))
-    alike = likenesses(words, context.live_words(), nodes)
+    ids = [context.graph.node(node).id for node in nodes.tolist()]
+    alike = likenesses(words, context.live_words(), ids)
     alike -= alike.mean()
     deviation = alike.std()
     return alike / deviation if deviation > 1e-9 else np.zeros(len(nodes))

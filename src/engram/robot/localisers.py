@@ -21,14 +21,12 @@ from engram.localiser import (
     Localiser,
     Matcher,
     Relocaliser,
-    Searched,
 )
 from engram.maps import Map
-from engram.places.stored_words import stored_words, vocabulary_or_default
+from engram.places.words import words_of
 from engram.ranking import (
     Background,
     Lessons,
-    QuantisedWords,
     RankingPolicy,
     policy_named,
     uses_words,
@@ -112,24 +110,7 @@ def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Reloca
     """
     if name not in RELOCALISERS:
         raise ConfigError(f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}")
-    return RELOCALISERS[name](
-        Searched(
-            opened.graph,
-            opened.frames,
-            lambda: vocabulary_or_default(opened, descriptor),
-            lambda vocabulary: stored_words(opened, vocabulary),
-        )
-    )
-
-
-def words_of(opened: Map, descriptor: DescriptorKind) -> QuantisedWords:
-    """The words of its nodes and of live frames of this kind: for `Map.derived`."""
-    return QuantisedWords(
-        opened.graph,
-        opened.frames,
-        lambda: vocabulary_or_default(opened, descriptor),
-        lambda vocabulary: stored_words(opened, vocabulary),
-    )
+    return RELOCALISERS[name](opened.graph, opened.derived(words_of, descriptor))
 
 
 def drives_of(opened: Map) -> dict[SessionId, Session]:

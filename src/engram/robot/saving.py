@@ -6,19 +6,16 @@ import platform
 from contextlib import ExitStack, nullcontext
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from engram import __version__
 from engram.config import to_dict
-from engram.frontend import DescriptorKind, Frame
+from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.graph.model import Session
 from engram.localiser import ByAppearance, FrameMatcher, Localiser
-from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeWords, Saver
+from engram.mapper import LoopConfig, LoopSearch, Mapper, Saver
 from engram.maps import Map, Revision, SessionState, SessionWriter
-from engram.places import RECOGNISERS, hash_of
-from engram.places.stored_words import keep_missing_words, vocabulary_or_default
+from engram.places import RECOGNISERS
+from engram.places.words import NodeWords, words_of
 from engram.robot.localisers import drives_of
 from engram.robot.settings import RobotOptions, Settings
 
@@ -132,13 +129,9 @@ def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> Node
     """How the words of saved nodes are found; those that older nodes lack are filled in first."""
     if relocaliser not in RECOGNISERS:
         return None
-    vocabulary = vocabulary_or_default(opened, settings.frontend.descriptor)
-    keep_missing_words(opened, vocabulary, [node.id for node in opened.graph.nodes])
-
-    def words_of(frame: Frame) -> NDArray[np.int32]:
-        return vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
-
-    return NodeWords(hash_of(vocabulary), words_of)
+    words = opened.derived(words_of, settings.frontend.descriptor)
+    words.keep_missing([node.id for node in opened.graph.nodes])
+    return words
 
 
 def loop_search(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from engram.errors import IncompatibleError, InputError, MapCorruptError
 from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus, Frontend
 from engram.graph.model import NodeId
 from engram.maps import Map
+from engram.monitor import QUIET, Monitor
 from engram.places import (
     TrainingConfig,
     Vocabulary,
@@ -24,7 +25,7 @@ from engram.places import (
     hash_of,
     train_vocabulary,
 )
-from engram.places.stored_words import keep_missing_words, vocabulary_or_default
+from engram.places.words import NodeWords, vocabulary_or_default
 from engram.robot.front import arriving
 from engram.robot.session import DriveSequence, open_drive
 from engram.robot.settings import Settings
@@ -91,7 +92,7 @@ def train_map_vocabulary(
     config: TrainingConfig,
     *,
     author: str,
-    advance: Callable[[str, float], None],
+    monitor: Monitor = QUIET,
 ) -> VocabularyReport:
     """Trains a vocabulary and keeps it in a map, in a revision of its own.
 
@@ -100,7 +101,7 @@ def train_map_vocabulary(
         sources: maps and drives to train on; the map itself where there are none.
         config: how it is trained.
         author: who asked for it.
-        advance: called now and then with what is done and the share of it, 0…1.
+        monitor: sees each part of the work.
 
     Raises:
         InputError: too few descriptors for so many words.
@@ -110,20 +111,22 @@ def train_map_vocabulary(
     with Map.open(map_path) as store:
         kind = store.descriptor
     frames: list[NDArray[np.uint8]] = []
-    for at, source in enumerate(sources or [map_path]):
-        for frame in _frames(source, kind):
-            kind = kind or frame.descriptor
-            if frame.descriptor != kind:
-                raise IncompatibleError(
-                    f"{source} has {frame.descriptor} descriptors, the map {kind}; a vocabulary "
-                    "has words of one kind"
-                )
-            frames.append(frame.landmarks.descriptors)
-        advance("read", (at + 1) / max(len(sources), 1))
+    sources = sources or [map_path]
+    with monitor.stage("read", len(sources)) as stage:
+        for source in sources:
+            for frame in _frames(source, kind):
+                kind = kind or frame.descriptor
+                if frame.descriptor != kind:
+                    raise IncompatibleError(
+                        f"{source} has {frame.descriptor} descriptors, the map {kind}; a "
+                        "vocabulary has words of one kind"
+                    )
+                frames.append(frame.landmarks.descriptors)
+            stage.advance()
     if kind is None:
         raise InputError(f"{map_path} is empty: map a drive first, or name drives to train on")
-    trained_on = ", ".join(source.name for source in sources or [map_path])
-    vocabulary = train_vocabulary(frames, kind, config, trained_on=trained_on, advance=advance)
+    trained_on = ", ".join(source.name for source in sources)
+    vocabulary = train_vocabulary(frames, kind, config, trained_on=trained_on, monitor=monitor)
     with Map.open(map_path, writes=True) as writable:
         revision = writable.put_vocabulary(
             encode_vocabulary(vocabulary),
@@ -131,7 +134,7 @@ def train_map_vocabulary(
             message=f"vocabulary of {len(vocabulary)} words",
             configuration={"vocabulary": to_dict(config), "trained_on": trained_on},
         )
-        keep_missing_words(writable, vocabulary, _node_ids(writable), advance)
+        NodeWords.of_map(writable, vocabulary).keep_missing(_node_ids(writable), monitor)
     return _report(vocabulary, default=False, revision=revision.number)
 
 
@@ -140,7 +143,7 @@ def use_vocabulary(
     source: Path,
     *,
     author: str,
-    advance: Callable[[str, float], None],
+    monitor: Monitor = QUIET,
 ) -> VocabularyReport:
     """Gives a map the vocabulary of another one, in a revision of its own.
 
@@ -150,7 +153,7 @@ def use_vocabulary(
         map_path: the map.
         source: a map with a vocabulary, or an encoded vocabulary.
         author: who asked for it.
-        advance: called now and then with what is done and the share of it, 0…1.
+        monitor: sees each part of the work.
 
     Raises:
         InputError: the source has no vocabulary of its own.
@@ -174,7 +177,7 @@ def use_vocabulary(
             message=f"vocabulary of {source.name}",
             configuration={"used": source.name},
         )
-        keep_missing_words(writable, vocabulary, _node_ids(writable), advance)
+        NodeWords.of_map(writable, vocabulary).keep_missing(_node_ids(writable), monitor)
     return _report(vocabulary, default=False, revision=revision.number)
 
 

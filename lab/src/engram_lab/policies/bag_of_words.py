@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.graph.model import NodeId
+from engram.places.words import NodeWords
 from engram.ranking.context import RankingContext
 from engram.ranking.reasons import Reasons
-from engram.ranking.words import WordSource
 from engram_lab.policies.turns import IN_TURNS, round_robin
 
 # An experience looks like its nodes within so many metres do (SPEC §4).
@@ -52,14 +53,16 @@ def experience_similarities(context: RankingContext) -> NDArray[np.float64]:
     for rows in np.split(nearest_first, bounds):
         away_m = distance_m[rows]
         within = int(np.searchsorted(away_m, max(_HERE_M, away_m[0]), side="right"))
-        result[rows] = likeness_of(nodes[rows[:within]].tolist())
+        result[rows] = likeness_of(
+            [context.graph.node(node).id for node in nodes[rows[:within]].tolist()]
+        )
     return result
 
 
 class _Likeness:
     """Cosine, 0…1, of idf-weighted sets of words with those of one frame."""
 
-    def __init__(self, words: WordSource, live: NDArray[np.int32]) -> None:
+    def __init__(self, words: NodeWords, live: NDArray[np.int32]) -> None:
         self._words = words
         self._weights = words.idf**2
         self._seen = np.zeros(len(self._weights))
@@ -68,10 +71,11 @@ class _Likeness:
         # By word: whether a node before has it. A union by sorting takes several times as long.
         self._met = np.zeros(len(self._weights), np.bool_)
 
-    def __call__(self, nodes: list[int]) -> float:
+    def __call__(self, nodes: list[NodeId]) -> float:
         """Of all that some nodes show together."""
         shared = whole = 0.0
-        sets = [self._words.of_node(node) for node in nodes]
+        found = (self._words.of_node(node) for node in nodes)
+        sets = [one for one in found if one is not None]
         for one in sets:
             fresh = one if len(sets) == 1 else one[~self._met[one]]
             self._met[fresh] = True

@@ -267,7 +267,8 @@ def _write_draft(
     ):
         _write(writer, stock, selection.sent, bridges, options, part)
         writer.commit()
-        stock.words.give(draft, [stock.node_ids[at] for at in np.flatnonzero(selection.sent)])
+        if stock.words is not None:
+            stock.words.give(draft, [stock.node_ids[at] for at in np.flatnonzero(selection.sent)])
     return _Sent(selection, bridges)
 
 

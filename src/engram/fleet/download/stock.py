@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.fleet.merge.words import CentreWords
 from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
 from engram.maps import Map
+from engram.places.words import NodeWords, words_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -71,9 +71,10 @@ class Stock:
         return self.store.content_hash()
 
     @cached_property
-    def words(self) -> CentreWords:
-        """Words of the nodes."""
-        return CentreWords(self.store)
+    def words(self) -> NodeWords | None:
+        """Words of the nodes; None while the centre is empty."""
+        kind = self.store.descriptor
+        return None if kind is None else words_of(self.store, kind)
 
     @cached_property
     def node_ids(self) -> list[NodeId]:

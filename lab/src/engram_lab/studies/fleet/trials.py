@@ -31,7 +31,7 @@ from engram.places import (
     decode_vocabulary,
     default_vocabulary,
 )
-from engram.places.stored_words import stored_words
+from engram.places.words import NodeWords
 from engram.sequences import FrameLog
 from engram_lab.studies.building import true_nodes, write_json
 from engram_lab.studies.drives import EvaluatedDrive
@@ -198,7 +198,7 @@ class _Queries:
             self._vocabulary = (
                 default_vocabulary(drive.descriptor) if body is None else decode_vocabulary(body)
             )
-            self._words = stored_words(store, self._vocabulary)
+            self._words = NodeWords.of_map(store, self._vocabulary).kept
         log = FrameLog(drive.path)
         every = max(len(log) // _QUERIES, 1)
         frames = [one.frame for one in islice(log, 0, None, every)]
