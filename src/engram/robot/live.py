@@ -67,12 +67,14 @@ class Owner:
         camera: its camera.
         settings: the resolved configuration.
         options: how it localises.
+        recorded: the session, where it is known before the first frame.
     """
 
     name: str | None
     camera: StereoCamera
     settings: Settings
     options: RobotOptions
+    recorded: Session | None = None
 
     def made_by(self, first: Arrived) -> tuple[DescriptorKind, str]:
         """Kind of descriptors, and hash of the front-end; a logged frame brings its own along."""
@@ -95,6 +97,8 @@ class Owner:
 
     def session(self, first: Arrived) -> Session:
         """The session that begins with this pair or logged frame."""
+        if self.recorded is not None:
+            return self.recorded
         pair = first if isinstance(first, StereoPair) else first.frame
         clock = Clock.UTC if pair.stamp_ns >= _CLOCK_FROM_NS else Clock.RELATIVE
         info = SequenceInfo(self.name or "live", "live", clock, self.name)

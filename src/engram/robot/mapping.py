@@ -21,6 +21,7 @@ from engram.robot.robot import Robot
 from engram.robot.saving import SavedDrive, begin_or_resume, configuration_of, node_words
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
+from engram.robot.spool import commit_spools
 from engram.sequences import FrameLog
 
 
@@ -120,6 +121,7 @@ def map_drive(
         _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
     session = session_of_drive(sequence)
     report = MapReport(session)
+    commit_spools(map_path)
     with open_map(map_path, create=True) as opened, opened.writing():
         if descriptor is not None:
             mend = "map the drive into another map"

@@ -102,6 +102,11 @@ class Robot:
             self._localiser.close()
 
     @property
+    def outcomes(self) -> list[Outcome]:
+        """What became of the attempts for the last frame, in ranked order."""
+        return self._localiser.outcomes
+
+    @property
     def saving(self) -> Saving:
         """Whether what a live robot finds is saved, and where it came to."""
         return self._saving
@@ -208,10 +213,7 @@ class Robot:
         Nothing in the loop withdraws yet; it is for whoever knows better.
         """
         self._track = deque(
-            (
-                (at, replace(one, position=None) if one is found else one)
-                for at, one in self._track
-            ),
+            ((at, replace(one, position=None) if one is found else one) for at, one in self._track),
             _REMEMBERED,
         )
         self._keeper.withdrawn(found)

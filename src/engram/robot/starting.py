@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from engram.errors import ConfigError, RevisionError
 from engram.geometry import StereoCamera
 from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
 from engram.robot.front import Front
-from engram.robot.live import IntoMap, IntoMemory, LiveKeeper, Owner
+from engram.robot.live import Into, IntoMap, IntoMemory, LiveKeeper, Owner
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
+from engram.robot.spool import commit_spools
 
 
 def robot_on(
@@ -20,8 +23,10 @@ def robot_on(
     settings: Settings,
     options: RobotOptions | None = None,
     policy: RankingPolicy | None = None,
+    *,
+    remembers: bool = False,
 ) -> Robot:
-    """A robot that localises a drive in a map, and keeps nothing.
+    """A robot that localises a drive in a map, and saves no nodes.
 
     Args:
         opened: the map.
@@ -29,12 +34,17 @@ def robot_on(
         settings: the resolved configuration.
         options: how; None for the defaults.
         policy: in place of that of the options.
+        remembers: whether path and attempts are kept as a session; see `Map.robot`.
 
     Raises:
         ConfigError: there is no such policy or relocaliser.
         SequenceError: the drive has no usable frame.
     """
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
+    session = session_of_drive(sequence)
+    if remembers:
+        owner = Owner(session.robot, sequence.camera, settings, options, session)
+        return _keeping(owner, IntoMemory(owner, opened))
     localiser = localiser_in(
         opened,
         sequence.camera,
@@ -42,7 +52,7 @@ def robot_on(
         policy=policy or options.policy,
         budget=options.budget,
         relocaliser=options.relocaliser,
-        live=session_of_drive(sequence).id,
+        live=session.id,
         threads=options.threads,
         clock=sequence.info,
     )
@@ -72,6 +82,12 @@ def robot_in(
             f"{opened.location} is open as of revision {opened.revision}; to keep drives, open it "
             "without naming a revision"
         )
-    into = IntoMap(owner, open_map(opened.location)) if maps else IntoMemory(owner, opened)
-    keeper = LiveKeeper(owner, into)
-    return Robot(Front(settings), into.localiser, keeper, deadline_ms=options.deadline_ms)
+    if not maps:
+        return _keeping(owner, IntoMemory(owner, opened))
+    commit_spools(Path(opened.location))
+    return _keeping(owner, IntoMap(owner, open_map(opened.location)))
+
+
+def _keeping(owner: Owner, into: Into) -> Robot:
+    keeper, deadline_ms = LiveKeeper(owner, into), owner.options.deadline_ms
+    return Robot(Front(owner.settings), into.localiser, keeper, deadline_ms=deadline_ms)

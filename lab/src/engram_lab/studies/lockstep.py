@@ -16,10 +16,10 @@ from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import NodeId, PathEntryKind
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.graph.paths import PathMemory
-from engram.localiser import Localiser, Matcher, Position
+from engram.localiser import Hint, Keeper, Matcher, Position
 from engram.maps import Map
-from engram.odometry import GapFiller, driven_steps_m
-from engram.robot import Settings
+from engram.odometry import GapFiller, Motion, driven_steps_m
+from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in
 from engram.sequences import LoggedFrame
 from engram_lab.studies.configurations import EVERYTHING, Configuration, PathKinds, Radius
@@ -163,38 +163,49 @@ def run_in_step(
     step_m = driven_steps_m(motions, [one.frame.stamp_ns for one in frames])
     runs = Runs.empty(configurations, step_m)
     search = SharedSearch(situation.opened.graph.neighbourhood)
-    with _localisers(
-        situation, configurations, settings, matcher, search, relocaliser
-    ) as localisers:
+    with _robots(situation, configurations, settings, matcher, search, relocaliser) as robots:
         for number, logged in enumerate(frames):
             if situation.start is None or number < situation.start[0]:
-                for localiser in localisers:
-                    localiser.move(motions[number])
+                for robot in robots:
+                    robot.follow(logged, motion=motions[number])
                 continue
             search.next_frame()
             judge = _Judge(situation, logged.frame)
-            for row, localiser in enumerate(localisers):
+            for row, robot in enumerate(robots):
                 started, made = clock(), cost_so_far()
-                localiser.move(motions[number])
-                if number == situation.start[0]:
-                    localiser.place_at(situation.start[1])
-                found = localiser.localise(logged.frame)
+                found = robot.step(logged, motion=motions[number])
                 seconds = clock() - started - (cost_so_far() - made)
                 runs.step_ms[row] += 1e3 * seconds
                 runs.matched[row, number] = found.node is not None
                 runs.attempts[row, number] = found.attempts
                 runs.candidates[row, number] = found.candidates
-                runs.succeeded[row, number] = sum(one.accepted for one in localiser.outcomes)
+                runs.succeeded[row, number] = sum(one.accepted for one in robot.outcomes)
                 if found.node is not None and found.node_from_live is not None:
                     error = judge.error(found.node, found.node_from_live)
                     runs.offset_m[row, number], runs.turn_rad[row, number] = error
                     if configurations[row] == EVERYTHING:
                         near = judge.near()
-                        seen = {one.candidate.node for one in localiser.outcomes}
+                        seen = {one.candidate.node for one in robot.outcomes}
                         runs.near[row, number] = len(near)
                         runs.near_seen[row, number] = len(near & seen)
     runs.step_ms[:] /= max(len(frames), 1)
     return runs
+
+
+class _Placing(Keeper):
+    """Knows where the drive starts, and keeps nothing."""
+
+    def __init__(self, situation: Situation) -> None:
+        self._start = situation.start
+        if self._start is not None:
+            self._stamp_ns = situation.frames[self._start[0]].frame.stamp_ns
+
+    def hint(self, live: Frame, motion: Motion) -> Hint | None:
+        """See `Keeper`."""
+        del motion
+        if self._start is None or live.stamp_ns != self._stamp_ns:
+            return None
+        return Hint(self._start[1])
 
 
 class _Judge:
@@ -226,18 +237,18 @@ class _Judge:
 
 
 @contextmanager
-def _localisers(
+def _robots(
     situation: Situation,
     configurations: Iterable[Configuration],
     settings: Settings,
     matcher: Matcher | None,
     search: SharedSearch,
     relocaliser: str | None,
-) -> Iterator[list[Localiser]]:
+) -> Iterator[list[Robot]]:
     """One per configuration; in one map they share what is known of it."""
     memories: dict[PathKinds, PathMemory] = {}
     with ExitStack() as stack:
-        localisers = []
+        front, keeper, robots = Front(settings), _Placing(situation), list[Robot]()
         for one in configurations:
             if one.paths not in memories:
                 memories[one.paths] = _counting(situation.opened, one.paths.kinds)
@@ -254,8 +265,8 @@ def _localisers(
                 clock=situation.drive.session,
                 path_memory=memories[one.paths],
             )
-            localisers.append(stack.enter_context(localiser))
-        yield localisers
+            robots.append(stack.enter_context(Robot(front, localiser, keeper)))
+        yield robots
 
 
 def _counting(opened: Map, kinds: Collection[PathEntryKind]) -> PathMemory:
