@@ -11,7 +11,7 @@ from tests.worlds import attempts_of
 
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import Reason, Seed
-from engram.fleet.merge.handed_in import HandedIn
+from engram.fleet.merge.state import Merge
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
 from engram.maps import Map, check_file, open_map
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
@@ -198,8 +198,9 @@ def test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match(tmp_path, fl
     robot_map(path, np.arange(0, 24, 0.8), name="r5", day=5, aside_m=0.1)
     again = robot_map(path, np.arange(0, 12, 0.8), name="r5", day=6)
     assert not again.saved
-    with Map.open(path) as store, HandedIn(store, "r5") as handed_in:
-        relied_on, all_nodes = handed_in.relied_on, set(handed_in.nodes)
+    with Map.open(path) as store:
+        merge = Merge(store, store)
+        relied_on, all_nodes = merge.relied_on, {node.id for node in store.graph.nodes}
     assert 5 <= len(relied_on) <= len(all_nodes) / 2 + 1
 
     def taken_by(centre, sure_inliers):

@@ -7,7 +7,6 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.state import Merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
@@ -19,7 +18,7 @@ def test_a_node_is_apart_while_no_edges_lead_from_it_to_what_was_there(seed: int
     rng = random.Random(seed)
     Map.create(tmp_path / "empty.engram").close()
     with Map.open(tmp_path / "empty.engram") as store:
-        merge = Merge(store, HandedIn(store, "robot"))
+        merge = Merge(store, store)
     merge.writer = Mock()
     session = SessionId(UUID(int=1))
     ids = [NodeId(UUID(int=number)) for number in range(2, 22)]

@@ -19,7 +19,7 @@ from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
 from engram.frontend import DescriptorKind
 from engram.frontend.blobs import content_digest
-from engram.geometry import StereoCamera
+from engram.geometry import CameraId, StereoCamera
 from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
 from engram.graph.graph import ExperienceGraph
@@ -286,6 +286,12 @@ class Map:
     def sessions(self) -> dict[SessionId, Session]:
         """The drives that the map knows, by id, in the order of their coming."""
         return {one.id: one for one in self._read(reading.load_sessions)}
+
+    @cached_property
+    def cameras(self) -> dict[CameraId, StereoCamera]:
+        """The cameras of its sessions, by id."""
+        with self._database.reading() as connection:
+            return {one.id: one for one in reading.load_cameras(connection).values()}
 
     @cached_property
     def vocabulary(self) -> bytes | None:

@@ -11,12 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from engram.fleet.merge.segments import Segment
-from engram.frontend import Frame
-from engram.graph.model import NodeId
-from engram.localiser import Localisation, LocalisationStatus, Localiser, Position
+from engram.localiser import Localisation, Position
 from engram.localiser.attempts import Outcome
-from engram.maps import StoredNode
-from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
+from engram.odometry import GapFiller, OdometryStatus, OdometryStep
+from engram.robot import Robot
+from engram.sequences import LoggedFrame
 
 # A guess over a longer way is none. Source: SPEC §3.4, after which a robot counts as lost.
 _GUESS_WITHIN_M = 10.0
@@ -28,17 +27,15 @@ _BASE_LINE_M = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FoundNode:
-    """A node of a segment, matched before its turn came.
+class Ahead:
+    """A node of a segment that was localised before its turn came.
 
     Attributes:
-        node: of the segment.
-        localisation: of its frame.
+        found: what was found of it.
         outcomes: of the attempts for it.
     """
 
-    node: NodeId
-    localisation: Localisation
+    found: Localisation
     outcomes: list[Outcome]
 
 
@@ -67,37 +64,31 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
     return end.carried_on(guess.prev_from_curr, guess.covariance)
 
 
-def look_along(
-    localiser: Localiser,
-    start: Position,
-    frames: Iterable[tuple[StoredNode, Frame, Motion]],
-) -> tuple[FoundNode | None, int]:
+def look_along(robot: Robot, frames: Iterable[LoggedFrame]) -> tuple[Ahead | None, int]:
     """Looks for the first frames of a segment from a guess of where it begins.
 
     Args:
-        localiser: without a relocaliser.
-        start: where the first frame is thought to be.
-        frames: of the segment, in the order of time, with their nodes and motion.
+        robot: placed where the first frame is thought to be; it looks nowhere else.
+        frames: of the segment, in the order of time.
 
     Returns:
         The first of two frames at least 4 m apart that are matched; None where there are no two.
         And how many attempts that took.
     """
-    first: FoundNode | None = None
+    first: Ahead | None = None
     driven_m = first_at_m = 0.0
     attempts = 0
-    localiser.place_at(start)
-    for stored, frame, motion in frames:
-        driven_m += motion.odometry.moved_m
+    for logged in frames:
+        driven_m += logged.odometry.moved_m
         if driven_m > _LOOK_WITHIN_M:
             break
-        localiser.move(motion)
-        found = localiser.localise(frame)
+        found = robot.step(logged)
         attempts += found.attempts
-        if found.status is not LocalisationStatus.LOCALISED:
+        if not found.localised:
             continue
         if first is None:
-            first, first_at_m = FoundNode(stored.node.id, found, localiser.outcomes), driven_m
+            assert robot.last is not None
+            first, first_at_m = Ahead(found, robot.last.outcomes), driven_m
         elif driven_m - first_at_m >= _BASE_LINE_M:
             return first, attempts
     return None, attempts

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 from engram.errors import IncompatibleError
-from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.state import Merge
 from engram.graph.model import Clock, Node, NodeId, Session, SessionId
+from engram.maps import Map
 
 _NS_PER_S = 1_000_000_000
 # Stamps count as running backwards only where odometry says that the robot drove on by as much.
@@ -26,29 +27,32 @@ def check_fits(merge: Merge) -> None:
             the UUID of one of the centre's, and another content.
     """
     robot, known = merge.robot, merge.centre.sessions
-    kind, theirs = merge.centre.descriptor, robot.store.descriptor
+    kind, theirs = merge.centre.descriptor, robot.descriptor
     if None not in {kind, theirs} and kind is not theirs:
         raise IncompatibleError(
-            f"{robot.name} holds {theirs} descriptors, the centre {kind}; the two cannot be "
-            "matched: extract and map the drives again"
+            f"{robot.location} holds {theirs} descriptors, the centre {kind}; the two cannot "
+            "be matched: extract and map the drives again"
         )
-    for session in robot.sessions:
+    for session in merge.sessions:
         ours = known.get(session.id)
         if ours is not None and _drive(ours) != _drive(session):
             raise IncompatibleError(
-                f"session {session.id} is a drive of {session.robot} in {robot.name} and another "
-                f"one, of {ours.robot}, in the centre: one of the two maps is not what it says"
+                f"session {session.id} is a drive of {session.robot} in {robot.location} and "
+                f"another one, of {ours.robot}, in the centre: one of the two maps is not what it "
+                "says"
             )
-    landmarks = merge.landmark_hashes
+    landmarks = merge.centre.landmark_hashes
     for node, brought in robot.landmark_hashes.items():
         held = landmarks.get(node, brought)
         if held != brought or not _same_record(merge, node):
-            record = robot.nodes.get(node)
-            which = f" (session {record.session}, stamp {record.stamp_ns})" if record else ""
+            which = ""
+            if node in robot.graph:
+                record = robot.graph.node(robot.graph.index(node))
+                which = f" (session {record.session}, stamp {record.stamp_ns})"
             raise IncompatibleError(
-                f"node {node}{which} has one content in {robot.name} and another in the centre, "
-                f"landmarks {brought.hex()} and {held.hex()}: a node never changes, so one of the "
-                "two maps is not what it says"
+                f"node {node}{which} has one content in {robot.location} and another in the "
+                f"centre, landmarks {brought.hex()} and {held.hex()}: a node never changes, so "
+                "one of the two maps is not what it says"
             )
 
 
@@ -59,22 +63,21 @@ def _drive(session: Session) -> tuple[str, str, int]:
 
 def _same_record(merge: Merge, node: NodeId) -> bool:
     """Whether a node that both have is of the same drive, moment and camera."""
-    if node not in merge.graph or node not in merge.robot.nodes:
+    graphs = merge.graph, merge.robot.graph
+    if not all(node in graph for graph in graphs):
         return True
-    ours, theirs = (
-        (one.session, one.stamp_ns, one.camera)
-        for one in (merge.graph.node(merge.graph.index(node)), merge.robot.nodes[node])
-    )
+    records = (graph.node(graph.index(node)) for graph in graphs)
+    ours, theirs = ((one.session, one.stamp_ns, one.camera) for one in records)
     return ours == theirs
 
 
-def check_readable(robot: HandedIn, nodes: Sequence[Node]) -> None:
+def check_readable(robot: Map, nodes: Sequence[Node]) -> None:
     """Reads all landmarks that may be taken once, before a byte of the centre is written.
 
     Raises:
         MapError: something of them was damaged on the way.
     """
-    for _ in robot.store.frames.stored(list(nodes)):
+    for _ in robot.frames.stored(list(nodes)):
         pass
 
 
@@ -89,13 +92,16 @@ def notes(merge: Merge, now_ns: int) -> list[str]:
     """
     robot = merge.robot
     found = [
-        f"session {one.session.id} of {one.session.robot} was interrupted in {robot.name}: it is "
-        "not handed in before it is resumed or sealed there"
-        for one in robot.store.interrupted()
+        f"session {one.session.id} of {one.session.robot} was interrupted in {robot.location}: it "
+        "is not handed in before it is resumed or sealed there"
+        for one in robot.interrupted()
     ]
-    new = [one for one in robot.sessions if one.id not in merge.centre.sessions]
+    new = [one for one in merge.sessions if one.id not in merge.centre.sessions]
+    saved: dict[SessionId, list[Node]] = defaultdict(list)
+    for node in sorted(robot.graph.nodes, key=lambda one: (one.stamp_ns, one.id)):
+        saved[node.session].append(node)
     for session in new:
-        found += _backwards(session, robot.nodes_of[session])
+        found += _backwards(session, saved[session.id])
         if session.clock is Clock.UTC and session.start_ns > now_ns:
             found.append(
                 f"session {session.id} of {session.robot} begins "
@@ -164,9 +170,9 @@ def overlapping(
 
 def _spans(merge: Merge) -> list[Span]:
     """Of every session whose clock is UTC."""
-    sessions = {**merge.centre.sessions, **{one.id: one for one in merge.robot.sessions}}
+    sessions = {**merge.centre.sessions, **merge.robot.sessions}
     last = {one.id: one.start_ns for one in sessions.values()}
-    for node in (*merge.graph.nodes, *merge.robot.contents.nodes):
+    for node in (*merge.graph.nodes, *merge.robot.graph.nodes):
         last[node.session] = max(last[node.session], node.stamp_ns)
     return [
         Span(one, one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC

@@ -6,12 +6,12 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from engram.errors import InputError
 from engram.fleet.merge.checks import check_fits, check_readable
 from engram.fleet.merge.gate import Gate
-from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.pictures import picture_before_and_after
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
@@ -120,24 +120,24 @@ def _merged(
 ) -> MergeReport:
     """One merge in a freshly opened map, so that it does not matter what came before it."""
     started = time.perf_counter()
-    with HandedIn(Map.open(path), str(path)) as robot:
+    with Map.open(path) as robot:
         try:
             monitor.check()
             _check_before_raising(place, robot)
             with Map.open(place, writes=True) as store:
-                settings = settings.for_descriptor(robot.store.descriptor)
+                settings = settings.for_descriptor(robot.descriptor)
                 report = merge_one(store, robot, settings, options, gate, monitor)
             if report.revision is None:
                 monitor.check()
         except KeyboardInterrupt:
-            report = MergeReport(str(path), robot.content_hash, robot.robots, interrupted=True)
+            report = replace(MergeReport.of(robot), interrupted=True)
             with Map.open(place) as store:
                 report.content_hash = store.content_hash()
     report.seconds = time.perf_counter() - started
     return report
 
 
-def _check_before_raising(place: Path, robot: HandedIn) -> None:
+def _check_before_raising(place: Path, robot: Map) -> None:
     """A map of an older format becomes one of the newest when it is opened for writing.
 
     A robot's map that is refused shall not do even that.
@@ -145,7 +145,7 @@ def _check_before_raising(place: Path, robot: HandedIn) -> None:
     with Map.open(place) as store:
         if store.format_version < FORMAT_VERSION:
             check_fits(Merge(store, robot))
-            check_readable(robot, robot.contents.nodes)
+            check_readable(robot, robot.graph.nodes)
 
 
 @contextmanager

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
 
 from engram.config import check_bounds
 from engram.errors import ConfigError
-from engram.fleet.merge.behind_gaps import FoundNode, look_along, position_behind_gap
+from engram.fleet.merge.behind_gaps import Ahead, look_along, position_behind_gap
 from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
@@ -35,20 +35,22 @@ from engram.graph.proximity import lay_proximity_edges, tighten_chain
 from engram.localiser import (
     RELOCALISERS,
     Budget,
+    Hint,
+    Keeper,
     Localisation,
-    LocalisationStatus,
     Localiser,
     Position,
     Relocaliser,
 )
 from engram.localiser.attempts import Outcome
-from engram.mapper import Walk, match_edges
+from engram.mapper import match_edges
 from engram.maps import StoredNode
 from engram.monitor import Monitor
-from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep
+from engram.odometry import Motion, OdometryStatus, OdometryStep
 from engram.ranking import check_for_robot
-from engram.robot import Settings
+from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in, relocaliser_in
+from engram.sequences import LoggedFrame
 
 # A segment is seeded from a neighbour this far along it: farther, places are looked up instead.
 # Source: the distance after which own nodes are neighbours again (SPEC §3.1).
@@ -97,8 +99,10 @@ class MergeOptions:
             )
 
 
-class Replay:
+class Replay(Keeper):
     """Replays segments one after another and adds what the centre lacks.
+
+    Each segment is a drive of `Robot.step`, of which this is the keeper.
 
     Args:
         merge: what is known and added.
@@ -124,43 +128,84 @@ class Replay:
             None if (name := options.relocaliser) is None else self._lazy_relocaliser(name)
         )
         self._taken: set[NodeId] = set()
-        self._run: list[int] = []  # nodes taken one after another, by their dense indices
         self._iterations: dict[SessionId, int] = {}
         # How far each drive had come when the centre last knew it.
         self._matched_at_m: dict[SessionId, float] = {}
-        self._walk: Walk  # of the segment being replayed
         self._last: Segment | None = None  # the one that was replayed last
-        # Found behind gaps, before their turn came.
-        self._looked_up: dict[NodeId, FoundNode] = {}
+        # Of the segment that is being replayed:
+        self._localiser: Localiser
+        self._stored: StoredNode
+        self._start: Position | None = None  # where its first node is, where that is known
+        self._ahead: Ahead | None = None  # found behind a gap, before its turn came
+        self._run: list[int] = []  # nodes taken one after another, by their dense indices
+        self._visited: NodeId | None = None  # matched or taken last
+        self._kept: list[KeptNode] = []
 
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
         """Replays one segment: what localises is omitted, the rest is taken (SPEC §7 MERGE 3).
 
         Taken is, too, what others rely on and the centre barely shows; see `MergeOptions`.
         """
-        seed = Seed.NONE
-        if (start := self._seed(segment)) is not None:
+        seed, self._ahead, self._visited, self._kept = Seed.NONE, None, None, []
+        self._start = self._seed(segment)
+        if self._start is not None:
             seed = Seed.NEIGHBOUR
-        elif self._look_behind_gap(session, segment):
-            seed = Seed.GAP
+        else:
+            self._ahead = self._look_behind_gap(session, segment)
+            seed = Seed.NONE if self._ahead is None else Seed.GAP
         self._last = segment
         if self._relocaliser is not None:
             self._relocaliser.forget()
-        kept: list[KeptNode] = []
-        self._walk = Walk(path_id(session.id))
-        with self._localiser(session, segment, self._relocaliser) as localiser:
-            if start is not None:
-                self._start_at(localiser, start, segment.nodes[0])
-            for stored, frame, motion in self._stream(segment):
-                localiser.move(motion)
-                found, outcomes = self._localise(localiser, stored.node, frame)
-                reason = self._keep(localiser, stored, frame, found, outcomes)
-                kept.append(KeptNode(stored.node.stamp_ns, motion.odometry.moved_m, reason))
-                if found.status is LocalisationStatus.LOCALISED and seed is Seed.NONE:
-                    seed = Seed.PLACE
+        self._localiser = self._localiser_of(session, segment, self._relocaliser)
+        with Robot(Front(self._settings), self._localiser, self) as robot:
+            for stored, logged in self._stream(segment):
+                self._stored = stored
+                robot.step(logged)
             self._end_run()
-            self._remember(session, localiser)
-        return SegmentReport.of(session, seed, kept)
+            self._iterations[session.id] = self._localiser.iteration + _ITERATION_GAP
+        return SegmentReport.of(session, seed, self._kept)
+
+    def hint(self, live: Frame, motion: Motion) -> Hint | None:
+        """See `Keeper`: where the robot itself measured how a frame lies to a known node."""
+        del motion
+        node, (known, self._start) = self._stored.node, (self._start, None)
+        if self._ahead is not None and self._ahead.found.stamp_ns == live.stamp_ns:
+            return Hint(self._ahead.found.position, found=self._ahead.found)
+        if self._run:
+            known = self._known_neighbour(node.id, _MEASURED, self._run[0])
+        if known is None:
+            return None
+        # A robot that only its own nodes vouch for is as lost as it was when it saved them.
+        open_loop_m = 0.0
+        if self._merge.is_apart(known.node):
+            open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
+        return Hint(known, open_loop_m)
+
+    def keep(self, live: Frame, found: Localisation) -> Localisation:
+        """See `Keeper`: omits or takes the node."""
+        stored, outcomes = self._stored, self._localiser.outcomes
+        node = stored.node
+        if self._ahead is not None and self._ahead.found is found:
+            outcomes = self._ahead.outcomes
+        else:
+            self._remember(node, found)
+        reason = self._reason(node, live, found)
+        if reason is None:
+            # The centre shows this place alike already.
+            self._merge.omit(node.id, _measured(found), stored.landmark_hash)
+            self._link(node.id)
+        else:
+            self._take(stored, live, found)
+        if found.localised:
+            self._matched(node, outcomes)
+        report = self._merge.report
+        report.match_attempts += found.attempts
+        report.proposed_attempts += found.proposed
+        report.lookups += found.looked_up
+        self._kept.append(KeptNode(node.stamp_ns, found.motion.odometry.moved_m, reason))
+        self._monitor.advance("added" if reason else "covered")
+        self._monitor.check()
+        return found
 
     # -- the stream
 
@@ -169,13 +214,13 @@ class Replay:
         centre, descriptor = self._merge.centre, self._settings.frontend.descriptor
         return LazyRelocaliser(name, lambda: relocaliser_in(centre, name, descriptor))
 
-    def _localiser(
+    def _localiser_of(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None
     ) -> Localiser:
         robot, centre, options = self._merge.robot, self._merge.centre, self._options
         localiser = localiser_in(
             centre,
-            robot.contents.cameras[segment.nodes[0].camera],
+            robot.cameras[segment.nodes[0].camera],
             self._settings,
             policy=options.policy,
             # The lost get no more, for the next node asks again, from a step on: four times as
@@ -192,57 +237,31 @@ class Replay:
         localiser.resume(segment.nodes[0].driven_m, self._iterations[session.id])
         return localiser
 
-    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, Frame, Motion]]:
-        """The nodes in the order of time, each with its motion since the one before."""
-        gaps, frames = GapFiller(), self._merge.robot.store.frames
+    def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, LoggedFrame]]:
+        """The nodes in the order of time, each as a frame log would give it."""
+        frames = self._merge.robot.frames
         steps = [
             OdometryStep(OdometryStatus.FIRST),
             *(OdometryStep(OdometryStatus.OK, *motion) for motion in segment.motions),
         ]
         for stored, step in zip(frames.stored(segment.nodes), steps, strict=True):
-            yield stored, frames.decode(stored), gaps.motion(step, stored.node.stamp_ns)
+            yield stored, LoggedFrame(frames.decode(stored), step)
 
-    def _localise(
-        self, localiser: Localiser, node: Node, frame: Frame
-    ) -> tuple[Localisation, list[Outcome]]:
-        """One frame; where the robot itself measured how it lies to a known node, from there."""
-        looked_up = self._looked_up.pop(node.id, None)
-        if looked_up is not None:
-            position = looked_up.localisation.position
-            assert position is not None
-            localiser.place_at(position)
-            return looked_up.localisation, looked_up.outcomes
-        known = self._known_neighbour(node.id, _MEASURED, self._run[0]) if self._run else None
-        if known is not None:
-            self._start_at(localiser, known, node)
-        found = localiser.localise(frame)
-        self.attempts.setdefault(node.session, []).extend(localiser.attempts())
-        if found.node is not None:
-            self._walk.visit(found.node, PathEntryKind.MATCHED, frame.stamp_ns)
-        return found, localiser.outcomes
-
-    def _start_at(self, localiser: Localiser, position: Position, node: Node) -> None:
-        """A robot that only its own nodes vouch for is as lost as it was when it saved them."""
-        open_loop_m = 0.0
-        if self._merge.is_apart(position.node):
-            open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
-        localiser.place_at(position, open_loop_m)
-
-    def _look_behind_gap(self, session: Session, segment: Segment) -> bool:
-        """Whether a segment is found from where the one before it ended; see `behind_gaps`."""
+    def _look_behind_gap(self, session: Session, segment: Segment) -> Ahead | None:
+        """What of a segment is found from where the one before it ended; see `behind_gaps`."""
         before = self._last
         if before is None or before.nodes[0].session != session.id:
-            return False
+            return None
         end = self._merge.equivalent(before.nodes[-1].id)
         start = None if end is None else position_behind_gap(end, before, segment)
         if start is None:
-            return False
-        with self._localiser(session, segment, relocaliser=None) as localiser:
-            found, attempts = look_along(localiser, start, self._stream(segment))
+            return None
+        localiser = self._localiser_of(session, segment, relocaliser=None)
+        with Robot(Front(self._settings), localiser) as robot:
+            robot.place_at(start)
+            found, attempts = look_along(robot, (logged for _, logged in self._stream(segment)))
         self._merge.report.match_attempts += attempts
-        if found is not None:
-            self._looked_up[found.node] = found
-        return found is not None
+        return found
 
     def _seed(self, segment: Segment) -> Position | None:
         """Where the first frame is, by the nearest node of the segment with a known neighbour."""
@@ -273,7 +292,7 @@ class Replay:
                 which say no more than odometry does.
         """
         found = []
-        for edge in self._merge.robot.edges_of.get(node, ()):
+        for edge in self._merge.edges_of(node):
             other = self._merge.equivalent(edge.b if edge.a == node else edge.a)
             if other is None or edge.kind not in kinds:
                 continue
@@ -283,36 +302,20 @@ class Replay:
 
     # -- what becomes of a frame
 
-    def _keep(
-        self,
-        localiser: Localiser,
-        stored: StoredNode,
-        frame: Frame,
-        found: Localisation,
-        outcomes: list[Outcome],
-    ) -> Reason | None:
-        """Omits or takes a node; returns why it was taken."""
-        reason = self._reason(stored.node, frame, found)
-        if reason is None:
-            # The centre shows this place alike already.
-            self._merge.omit(stored.node.id, _measured(found), stored.landmark_hash)
-            self._link(stored.node.id)
-        else:
-            self._take(stored, frame, localiser, found)
-        if found.status is LocalisationStatus.LOCALISED:
-            self._matched(stored.node, outcomes)
-        report = self._merge.report
-        report.match_attempts += found.attempts
-        report.proposed_attempts += found.proposed
-        self._monitor.advance("added" if reason else "covered")
-        self._monitor.check()
-        return reason
+    def _remember(self, node: Node, found: Localisation) -> None:
+        """Attempts and matches of a frame, for the session's attempts and its path."""
+        self.attempts[node.session] += self._localiser.attempts()
+        if found.node is not None and found.node != self._visited:
+            self._visited = found.node
+            path, kind = path_id(node.session), PathEntryKind.REPLAYED
+            entry = PathEntry(path, 0, found.node, kind, node.stamp_ns)
+            self.entries[node.session].append(entry)
 
     def _reason(self, node: Node, frame: Frame, found: Localisation) -> Reason | None:
         """Why a node is taken; None where what it matched will do for all that localised by it."""
-        if found.status is LocalisationStatus.LOCALISED:
+        if found.localised:
             is_sure = found.inliers >= self._options.sure_inliers
-            relied_on = node.id in self._merge.robot.relied_on
+            relied_on = node.id in self._merge.relied_on
             return Reason.WEAK_MATCH if relied_on and not is_sure else None
         if frame.status is not FrameStatus.OK:
             return Reason.UNUSABLE_FRAME
@@ -320,24 +323,22 @@ class Replay:
             return Reason.NO_MATCH
         return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
-    def _take(
-        self, stored: StoredNode, frame: Frame, localiser: Localiser, found: Localisation
-    ) -> None:
+    def _take(self, stored: StoredNode, frame: Frame, found: Localisation) -> None:
         """A node that the centre is lacking, with its own edges and that to what it matched."""
         node = stored.node
         index = self._merge.take(stored, frame)
         self._taken.add(node.id)
         self._run.append(index)
         self._link(node.id)
-        if found.node is not None:
+        if found.localised:
             at = _measured(found)
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
             self._merge.add_edge(match)
         self._merge.write_edges(lay_proximity_edges(self._merge.graph, index))
-        localiser.settle_in(node.id)
-        self._walk.visit(node.id, PathEntryKind.SAVED, node.stamp_ns)
+        self._localiser.settle_in(node.id)
+        self._visited = node.id
 
-    def _matched(self, node: Node, outcomes: list[Outcome]) -> None:
+    def _matched(self, node: Node, outcomes: Sequence[Outcome]) -> None:
         """The robot knows where it is: a run ends, and what one frame matched lies together."""
         self._matched_at_m[node.session] = node.driven_m
         self._end_run()
@@ -347,7 +348,7 @@ class Replay:
 
     def _link(self, node: NodeId) -> None:
         """The robot's edges from a node to what is resolved already, to the equivalents of both."""
-        for edge in self._merge.robot.edges_of.get(node, ()):
+        for edge in self._merge.edges_of(node):
             a, b = self._merge.equivalent(edge.a), self._merge.equivalent(edge.b)
             if a is None or b is None or not {edge.a, edge.b} & self._taken:
                 continue
@@ -361,36 +362,19 @@ class Replay:
         if run:
             self._merge.write_edges(tighten_chain(self._merge.graph, run))
 
-    def _remember(self, session: Session, localiser: Localiser) -> None:
-        """Matches of a segment, for the session's path."""
-        self._iterations[session.id] = localiser.iteration + _ITERATION_GAP
-        self.entries[session.id] += (
-            replace(entry, kind=PathEntryKind.REPLAYED)
-            for entry in self._walk.take_new()
-            if entry.kind is PathEntryKind.MATCHED
-        )
-        if self._relocaliser is not None:
-            self._merge.report.lookups = self._relocaliser.asked
-
 
 class LazyRelocaliser:
-    """A relocaliser that is made when it is first asked: learning all nodes takes a while.
-
-    Attributes:
-        asked: how often it was, once for a frame.
-    """
+    """A relocaliser that is made when it is first asked: learning all nodes takes a while."""
 
     new_place: float | None = None
 
     def __init__(self, name: str, make: Callable[[], Relocaliser]) -> None:
         self.name = name
-        self.asked = 0
         self._make = make
         self._made: Relocaliser | None = None
 
     def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
         """See `Relocaliser`."""
-        self.asked += 1
         if self._made is None:
             self._made = self._make()
         proposed = self._made.propose(live, count, allowed)

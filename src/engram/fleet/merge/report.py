@@ -11,6 +11,7 @@ from typing import Any
 
 from engram.config import plain
 from engram.graph.model import Session
+from engram.maps import Map
 
 # Lines of drives that people are shown; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
@@ -99,7 +100,9 @@ class SegmentReport:
 
     @staticmethod
     def of(session: Session, seed: Seed, nodes: Sequence[KeptNode]) -> SegmentReport:
-        """Counts the nodes of a segment, in the order of time."""
+        """Counts the nodes of a segment, in the order of time; one that matches places it."""
+        if seed is Seed.NONE and any(one.reason in {None, Reason.WEAK_MATCH} for one in nodes):
+            seed = Seed.PLACE
         runs = []
         for _, some in groupby(nodes, key=lambda one: one.reason is None):
             run = list(some)
@@ -238,6 +241,12 @@ class MergeReport:
     held_out: HeldOutReport | None = None
     segments: list[SegmentReport] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    @staticmethod
+    def of(robot: Map) -> MergeReport:
+        """Of a map of which nothing is merged yet."""
+        robots = sorted({session.robot for session in robot.sessions.values()})
+        return MergeReport(robot.location, robot.content_hash(), robots)
 
     @property
     def changed(self) -> bool:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 
-from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.positions import uncertainty_m2
 from engram.fleet.merge.report import MergeReport
 from engram.frontend import Frame
@@ -23,6 +23,7 @@ from engram.graph.model import (
     PathEntryKind,
     PathId,
     SessionId,
+    path_id,
 )
 from engram.localiser import Position
 from engram.maps import BulkWriter, Map, StoredNode
@@ -44,27 +45,28 @@ class Merge:
     alike.
 
     Attributes:
-        store: the centre.
-        centre: its graph and path memory; they grow.
+        centre: the fleet's map; its graph and path memory grow.
         graph: the centre's.
         robot: the map handed in.
+        sessions: of the robot's map, in the order of their starts.
+        edges: of the robot's map, by their keys.
         report: counts so far.
         writer: the open revision; from when something is to be added.
     """
 
     writer: BulkWriter
 
-    def __init__(self, store: Map, robot: HandedIn) -> None:
-        self.store = store
-        self.centre = store
-        self.graph = self.centre.graph
+    def __init__(self, centre: Map, robot: Map) -> None:
+        self.centre = centre
+        self.graph = centre.graph
         self.robot = robot
-        self.report = MergeReport(robot.name, robot.content_hash, robot.robots)
-        self.landmark_hashes = store.landmark_hashes
+        self.sessions = sorted(robot.sessions.values(), key=lambda one: (one.start_ns, one.id))
+        self.edges = sorted(robot.graph.edges, key=_edge_key)
+        self.report = MergeReport.of(robot)
         spread = np.diag([_OMITTED_SIGMA_M**2] * 3 + [_OMITTED_SIGMA_RAD**2] * 3)
         self._omitted = {
             omission.omitted: Position(omission.node, omission.node_from_omitted, spread)
-            for omission in store.omissions.values()
+            for omission in centre.omissions.values()
         }
         self._entries: dict[PathId, set[_EntryKey]] = {}
         # Nodes that were taken, by what joins them: a graph search for each would take too long.
@@ -90,15 +92,32 @@ class Merge:
         """Whether a node was taken in this merge, and nothing leads from it to what was there."""
         return node in self._parts and not self._parts.connected(node, _CENTRE)
 
+    def edges_of(self, node: NodeId) -> list[Edge]:
+        """The robot's edges at a node, by their keys."""
+        graph = self.robot.graph
+        return sorted(graph.edges_of(graph.index(node)), key=_edge_key)
+
+    @cached_property
+    def relied_on(self) -> frozenset[NodeId]:
+        """Nodes of the robot's map that a drive other than their own localised by."""
+        graph, paths = self.robot.graph, self.robot.path_memory
+        return frozenset(
+            entry.node
+            for path in paths.paths
+            for entry in paths.entries(path)
+            if entry.kind is not PathEntryKind.SAVED
+            and path_id(graph.node(graph.index(entry.node)).session) != path
+        )
+
     # -- what the centre lacks
 
     def has_more(self) -> bool:
         """Whether a map without new nodes has anything else to say."""
-        known = self.centre.sessions
+        known, paths = self.centre.sessions, self.robot.path_memory
         return (
-            any(session.id not in known for session in self.robot.sessions)
-            or any(self.new_entry(entry) for entry in self.robot.contents.path_entries)
-            or any(map(self.lacks_edge, self.robot.edges))
+            any(session not in known for session in self.robot.sessions)
+            or any(self.new_entry(entry) for path in paths.paths for entry in paths.entries(path))
+            or any(map(self.lacks_edge, self.edges))
             or any(map(self.lacks_omission, self.robot.omissions))
             or len(self.new_attempts(known, self.centre.attempts)) > 0
         )
@@ -116,7 +135,7 @@ class Merge:
         """Where a node that the robot's map had omitted is in the centre; None if it is no news."""
         omission = self.robot.omissions[omitted]
         known = self.equivalent(omission.node)
-        if known is None or self.knows(omitted) or omitted in self.robot.nodes:
+        if known is None or self.knows(omitted) or omitted in self.robot.graph:
             return None
         return known.carried_on(omission.node_from_omitted, np.zeros((6, 6)))
 
@@ -149,17 +168,17 @@ class Merge:
             remembered: its attempts; `session` is a place in `sessions`.
 
         Returns:
-            `session`, `reference` and `node` are indices into the contents of the robot's map.
+            `session` is a place in the sessions of the robot's map; `reference` and `node` are
+            indices of its graph.
         """
-        contents = self.robot.contents
-        positions = [self.equivalent(node.id) for node in contents.nodes]
+        positions = [self.equivalent(node.id) for node in self.robot.graph.nodes]
         known = np.array([position is not None for position in positions], np.bool_)
-        made = contents.attempts
+        made = self.robot.attempts
         made = made.rows(known[made.reference] & known[made.node])
         place: dict[SessionId, int] = {}
-        for session in (*sessions, *(one.id for one in contents.sessions)):
+        for session in (*sessions, *self.robot.sessions):
             place.setdefault(session, len(place))
-        named = np.array([place[one.id] for one in contents.sessions], np.int32)
+        named = np.array([place[session] for session in self.robot.sessions], np.int32)
         new = made.rows(replace(made, session=named[made.session]).lacking(remembered))
         return new.moved_to([None if one is None else one.node_from_live for one in positions])
 
@@ -206,6 +225,10 @@ class Merge:
         if path not in self._entries:
             self._entries[path] = set(map(_key, self.centre.path_memory.entries(path)))
         return self._entries[path]
+
+
+def _edge_key(edge: Edge) -> tuple[NodeId, NodeId, EdgeKind]:
+    return edge.a, edge.b, edge.kind
 
 
 _EntryKey: TypeAlias = int | tuple[NodeId, int]

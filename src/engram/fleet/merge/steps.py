@@ -14,25 +14,25 @@ from engram import __version__
 from engram.config import to_dict
 from engram.fleet.merge.checks import check_fits, check_readable, notes
 from engram.fleet.merge.gate import Gate
-from engram.fleet.merge.handed_in import HandedIn
 from engram.fleet.merge.positions import recomposed, uncertainty_m2
 from engram.fleet.merge.replay import MergeOptions, Replay
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.segments import Segment, string_segments
 from engram.fleet.merge.state import Merge
-from engram.fleet.merge.words import keep_words
 from engram.graph.attempts import Attempts
+from engram.frontend import DescriptorKind
 from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
 from engram.maps import Map
 from engram.monitor import Monitor
 from engram.places import RECOGNISERS
+from engram.places.words import NodeWords, vocabulary_or_default
 from engram.robot import Settings
 from engram.robot.localisers import drives_of
 
 
 def merge_one(
-    store: Map,
-    robot: HandedIn,
+    centre: Map,
+    robot: Map,
     settings: Settings,
     options: MergeOptions,
     gate: Gate | None,
@@ -41,7 +41,7 @@ def merge_one(
     """Merges one robot's map into the centre: one revision, or none where nothing is new.
 
     Args:
-        store: the centre.
+        centre: the fleet's map, open for writing.
         robot: the map handed in.
         settings: of localiser and mapper.
         options: policy and budget.
@@ -53,28 +53,29 @@ def merge_one(
         RefusedError: the gate refuses the result. The centre is as it was.
         MapError: a map cannot be read or written. The centre is as it was.
     """
-    merge = Merge(store, robot)
+    merge = Merge(centre, robot)
     check_fits(merge)
     report, before = merge.report, len(merge.graph)
     report.notes = notes(merge, time.time_ns())
-    new = [node for node in robot.contents.nodes if not merge.knows(node.id)]
-    report.known_omissions = sum(merge.has_omitted(node) for node in robot.nodes)
-    report.known = len(robot.nodes) - len(new) - report.known_omissions
+    nodes = robot.graph.nodes
+    new = [node for node in nodes if not merge.knows(node.id)]
+    report.known_omissions = sum(merge.has_omitted(node.id) for node in nodes)
+    report.known = len(nodes) - len(new) - report.known_omissions
     if new or merge.has_more():
         check_readable(robot, new)
-        with store.begin_revision(**_about(merge, new, settings, options)) as merge.writer:
-            with monitor.stage(f"merge {robot.name}", len(new)) as stage:
+        with centre.begin_revision(**_about(merge, new, settings, options)) as merge.writer:
+            with monitor.stage(f"merge {robot.location}", len(new)) as stage:
                 _take_over(merge, new, Replay(merge, settings, options, stage))
             monitor.check()
             if gate is not None:
                 merge.writer.flush()
-                report.held_out = gate(store, robot.name, monitor)
+                report.held_out = gate(centre, robot.location, monitor)
                 monitor.check()
             report.revision = merge.writer.commit().number
         if options.relocaliser in RECOGNISERS:  # which know places by their words
-            keep_words(store, merge, settings.frontend.descriptor)
+            _keep_words(merge, settings.frontend.descriptor)
     _say_what_hangs_together(merge, before)
-    report.content_hash = store.content_hash()
+    report.content_hash = centre.content_hash()
     return report
 
 
@@ -87,7 +88,7 @@ def _about(
         "author": options.author or names or "nobody",
         "message": f"merge {names or 'a map without drives'}",
         "configuration": {
-            "merge": {"source": merge.robot.content_hash, **to_dict(options)},
+            "merge": {"source": merge.report.source_hash, **to_dict(options)},
             "settings": to_dict(settings),
             "engram": __version__,
         },
@@ -96,36 +97,35 @@ def _about(
 
 def _contributors(merge: Merge, new: Sequence[Node]) -> list[str]:
     """Whose drives bring nodes or ways that the centre lacks; all robots where none does."""
-    robot = merge.robot
-    saved = {node.session for node in new}
+    saved, paths = {node.session for node in new}, merge.robot.path_memory
     driven = {
-        entry.path
-        for entry in robot.contents.path_entries
-        if merge.new_entry(entry) is not None or not merge.knows(entry.node)
+        path
+        for path in paths.paths
+        if any(merge.new_entry(one) or not merge.knows(one.node) for one in paths.entries(path))
     }
     found = {
         one.robot
-        for one in robot.sessions
+        for one in merge.sessions
         if one.id not in merge.centre.sessions or one.id in saved or path_id(one.id) in driven
     }
-    return sorted(found) or robot.robots
+    return sorted(found) or list(merge.report.robots)
 
 
 def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
     """The steps of SPEC §7 MERGE, in order."""
     _take_vocabulary(merge)
     segments: dict[SessionId, list[Segment]] = defaultdict(list)
-    for segment in string_segments(new, merge.robot.edges):
+    for segment in string_segments(new, merge.edges):
         segments[segment.nodes[0].session].append(segment)
     late: list[PathEntry] = []
-    for session in merge.robot.sessions:
+    for session in merge.sessions:
         _add_session(merge, session)
         for segment in segments[session.id]:
             merge.report.segments.append(replay.segment(session, segment))
         late += _unite_path(merge, session, replay)
     merge.add_entries(late)
     _see_edges_again(merge)
-    for edge in filter(merge.lacks_edge, merge.robot.edges):
+    for edge in filter(merge.lacks_edge, merge.edges):
         merge.add_edge(edge)  # what the robot found out about nodes that the centre had
     _join_components(merge)
     _carry_omissions(merge)
@@ -136,8 +136,8 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
 
 def _take_vocabulary(merge: Merge) -> None:
     """A centre without a vocabulary of its own takes that of the robot."""
-    theirs = merge.robot.store.vocabulary
-    if theirs is not None and merge.store.vocabulary is None:
+    theirs = merge.robot.vocabulary
+    if theirs is not None and merge.centre.vocabulary is None:
         merge.writer.put_vocabulary(theirs)
 
 
@@ -146,7 +146,7 @@ def _add_session(merge: Merge, session: Session) -> None:
     descriptor, frontend = robot.frontends[session.id]
     merge.report.sessions += merge.writer.add_session(
         session,
-        robot.contents.cameras[session.camera],
+        robot.cameras[session.camera],
         descriptor=descriptor,
         frontend=frontend,
         partial=path_id(session.id) in robot.partial_paths,
@@ -156,7 +156,7 @@ def _add_session(merge: Merge, session: Session) -> None:
 
 def _unite_path(merge: Merge, session: Session, replay: Replay) -> list[PathEntry]:
     """The drive's path as far as its nodes are known; returns the entries that are not yet."""
-    entries = merge.robot.entries_of.get(path_id(session.id), [])
+    entries = merge.robot.path_memory.entries(path_id(session.id))
     merge.add_entries([one for one in entries if merge.knows(one.node)])
     merge.add_entries(replay.entries.get(session.id, []))
     return [one for one in entries if not merge.knows(one.node)]
@@ -167,7 +167,7 @@ def _see_edges_again(merge: Merge) -> None:
     if not merge.writer.shows_again:
         return
     merge.writer.flush()
-    graph, edges = merge.graph, merge.store.load().edges
+    graph, edges = merge.graph, merge.centre.load().edges
     graph.add_edges([one for one in edges if graph.find_edge(one.a, one.b, one.kind) is None])
 
 
@@ -175,7 +175,7 @@ def _join_components(merge: Merge) -> None:
     """Where two parts of the centre are joined only by nodes that were not taken."""
     labels, index = merge.graph.components(), merge.graph.index
     edges = []
-    for edge in merge.robot.edges:
+    for edge in merge.edges:
         a, b = merge.equivalent(edge.a), merge.equivalent(edge.b)
         moved = None if a is None or b is None else recomposed(edge, a, b)
         if moved is not None and labels[index(moved.a)] != labels[index(moved.b)]:
@@ -202,22 +202,34 @@ def _carry_attempts(merge: Merge, replay: Replay) -> None:
     if merge.writer.shows_again:
         # A node that is seen again brings back the attempts that were remembered at it.
         merge.writer.flush()
-        now = merge.store.load()
+        now = merge.centre.load()
         sessions, remembered = [session.id for session in now.sessions], now.attempts
     new = merge.new_attempts(sessions, remembered)
     merge.report.attempts += len(new)
-    contents = merge.robot.contents
     ids = [
         node.id if at is None else at.node
-        for node in contents.nodes
+        for node in merge.robot.graph.nodes
         for at in [merge.equivalent(node.id)]
     ]
-    place = {session.id: at for at, session in enumerate(contents.sessions)}
-    for session in merge.robot.sessions:
+    place = {session: at for at, session in enumerate(merge.robot.sessions)}
+    for session in merge.sessions:
         own = new.rows(new.session == place[session.id])
         merge.writer.add_attempts(session.id, own, ids)
         replayed, nodes = Attempts.of(replay.attempts.get(session.id, []))
         merge.writer.add_attempts(session.id, replayed, nodes)
+
+
+def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
+    """Copies the words that the robot's map has by the centre's vocabulary; works out the rest.
+
+    Words are no part of any revision: where this is interrupted, they are worked out later.
+    """
+    vocabulary, graph = vocabulary_or_default(merge.centre, descriptor), merge.graph
+    theirs = NodeWords.of_map(merge.robot, vocabulary)
+    brought = {node: words for node, words in theirs.kept.items() if node in graph}
+    if brought:
+        merge.centre.put_words(theirs.hash, brought)
+    NodeWords.of_map(merge.centre, vocabulary).keep_missing([node.id for node in graph.nodes])
 
 
 def _say_what_hangs_together(merge: Merge, before: int) -> None:
