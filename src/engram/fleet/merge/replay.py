@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import msgspec
@@ -18,7 +19,6 @@ from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
 from engram.fleet.merge.state import Merge
 from engram.frontend import Frame, FrameStatus
-from engram.geometry import SE3
 from engram.graph.model import (
     Attempt,
     Edge,
@@ -124,9 +124,6 @@ class Replay(Keeper):
         self._settings = settings
         self._options = options
         self._monitor = monitor
-        self._relocaliser = (
-            None if (name := options.relocaliser) is None else self._lazy_relocaliser(name)
-        )
         self._taken: set[NodeId] = set()
         self._iterations: dict[SessionId, int] = {}
         # How far each drive had come when the centre last knew it.
@@ -209,10 +206,11 @@ class Replay(Keeper):
 
     # -- the stream
 
-    def _lazy_relocaliser(self, name: str) -> LazyRelocaliser:
-        """One for all segments."""
-        centre, descriptor = self._merge.centre, self._settings.frontend.descriptor
-        return LazyRelocaliser(name, lambda: relocaliser_in(centre, name, descriptor))
+    @cached_property
+    def _relocaliser(self) -> Relocaliser | None:
+        """One for all segments; learning all nodes takes a while."""
+        name, descriptor = self._options.relocaliser, self._settings.frontend.descriptor
+        return None if name is None else relocaliser_in(self._merge.centre, name, descriptor)
 
     def _localiser_of(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None
@@ -361,40 +359,6 @@ class Replay(Keeper):
         run, self._run = self._run, []
         if run:
             self._merge.write_edges(tighten_chain(self._merge.graph, run))
-
-
-class LazyRelocaliser:
-    """A relocaliser that is made when it is first asked: learning all nodes takes a while."""
-
-    new_place: float | None = None
-
-    def __init__(self, name: str, make: Callable[[], Relocaliser]) -> None:
-        self.name = name
-        self._make = make
-        self._made: Relocaliser | None = None
-
-    def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
-        """See `Relocaliser`."""
-        if self._made is None:
-            self._made = self._make()
-        proposed = self._made.propose(live, count, allowed)
-        self.new_place = self._made.new_place
-        return proposed
-
-    def carry_on(self, motion: SE3 | None) -> None:
-        """See `Relocaliser`; one that was never asked believes nothing yet."""
-        if self._made is not None:
-            self._made.carry_on(motion)
-
-    def failed(self, nodes: Sequence[int]) -> None:
-        """See `Relocaliser`."""
-        if self._made is not None:
-            self._made.failed(nodes)
-
-    def forget(self) -> None:
-        """See `Relocaliser`."""
-        if self._made is not None:
-            self._made.forget()
 
 
 def _measured(found: Localisation) -> Position:
