@@ -19,8 +19,8 @@ from engram.fleet.merge.replay import MergeOptions, Replay
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.segments import Segment, string_segments
 from engram.fleet.merge.state import Merge
-from engram.graph.attempts import Attempts
 from engram.frontend import DescriptorKind
+from engram.graph.attempts import Attempts
 from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
 from engram.maps import Map
 from engram.monitor import Monitor
@@ -226,7 +226,8 @@ def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
     """
     vocabulary, graph = vocabulary_or_default(merge.centre, descriptor), merge.graph
     theirs = NodeWords.of_map(merge.robot, vocabulary)
-    brought = {node: words for node, words in theirs.kept.items() if node in graph}
+    robot = merge.robot.graph  # of what is hidden there nothing was checked
+    brought = {node: one for node, one in theirs.kept.items() if node in graph and node in robot}
     if brought:
         merge.centre.put_words(theirs.hash, brought)
     NodeWords.of_map(merge.centre, vocabulary).keep_missing([node.id for node in graph.nodes])
