@@ -11,10 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from engram.config import check_bounds
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.chain_error import ChainError
 from engram.graph.graph import ChainTree, ExperienceGraph
@@ -24,29 +27,60 @@ from engram.graph.neighbourhood import Neighbourhood, Search
 Array = NDArray[np.float64]
 
 _LINKS = frozenset({EdgeKind.PROXIMITY, EdgeKind.MATCH, EdgeKind.TIE})
-# Nodes of one experience that are further apart than this along the drive are different passes of
-# the place, each joined for itself. Also how far back own nodes are no neighbours (SPEC §3.1).
-_PASS_GAP_M = 30.0
-# 99.9 % of χ² with six degrees of freedom: two estimates further apart contradict each other.
-_CONSISTENT_CHI2 = 22.5
 
 
 @dataclass(frozen=True, slots=True)
 class ProximityConfig:
     """Settings of `lay_proximity_edges` and `tighten_chain`.
 
-    Attributes:
-        reach_m: nodes within this predicted distance are beside, plus two standard deviations.
-            The search radius, so that what a localiser should see is joined.
-        spacing_m: a chain is joined to the same experience no more often than this; the margin of
-            the neighbourhood search leaps it.
-        greatest_sigma_m: where the dead reckoning is vaguer than this it joins nothing: the chain's
-            far end will tell where it was.
+    Raises:
+        ConfigError: one is out of its bounds.
     """
 
-    reach_m: float = 8.0
-    spacing_m: float = 4.0
-    greatest_sigma_m: float = 15.0
+    reach_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="nodes within this predicted distance are beside, plus two standard "
+            "deviations, m: the search radius, so that what a localiser should see is joined",
+        ),
+    ] = 8.0
+    spacing_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="a chain is joined to the same experience no more often than this, m; the "
+            "margin of the neighbourhood search leaps it",
+        ),
+    ] = 4.0
+    greatest_sigma_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="dead reckoning vaguer than this, m, joins nothing: the chain's far end "
+            "will tell where it was",
+        ),
+    ] = 15.0
+    pass_gap_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="nodes of one experience further apart than this along the drive, m, are "
+            "different passes, each joined for itself; own nodes nearer behind are no neighbours. "
+            "Source: SPEC §3.1",
+        ),
+    ] = 30.0
+    consistent_chi2: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="two estimates of a transform further apart contradict each other: 99.9 % "
+            "of χ² with six degrees of freedom",
+        ),
+    ] = 22.5
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 DEFAULT_CONFIG = ProximityConfig()
@@ -67,7 +101,7 @@ def lay_proximity_edges(
     near = _beside(graph, node, config)
     linked = _linked_lately(graph, node, config.spacing_m)
     edges = []
-    for rows in _passes(graph, near):
+    for rows in _passes(graph, near, config.pass_gap_m):
         if not linked.isdisjoint(near.nodes[rows].tolist()):
             continue
         row = int(rows[np.argmin(near.distance_m[rows])])
@@ -105,7 +139,7 @@ def tighten_chain(
     Returns:
         The new and the superseding edges. They are in the graph already, and are to be stored.
     """
-    edges = list(_sharpened(graph, chain))
+    edges = list(_sharpened(graph, chain, config.consistent_chi2))
     graph.add_edges(edges)
     for node in reversed(chain):
         edges += lay_proximity_edges(graph, node, config)
@@ -119,19 +153,21 @@ def _beside(graph: ExperienceGraph, node: int, config: ProximityConfig) -> Neigh
         node,
         SE3.identity(),
         np.zeros((6, 6)),
-        Search(config.reach_m, np.pi, record.session, record.driven_m, _PASS_GAP_M),
+        Search(config.reach_m, np.pi, record.session, record.driven_m, config.pass_gap_m),
     )
     return near.rows(np.flatnonzero(near.sigma_m <= config.greatest_sigma_m))
 
 
-def _passes(graph: ExperienceGraph, near: Neighbourhood) -> Iterator[NDArray[np.intp]]:
+def _passes(
+    graph: ExperienceGraph, near: Neighbourhood, gap_m: float
+) -> Iterator[NDArray[np.intp]]:
     """Rows of each experience, parted where it came by more than once."""
     driven = graph.driven_m[near.nodes]
     experiences = graph.experiences[near.nodes]
     order = np.lexsort((driven, experiences))
     if len(order) == 0:
         return
-    parted = (np.diff(experiences[order]) != 0) | (np.diff(driven[order]) > _PASS_GAP_M)
+    parted = (np.diff(experiences[order]) != 0) | (np.diff(driven[order]) > gap_m)
     yield from np.split(order, np.flatnonzero(parted) + 1)
 
 
@@ -167,7 +203,9 @@ def _along_chain(graph: ExperienceGraph, node: int, within_m: float) -> list[int
     return list(members)
 
 
-def _sharpened(graph: ExperienceGraph, chain: Sequence[int]) -> Iterator[Edge]:
+def _sharpened(
+    graph: ExperienceGraph, chain: Sequence[int], consistent_chi2: float
+) -> Iterator[Edge]:
     """Each proximity edge that the chain laid, as both of its ends together predict it."""
     laid = [
         (edge, graph.index(edge.a), node)
@@ -187,9 +225,9 @@ def _sharpened(graph: ExperienceGraph, chain: Sequence[int]) -> Iterator[Edge]:
         if a in newer or not far_end.sees(a, b):
             continue
         if near_end.sees(a, b):
-            yield _fused_at_junction(edge, a, b, near_end, far_end)
+            yield _fused_at_junction(edge, (a, b), near_end, far_end, consistent_chi2)
         else:
-            yield _fused(edge, *far_end.predict(a, b))
+            yield _fused(edge, *far_end.predict(a, b), consistent_chi2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,16 +273,21 @@ def _view_from_end(
     )
 
 
-def _fused_at_junction(edge: Edge, a: int, b: int, near: _EndView, far: _EndView) -> Edge:
+def _fused_at_junction(
+    edge: Edge, ends: tuple[int, int], near: _EndView, far: _EndView, consistent_chi2: float
+) -> Edge:
     """Fuse where the two ends' chains to node a come together, and go on to a from there.
 
     From there on they share their edges, and so their errors: fused at a, the two would pass for
     independent and the result for surer than it is.
     """
+    a, b = ends
     junction = _junction(near.outward, far.outward, a)
     x_from_b, covariance = near.predict(junction, b)
     at_junction = _fused(
-        Edge(edge.a, edge.b, edge.kind, x_from_b, covariance), *far.predict(junction, b)
+        Edge(edge.a, edge.b, edge.kind, x_from_b, covariance),
+        *far.predict(junction, b),
+        consistent_chi2,
     )
     if junction == a:
         return at_junction
@@ -274,7 +317,12 @@ def _junction(one: ChainTree, other: ChainTree, node: int) -> int:
     return int(one.nodes[row])
 
 
-def _fused(edge: Edge, a_from_b: SE3, covariance: Array) -> Edge:
+def _fused(
+    edge: Edge,
+    a_from_b: SE3,
+    covariance: Array,
+    consistent_chi2: float = DEFAULT_CONFIG.consistent_chi2,
+) -> Edge:
     """The edge moved towards another estimate of it, as far as that is the surer one.
 
     Estimates that contradict each other are not averaged: somewhere a chain is worse than it
@@ -286,7 +334,7 @@ def _fused(edge: Edge, a_from_b: SE3, covariance: Array) -> Edge:
         weighted = np.linalg.solve(both, np.column_stack([difference, edge.covariance]))
     except np.linalg.LinAlgError:  # two edges without any uncertainty
         return edge
-    if not difference @ weighted[:, 0] <= _CONSISTENT_CHI2:
+    if not difference @ weighted[:, 0] <= consistent_chi2:
         surer = np.trace(covariance[:3, :3]) < np.trace(edge.covariance[:3, :3])
         return Edge(edge.a, edge.b, edge.kind, a_from_b, covariance) if surer else edge
     fused = edge.covariance - edge.covariance @ weighted[:, 1:]

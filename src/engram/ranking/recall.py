@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
+from engram.config import check_bounds
 from engram.graph.basin import prior_basin_m
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.likeness import standard_likenesses
@@ -20,61 +23,126 @@ Array = NDArray[np.float64]
 class RecallConstants:
     """The constants of Γ(recall); `RECALL` ships with the package.
 
-    Margins are logarithms of inliers over the 20 that a match needs.
+    Margins are logarithms of inliers over those that a match needs. Source: found on `village@2`, a
+    town that nothing is judged on, by `engram_lab.fits.recall`, and rounded: what is lost depends
+    little on any of them but the distance.
 
-    Attributes:
-        distance: margin lost per shipped match basin between node and robot, root mean square.
-        lessons: margin per log odds of how likely past drives matched the node.
-        level: margin at no distance of a node that every other past drive matched.
-        prior_weight: how many attempts of this very moment all that past drives say is worth.
-        memory_m: metres driven over which an attempt of this run comes to weigh e times less.
-        regret: how many attempts of this very moment a pick counts as, supposed to have failed.
-        tally: margin per log of how often this run matched the node's drive, over that of a drive
-            not tried yet.
-        tally_memory_m: metres driven over which an attempt comes to weigh e times less in that.
-        untried_rate, untried_attempts: success rate of a drive not tried yet, and how many attempts
-            that is worth. Source: SPEC §4, as Γ(bandit).
-        likeness: margin per standard deviation that a node looks liker than the others do.
-        vague_m: how vaguely even the surest candidate is known, σ, before likeness counts.
-        steepness: log odds of a success per margin.
-        bias: log odds of a success at margin 0.
+    Raises:
+        ConfigError: one is out of its bounds.
     """
 
-    distance: float
-    lessons: float
-    level: float
-    prior_weight: float
-    memory_m: float
-    regret: float
-    tally: float
-    tally_memory_m: float
-    untried_rate: float
-    untried_attempts: float
-    likeness: float
-    vague_m: float
-    steepness: float
-    bias: float
+    distance: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="margin lost per shipped match basin between node and robot, root mean "
+            "square",
+        ),
+    ] = 1.1
+    lessons: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="margin per log odds of how likely past drives matched the node",
+        ),
+    ] = 0.3
+    level: Annotated[
+        float,
+        Meta(
+            description="margin at no distance of a node that every other past drive matched",
+        ),
+    ] = 0.5
+    prior_weight: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="how many attempts of this very moment all past drives together are worth",
+        ),
+    ] = 0.5
+    memory_m: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="metres driven over which an attempt of this run comes to weigh e times "
+            "less",
+        ),
+    ] = 4.0
+    regret: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="how many attempts of this very moment a pick counts as, supposed to have "
+            "failed",
+        ),
+    ] = 2.0
+    tally: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="margin per log of how often this run matched the node's drive, over that "
+            "of a drive not tried yet",
+        ),
+    ] = 0.5
+    tally_memory_m: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="metres driven over which an attempt comes to weigh e times less there",
+        ),
+    ] = 8.0
+    untried_rate: Annotated[
+        float,
+        Meta(
+            gt=0, description="success rate of a drive not tried yet. Source: SPEC §4, as Γ(bandit)"
+        ),
+    ] = 0.3
+    untried_attempts: Annotated[
+        float,
+        Meta(
+            gt=0, description="how many attempts that rate is worth. Source: SPEC §4, as Γ(bandit)"
+        ),
+    ] = 1.0
+    likeness: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="margin per standard deviation that a node looks more like the frame than "
+            "the others do. Source: trials with lost robots",
+        ),
+    ] = 0.4
+    vague_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="how vaguely even the surest candidate is known, σ in m, before likeness "
+            "counts. Source: trials with lost robots",
+        ),
+    ] = 0.5
+    steepness: Annotated[float, Meta(gt=0, description="log odds of a success per margin")] = 1.8
+    bias: Annotated[float, Meta(description="log odds of a success at margin 0")] = 0.6
+    needed: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="fewest inliers of a match; an attempt without any counts as one. "
+            "Source: SPEC §3",
+        ),
+    ] = 20
+    attempts: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="how many of this run's newest attempts count: 20 m at four every 0.7 m",
+        ),
+    ] = 128
+    picks: Annotated[int, Meta(ge=0, description="how many picks are made greedily")] = 8
+    shortlist: Annotated[int, Meta(ge=0, description="among how many of the best they are")] = 32
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
-# Found on `village@2`, a town that nothing is judged on, as `benchmarks/fit_recall.py` does it, and
-# rounded: what is lost depends little on any of them but the distance. Likeness and what counts as
-# vague are of other origin (docs/ranking.md).
-RECALL = RecallConstants(
-    distance=1.1,
-    lessons=0.3,
-    level=0.5,
-    prior_weight=0.5,
-    memory_m=4.0,
-    regret=2.0,
-    tally=0.5,
-    tally_memory_m=8.0,
-    untried_rate=0.3,
-    untried_attempts=1.0,
-    likeness=0.4,
-    vague_m=0.5,
-    steepness=1.8,
-    bias=0.6,
-)
+RECALL = RecallConstants()
 
 _MEANING = {
     "distance": "log of inliers lost by the distance of the node, which is the longer the more "
@@ -87,12 +155,6 @@ _MEANING = {
     "tally": "how often this run matched the node's drive: what keeps failing gives way, however "
     "nearly it matches",
 }
-# Fewest inliers of a match: SPEC §3. An attempt that came to nothing counts as one.
-_NEEDED = 20
-_PICKS = 8
-_SHORTLIST = 32
-# The newest of this run's attempts are enough: 20 m at four attempts every 0.7 m.
-_MOST_ATTEMPTS = 128
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,7 +251,7 @@ class RecallPolicy:
         by_turn = np.zeros(len(order), dtype=np.bool_)
         if not vague.any():
             return order, by_turn
-        run = context.run.newest(_MOST_ATTEMPTS)
+        run = context.run.newest(self._constants.attempts)
         tried = (run.nodes[:, None] == near.nodes[order]).sum(axis=0)
         turns = order[np.argsort(np.where(vague, tried, 0), kind="stable")]
         turn_first = run.frames % 2
@@ -256,12 +318,7 @@ class RecallPolicy:
 def _bound(constants: RecallConstants) -> _core.RecallConstants:
     """As the core takes them, but for `per_m`, which the lens decides."""
     bound = _core.RecallConstants()
-    for name in ("level", "memory_m", "prior_weight", "regret", "tally", "tally_memory_m"):
-        setattr(bound, name, getattr(constants, name))
-    bound.untried_rate, bound.untried_attempts = (
-        constants.untried_rate,
-        constants.untried_attempts,
-    )
-    bound.needed, bound.attempts = _NEEDED, _MOST_ATTEMPTS
-    bound.picks, bound.shortlist = _PICKS, _SHORTLIST
+    for one in fields(constants):
+        if hasattr(bound, one.name):  # the core knows no likeness and no chances
+            setattr(bound, one.name, getattr(constants, one.name))
     return bound

@@ -6,11 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import takewhile
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.errors import ConfigError
+from engram.config import check_bounds
 
 
 class IterationUnit(StrEnum):
@@ -24,26 +26,32 @@ class IterationUnit(StrEnum):
 class RecentConfig:
     """Settings of `RecentAttempts`.
 
-    Attributes:
-        T: iterations remembered; the paper finds 5…200 nearly flat and 0 clearly worse.
-        T_unit: `distance` makes one iteration of all frames within `iteration_m` of its first, so
-            that the memory does not depend on the frame rate (SPEC §3.6); `frame` makes one of
-            each frame, as the paper does.
-        iteration_m: length of an iteration, metres.
-
     Raises:
         ConfigError: T is negative or the length is not positive.
     """
 
-    T: int = 10
-    T_unit: IterationUnit = IterationUnit.DISTANCE
-    iteration_m: float = 0.5
+    T: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="iterations remembered; 5 to 200 are nearly alike, 0 is clearly worse. "
+            "Source: [L15] Fig. 13",
+        ),
+    ] = 10
+    T_unit: Annotated[
+        IterationUnit,
+        Meta(
+            description="distance makes one iteration of all frames within iteration_m of its "
+            "first, so that the memory does not depend on the frame rate; frame makes one of each, "
+            "as the paper does. Source: SPEC §3.6"
+        ),
+    ] = IterationUnit.DISTANCE
+    iteration_m: Annotated[
+        float, Meta(gt=0, description="length of an iteration, m. Source: SPEC §3.6")
+    ] = 0.5
 
     def __post_init__(self) -> None:
-        if self.T < 0:
-            raise ConfigError(f"T is {self.T}, must be 0 or more")
-        if not self.iteration_m > 0:
-            raise ConfigError(f"iteration_m is {self.iteration_m}, must be > 0")
+        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -58,8 +58,8 @@ SEARCHED: dict[str, tuple[float, ...]] = {
 CHANCES = ("bias", "steepness")
 # Replays start from where the robot truly was: these say nothing there.
 WHEN_LOST = ("likeness", "vague_m")
-# What a node that nobody tried is believed to do; counted, not searched.
-COUNTED = ("untried_rate", "untried_attempts")
+# What a node that nobody tried is believed to do, and how much is looked at: not searched.
+COUNTED = ("untried_rate", "untried_attempts", "needed", "attempts", "picks", "shortlist")
 OTHERS = ("bandit", "path-near", "distance", "time-of-day")
 # A robot that has so many candidates does not know where it is; to match all takes long.
 MOST_CANDIDATES = 200
