@@ -87,7 +87,7 @@ class RecallConstants:
         float,
         Meta(
             gt=0,
-            description="metres driven over which an attempt comes to weigh e times less there",
+            description="metres driven over which an attempt weighs e times less there",
         ),
     ] = 8.0
     untried_rate: Annotated[

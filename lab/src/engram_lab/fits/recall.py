@@ -19,6 +19,7 @@ import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ from engram_lab.studies.memo import MatchMemo
 from engram_lab.town import campaign_named
 from engram_lab.town.simulating import campaigns_folder
 
-SEARCHED: dict[str, tuple[float, ...]] = {
+SEARCHED: dict[str, tuple[Any, ...]] = {
     "distance": (0.4, 0.7, 1.1, 1.5, 2.2),
     "lessons": (0.0, 0.15, 0.3, 0.6),
     "level": (-0.5, 0.0, 0.5, 1.0),
