@@ -29,5 +29,6 @@ def test_addresses_of_databases_are_refused_and_never_taken_for_files(
     ran = engram(*words)
     assert ran.status == 2
     assert "PostgreSQL" in ran.err
+    assert "engram centre" in " ".join(ran.err.split())
     assert "secret" not in ran.err
     assert list(tmp_path.iterdir()) == []

@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 
 from engram.fleet.merge import merge
-from engram.maps import bulk_writer
+from engram.maps import writer
 
 from .robots import OPTIONS
 
 
 def main(centre: str, robot: str) -> None:
-    bulk_writer._BATCH_BYTES = 100_000  # so that a merge is written in several transactions
+    writer._BATCH_BYTES = 100_000  # so that a merge is written in several transactions
     print("merging", flush=True)
     merge(Path(centre), [Path(robot)], OPTIONS)
     print("merged", flush=True)

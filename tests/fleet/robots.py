@@ -68,7 +68,7 @@ def rewritten(
                 )
             for stored in given.frames.stored(contents.nodes):
                 kept = replace(stored, descriptor=descriptor or stored.descriptor)
-                writer.add_node(node(kept))
+                writer.copy_node(node(kept))
             for edge in contents.edges:
                 writer.add_edge(edge)
             for entry in contents.path_entries:

@@ -35,7 +35,7 @@ from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, Segm
 from engram.frontend import TEBLID
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
-from engram.maps import BulkWriter, Map, check_file, copy_map
+from engram.maps import Map, RevisionWriter, check_file, copy_map
 from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
 from engram.robot import RobotOptions, Settings, map_drive, open_drive, session_of_drive
@@ -571,7 +571,7 @@ class TestInterrupted:
         assert report.interrupted
 
     def test_when_a_merge_was_done_the_next_one_is_not_begun(self, centre, fleet, pressed):
-        pressed(BulkWriter, "commit")
+        pressed(RevisionWriter, "commit")
         maps = [fleet[name][0] for name in ("other", "longer")]
         done, stopped = merged(centre, *maps)
         assert (done.interrupted, done.revision) == (False, 2)
@@ -581,7 +581,7 @@ class TestInterrupted:
 
     def test_when_the_last_merge_was_done_whoever_called_hears_of_it(self, centre, fleet, pressed):
         told = []
-        pressed(BulkWriter, "commit")
+        pressed(RevisionWriter, "commit")
         with pytest.raises(KeyboardInterrupt):
             merged(centre, fleet["longer"][0], monitor=Told(told))
         assert [report.revision for report in told] == [2]

@@ -1,4 +1,4 @@
-"""A whole map copied into another one through the bulk writer."""
+"""A whole map copied into another one in one revision."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import signal
 from pathlib import Path
 
 from engram.graph.model import PathId, SessionId, path_id
-from engram.maps import BulkWriter, Map
+from engram.maps import Map, RevisionWriter
 
 
-def begin_bulk(store: Map) -> BulkWriter:
+def begin_bulk(store: Map) -> RevisionWriter:
     return store.begin_revision(author="tests", message="copy", configuration={"policy": "copy"})
 
 
 def copy_into(
-    writer: BulkWriter,
+    writer: RevisionWriter,
     source: Map,
     partial: set[PathId] | frozenset[PathId] = frozenset(),
     only: set[SessionId] | None = None,
@@ -35,7 +35,7 @@ def copy_into(
             )
     ids = {one.id for one in contents.nodes if one.session in taken}
     for stored in source.frames.stored(one for one in contents.nodes if one.id in ids):
-        writer.add_node(stored)
+        writer.copy_node(stored)
     for edge in contents.edges:
         if edge.a in ids and edge.b in ids:
             writer.add_edge(edge)
@@ -46,9 +46,7 @@ def copy_into(
     for place, one in enumerate(contents.sessions):
         if one.id in taken:
             made = contents.attempts.rows(contents.attempts.session == place)
-            writer.add_attempts(one.id, made, node_ids)
-    for name, values in source.statistics().items():
-        writer.put_statistics(name, values)
+            writer.copy_attempts(one.id, made, node_ids)
     vocabulary = source.vocabulary
     if vocabulary is not None:
         writer.put_vocabulary(vocabulary)
@@ -58,5 +56,5 @@ def copy_and_die(target: str, source: str) -> None:
     with Map.open(Path(target), writes=True) as store, Map.open(Path(source)) as other:
         writer = begin_bulk(store)
         copy_into(writer, other)
-        writer.flush()
+        writer.checkpoint()
         os.kill(os.getpid(), signal.SIGKILL)

@@ -19,9 +19,10 @@ from engram.graph.model import (
     PathEntryKind,
     Session,
     node_id,
+    path_id,
     session_id,
 )
-from engram.maps import Map, SessionWriter
+from engram.maps import Map, RevisionWriter
 
 from .frames import CAMERA, FRONTEND, frame
 
@@ -38,7 +39,7 @@ def session(name: str = "robot-1", start_ns: int = 1_000) -> Session:
     )
 
 
-def begin(store: Map, drive: Session, **changes: object) -> SessionWriter:
+def begin(store: Map, drive: Session, **changes: object) -> RevisionWriter:
     arguments = {
         "descriptor": BRIEF,
         "frontend": FRONTEND,
@@ -92,7 +93,7 @@ class Drive:
     def __repr__(self) -> str:
         return f"Drive({self.session.robot}, {len(self.nodes)} nodes)"
 
-    def write_node(self, writer: SessionWriter, index: int) -> None:
+    def write_node(self, writer: RevisionWriter, index: int) -> None:
         """One more node with its edge, path entry and attempts."""
         one, its_frame = node(self.session, index), node_frame(self.session, index)
         writer.add_node(one, its_frame)
@@ -104,12 +105,13 @@ class Drive:
             writer.add_attempts(made)
             self.attempts += made
         self.nodes.append(one)
-        entry = PathEntry(writer.path, index, one.id, PathEntryKind.SAVED, one.stamp_ns)
+        path = path_id(self.session.id)
+        entry = PathEntry(path, index, one.id, PathEntryKind.SAVED, one.stamp_ns)
         writer.add_path_entry(entry)
         self.entries.append(entry)
 
 
-def write_drive(writer: SessionWriter, count: int = 5) -> Drive:
+def write_drive(writer: RevisionWriter, count: int = 5) -> Drive:
     drive = Drive(writer.session)
     for index in range(count):
         drive.write_node(writer, index)

@@ -27,9 +27,10 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.graph.model import path_id
-from engram.maps import Map, check_file, sqlite
+from engram.maps import Map, check_file
 from engram.maps.rows import sealed
 from engram.maps.schema import FORMAT_VERSION, edges, nodes, path_entries
+from engram.sqlite import SqliteFile
 
 from .frames import assert_same_landmarks
 from .maps import Drive, assert_same_edges, begin, session, write_drive
@@ -44,7 +45,6 @@ def sound(tmp_path_factory):
         for name in ("robot-1", "robot-2"):
             writer = begin(store, session(name))
             drives.append(write_drive(writer, 3))
-            writer.put_statistics("basin", {"g": [1, 2]})
             writer.commit()
     return path, drives
 
@@ -136,9 +136,9 @@ def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
     for path, fact in (
         (tmp_path / "missing", "no such file"),
         (empty, "empty file"),
-        (text, "no map file"),
+        (text, "no map"),
         (folder, "folder"),
-        (other, "no Engram map"),
+        (other, "an SQLite file, but no map"),
     ):
         for opener in (Map.open, partial(Map.open, writes=True), check_file):
             with pytest.raises(NotAMapError, match=fact):
@@ -454,16 +454,16 @@ def test_a_map_written_under_a_reader_without_rights_is_no_damaged_one(sound, tm
 def test_a_map_on_a_full_disk_is_read(sound, tmp_path, monkeypatch):
     """There is no room for the file in which readers and writers agree."""
     path = shutil.copy(sound[0], tmp_path / "town.engram")
-    connect = sqlite._connect
+    connect = SqliteFile.connect
 
-    def no_room(uri: str, prepare: object) -> object:
-        if "immutable" in uri or str(path) not in uri:
-            return connect(uri, prepare)
+    def no_room(self: SqliteFile, options: str) -> object:
+        if "immutable" in options or self.path != path:
+            return connect(self, options)
         error = sqlite3.OperationalError("disk I/O error")
         error.sqlite_errorcode = sqlite3.SQLITE_IOERR_SHMSIZE
         raise error
 
-    monkeypatch.setattr(sqlite, "_connect", no_room)
+    monkeypatch.setattr(SqliteFile, "connect", no_room)
     with Map.open(path) as store:
         assert len(store.load().nodes) == 6
     # A log may hold what the file does not have yet.

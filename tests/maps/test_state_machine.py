@@ -18,9 +18,10 @@ from hypothesis.stateful import (
     rule,
 )
 
+from engram.centre.postgresql import PostgresMap
 from engram.errors import RevisionError
 from engram.graph.model import EdgeKind
-from engram.maps import Map, SessionState, SessionWriter, check_file
+from engram.maps import Map, RevisionWriter, SessionState, check_file
 
 from .conftest import drop_postgres_map, new_postgres_map
 from .frames import assert_same_landmarks
@@ -38,15 +39,15 @@ class MapMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.location: Path | str = self.new_location()
+        self.location: Path | PostgresMap = self.new_location()
         self.committed: list[tuple[Drive, dict]] = []
         self.interrupted: dict[str, tuple[Drive, dict]] = {}
         self.writing: tuple[Drive, dict] | None = None
         self.durable: tuple[Drive, dict] | None = None
-        self.writer: SessionWriter | None = None
+        self.writer: RevisionWriter | None = None
         self.seed = 0
 
-    def new_location(self) -> Path | str:
+    def new_location(self) -> Path | PostgresMap:
         self.folder = tempfile.TemporaryDirectory()
         return Path(self.folder.name) / "town.engram"
 
@@ -196,11 +197,12 @@ class MapMachine(RuleBasedStateMachine):
 class PostgresMachine(MapMachine):
     """The same map in PostgreSQL."""
 
-    def new_location(self) -> str:
-        return new_postgres_map()
+    def new_location(self) -> PostgresMap:
+        self.address, place = new_postgres_map()
+        return place
 
     def drop_location(self) -> None:
-        drop_postgres_map(self.location)
+        drop_postgres_map(self.address)
 
 
 TestFileMachine = MapMachine.TestCase

@@ -4,7 +4,8 @@ from pathlib import Path
 
 from sqlalchemy.util import LRUCache
 
-from engram.maps import Map, sqlite
+from engram import sqlite
+from engram.maps import Map
 
 from .maps import begin, session, write_drive
 

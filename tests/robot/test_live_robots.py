@@ -12,8 +12,7 @@ from tests.synthetic_world import Seen, World, drive
 
 from engram.errors import ConfigError, StorageFullError
 from engram.fleet.merge import merge
-from engram.maps import Map, check_file, open_map
-from engram.maps.session_writer import SessionWriter
+from engram.maps import Map, RevisionWriter, check_file, open_map
 from engram.robot import Robot, Settings
 from engram.robot.live import SavingState
 
@@ -88,15 +87,15 @@ def test_the_same_drive_gives_the_nodes_that_map_gives_wherever_it_comes_from(pa
 def test_a_full_disk_ends_saving_and_not_localising(
     path: Path, town: Map, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    checkpoint, made = SessionWriter.checkpoint, []
+    checkpoint, made = RevisionWriter.checkpoint, []
 
-    def full(writer: SessionWriter) -> None:
+    def full(writer: RevisionWriter) -> None:
         made.append(1)
         if len(made) > 1:
             raise StorageFullError("no space is left")
         checkpoint(writer)
 
-    monkeypatch.setattr(SessionWriter, "checkpoint", full)
+    monkeypatch.setattr(RevisionWriter, "checkpoint", full)
     road = drive(World(90.0), np.arange(0.0, 80.0, 0.7))
     with town.robot(CAMERA, name="r1", maps=True) as robot:
         words = run(robot, road)

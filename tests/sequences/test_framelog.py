@@ -261,7 +261,7 @@ def test_a_full_disk_loses_nothing_that_was_committed(tmp_path: Path) -> None:
         for index in range(2, PAIRS):
             writer.append(logged(index), pair_hash(index))
 
-    with pytest.raises(StorageFullError, match="up to the last checkpoint are safe"):
+    with pytest.raises(StorageFullError, match="up to the last checkpoint is safe"):
         record_the_rest()
     with pytest.raises(InputError, match="closed"):
         writer.append(logged(5), pair_hash(5))

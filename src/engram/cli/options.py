@@ -22,16 +22,15 @@ def map_file(text: str) -> Path:
     """A map as it is typed: a file; maps in PostgreSQL have addresses, which no verb takes.
 
     Raises:
-        BadParameter: it is an address. It may hold a password, so it is not repeated.
+        BadParameter: it is an address.
     """
-    from engram.maps.map import is_address
+    from engram.errors import InputError
+    from engram.maps.sqlite import map_path
 
-    if is_address(text):
-        raise typer.BadParameter(
-            "this is the address of a map in PostgreSQL; the program works on map files. From "
-            "Python, engram.fleet.download writes such a map to a file"
-        )
-    return Path(text)
+    try:
+        return map_path(text)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from error
 
 
 def _british(word: str) -> str:

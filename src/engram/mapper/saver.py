@@ -29,7 +29,7 @@ class FrameHolder(Protocol):
 
 
 class RecordWriter(Protocol):
-    """Where a session's records go; `engram.maps.SessionWriter` is one."""
+    """Where a session's records go; `engram.maps.RevisionWriter` is one."""
 
     def add_node(self, node: Node, frame: Frame) -> None:
         """Adds a node with the frame that it was."""

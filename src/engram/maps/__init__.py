@@ -1,6 +1,5 @@
 """A map on disk: revisions, transactions, integrity, history."""
 
-from engram.maps.bulk_writer import BulkWriter
 from engram.maps.difference import MapDifference
 from engram.maps.hiding import Reverted
 from engram.maps.history import (
@@ -28,12 +27,11 @@ from engram.maps.records import (
     StoredSession,
 )
 from engram.maps.schema import FORMAT_VERSION
-from engram.maps.session_writer import SessionWriter
 from engram.maps.tags import Tag
+from engram.maps.writer import RevisionWriter
 
 __all__ = [
     "FORMAT_VERSION",
-    "BulkWriter",
     "CheckReport",
     "InterruptedSession",
     "Map",
@@ -45,8 +43,8 @@ __all__ = [
     "RevertReport",
     "Reverted",
     "Revision",
+    "RevisionWriter",
     "SessionState",
-    "SessionWriter",
     "StoredNode",
     "StoredSession",
     "Tag",

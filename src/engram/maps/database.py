@@ -1,15 +1,20 @@
-"""What the store asks of a database: SQLite is one (`sqlite`), PostgreSQL another."""
+"""What a map asks of a database, and how one of an older format is brought to the newest."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Protocol
 
-from sqlalchemy import Connection, Executable, Select, Table
+from sqlalchemy import Connection, Executable, Select, Table, delete, insert, text
+from sqlalchemy.schema import CreateTable
+from sqlalchemy.sql.base import ReadOnlyColumnCollection
 
+from engram import __version__
 from engram.errors import MapCorruptError
-from engram.maps.lock import Holder
+from engram.files import Holder
+from engram.maps.rows import sealed
+from engram.maps.schema import FORMAT_VERSION, map_format, missing_in, rebuilt_from
 
 
 @contextmanager
@@ -105,3 +110,57 @@ class Database(Protocol):
     def close(self) -> None:
         """Give back all connections."""
         ...
+
+
+class Place(Protocol):
+    """Where a map lies, or is to lie, that is not a file."""
+
+    def create(self) -> None:
+        """Make an empty map.
+
+        Raises:
+            InputError: there is one already.
+        """
+        ...
+
+    def open(self) -> Database:
+        """The database of the map.
+
+        Raises:
+            NotAMapError: there is none.
+        """
+        ...
+
+
+def replaced(proposed: ReadOnlyColumnCollection[str, Any], key: tuple[str, ...]) -> dict[str, Any]:
+    """What an upsert sets: all columns of the row that is in the way, but those of the key."""
+    return {column.name: column for column in proposed if column.name not in key}
+
+
+def raise_tables(
+    connection: Connection,
+    version: int,
+    free_names: Callable[[Connection, str], None] | None = None,
+) -> None:
+    """Make the tables that are new, copy those whose constraints changed, note the format.
+
+    Args:
+        connection: in a transaction, which makes it all or nothing.
+        version: the format that the map has.
+        free_names: called with a table that was renamed out of the way: frees those names of its
+            constraints that its successor needs; None where constraints have no names.
+    """
+    for table in missing_in(version):
+        connection.execute(CreateTable(table))
+    for table in rebuilt_from(version):
+        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO older"))
+        if free_names is not None:
+            free_names(connection, "older")
+        connection.execute(CreateTable(table))
+        columns = ", ".join(table.columns.keys())
+        copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
+        connection.execute(text(copied))
+        connection.execute(text("DROP TABLE older"))
+    connection.execute(delete(map_format))
+    row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
+    connection.execute(insert(map_format), sealed(map_format, row))

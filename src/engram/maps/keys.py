@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, Table, func, insert, select
+from sqlalchemy import Table, func, select
 
-from engram.frontend import DescriptorKind
-from engram.geometry import StereoCamera
 from engram.graph.model import NodeId
 from engram.maps.database import Database
-from engram.maps.rows import camera_row, sealed
-from engram.maps.schema import KEYED, cameras, frontends, nodes
+from engram.maps.schema import KEYED, nodes
 from engram.maps.view import View
 
 
@@ -57,26 +54,3 @@ class KeyBook:
             with self._database.reading() as connection:
                 self._nodes = {row[0]: row[1] for row in connection.execute(query)}
         return self._nodes
-
-    def ensure_camera(self, connection: Connection, camera: StereoCamera) -> int:
-        """Key of the camera, stored if it is new."""
-        query = select(cameras.c.key).where(cameras.c.id == camera.id).order_by(cameras.c.key)
-        key = connection.execute(query).scalar()
-        if key is None:
-            key = self.next(cameras)
-            connection.execute(insert(cameras), [sealed(cameras, camera_row(camera, key))])
-        return key
-
-    def ensure_frontend(
-        self, connection: Connection, descriptor: DescriptorKind, frontend: str
-    ) -> int:
-        """Key of the front-end, stored if it is new."""
-        query = select(frontends.c.key).where(
-            frontends.c.descriptor == str(descriptor), frontends.c.hash == frontend
-        )
-        key = connection.execute(query.order_by(frontends.c.key)).scalar()
-        if key is None:
-            key = self.next(frontends)
-            row = {"key": key, "descriptor": str(descriptor), "hash": frontend}
-            connection.execute(insert(frontends), [sealed(frontends, row)])
-        return key

@@ -17,8 +17,8 @@ from sqlalchemy import Connection, insert, select
 
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
+from engram.files import Holder
 from engram.frontend import DescriptorKind
-from engram.frontend.blobs import content_digest
 from engram.geometry import CameraId, StereoCamera
 from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
@@ -29,29 +29,16 @@ from engram.graph.model import (
     PathId,
     Session,
     SessionId,
-    path_id,
 )
 from engram.graph.paths import PathMemory
 from engram.maps import reading
-from engram.maps.bulk_writer import BulkWriter
 from engram.maps.checking import check
-from engram.maps.collecting import collect_abandoned
-from engram.maps.committing import change_revision, commit_revision
 from engram.maps.content import content_hash, record_hashes
-from engram.maps.database import Database, Lock
+from engram.maps.database import Database, Lock, Place
 from engram.maps.difference import MapDifference, difference
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
-from engram.maps.hiding import (
-    Reverted,
-    check_same_session,
-    compare,
-    hidden_row,
-    hidden_rows,
-    hide_revision,
-)
+from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.keys import KeyBook
-from engram.maps.lock import Holder
-from engram.maps.postgresql import PostgresDatabase
 from engram.maps.provenance import Origin, origin_of
 from engram.maps.records import (
     CheckReport,
@@ -62,45 +49,34 @@ from engram.maps.records import (
     Revision,
     RevisionStatus,
     SessionState,
-    StoredSession,
 )
 from engram.maps.regions import STRETCH_M
-from engram.maps.rows import (
-    Row,
-    checked_text,
-    sealed,
-    session_from_row,
-    session_row,
-    to_json,
-    verified,
-)
-from engram.maps.schema import hidden, nodes, paths, revisions, sessions, vocabularies
-from engram.maps.session_states import (
+from engram.maps.revisions import (
+    change_revision,
+    collect_abandoned,
+    commit_revision,
     interrupted_sessions,
     session_and_revision,
     stored_session,
 )
-from engram.maps.session_writer import SessionWriter
-from engram.maps.sqlite import SqliteDatabase
+from engram.maps.rows import Row, checked_text, sealed, session_from_row, to_json, verified
+from engram.maps.schema import revisions
+from engram.maps.sqlite import SqliteDatabase, map_path
 from engram.maps.tags import Tag, checked_tag, load_tags, resolve, write_tag
 from engram.maps.view import View, head
 from engram.maps.words import load_words, words_row, write_words
+from engram.maps.writer import RevisionWriter
 
 if TYPE_CHECKING:
     from engram.robot.robot import Robot
     from engram.robot.settings import Settings
 
 
-def is_address(location: Path | str) -> bool:
-    """Whether a map lies in PostgreSQL, not in a file."""
-    return isinstance(location, str) and location.startswith("postgresql")
-
-
-def open_database(location: Path | str) -> Database:
+def open_database(location: Path | str | Place) -> Database:
     """The database of an existing map."""
-    if is_address(location):
-        return PostgresDatabase(str(location))
-    return SqliteDatabase(Path(location))
+    if isinstance(location, Path | str):
+        return SqliteDatabase(map_path(location))
+    return location.open()
 
 
 _P = ParamSpec("_P")
@@ -191,26 +167,25 @@ class Map:
         self._contents_lock = threading.RLock()
         self._contents: _Contents | None = None
         self._derived: dict[tuple[object, ...], Any] = {}
-        self._open_session: SessionWriter | None = None
-        self._bulk: BulkWriter | None = None
+        self._writing: RevisionWriter | None = None
 
     @staticmethod
-    def create(location: Path | str) -> Map:
+    def create(location: Path | str | Place) -> Map:
         """Make an empty map and open it for writing.
 
         Raises:
             InputError: something is there already, or the folder is not.
             MapError: it cannot be written.
         """
-        if is_address(location):
-            PostgresDatabase.create(str(location))
+        if isinstance(location, Path | str):
+            SqliteDatabase.create(map_path(location))
         else:
-            SqliteDatabase.create(Path(location))
+            location.create()
         return Map.open(location, writes=True)
 
     @staticmethod
     def open(
-        location: Path | str,
+        location: Path | str | Place,
         *,
         at: int | str | None = None,
         writes: bool = False,
@@ -219,7 +194,7 @@ class Map:
         """Open an existing map.
 
         Args:
-            location: path of the map file, or address of a map in PostgreSQL.
+            location: path of the map file, or a place where a map lies in another database.
             at: number or name of the revision to see (`resolve`); None for the newest, 0 for the
                 map before the first.
             writes: become its only writer at once, until `close`.
@@ -559,7 +534,7 @@ class Map:
         author: str,
         configuration: Mapping[str, Any],
         message: str = "",
-    ) -> SessionWriter:
+    ) -> RevisionWriter:
         """Begin to write one drive, in a revision of its own.
 
         Args:
@@ -578,21 +553,19 @@ class Map:
             InputError: the camera is not the session's, or the configuration is no JSON data.
         """
         self._check_none_open()
-        if session.camera != camera.id:
-            raise InputError(f"session {session.id} has camera {session.camera}, not {camera.id}")
         self._check_new(session)
-        opened = self._revision_row(author, message, to_json(configuration))
-        with self._database.writing() as connection:
-            collect_abandoned(connection)  # whose UUIDs may come again
-            self._check_descriptor(connection, descriptor)
-            connection.execute(insert(revisions), [sealed(revisions, opened)])
-            camera_key = self._keys.ensure_camera(connection, camera)
-            frontend_key = self._keys.ensure_frontend(connection, descriptor, frontend)
-            self._insert_session(connection, session, opened["key"], camera_key, frontend_key)
-        return self._writer(session.id, StoredSession())
+        row = self._revision_row(author, message, configuration)
+        writer = self._begin(row, session=session)
+        try:
+            writer.add_session(session, camera, descriptor=descriptor, frontend=frontend)
+            writer.checkpoint()
+        except BaseException:
+            writer.abandon()
+            raise
+        return writer
 
-    def resume_session(self, session: SessionId) -> SessionWriter:
-        """Go on with an interrupted session; `SessionWriter.stored` says where.
+    def resume_session(self, session: SessionId) -> RevisionWriter:
+        """Go on with an interrupted session; `RevisionWriter.stored` says where.
 
         Raises:
             RevisionError: the map has no interrupted session of this id.
@@ -600,6 +573,7 @@ class Map:
         """
         self._check_none_open()
         row, revision = self._interrupted_rows(session)
+        own = View(self._view.at, revision["key"])
         with self._database.writing() as connection:
             change_revision(
                 connection,
@@ -608,8 +582,9 @@ class Map:
                 pid=self._holder.pid,
                 writer=self._holder.token,
             )
-            stored = stored_session(connection, View(self._view.at, revision["key"]), row)
-        return self._writer(session, stored)
+            stored = stored_session(connection, own, row)
+            camera = reading.load_cameras(connection)[row["camera"]]
+        return self._written(own, session=session_from_row(row, camera.id), stored=stored)
 
     @_writes
     def seal(self, session: SessionId) -> Revision:
@@ -628,7 +603,7 @@ class Map:
         message: str,
         configuration: Mapping[str, Any],
         at_ns: int | None = None,
-    ) -> BulkWriter:
+    ) -> RevisionWriter:
         """Begin to write one revision that brings records of many sessions at once.
 
         Args:
@@ -643,27 +618,10 @@ class Map:
             InputError: the configuration is no JSON data.
         """
         self._check_none_open()
-        row = self._revision_row(author, message, to_json(configuration))
+        row = self._revision_row(author, message, configuration)
         if at_ns is not None:
             row |= {"opened_ns": at_ns, "host": "", "pid": 0, "writer": ""}
-        row["status"] = str(RevisionStatus.ABANDONED)
-        with self._database.writing() as connection:
-            collect_abandoned(connection)  # whose UUIDs may come again
-            connection.execute(insert(revisions), [sealed(revisions, row)])
-        own = View(self._view.at, row["key"])
-        self._keys.forget_nodes()  # some may have been hidden since they were learnt
-        self._see(own)
-        self._bulk = BulkWriter(
-            self._database,
-            self._keys,
-            self.frames,
-            revision_key=row["key"],
-            view=own,
-            on_cameras=lambda: self.frames.set_view(own),
-            on_end=self._writing_ended,
-            committed_ns=at_ns,
-        )
-        return self._bulk
+        return self._begin(row, committed_ns=at_ns)
 
     @_writes
     def revert(
@@ -687,7 +645,7 @@ class Map:
         if number == 0:
             raise RevisionError(f"{self._database.name}: there is no revision 0 to take back")
         said = f"revert revision {number}" + (f": {message}" if message else "")
-        opened = self._revision_row(author, said, to_json({"revert": number}))
+        opened = self._revision_row(author, said, {"revert": number})
         try:
             with self._database.writing() as connection:
                 connection.execute(insert(revisions), [sealed(revisions, opened)])
@@ -696,7 +654,8 @@ class Map:
                 done = compare(connection, number, self._view, own)
                 if dry_run:
                     raise _DryRunError
-                done = replace(done, revision=commit_revision(connection, opened["key"]))
+                revision = commit_revision(connection, opened["key"], was=RevisionStatus.ABANDONED)
+                done = replace(done, revision=revision)
         except _DryRunError:
             return done
         self.frames.forget()
@@ -742,20 +701,12 @@ class Map:
             RevisionError: a session is being written.
             StorageFullError: no space; the map is as it was.
         """
-        self._check_none_open()
-        opened = self._revision_row(author, message, to_json(configuration))
-        row: Row = {
-            "key": self._keys.next(vocabularies),
-            "revision": opened["key"],
-            "hash": content_digest(body),
-            "body": body,
-        }
-        with self._database.writing() as connection:
-            connection.execute(insert(revisions), [sealed(revisions, opened)])
-            connection.execute(insert(vocabularies), [sealed(vocabularies, row)])
-            revision = commit_revision(connection, opened["key"])
+        with self.begin_revision(
+            author=author, message=message, configuration=configuration
+        ) as writer:
+            writer.put_vocabulary(body)
+            revision = writer.commit()
         self._derived.clear()
-        self._see(View(revision.number))
         return revision
 
     @_writes
@@ -874,16 +825,16 @@ class Map:
         holder = self._database.writer()
         return holder is not None and holder.token == revision["writer"]
 
-    def _revision_row(self, author: str, message: str, configuration: str) -> Row:
+    def _revision_row(self, author: str, message: str, configuration: Mapping[str, Any]) -> Row:
         return {
             "key": self._keys.next(revisions),
             "number": None,
-            "status": "open",
+            "status": str(RevisionStatus.ABANDONED),  # until it has something to keep
             "parent": None,
             "author": checked_text(author, "author"),
             "message": checked_text(message, "message"),
             "tool_version": __version__,
-            "configuration": configuration,
+            "configuration": to_json(configuration),
             "contents": "{}",
             "opened_ns": time.time_ns(),
             "committed_ns": None,
@@ -892,61 +843,35 @@ class Map:
             "writer": self._holder.token,
         }
 
-    def _insert_session(
-        self, connection: Connection, session: Session, revision: int, camera: int, frontend: int
-    ) -> None:
-        """The session and its path: new rows, or those that a revert has hidden."""
-        again = hidden_rows(connection, self._view, sessions).get(session.id.bytes)
-        if again is not None:
-            check_same_session(again, session, camera, frontend)
-        key = self._keys.next(sessions) if again is None else again["key"]
-        path_again = hidden_rows(connection, self._view, paths).get(path_id(session.id).bytes)
-        row = session_row(session, key, revision, camera, frontend)
-        path: Row = {
-            "key": self._keys.next(paths),
-            "uuid": path_id(session.id).bytes,
-            "revision": revision,
-            "session": key,
-            "partial": 0,
-        }
-        for table, new, old in ((sessions, row, again), (paths, path, path_again)):
-            if old is None:
-                connection.execute(insert(table), [sealed(table, new)])
-            else:
-                shown = hidden_row(self._keys, revision, table, old["key"], hide=False)
-                connection.execute(insert(hidden), [shown])
+    def _begin(
+        self, row: Row, *, session: Session | None = None, committed_ns: int | None = None
+    ) -> RevisionWriter:
+        """A new revision, in which nothing is yet."""
+        with self._database.writing() as connection:
+            collect_abandoned(connection)  # whose UUIDs may come again
+            connection.execute(insert(revisions), [sealed(revisions, row)])
+        self._keys.forget_nodes()  # some may have been hidden since they were learnt
+        own = View(self._view.at, row["key"])
+        return self._written(own, session=session, committed_ns=committed_ns)
 
-    def _writer(self, session: SessionId, stored: StoredSession) -> SessionWriter:
-        with self._database.reading() as connection:
-            found = session_and_revision(connection, session, self._view.at)
-            assert found is not None
-            row, revision = found
-            camera = reading.load_cameras(connection)[row["camera"]]
-            path_query = select(paths.c.key).where(paths.c.uuid == path_id(session).bytes)
-            path_key = connection.execute(path_query.order_by(paths.c.key)).scalar_one()
-            frontend = reading.load_frontends(connection)[row["frontend"]]
-            own = View(self._view.at, revision["key"])
-            hidden_nodes = hidden_rows(connection, own, nodes)
-        self.forget()  # what is read from now on includes the session
+    def _written(self, own: View, *, session: Session | None, **kind: Any) -> RevisionWriter:
+        """The writer of a revision; until it ends, this map is seen with what it has written."""
+        if session is not None:
+            self.forget()  # what is read from now on includes the session
         self._see(own)
-        self._open_session = SessionWriter(
+        self._writing = RevisionWriter(
             self._database,
             self._keys,
             self.frames,
-            session=session_from_row(row, camera.id),
-            revision_key=revision["key"],
-            session_key=row["key"],
-            path_key=path_key,
-            camera_key=row["camera"],
-            frontend=(row["frontend"], *frontend),
-            stored=stored,
-            hidden_nodes=hidden_nodes,
-            on_end=self._writing_ended,
+            own,
+            self._writing_ended,
+            session=session,
+            **kind,
         )
-        return self._open_session
+        return self._writing
 
     def _writing_ended(self) -> None:
-        self._open_session = self._bulk = None
+        self._writing = None
         with self._database.reading() as connection:
             newest = head(connection)
         self._see(View(newest))
@@ -959,12 +884,11 @@ class Map:
         self.frames.set_view(view)
 
     def _check_none_open(self) -> None:
-        if self._open_session is not None:
-            raise RevisionError(
-                f"session {self._open_session.session.id} is being written; commit or abandon it"
-            )
-        if self._bulk is not None:
-            raise RevisionError("a revision is being written; commit or abandon it")
+        if self._writing is None:
+            return
+        writer = self._writing
+        what = f"session {writer.session.id}" if writer.resumable else "a revision"
+        raise RevisionError(f"{what} is being written; commit or abandon it")
 
     def _check_new(self, session: Session) -> None:
         state = self.session_state(session.id)
@@ -1013,7 +937,7 @@ def open_map(path: Path | str, at: int | str | None = None, create: bool = False
         MapError: the file is no map, of a newer format, or damaged.
         RevisionError: there is no such revision.
     """
-    if create and not is_address(path) and not Path(path).exists():
+    if create and not map_path(path).exists():
         Map.create(path).close()
     return Map.open(path, at=at)
 
@@ -1052,7 +976,7 @@ def publish_map(draft: Path, target: Path) -> None:
     SqliteDatabase.publish(draft, target)
 
 
-def check_file(location: Path | str) -> CheckReport:
+def check_file(location: Path | str | Place) -> CheckReport:
     """Verify a map file to the last byte, also one that is too damaged to open.
 
     Raises:

@@ -13,7 +13,7 @@ from engram.geometry import StereoCamera
 from engram.graph.model import Session
 from engram.localiser import ByAppearance, FrameMatcher, Localiser
 from engram.mapper import LoopConfig, LoopSearch, Mapper, Saver
-from engram.maps import Map, Revision, SessionState, SessionWriter
+from engram.maps import Map, Revision, RevisionWriter, SessionState
 from engram.places import RECOGNISERS
 from engram.places.words import NodeWords, words_of
 from engram.robot.localisers import drives_of
@@ -38,7 +38,7 @@ class SavedDrive:
     def __init__(
         self,
         opened: Map,
-        writer: SessionWriter,
+        writer: RevisionWriter,
         localiser: Localiser,
         settings: Settings,
         words: NodeWords | None,
@@ -87,7 +87,7 @@ def begin_or_resume(
     configuration: dict[str, Any],
     message: str,
     author: str | None = None,
-) -> SessionWriter:
+) -> RevisionWriter:
     """The writer of a drive: of a new session, or of one that was interrupted.
 
     Args:

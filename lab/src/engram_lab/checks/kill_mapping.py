@@ -31,18 +31,18 @@ from sqlalchemy import event
 from sqlalchemy.engine import Engine
 from engram.monitor import Advancing
 from engram.robot import map_drive, open_drive
-from engram.maps.session_writer import SessionWriter
+from engram.maps import RevisionWriter
 from engram_lab.there_and_back import ThereAndBack
 
 @event.listens_for(Engine, "commit")
 def about_to_commit(connection):
     print("commit", flush=True)
 
-plain = SessionWriter.checkpoint
+plain = RevisionWriter.checkpoint
 def checkpoint(self):
     plain(self)
     print("durable", flush=True)
-SessionWriter.checkpoint = checkpoint
+RevisionWriter.checkpoint = checkpoint
 
 sequence = ThereAndBack(open_drive(Path(sys.argv[2])), int(sys.argv[3]))
 def tell(word):

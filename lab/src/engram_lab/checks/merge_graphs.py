@@ -200,13 +200,13 @@ def write(made: RandomMap, path: Path, order: int) -> None:
             writer.add_session(one, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND)
         for node, place, appearance in shuffled(made.nodes.values(), rng):
             blob = blob_of(place, appearance, node.stamp_ns % 1_000_003)
-            writer.add_node(stored(node, blob))
+            writer.copy_node(stored(node, blob))
         for edge in shuffled(made.edges.values(), rng):
             writer.add_edge(edge)
         for entry in shuffled(made.entries, rng):
             writer.add_path_entry(entry)
         for session, tried in shuffled(made.attempts.items(), rng):
-            writer.add_attempts(session, *Attempts.of(tried))
+            writer.copy_attempts(session, *Attempts.of(tried))
         writer.commit()
 
 

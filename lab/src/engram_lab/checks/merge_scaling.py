@@ -25,7 +25,7 @@ import numpy as np
 from engram.fleet.merge import merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
-from engram.maps import BulkWriter, Map, copy_map
+from engram.maps import Map, RevisionWriter, copy_map
 from engram_lab.checks.synthetic_places import (
     CAMERA,
     DESCRIPTOR,
@@ -45,7 +45,7 @@ GIB = 2**30
 
 
 def write_session(
-    writer: BulkWriter, robot: str, number: int, places: range, rng: np.random.Generator | None
+    writer: RevisionWriter, robot: str, number: int, places: range, rng: np.random.Generator | None
 ) -> None:
     """One drive past some places, saved whole."""
     start_ns = 1_000_000_000_000 * (number + 1)
@@ -56,7 +56,7 @@ def write_session(
         stamp_ns = start_ns + at * 100_000_000
         node = node_of(drive, stamp_ns, float(at))
         blob = landmark_bytes(np.random.default_rng(place), rng, LANDMARKS)
-        writer.add_node(stored(node, blob))
+        writer.copy_node(stored(node, blob))
         if before is not None:
             writer.add_edge(Edge(before.id, node.id, EdgeKind.ODOMETRY, STEP, SIGMA))
         entry = PathEntry(path_id(drive.id), at, node.id, PathEntryKind.SAVED, stamp_ns)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from engram.errors import InputError, MapLockedError, storage_full
-from engram.maps.lock import WriterLock, current_holder
+from engram.files import WriterLock, current_holder
 
 
 @contextmanager

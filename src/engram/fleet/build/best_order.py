@@ -15,6 +15,7 @@ import numpy as np
 
 from engram.config import config_hash, to_dict
 from engram.errors import ConfigError, MapError
+from engram.files import remove_left_drafts
 from engram.fleet.build.orders import (
     BestOrder,
     JudgeOptions,
@@ -29,7 +30,6 @@ from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.graph.model import Session
 from engram.maps import Map, copy_map
-from engram.maps.drafts import remove_left_drafts
 from engram.measures import failure_curve, failure_route, route_not_localised
 from engram.monitor import Monitor
 from engram.robot import Settings, measure, open_drive

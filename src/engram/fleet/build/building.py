@@ -11,6 +11,7 @@ from uuid import UUID
 
 from engram.config import config_hash, plain, to_dict
 from engram.errors import ConfigError
+from engram.files import check_parent
 from engram.fleet.build.best_order import find_best_order
 from engram.fleet.build.cluster import check_scheduler, map_groups_on_cluster
 from engram.fleet.build.group_mapping import GroupResult, GroupTask, fetched, map_group
@@ -29,7 +30,6 @@ from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
 from engram.graph.model import SessionId, path_id
 from engram.maps import Map, copy_map
-from engram.maps.drafts import check_parent
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.processes import run_in_processes
 from engram.robot import RobotOptions, Settings

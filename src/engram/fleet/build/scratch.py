@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import msgspec
 
 from engram.errors import ConfigError, MapError, MapLockedError, storage_full
+from engram.files import WriterLock, current_holder
 from engram.fleet.build.group_mapping import GroupResult
 from engram.fleet.build.orders import BestOrder
 from engram.maps import Map
-from engram.maps.lock import WriterLock, current_holder
 from engram.monitor import write_whole
 
 Kept = TypeVar("Kept")

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from engram.config import plain, to_dict
 from engram.errors import InputError
+from engram.files import check_parent, draft_folder
 from engram.fleet.download.bridges import close_gaps, components
 from engram.fleet.download.coverage import Coverage, expected_missed
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.download.stock import Mask, Stock
 from engram.graph.model import Edge, PathId, path_id
-from engram.maps import BulkWriter, Map, compact_map, publish_map
-from engram.maps.drafts import check_parent, draft_folder
+from engram.maps import Map, RevisionWriter, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
 # What a node takes beside its blobs: rows and indices of it, its edges and path entries; measured
@@ -272,7 +272,7 @@ def _write_draft(
     return _Sent(selection, bridges)
 
 
-def _begin(draft: Map, stock: Stock, options: DownloadOptions) -> BulkWriter:
+def _begin(draft: Map, stock: Stock, options: DownloadOptions) -> RevisionWriter:
     newest = stock.store.log()[-1]
     return draft.begin_revision(
         author="centre",
@@ -289,7 +289,7 @@ def _begin(draft: Map, stock: Stock, options: DownloadOptions) -> BulkWriter:
 
 
 def _write(
-    writer: BulkWriter,
+    writer: RevisionWriter,
     stock: Stock,
     sent: Mask,
     bridges: list[Edge],
@@ -300,7 +300,7 @@ def _write(
     _write_sessions(writer, stock, sent)
     nodes = [stock.nodes[at] for at in np.flatnonzero(sent)]
     for stored in stock.store.frames.stored(nodes):
-        writer.add_node(stored if options.with_thumbnails else replace(stored, thumbnail=None))
+        writer.copy_node(stored if options.with_thumbnails else replace(stored, thumbnail=None))
         monitor.advance()
     for edge in stock.edges:
         if sent[stock.index[edge.a]] and sent[stock.index[edge.b]]:
@@ -314,14 +314,12 @@ def _write(
     if options.policy == "copy":
         for _, omission in sorted(stock.store.omissions.items()):
             writer.add_omission(omission)
-    for name, values in sorted(stock.store.statistics().items()):
-        writer.put_statistics(name, values)
     vocabulary = stock.store.vocabulary
     if vocabulary is not None:
         writer.put_vocabulary(vocabulary)
 
 
-def _write_sessions(writer: BulkWriter, stock: Stock, sent: Mask) -> None:
+def _write_sessions(writer: RevisionWriter, stock: Stock, sent: Mask) -> None:
     """Those that saved, passed or tried what is sent; all for a whole map."""
     frontends = stock.store.frontends
     partial = _partial_paths(stock, sent)
@@ -364,12 +362,12 @@ def _attempts_between(stock: Stock, sent: Mask) -> NDArray[np.intp]:
     return np.flatnonzero(sent[made.reference] & sent[made.node])
 
 
-def _write_attempts(writer: BulkWriter, stock: Stock, sent: Mask) -> None:
+def _write_attempts(writer: RevisionWriter, stock: Stock, sent: Mask) -> None:
     kept = stock.attempts.rows(_attempts_between(stock, sent))
     for at, session in enumerate(stock.sessions):
         rows = np.flatnonzero(kept.session == at)
         if len(rows):
-            writer.add_attempts(session.id, kept.rows(rows), stock.node_ids)
+            writer.copy_attempts(session.id, kept.rows(rows), stock.node_ids)
 
 
 def _report(

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from engram.errors import InputError
+from engram.files import draft_folder
 from engram.fleet.merge.checks import check_fits, check_readable
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.pictures import picture_before_and_after
@@ -18,7 +19,6 @@ from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.state import Merge
 from engram.fleet.merge.steps import merge_one
 from engram.maps import FORMAT_VERSION, Map, copy_map, publish_map
-from engram.maps.drafts import draft_folder
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.robot import Settings
 from engram.viewing import check_picture

@@ -26,7 +26,7 @@ from engram.graph.model import (
     path_id,
 )
 from engram.localiser import Position
-from engram.maps import BulkWriter, Map, StoredNode
+from engram.maps import Map, RevisionWriter, StoredNode
 
 # Entries that a merge adds itself stand behind all that robots wrote (docs/format.md).
 FIRST_REPLAYED = 2**32
@@ -54,7 +54,7 @@ class Merge:
         writer: the open revision; from when something is to be added.
     """
 
-    writer: BulkWriter
+    writer: RevisionWriter
 
     def __init__(self, centre: Map, robot: Map) -> None:
         self.centre = centre
@@ -186,7 +186,7 @@ class Merge:
 
     def take(self, stored: StoredNode, frame: Frame) -> int:
         """A node that the centre was lacking; returns its dense index."""
-        self.writer.add_node(stored, frame)
+        self.writer.copy_node(stored, frame)
         self._parts.add(stored.node.id)
         return self.graph.add_node(stored.node)
 

@@ -68,7 +68,7 @@ def merge_one(
                 _take_over(merge, new, Replay(merge, settings, options, stage))
             monitor.check()
             if gate is not None:
-                merge.writer.flush()
+                merge.writer.checkpoint()
                 report.held_out = gate(centre, robot.location, monitor)
                 monitor.check()
             report.revision = merge.writer.commit().number
@@ -166,7 +166,7 @@ def _see_edges_again(merge: Merge) -> None:
     """A node that a revert had hidden brings back its edges to nodes that stayed."""
     if not merge.writer.shows_again:
         return
-    merge.writer.flush()
+    merge.writer.checkpoint()
     graph, edges = merge.graph, merge.centre.load().edges
     graph.add_edges([one for one in edges if graph.find_edge(one.a, one.b, one.kind) is None])
 
@@ -201,7 +201,7 @@ def _carry_attempts(merge: Merge, replay: Replay) -> None:
     sessions, remembered = list(merge.centre.sessions), merge.centre.attempts
     if merge.writer.shows_again:
         # A node that is seen again brings back the attempts that were remembered at it.
-        merge.writer.flush()
+        merge.writer.checkpoint()
         now = merge.centre.load()
         sessions, remembered = [session.id for session in now.sessions], now.attempts
     new = merge.new_attempts(sessions, remembered)
@@ -214,9 +214,9 @@ def _carry_attempts(merge: Merge, replay: Replay) -> None:
     place = {session: at for at, session in enumerate(merge.robot.sessions)}
     for session in merge.sessions:
         own = new.rows(new.session == place[session.id])
-        merge.writer.add_attempts(session.id, own, ids)
+        merge.writer.copy_attempts(session.id, own, ids)
         replayed, nodes = Attempts.of(replay.attempts.get(session.id, []))
-        merge.writer.add_attempts(session.id, replayed, nodes)
+        merge.writer.copy_attempts(session.id, replayed, nodes)
 
 
 def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:

@@ -1,46 +1,15 @@
-"""The SQLite file of a frame log: tables, connections, and what SQLite's errors mean.
-
-All that is particular to SQLite stands here.
-"""
+"""The SQLite file of a frame log: its tables, and how its write-ahead log comes and goes."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import quote
 
-from sqlalchemy import (
-    BigInteger,
-    Column,
-    Connection,
-    Engine,
-    Integer,
-    LargeBinary,
-    MetaData,
-    Table,
-    Text,
-    create_engine,
-    exc,
-)
-from sqlalchemy.pool import QueuePool
+from sqlalchemy import BigInteger, Column, Connection, Integer, LargeBinary, MetaData, Table, Text
+from sqlalchemy.exc import OperationalError
 
-from engram.errors import (
-    FormatVersionError,
-    MapCorruptError,
-    MapError,
-    MapLockedError,
-    SequenceError,
-    StorageFullError,
-)
-
-FORMAT_VERSION = 1
-# "EnFL": SQLite keeps it in the file's header, so that `file` and we know what it is.
-_APPLICATION_ID = 0x456E464C
-
-# A second writer gives up after this; a reader never waits for a writer (WAL).
-_BUSY_S = 1.0
+from engram.errors import SequenceError
+from engram.sqlite import FileKind, SqliteFile
 
 metadata = MetaData()
 
@@ -78,48 +47,25 @@ frames_table = Table(
 )
 
 
-def writing_engine(path: Path) -> Engine:
-    """An engine that makes the file where there is none."""
-    return _engine(path, "rwc")
+FRAME_LOG = FileKind(
+    noun="frame log",
+    application_id=0x456E464C,  # "EnFL"
+    format_version=1,
+    metadata=metadata,
+    strange=SequenceError,
+    cure="restore a copy or extract it anew",
+    busy_s=1.0,  # a second writer gives up after this; a reader never waits for a writer
+)
 
 
-def reading_engine(path: Path) -> Engine:
-    """An engine that cannot change the file."""
-    return _engine(path, "ro")
-
-
-def _engine(path: Path, mode: str) -> Engine:
-    uri = f"file:{quote(str(path.resolve()))}?mode={mode}"
-
-    def connect() -> sqlite3.Connection:
-        # Transactions are begun by hand (isolation level None): the driver would begin them late.
-        connection = sqlite3.connect(
-            uri, uri=True, timeout=_BUSY_S, isolation_level=None, check_same_thread=False
-        )
-        # Nothing in a file from elsewhere may call functions with effects.
-        connection.execute("PRAGMA trusted_schema = OFF")
-        connection.execute("PRAGMA cell_size_check = ON")
-        return connection
-
-    return create_engine("sqlite://", creator=connect, poolclass=QueuePool)
+def framelog_file(path: Path) -> SqliteFile:
+    """The file of a frame log, which need not be there yet."""
+    return SqliteFile(path, FRAME_LOG)
 
 
 def begin_writing(connection: Connection) -> None:
     """Take the file's one write lock; readers go on seeing what was committed last."""
     connection.exec_driver_sql("BEGIN IMMEDIATE")
-
-
-def prepare(connection: Connection) -> None:
-    """Make the tables of a new, empty file; within a write transaction."""
-    metadata.create_all(connection)
-    connection.exec_driver_sql(f"PRAGMA application_id = {_APPLICATION_ID}")
-    connection.exec_driver_sql(f"PRAGMA user_version = {FORMAT_VERSION}")
-
-
-def is_empty(connection: Connection) -> bool:
-    """Whether the file holds nothing at all yet."""
-    count = connection.exec_driver_sql("SELECT count(*) FROM sqlite_schema").scalar()
-    return count == 0 and _pragma(connection, "application_id") == 0
 
 
 def log_while_writing(connection: Connection) -> None:
@@ -135,79 +81,7 @@ def fold_log_in(connection: Connection) -> None:
     """
     try:
         connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
-    except exc.OperationalError as error:
-        if not _is(error, "SQLITE_BUSY", "SQLITE_LOCKED"):
+    except OperationalError as error:
+        code = getattr(error.orig, "sqlite_errorcode", 0) & 0xFF
+        if code not in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
             raise
-
-
-def check_kind(connection: Connection, path: Path) -> None:
-    """Refuse what is no frame log, or a newer one.
-
-    Raises:
-        SequenceError: another kind of file.
-        FormatVersionError: written by a newer Engram.
-        MapCorruptError: its tables are not those of a frame log.
-    """
-    if _pragma(connection, "application_id") != _APPLICATION_ID:
-        raise SequenceError(f"{path}: is an SQLite file, but no frame log")
-    version = _pragma(connection, "user_version")
-    if version > FORMAT_VERSION:
-        raise FormatVersionError(
-            f"{path}: frame log of format {version}, this Engram reads up to {FORMAT_VERSION}: "
-            "upgrade it"
-        )
-    # Views and triggers in a file from elsewhere could run without end.
-    kinds = connection.exec_driver_sql(
-        "SELECT type, tbl_name FROM sqlite_schema WHERE type != 'index' ORDER BY tbl_name"
-    ).all()
-    if [tuple(kind) for kind in kinds] != [("table", name) for name in sorted(metadata.tables)]:
-        raise MapCorruptError(f"{path}: holds other tables than a frame log's")
-
-
-def _pragma(connection: Connection, name: str) -> int:
-    return int(connection.exec_driver_sql(f"PRAGMA {name}").scalar_one())
-
-
-@contextmanager
-def plain_errors(path: Path) -> Iterator[None]:
-    """SQLite's errors as ours, each with the file's name.
-
-    Raises:
-        SequenceError: the file is no SQLite file, or cannot be opened.
-        MapCorruptError: it is damaged or cut short.
-        MapLockedError: another process writes to it.
-        StorageFullError: no space is left.
-        MapError: it cannot be written, for example on read-only media.
-    """
-    try:
-        yield
-    except UnicodeDecodeError as error:
-        # Python's driver cannot even form the message when damage has reached the schema.
-        raise MapCorruptError(
-            f"{path}: damaged ({error}); restore a copy or extract it anew"
-        ) from error
-    except exc.DBAPIError as error:
-        fact = str(error.orig)
-        if _is(error, "SQLITE_NOTADB"):
-            raise SequenceError(f"{path}: is no frame log (no SQLite file)") from error
-        if _is(error, "SQLITE_CANTOPEN"):
-            raise SequenceError(f"{path}: cannot be opened: {fact}") from error
-        if _is(error, "SQLITE_BUSY", "SQLITE_LOCKED"):
-            raise MapLockedError(
-                f"{path}: another process writes to this frame log; wait until it is done"
-            ) from error
-        if _is(error, "SQLITE_FULL"):
-            raise StorageFullError(
-                f"{path}: no space is left; frames up to the last checkpoint are safe, free some "
-                "space and record again to go on from there"
-            ) from error
-        if _is(error, "SQLITE_READONLY", "SQLITE_IOERR"):
-            raise MapError(f"{path}: cannot be read or written here: {fact}") from error
-        raise MapCorruptError(
-            f"{path}: damaged or cut short ({fact}); restore a copy or extract it anew"
-        ) from error
-
-
-def _is(error: exc.DBAPIError, *names: str) -> bool:
-    found = getattr(error.orig, "sqlite_errorname", "")
-    return any(found == name or found.startswith(f"{name}_") for name in names)

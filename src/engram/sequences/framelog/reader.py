@@ -15,8 +15,7 @@ from engram.errors import ConfigError, MapCorruptError, SequenceError
 from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera, propagate_covariance
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.sequences.framelog import file
-from engram.sequences.framelog.file import frames_table, log_table
+from engram.sequences.framelog.file import framelog_file, frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
 from engram.sequences.image_sequence import with_options
@@ -66,12 +65,13 @@ class FrameLog:
     def __init__(self, path: str | Path, options: OpenOptions | None = None) -> None:
         self._path = Path(path)
         options = options or OpenOptions()
-        if not self._path.is_file():
-            raise SequenceError(f"{self._path}: there is no such frame log")
-        self._engine = file.reading_engine(self._path)
+        self._file = framelog_file(self._path)
+        self._file.check_regular()
+        self._engine = self._file.engine("mode=ro")
         try:
-            with file.plain_errors(self._path), self._engine.connect() as connection:
-                file.check_kind(connection, self._path)
+            with self._file.errors(), self._engine.connect() as connection:
+                self._file.identify(connection.exec_driver_sql)
+                self._file.check_tables(connection.exec_driver_sql)
                 self._header, self._complete = read_header(connection)
                 stamps_ns, self._usable = _read_stamps(connection)
         except MapCorruptError as error:
@@ -122,7 +122,7 @@ class FrameLog:
     def pair_hash(self, index: int) -> str:
         """`first_pair_hash` of the images of a chosen frame."""
         number = self._numbers[index]
-        with file.plain_errors(self._path), self._engine.connect() as connection:
+        with self._file.errors(), self._engine.connect() as connection:
             return next(self._steps(connection, number, number)).pair_hash
 
     @property
@@ -176,7 +176,7 @@ class FrameLog:
     def _read(self, number: int, previous: int | None) -> LoggedFrame:
         """A frame with the motion since `previous`, the last usable frame that was chosen."""
         try:
-            with file.plain_errors(self._path), self._engine.connect() as connection:
+            with self._file.errors(), self._engine.connect() as connection:
                 row, step = self._frame_row(connection, number)
                 frame = decode_frame(step, row.landmarks, row.thumbnail, self._header)
                 odometry = self._motion(connection, previous, step)

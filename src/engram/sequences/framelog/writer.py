@@ -13,8 +13,15 @@ from sqlalchemy import Connection, func, insert, select, update
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapError
 from engram.frontend.blobs import content_digest
-from engram.sequences.framelog import file
-from engram.sequences.framelog.file import frames_table, log_table
+from engram.sequences.framelog.file import (
+    begin_writing,
+    fold_log_in,
+    framelog_file,
+    frames_table,
+    log_table,
+    log_while_writing,
+    metadata,
+)
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.reader import read_header
 from engram.sequences.framelog.rows import encode_row
@@ -50,11 +57,13 @@ class FrameLogWriter:
         self._header = header
         self._checkpoint_every = checkpoint_every
         self._since_checkpoint = 0
-        self._engine = file.writing_engine(self._path)
+        self._file = framelog_file(self._path)
+        self._file.check_regular(may_be_new=True)
+        self._engine = self._file.engine("mode=rwc")
         self._connection: Connection | None = None
         self._recorded, self._last_stamp_ns = 0, None
         try:
-            with file.plain_errors(self._path):
+            with self._file.errors():
                 self._connection = self._engine.connect()
                 self._recorded, self._last_stamp_ns = self._begin(self._connection)
         except BaseException:
@@ -129,7 +138,7 @@ class FrameLogWriter:
         with self._or_abandon() as connection:
             connection.commit()
             # Begun again at once, so that no second writer gets between two checkpoints.
-            file.begin_writing(connection)
+            begin_writing(connection)
         self._since_checkpoint = 0
 
     def close(self, *, complete: bool = False) -> None:
@@ -141,10 +150,10 @@ class FrameLogWriter:
         if connection is None:
             return
         try:
-            with file.plain_errors(self._path):
+            with self._file.errors():
                 connection.execute(update(log_table).values(complete=int(complete)))
                 connection.commit()
-                file.fold_log_in(connection)
+                fold_log_in(connection)
         finally:
             self._abandon()
 
@@ -161,18 +170,16 @@ class FrameLogWriter:
 
     def _begin(self, connection: Connection) -> tuple[int, int | None]:
         """Make or find the log; the number of its frames and the stamp of the last."""
-        if file.is_empty(connection):
-            connection.rollback()
-            file.log_while_writing(connection)
-            file.begin_writing(connection)
-            if file.is_empty(connection):
-                self._make(connection)
-                return 0, None
-        else:
-            file.check_kind(connection, self._path)
-            connection.rollback()
-            file.log_while_writing(connection)
-            file.begin_writing(connection)
+        run = connection.exec_driver_sql
+        if not self._file.is_new(run):
+            self._file.identify(run)
+            self._file.check_tables(run)
+        connection.rollback()
+        log_while_writing(connection)
+        begin_writing(connection)
+        if self._file.is_new(run):
+            self._make(connection)
+            return 0, None
         found, _ = read_header(connection)
         if found.to_json() != self._header.to_json():
             raise IncompatibleError(
@@ -185,7 +192,8 @@ class FrameLogWriter:
         return int(count), last_ns
 
     def _make(self, connection: Connection) -> None:
-        file.prepare(connection)
+        metadata.create_all(connection)
+        self._file.mark(connection.exec_driver_sql)
         header = self._header.to_json()
         connection.execute(
             insert(log_table),
@@ -198,7 +206,7 @@ class FrameLogWriter:
             },
         )
         connection.commit()
-        file.begin_writing(connection)
+        begin_writing(connection)
 
     @contextmanager
     def _or_abandon(self) -> Iterator[Connection]:
@@ -209,7 +217,7 @@ class FrameLogWriter:
         if self._connection is None:
             raise InputError(f"{self._path}: this writer is closed")
         try:
-            with file.plain_errors(self._path):
+            with self._file.errors():
                 yield self._connection
         except MapError:
             self._abandon()

@@ -39,9 +39,8 @@ from engram.errors import (
     NotAMapError,
     StorageFullError,
 )
-from engram.maps.database import damage_named
-from engram.maps.lock import Holder
-from engram.maps.raising import raise_tables
+from engram.files import Holder
+from engram.maps.database import damage_named, raise_tables, replaced
 from engram.maps.rows import sealed
 from engram.maps.schema import (
     FORMAT_VERSION,
@@ -56,24 +55,59 @@ _LOCK_CLASS = 0x4547524D
 _NAME_BYTES = 63
 
 
-class PostgresDatabase:
-    """One map in a PostgreSQL database.
+class PostgresMap:
+    """Where a map lies, or is to lie: a `Place` that maps are made at and opened from.
 
     Args:
         address: URL with ``map=NAME`` in its query.
 
     Raises:
         InputError: the address cannot be understood.
-        NotAMapError: the database has no such map.
-        FormatVersionError: written by a newer Engram.
-        MapError: no connection.
     """
 
     def __init__(self, address: str) -> None:
-        url, self._schema = _parse(address)
-        self.name = f"{url.render_as_string(hide_password=True)} map {self._schema}"
-        self._url = url
-        self._engine = _engine(url, self._schema)
+        self._url, self._schema = _parse(address)
+
+    def create(self) -> None:
+        """Make an empty map: all of it or nothing.
+
+        Raises:
+            InputError: the map exists.
+            MapError: no connection.
+        """
+        schema = self._schema
+        engine = _engine(self._url, schema)
+        try:
+            with _translated(schema), engine.begin() as connection:
+                if inspect(connection).has_schema(schema):
+                    raise InputError(
+                        f"map {schema} exists already; open it, or choose another name"
+                    )
+                connection.execute(text(f'CREATE SCHEMA "{schema}"'))
+                metadata.create_all(connection, checkfirst=False)
+                row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
+                connection.execute(insert(map_format), sealed(map_format, row))
+        finally:
+            engine.dispose()
+
+    def open(self) -> PostgresDatabase:
+        """The map's database.
+
+        Raises:
+            NotAMapError: the database has no such map.
+            FormatVersionError: written by a newer Engram.
+            MapError: no connection.
+        """
+        return PostgresDatabase(self._url, self._schema)
+
+
+class PostgresDatabase:
+    """One map in a PostgreSQL database; made by `PostgresMap.open`."""
+
+    def __init__(self, url: URL, schema: str) -> None:
+        self.name = f"{url.render_as_string(hide_password=True)} map {schema}"
+        self._url, self._schema = url, schema
+        self._engine = _engine(url, schema)
         self.format_version = self._read_version()
         if self.format_version < FORMAT_VERSION:
             _show_missing_tables(self._engine, self.format_version)
@@ -91,28 +125,6 @@ class PostgresDatabase:
                 f"{FORMAT_VERSION}; install a newer one"
             )
         return version
-
-    @staticmethod
-    def create(address: str) -> None:
-        """Make an empty map: all of it or nothing.
-
-        Raises:
-            InputError: the address cannot be understood, or the map exists.
-        """
-        url, schema = _parse(address)
-        engine = _engine(url, schema)
-        try:
-            with _translated(schema), engine.begin() as connection:
-                if inspect(connection).has_schema(schema):
-                    raise InputError(
-                        f"map {schema} exists already; open it, or choose another name"
-                    )
-                connection.execute(text(f'CREATE SCHEMA "{schema}"'))
-                metadata.create_all(connection, checkfirst=False)
-                row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
-                connection.execute(insert(map_format), sealed(map_format, row))
-        finally:
-            engine.dispose()
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -177,12 +189,7 @@ class PostgresDatabase:
         """An upsert."""
         statement = Insert(table)
         return statement.on_conflict_do_update(
-            index_elements=list(key),
-            set_={
-                column.name: statement.excluded[column.name]
-                for column in table.columns
-                if column.name not in key
-            },
+            index_elements=list(key), set_=replaced(statement.excluded, key)
         )
 
     def integrity_problems(self) -> list[str]:
@@ -263,7 +270,7 @@ def _engine(url: URL, schema: str, **options: str) -> Engine:
         )
     except ImportError as error:
         raise MissingExtraError(
-            "maps in PostgreSQL need its driver: pip install 'engram[server]'"
+            "maps in PostgreSQL need its driver: pip install 'engram-localisation[server]'"
         ) from error
 
 

@@ -14,7 +14,8 @@ from tests.worlds import attempts_of
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.frontend import BRIEF, TEBLID
 from engram.graph.model import NodeId, Omission, PathEntry, PathEntryKind, node_id, path_id
-from engram.maps import BulkWriter, Map, SessionState, bulk_writer, check_file
+from engram.maps import Map, RevisionWriter, SessionState, check_file
+from engram.maps import writer as writer_module
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
 
@@ -25,13 +26,12 @@ from .maps import assert_same_edges, begin, edge, session, write_drive
 
 @pytest.fixture
 def source(tmp_path):
-    """Two drives, statistics, and an interrupted session that nobody should copy."""
+    """Two drives, a vocabulary, and an interrupted session that nobody should copy."""
     path = tmp_path / "source.engram"
     with Map.create(path) as store:
         for name in ("robot-1", "robot-2"):
             writer = begin(store, session(name))
             write_drive(writer, 12)
-            writer.put_statistics("basin", {"g": [1.0, 0.5], "by": name})
             writer.commit()
         store.put_vocabulary(b"words", author="tests", message="", configuration={})
         write_drive(begin(store, session("robot-3")), 2)
@@ -55,7 +55,6 @@ def assert_same_contents(copy: Map, source: Map) -> None:
         assert attempts_of(read, one.id) == attempts_of(written, one.id)
     assert copy.frontends == source.frontends
     assert copy.landmark_hashes == source.landmark_hashes
-    assert copy.statistics() == source.statistics()
     assert copy.vocabulary == source.vocabulary
     for mine, theirs in zip(
         copy.frames.stored(read.nodes), source.frames.stored(written.nodes), strict=True
@@ -79,7 +78,7 @@ def test_the_content_hash_does_not_tell_in_how_many_batches_it_was_written(
 ):
     hashes = set()
     for number, batch_bytes in enumerate((1, 10_000, 2**30)):
-        monkeypatch.setattr(bulk_writer, "_BATCH_BYTES", batch_bytes)
+        monkeypatch.setattr(writer_module, "_BATCH_BYTES", batch_bytes)
         with Map.create(tmp_path / f"{number}.engram") as store:
             with begin_bulk(store) as writer:
                 copy_into(writer, source)
@@ -89,13 +88,13 @@ def test_the_content_hash_does_not_tell_in_how_many_batches_it_was_written(
 
 
 def test_memory_does_not_grow_with_the_revision(target, source, monkeypatch):
-    monkeypatch.setattr(bulk_writer, "_BATCH_BYTES", 20_000)
-    flushes = []
-    flush = BulkWriter.flush
-    monkeypatch.setattr(BulkWriter, "flush", lambda self: (flushes.append(1), flush(self)))
+    monkeypatch.setattr(writer_module, "_BATCH_BYTES", 20_000)
+    written = []
+    plain = RevisionWriter.checkpoint
+    monkeypatch.setattr(RevisionWriter, "checkpoint", lambda self: (written.append(1), plain(self)))
     with begin_bulk(target) as writer:
         copy_into(writer, source)
-        assert len(flushes) > 3
+        assert len(written) > 3
         assert writer._waiting_bytes <= 20_000
 
 
@@ -103,7 +102,7 @@ def test_readers_see_nothing_before_the_commit_and_the_writer_everything(target,
     before = target.content_hash()
     with begin_bulk(target) as writer:
         copy_into(writer, source)
-        writer.flush()
+        writer.checkpoint()
         wanted = source.load().nodes[3].id
         with Map.open(location) as reader:
             assert reader.load().nodes == ()
@@ -119,7 +118,7 @@ def test_a_decoded_frame_is_read_from_memory_until_it_is_written(target, source)
     stored = next(source.frames.stored(source.load().nodes))
     with begin_bulk(target) as writer:
         writer.add_session(session("robot-1"), CAMERA, descriptor=BRIEF, frontend=FRONTEND)
-        writer.add_node(stored, source.frames.decode(stored))
+        writer.copy_node(stored, source.frames.decode(stored))
         found = target.frames.frame(stored.node.id)
     assert_same_landmarks(found.landmarks, source.frames.frame(stored.node.id).landmarks)
 
@@ -127,7 +126,7 @@ def test_a_decoded_frame_is_read_from_memory_until_it_is_written(target, source)
 def test_what_was_abandoned_is_collected_and_can_be_written_again(target, location, source):
     with begin_bulk(target) as writer:
         copy_into(writer, source)
-        writer.flush()
+        writer.checkpoint()
     report = check_file(location)
     assert report.problems == ()
     assert report.abandoned_rows > 100
@@ -137,7 +136,7 @@ def test_what_was_abandoned_is_collected_and_can_be_written_again(target, locati
     assert_same_contents(target, source)
     assert check_file(location).abandoned_rows == 0
     with pytest.raises(RevisionError, match="committed or abandoned"):
-        writer.flush()
+        writer.checkpoint()
 
 
 def test_killed_before_the_commit_the_map_is_as_it_was(tmp_path, source):
@@ -210,16 +209,16 @@ def test_what_does_not_fit_is_refused_by_name(target, source):
     stored = next(source.frames.stored(contents.nodes))
     strange = NodeId(node_id(session("nobody").id, 1))
     write_drive(begin(target, session("robot-2")), 2).nodes.clear()
-    target._open_session.checkpoint()
+    target._writing.checkpoint()
     target._writing_ended()  # as if that process had died
     with begin_bulk(target) as writer:
         with pytest.raises(InputError, match="its session"):
-            writer.add_node(stored)
+            writer.copy_node(stored)
         with pytest.raises(RevisionError, match="interrupted in this map"):
             copy_into(writer, source)
-        writer.add_node(stored)
+        writer.copy_node(stored)
         with pytest.raises(InputError, match="already"):
-            writer.add_node(stored)
+            writer.copy_node(stored)
         with pytest.raises(InputError, match=f"edge: node {strange}"):
             writer.add_edge(edge(stored.node.id, strange))
         with pytest.raises(IncompatibleError, match="brief"):

@@ -1,7 +1,8 @@
-"""Drafts of new files: whole under their name, or gone."""
+"""Drafts of new files, whole under their name or gone; and the locks of those who write."""
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -9,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from engram.errors import InputError
+from engram.errors import InputError, MapError
+from engram.files import WriterLock, current_holder, draft_folder, remove_left_drafts
 from engram.maps import Map
-from engram.maps.drafts import draft_folder, remove_left_drafts
 
 _WRITES_ON = """
 import sys
 from pathlib import Path
-from engram.maps.drafts import draft_folder
+from engram.files import draft_folder
 with draft_folder(Path(sys.argv[1])) as folder:
     (folder / "half").write_bytes(b"half a map")
     print(folder, flush=True)
@@ -102,3 +103,31 @@ def test_a_mistyped_folder_is_not_made(tmp_path: Path) -> None:
     ):
         pass
     assert not (tmp_path / "twon").exists()
+
+
+def test_no_lock_is_taken_through_a_symbolic_link(tmp_path: Path) -> None:
+    """Whoever may write to the folder could have the file of another overwritten."""
+    (other := tmp_path / "precious").write_text("mine")
+    lock = tmp_path / "town.engram-lock"
+    for target in (other, tmp_path / "not-there"):
+        lock.symlink_to(target)
+        with pytest.raises(MapError, match="is a symbolic link"):
+            WriterLock(tmp_path / "town.engram")
+        assert current_holder(tmp_path / "town.engram") is None
+        lock.unlink()
+    assert other.read_text() == "mine"
+    assert not (tmp_path / "not-there").exists()
+
+
+def test_what_is_no_regular_file_is_no_lock(tmp_path: Path) -> None:
+    lock = tmp_path / "town.engram-lock"
+    for make, remove in ((os.mkfifo, os.unlink), (os.mkdir, os.rmdir)):
+        make(lock)
+        with pytest.raises(MapError, match="engram-lock"):
+            WriterLock(tmp_path / "town.engram")
+        assert current_holder(tmp_path / "town.engram") is None
+        remove(lock)
+    held = WriterLock(tmp_path / "town.engram")
+    assert current_holder(tmp_path / "town.engram") == held.holder
+    held.release()
+    assert current_holder(tmp_path / "town.engram") is None

@@ -1,0 +1,663 @@
+"""One revision on its way into a map: buffered, checkpointed, then committed in one small step."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Table, delete, insert, select
+
+from engram.errors import IncompatibleError, InputError, RevisionError
+from engram.frontend import DescriptorKind, Frame
+from engram.frontend.blobs import blob_hash, content_digest, encode_landmarks, encode_thumbnail
+from engram.geometry import StereoCamera
+from engram.graph.attempts import Attempts
+from engram.graph.model import (
+    Attempt,
+    Edge,
+    Node,
+    NodeId,
+    Omission,
+    PathEntry,
+    PathId,
+    Session,
+    SessionId,
+    path_id,
+)
+from engram.maps import reading
+from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, pack, unpack
+from engram.maps.database import Database
+from engram.maps.frame_reader import FrameReader
+from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
+from engram.maps.keys import KeyBook
+from engram.maps.records import Revision, RevisionStatus, StoredNode, StoredSession
+from engram.maps.revisions import (
+    change_revision,
+    commit_revision,
+    open_sessions,
+    revision_contents,
+)
+from engram.maps.rows import (
+    Row,
+    camera_row,
+    checked_int,
+    edge_row,
+    sealed,
+    session_row,
+    transform_bytes,
+    verified,
+)
+from engram.maps.schema import (
+    attempts,
+    cameras,
+    edges,
+    frames,
+    frontends,
+    hidden,
+    nodes,
+    omissions,
+    omitted_landmarks,
+    path_entries,
+    paths,
+    sessions,
+    vocabularies,
+)
+from engram.maps.view import View
+from engram.maps.words import words_row, write_words
+
+# What may wait in memory of a revision that cannot be resumed.
+_BATCH_BYTES = 8 * 2**20
+# Beside the blob: a row as Python objects.
+_ROW_BYTES = 600
+# Covariances come from products with their own transposes: what is left of asymmetry is rounding.
+_ASYMMETRY_LIMIT = 1e-6
+# In the order in which rows refer to each other, so that a reader between two batches of an
+# abandoned revision never meets a reference to what is not there.
+_BUFFERED = (
+    cameras,
+    frontends,
+    sessions,
+    nodes,
+    frames,
+    paths,
+    path_entries,
+    omissions,
+    omitted_landmarks,
+    vocabularies,
+    hidden,
+)
+
+
+class RevisionWriter:
+    """Adds records to a map, in one revision that appears whole or not at all.
+
+    Made by `begin_session`, `resume_session` and `begin_revision` of `Map`. What is
+    added waits in memory until `checkpoint` writes it; readers see it after `commit`. Sessions come
+    before their nodes, nodes before what refers to them. What a revert has hidden is shown again
+    when it is added again.
+
+    A revision of one drive that is being mapped is *resumable*: killed, or left without `commit`,
+    it keeps what was checkpointed, to be resumed or sealed. Any other, a merge or a download, is
+    lost then, and its rows are collected by the next writer or by ``check --clean``; it checkpoints
+    itself before more than 8 MiB wait, so that memory does not grow with it.
+
+    One thread at a time may write. The map's `frames` can read a node, from any thread, as soon as
+    it was added.
+
+    Args:
+        database, keys, frame_reader: the map's.
+        view: the newest revision, and the revision that is written, which is born abandoned.
+        on_end: called when it is committed or abandoned.
+        session: the drive of a resumable revision; None for any other.
+        stored: what a resumed session has checkpointed; None for a new revision.
+        committed_ns: a time that stands for that of the commit, UTC; None for that time itself.
+
+    Attributes:
+        resumable: whether it is of one drive.
+        stored: as given; empty for a new revision.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        keys: KeyBook,
+        frame_reader: FrameReader,
+        view: View,
+        on_end: Callable[[], None],
+        *,
+        session: Session | None = None,
+        stored: StoredSession | None = None,
+        committed_ns: int | None = None,
+    ) -> None:
+        assert view.own is not None
+        self.resumable = session is not None
+        self._session = session
+        self.stored = stored or StoredSession()
+        self._database = database
+        self._keys = keys
+        self._frames = frame_reader
+        self._view = view
+        self._revision_key = view.own
+        self._status = RevisionStatus.ABANDONED if stored is None else RevisionStatus.OPEN
+        self._on_end = on_end
+        self._committed_ns = committed_ns
+        self._ended = False
+        with database.reading() as connection:
+            self._descriptor = reading.descriptor_of(connection, view)
+            self._frontend_keys = {
+                content: key for key, content in reading.load_frontends(connection).items()
+            }
+            self._camera_keys = {
+                camera.id: key for key, camera in reading.load_cameras(connection).items()
+            }
+            self._sessions = {
+                row["uuid"]: (row["key"], row["camera"], row["frontend"])
+                for row in view.rows(connection, sessions)
+            }
+            self._path_keys = {row["uuid"]: row["key"] for row in view.rows(connection, paths)}
+            self._hidden = {
+                table: hidden_rows(connection, view, table) for table in (sessions, nodes, paths)
+            }
+            self._interrupted = open_sessions(connection)
+        self._sequences: dict[int, set[int]] = {}
+        self._omitted: set[bytes] = set()
+        self._shows_again = False
+        self._clear()
+
+    # -- what may be added
+
+    def add_session(
+        self,
+        session: Session,
+        camera: StereoCamera,
+        *,
+        descriptor: DescriptorKind,
+        frontend: str,
+        partial: bool = False,
+    ) -> bool:
+        """Add a drive with its path; one that the map has already changes nothing.
+
+        Args:
+            session: the drive.
+            camera: the session's camera.
+            descriptor: kind of its descriptors.
+            frontend: hash of its front-end.
+            partial: whether some of its path's entries stay elsewhere.
+
+        Returns:
+            Whether it was new.
+
+        Raises:
+            IncompatibleError: the map's frames have another kind of descriptor.
+            InputError: the camera is not the session's.
+            RevisionError: the map holds what an interrupted run of the session had saved.
+        """
+        self._check_open()
+        if session.camera != camera.id:
+            raise InputError(f"session {session.id} has camera {session.camera}, not {camera.id}")
+        if session.id.bytes in self._sessions:
+            return False
+        if session.id.bytes in self._interrupted:
+            raise RevisionError(
+                f"session {session.id} was interrupted in this map; resume it or seal what is "
+                "there first"
+            )
+        if self._descriptor not in {None, descriptor}:
+            raise IncompatibleError(
+                f"{self._database.name} holds {self._descriptor} descriptors, session "
+                f"{session.id} {descriptor}; the two cannot be matched: extract the session again, "
+                "or make another map"
+            )
+        self._descriptor = descriptor
+        camera_key = self._camera_key(camera)
+        frontend_key = self._frontend_key(descriptor, frontend)
+        again = self._hidden[sessions].get(session.id.bytes)
+        if again is not None:
+            check_same_session(again, session, camera_key, frontend_key)
+        key = self._shown_again(sessions, session.id.bytes)
+        if key is None:
+            key = self._keys.next(sessions)
+            self._put(
+                sessions, session_row(session, key, self._revision_key, camera_key, frontend_key)
+            )
+        self._sessions[session.id.bytes] = (key, camera_key, frontend_key)
+        self._add_path(path_id(session.id), key, partial)
+        return True
+
+    def add_node(self, node: Node, frame: Frame) -> None:
+        """Save a frame as a node.
+
+        Raises:
+            InputError: node and frame do not belong together, the landmarks cannot be stored
+                without loss, or as `copy_node`.
+            IncompatibleError: the frame comes from another front-end than the session's.
+        """
+        if (node.stamp_ns, node.camera) != (frame.stamp_ns, frame.camera.id):
+            raise InputError(
+                f"node {node.id} (stamp {node.stamp_ns}, camera {node.camera}) does not fit its "
+                f"frame (stamp {frame.stamp_ns}, camera {frame.camera.id})"
+            )
+        landmarks = encode_landmarks(frame.landmarks, frame.camera)
+        stored = StoredNode(
+            node=node,
+            descriptor=frame.descriptor,
+            frontend=frame.frontend,
+            status=frame.status,
+            landmark_hash=blob_hash(landmarks),
+            landmarks=landmarks,
+            thumbnail=None if frame.thumbnail is None else encode_thumbnail(frame.thumbnail),
+        )
+        self.copy_node(stored, frame)
+
+    def copy_node(self, stored: StoredNode, frame: Frame | None = None) -> None:
+        """Add a node of another map, its landmarks copied byte for byte.
+
+        Args:
+            stored: from another map's `frames.stored`.
+            frame: its frame, if it was decoded anyway: read from memory until it is written.
+
+        Raises:
+            InputError: its session has not been added or has another camera, the map has the node
+                already or had it with other landmarks, or a number of it cannot be.
+            IncompatibleError: it comes from another front-end than its session.
+        """
+        self._check_open()
+        node = stored.node
+        self._check_node(stored)
+        again = self._hidden[nodes].get(node.id.bytes)
+        if again is not None:
+            check_same_node(again, node, stored.landmark_hash)
+        key = self._shown_again(nodes, node.id.bytes)
+        if key is None:
+            key = self._insert_node(stored)
+        self._keys.learn_node(node.id, key)
+        if frame is not None:
+            self._frames.hold(node.id, frame)
+            self._held.append(node.id)
+
+    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
+        """Keep the words of a node by the vocabulary of this hash (16 bytes).
+
+        Args:
+            node: a node of the map.
+            vocabulary: the vocabulary's hash.
+            found: (n,) the distinct words that the node shows, rising.
+
+        Raises:
+            InputError: the node is not in the map, or the words do not rise.
+        """
+        self._check_open()
+        key = self._node_key(node, "words")
+        self._words[key] = words_row(key, vocabulary, found)
+
+    def add_edge(self, edge: Edge) -> None:
+        """Add an edge; it takes the place of an older one with the same (a, b, kind).
+
+        Raises:
+            InputError: an end is not in the map, both are the same, or a number is not finite.
+        """
+        self._check_open()
+        _check_edge(edge)
+        a, b = self._node_key(edge.a, "edge"), self._node_key(edge.b, "edge")
+        row = edge_row(edge, self._keys.next(edges), self._revision_key, a, b)
+        self._edges.pop((a, b, row["kind"]), None)
+        self._edges[a, b, row["kind"]] = sealed(edges, row)
+        self._grow(_ROW_BYTES)
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        """Add a step of any session's path, in any order.
+
+        Raises:
+            InputError: the path or the node is not in the map, or the path has an entry of this
+                sequence number.
+        """
+        self._check_open()
+        path_key = self._path_keys.get(entry.path.bytes)
+        if path_key is None:
+            raise InputError(f"path {entry.path} is not in the map; add its session first")
+        node_key = self._node_key(entry.node, "path entry")
+        taken = self._sequences_of(path_key)
+        if entry.sequence in taken:
+            raise InputError(f"path {entry.path} has an entry {entry.sequence} already")
+        self._new(
+            path_entries,
+            path=path_key,
+            sequence=checked_int(entry.sequence, "sequence"),
+            node=node_key,
+            kind=str(entry.kind),
+            stamp_ns=checked_int(entry.stamp_ns, "stamp_ns"),
+        )
+        taken.add(entry.sequence)
+
+    def add_attempts(self, made: Sequence[Attempt]) -> None:
+        """Remember match attempts (SPEC §3.5) of the drive being mapped, rounded to 18 bytes each.
+
+        Offsets and headings keep 11 bits, standard deviations are right to 3 %, ranks end at 255.
+
+        Raises:
+            InputError: a node is not in the map.
+        """
+        self._check_open()
+        self.copy_attempts(self.session.id, *Attempts.of(made))
+
+    def copy_attempts(self, session: SessionId, made: Attempts, node_ids: Sequence[NodeId]) -> None:
+        """Remember attempts of one session of another map, in the order of their iterations.
+
+        Args:
+            session: whose they are.
+            made: the attempts; their column `session` is of no account.
+            node_ids: what their `reference` and `node` are indices into.
+
+        Raises:
+            InputError: the session or a node is not in the map.
+        """
+        self._check_open()
+        if session.bytes not in self._sessions:
+            raise InputError(f"attempts of session {session}, which is not in the map")
+        if not len(made):
+            return
+        columns: dict[str, NDArray[np.generic]] = {
+            name: np.asarray(
+                self._node_keys(getattr(made, name), node_ids)
+                if name in {"reference", "node"}
+                else getattr(made, name),
+                kind,
+            )
+            for name, kind in COLUMNS
+        }
+        key, *_ = self._sessions[session.bytes]
+        self._attempts[key].append(AttemptTable(columns, made.policy, made.policies))
+        self._grow(64 * len(made))
+
+    def add_omission(self, omission: Omission) -> None:
+        """Remember that a node was not taken, and for which.
+
+        Raises:
+            InputError: the equivalent is not in the map, or the omitted node is remembered already.
+        """
+        self._check_open()
+        node_key = self._node_key(omission.node, "omission")
+        if omission.omitted.bytes in self._omitted:
+            raise InputError(f"node {omission.omitted} is omitted twice")
+        uuid, node_from_omitted = (
+            omission.omitted.bytes,
+            transform_bytes(omission.node_from_omitted),
+        )
+        self._omitted.add(uuid)
+        self._new(omissions, uuid=uuid, node=node_key, node_from_omitted=node_from_omitted)
+        if omission.landmark_hash is not None:
+            self._new(omitted_landmarks, uuid=uuid, landmark_hash=omission.landmark_hash)
+
+    def put_vocabulary(self, body: bytes) -> None:
+        """Keep a vocabulary, encoded; the newest counts."""
+        self._check_open()
+        self._new(vocabularies, len(body), hash=content_digest(body), body=body)
+
+    @property
+    def session(self) -> Session:
+        """The drive of a resumable revision."""
+        assert self._session is not None
+        return self._session
+
+    @property
+    def shows_again(self) -> bool:
+        """Whether anything that a revert had hidden is seen again by this revision."""
+        return self._shows_again
+
+    # -- how it ends
+
+    def checkpoint(self) -> None:
+        """Write what waits, in one durable transaction. Readers see it after `commit`.
+
+        Raises:
+            StorageFullError: no space; the last checkpoint is intact, and this may be tried again.
+        """
+        self._check_open()
+        opens = self.resumable and self._status is RevisionStatus.ABANDONED
+        with self._database.writing() as connection:
+            self._write(connection)
+            if opens:
+                change_revision(connection, self._revision_key, was=self._status, status="open")
+        if opens:
+            self._status = RevisionStatus.OPEN
+        if self._rows[cameras] or self._rows[frontends]:
+            self._frames.set_view(self._view)
+        self._frames.show(self._rows[hidden])
+        self._frames.release(self._held)
+        self._clear()
+
+    def commit(self) -> Revision:
+        """Make all of it part of the map: a last checkpoint, then the revision's status.
+
+        Raises:
+            StorageFullError: as `checkpoint`.
+        """
+        self.checkpoint()
+        with self._database.reading() as connection:
+            contents = revision_contents(connection, self._revision_key)
+        with self._database.writing() as connection:
+            if self.resumable:
+                self._repack_attempts(connection)
+            revision = commit_revision(
+                connection,
+                self._revision_key,
+                was=self._status,
+                contents=contents,
+                committed_ns=self._committed_ns,
+            )
+        self._end()
+        return revision
+
+    def abandon(self) -> None:
+        """Give the revision up: the map is as it was. Without effect once it is over."""
+        if self._ended:
+            return
+        if self._status is RevisionStatus.OPEN:
+            with self._database.writing() as connection:
+                change_revision(connection, self._revision_key, status="abandoned")
+        self._clear()
+        self._keys.forget_nodes()
+        self._frames.forget()
+        self._end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._status is not RevisionStatus.OPEN:
+            self.abandon()
+
+    # -- inside
+
+    def _end(self) -> None:
+        self._ended = True
+        self._on_end()
+
+    def _check_open(self) -> None:
+        if self._ended:
+            raise RevisionError("this revision is committed or abandoned already")
+
+    def _clear(self) -> None:
+        self._rows: dict[Table, list[Row]] = {table: [] for table in _BUFFERED}
+        self._edges: dict[tuple[int, int, str], Row] = {}
+        self._words: dict[int, Row] = {}
+        self._attempts: dict[int, list[AttemptTable]] = defaultdict(list)
+        self._held: list[NodeId] = []
+        self._waiting_bytes = 0
+
+    def _new(self, table: Table, size_bytes: int = 0, **values: Any) -> int:
+        """A row of this revision; returns its key."""
+        key = self._keys.next(table)
+        self._put(table, {"key": key, "revision": self._revision_key, **values}, size_bytes)
+        return key
+
+    def _put(self, table: Table, row: Row, size_bytes: int = 0) -> None:
+        self._rows[table].append(sealed(table, row))
+        self._grow(_ROW_BYTES + size_bytes)
+
+    def _grow(self, size_bytes: int) -> None:
+        self._waiting_bytes += size_bytes
+        # What is resumed must not begin in the middle of a frame's records.
+        if not self.resumable and self._waiting_bytes > _BATCH_BYTES:
+            self.checkpoint()
+
+    def _write(self, connection: Connection) -> None:
+        for table, rows in self._rows.items():
+            if rows:
+                connection.execute(insert(table), rows)
+        if self._edges:
+            key = ("a", "b", "kind", "revision")
+            connection.execute(self._database.replace(edges, key), list(self._edges.values()))
+        write_words(connection, self._database, list(self._words.values()))
+        for session_key, tables in self._attempts.items():
+            self._write_attempts(connection, session_key, tables)
+
+    def _write_attempts(
+        self, connection: Connection, session_key: int, tables: list[AttemptTable]
+    ) -> None:
+        rows = [
+            sealed(
+                attempts,
+                {
+                    "key": self._keys.next(attempts),
+                    "revision": self._revision_key,
+                    "session": session_key,
+                    "count": count,
+                    "body": body,
+                },
+            )
+            for count, body in pack(concatenate(tables))
+        ]
+        connection.execute(insert(attempts), rows)
+
+    def _repack_attempts(self, connection: Connection) -> None:
+        """Pack those of all checkpoints together: the file does not tell when they were made."""
+        written = attempts.c.revision == self._revision_key
+        found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
+        tables: dict[int, list[AttemptTable]] = defaultdict(list)
+        for row in verified(attempts, found):
+            tables[row["session"]].append(unpack(row["body"], row["count"]))
+        connection.execute(delete(attempts).where(written))
+        for session_key, made in tables.items():
+            self._write_attempts(connection, session_key, made)
+
+    def _camera_key(self, camera: StereoCamera) -> int:
+        if camera.id not in self._camera_keys:
+            key = self._camera_keys[camera.id] = self._keys.next(cameras)
+            self._put(cameras, camera_row(camera, key))
+        return self._camera_keys[camera.id]
+
+    def _frontend_key(self, descriptor: DescriptorKind, frontend: str) -> int:
+        content = (descriptor, frontend)
+        if content not in self._frontend_keys:
+            key = self._frontend_keys[content] = self._keys.next(frontends)
+            row = {"key": key, "descriptor": str(descriptor), "hash": frontend}
+            self._put(frontends, row)
+        return self._frontend_keys[content]
+
+    def _add_path(self, path: PathId, session_key: int, partial: bool) -> None:
+        key = self._shown_again(paths, path.bytes)
+        if key is None:
+            key = self._new(paths, uuid=path.bytes, session=session_key, partial=int(partial))
+        self._path_keys[path.bytes] = key
+
+    def _check_node(self, stored: StoredNode) -> None:
+        node = stored.node
+        if node.session.bytes not in self._sessions:
+            raise InputError(f"node {node.id}: its session {node.session} is not in the map")
+        _, camera_key, frontend_key = self._sessions[node.session.bytes]
+        if self._keys.find_node(node.id) is not None:
+            raise InputError(f"node {node.id} is in the map already; a node is saved once")
+        if not np.isfinite(node.driven_m):
+            raise InputError(f"node {node.id}: driven_m is {node.driven_m}, must be finite")
+        if self._camera_keys.get(node.camera) != camera_key:
+            raise InputError(
+                f"node {node.id} is of camera {node.camera}, its session {node.session} of "
+                "another; a recalibrated robot begins another session"
+            )
+        if self._frontend_keys.get((stored.descriptor, stored.frontend)) != frontend_key:
+            raise IncompatibleError(
+                f"node {node.id} comes from front-end {stored.frontend} ({stored.descriptor}), "
+                f"its session {node.session} from another; begin another session"
+            )
+
+    def _insert_node(self, stored: StoredNode) -> int:
+        node = stored.node
+        session_key, camera_key, frontend_key = self._sessions[node.session.bytes]
+        key = self._new(
+            nodes,
+            uuid=node.id.bytes,
+            session=session_key,
+            camera=camera_key,
+            frontend=frontend_key,
+            stamp_ns=checked_int(node.stamp_ns, "stamp_ns"),
+            driven_m=float(node.driven_m),
+            status=str(stored.status),
+            landmark_hash=stored.landmark_hash,
+        )
+        blobs = {"landmarks": stored.landmarks, "thumbnail": stored.thumbnail}
+        size_bytes = len(stored.landmarks) + len(stored.thumbnail or b"")
+        self._put(frames, {"node": key, "revision": self._revision_key, **blobs}, size_bytes)
+        return key
+
+    def _node_key(self, node: NodeId, what: str) -> int:
+        key = self._keys.find_node(node)
+        if key is None:
+            raise InputError(f"{what}: node {node} is not in the map; add it first")
+        return key
+
+    def _node_keys(
+        self, indices: NDArray[np.int32], node_ids: Sequence[NodeId]
+    ) -> NDArray[np.int64]:
+        used, inverse = np.unique(indices, return_inverse=True)
+        keys = [self._node_key(node_ids[int(index)], "attempt") for index in used]
+        return np.array(keys, np.int64)[inverse]
+
+    def _sequences_of(self, path_key: int) -> set[int]:
+        """Sequence numbers of the entries of a path that are seen."""
+        if path_key not in self._sequences:
+            query = (
+                self._view.select(path_entries)
+                .with_only_columns(path_entries.c.sequence)
+                .where(path_entries.c.path == path_key)
+            )
+            with self._database.reading() as connection:
+                self._sequences[path_key] = set(connection.execute(query).scalars())
+        return self._sequences[path_key]
+
+    def _shown_again(self, table: Table, uuid: bytes) -> int | None:
+        """Key of a row that was hidden and is shown from this revision on; None without one."""
+        again = self._hidden[table].pop(uuid, None)
+        if again is None:
+            return None
+        self._shows_again = True
+        self._put(
+            hidden, hidden_row(self._keys, self._revision_key, table, again["key"], hide=False)
+        )
+        return int(again["key"])
+
+
+def _check_edge(edge: Edge) -> None:
+    """Refuse an edge that no map should hold.
+
+    Raises:
+        InputError: it joins a node with itself, or its numbers are not finite and symmetric.
+    """
+    what = f"edge {edge.a} → {edge.b} ({edge.kind})"
+    if edge.a == edge.b:
+        raise InputError(f"{what} joins a node with itself")
+    transform = np.concatenate([edge.a_from_b.rotation.ravel(), edge.a_from_b.translation])
+    if not np.isfinite(transform).all() or edge.covariance.shape != (6, 6):
+        raise InputError(f"{what}: a transform is finite, its covariance (6, 6)")
+    asymmetry = np.abs(edge.covariance - edge.covariance.T).max()
+    if not asymmetry <= _ASYMMETRY_LIMIT * max(1.0, np.abs(edge.covariance).max()):
+        raise InputError(f"{what}: its covariance is not finite and symmetric")

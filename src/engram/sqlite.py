@@ -1,0 +1,290 @@
+"""SQLite files of ours, maps and frame logs: what makes one, how it is opened, what errors mean.
+
+Nobody but SQLite opens such a file, not even to look at its header: closing a handle of one's own
+drops the locks that this process holds through SQLite. The next process to close the file would
+then take itself for the last, and remove the write-ahead log under the writer.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import stat
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+from urllib.parse import quote
+
+from sqlalchemy import Engine, MetaData, create_engine
+from sqlalchemy.dialects import registry
+from sqlalchemy.dialects.sqlite.pysqlite import SQLiteDialect_pysqlite
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import QueuePool
+from sqlalchemy.util import LRUCache
+
+from engram import __version__
+from engram.errors import (
+    EngramError,
+    FormatVersionError,
+    MapCorruptError,
+    MapError,
+    MapLockedError,
+    StorageFullError,
+)
+
+_OLDEST_SQLITE = (3, 37, 0)  # knows STRICT tables
+_CACHE_KIB = 8192
+
+_FULL = {
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR_WRITE,
+    sqlite3.SQLITE_IOERR_TRUNCATE,
+    sqlite3.SQLITE_IOERR_FSYNC,
+    sqlite3.SQLITE_IOERR_SHMSIZE,
+}
+
+# Runs one statement on an open connection, of SQLAlchemy or of SQLite.
+Execute: TypeAlias = Callable[[str], Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FileKind:
+    """What tells one kind of file from another.
+
+    Attributes:
+        noun: what people call it.
+        application_id: stands in the file's header, so that `file` and we know what it is.
+        format_version: the newest format that is known.
+        metadata: its tables, in the newest format.
+        strange: the error for what is no such file, or cannot be opened.
+        cure: what to do about a damaged one.
+        busy_s: for how long another process may hold the file before that is an error.
+    """
+
+    noun: str
+    application_id: int
+    format_version: int
+    metadata: MetaData
+    strange: type[EngramError]
+    cure: str
+    busy_s: float
+
+
+class SqliteFile:
+    """One file of a kind.
+
+    Args:
+        path: where it is, or is to be.
+        kind: what it is.
+    """
+
+    def __init__(self, path: Path, kind: FileKind) -> None:
+        self.path = path
+        self.kind = kind
+
+    def check_regular(self, *, may_be_new: bool = False) -> None:
+        """Refuse what SQLite would wait for, or take for an empty database.
+
+        Args:
+            may_be_new: whether the file may be empty, or not there.
+
+        Raises:
+            EngramError: the kind's `strange`: no regular file, or an empty one.
+            MapError: the file cannot be looked at.
+        """
+        noun, strange = self.kind.noun, self.kind.strange
+        try:
+            found = self.path.stat()
+        except (FileNotFoundError, NotADirectoryError) as error:
+            if may_be_new:
+                return
+            raise strange(f"{self.path}: there is no such file") from error
+        except OSError as error:
+            raise MapError(f"{self.path} cannot be read: {error.strerror}") from error
+        if stat.S_ISDIR(found.st_mode):
+            raise strange(f"{self.path} is a folder, no {noun}")
+        if not stat.S_ISREG(found.st_mode):
+            raise strange(f"{self.path} is a pipe, a socket or a device, no {noun}")
+        if not found.st_size and not may_be_new:
+            raise strange(f"{self.path} is an empty file, no {noun}")
+
+    def identify(self, execute: Execute) -> int:
+        """Format of the file, as SQLite sees it: the log may be newer than the first page.
+
+        Raises:
+            EngramError: the kind's `strange`: a file of another kind.
+            FormatVersionError: written by a newer Engram.
+            MapCorruptError: there never was such a format.
+        """
+        kind = self.kind
+        if self._pragma(execute, "application_id") != kind.application_id:
+            raise kind.strange(f"{self.path} is an SQLite file, but no {kind.noun}")
+        version = self._pragma(execute, "user_version")
+        if version > kind.format_version:
+            raise FormatVersionError(
+                f"{self.path} is a {kind.noun} of format {version}, this Engram ({__version__}) "
+                f"reads up to {kind.format_version}: upgrade it"
+            )
+        if version < 1:
+            raise MapCorruptError(f"{self.path}: format {version} never existed; {kind.cure}")
+        return version
+
+    def is_new(self, execute: Execute) -> bool:
+        """Whether the file holds nothing at all yet."""
+        (count,) = execute("SELECT count(*) FROM sqlite_schema").fetchone()
+        return not count and self._pragma(execute, "application_id") == 0
+
+    def mark(self, execute: Execute) -> None:
+        """Write into the header what the file is."""
+        execute(f"PRAGMA application_id={self.kind.application_id}")
+        execute(f"PRAGMA user_version={self.kind.format_version}")
+
+    def check_tables(self, execute: Execute, missing: Collection[str] = ()) -> None:
+        """Only our tables with our columns: no view, trigger or computed column of a stranger.
+
+        Args:
+            execute: of an open connection; tables that are missing may stand in it for itself.
+            missing: tables that the file's format does not have.
+
+        Raises:
+            MapCorruptError: other tables, or other columns.
+        """
+        expected = self.kind.metadata.tables.keys() - set(missing)
+        found = execute("SELECT type, name FROM sqlite_schema WHERE type != 'index'").fetchall()
+        here = {(str(kind), str(name)) for kind, name in found}
+        wanted = {("table", name) for name in expected}
+        if here != wanted:
+            raise MapCorruptError(
+                f"{self.path}: not the tables of its format: missing {sorted(wanted - here)}, "
+                f"strange {sorted(here - wanted)}"
+            )
+        for table in self.kind.metadata.sorted_tables:
+            rows = execute(f"PRAGMA table_xinfo({table.name})").fetchall()
+            columns = [(row[1], row[6]) for row in rows]
+            if columns != [(column.name, 0) for column in table.columns]:
+                raise MapCorruptError(f"{self.path}: table {table.name} has the columns {columns}")
+
+    def connect(self, options: str) -> sqlite3.Connection:
+        """A connection; transactions are begun by hand.
+
+        Args:
+            options: of SQLite's URI: ``mode=ro``, ``mode=rw`` or ``mode=rwc``.
+
+        Raises:
+            MapError: this Python's SQLite is too old.
+        """
+        if sqlite3.sqlite_version_info < _OLDEST_SQLITE:
+            raise MapError(
+                f"this Python comes with SQLite {sqlite3.sqlite_version}; a {self.kind.noun} needs "
+                f"{'.'.join(map(str, _OLDEST_SQLITE))} or newer"
+            )
+        connection = sqlite3.connect(
+            f"file:{quote(str(self.path.absolute()))}?{options}",
+            uri=True,
+            timeout=self.kind.busy_s,
+            check_same_thread=False,  # whoever takes a connection has it alone until giving it back
+            isolation_level=None,
+        )
+        try:
+            connection.execute("PRAGMA trusted_schema=OFF")  # no function of a stranger's is called
+            connection.execute("PRAGMA cell_size_check=ON")
+            connection.execute("PRAGMA synchronous=FULL")
+            connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")
+        except sqlite3.Error:
+            connection.close()
+            raise
+        return connection
+
+    def engine(
+        self, options: str, prepare: Callable[[sqlite3.Connection], object] | None = None
+    ) -> Engine:
+        """A pool of such connections, each prepared before it is used."""
+
+        def connect() -> sqlite3.Connection:
+            connection = self.connect(options)
+            try:
+                if prepare is not None:
+                    prepare(connection)
+            except sqlite3.Error:
+                connection.close()
+                raise
+            return connection
+
+        return create_engine(
+            "engramfile://",
+            creator=connect,
+            poolclass=QueuePool,
+            max_overflow=-1,
+            execution_options={"compiled_cache": _COMPILED},
+        )
+
+    @contextmanager
+    def errors(self) -> Iterator[None]:
+        """SQLite's errors as ours, each with the file's name.
+
+        Raises:
+            EngramError: the kind's `strange`: no SQLite file, or it cannot be opened.
+            MapCorruptError: it is damaged or cut short.
+            MapLockedError: another process writes to it.
+            StorageFullError: no space is left.
+            MapError: anything else, as on read-only media.
+        """
+        try:
+            yield
+        except (DBAPIError, sqlite3.Error) as error:
+            cause = error.orig if isinstance(error, DBAPIError) else error
+            raise self._translate(cause) from error
+        except UnicodeDecodeError as error:  # sqlite3 reads names of columns without a net
+            raise MapCorruptError(f"{self.path} is damaged ({error}); {self.kind.cure}") from error
+
+    def _translate(self, cause: BaseException | None) -> EngramError:
+        code = getattr(cause, "sqlite_errorcode", 0)
+        primary, noun = code & 0xFF, self.kind.noun
+        error: type[EngramError] = MapError
+        fact = f"cannot be read or written: {cause}"
+        if code in _FULL:
+            error = StorageFullError
+            fact = (
+                f"cannot grow ({cause}); free some space or raise the limit and try again: "
+                "everything up to the last checkpoint is safe"
+            )
+        elif primary == sqlite3.SQLITE_NOTADB:
+            error = self.kind.strange
+            fact = f"is no {noun}: it is no SQLite file, or its beginning is damaged"
+        elif primary == sqlite3.SQLITE_CANTOPEN:
+            error = self.kind.strange
+            fact = (
+                f"cannot be opened ({cause}); if it lies on read-only media with a file "
+                f"{self.path.name}-wal beside it, copy both where they may be written"
+            )
+        elif primary in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
+            error = MapLockedError
+            fact = f"is a {noun} that another process writes to ({cause}); wait until it is done"
+        elif primary == sqlite3.SQLITE_CORRUPT or "decode" in str(cause):
+            error, fact = MapCorruptError, f"is damaged ({cause}); {self.kind.cure}"
+        return error(f"{self.path} {fact}")
+
+    @staticmethod
+    def _pragma(execute: Execute, name: str) -> int:
+        return int(execute(f"PRAGMA {name}").fetchone()[0])
+
+
+class _FileDialect(SQLiteDialect_pysqlite):
+    """SQLite's dialect, equal for all files: a statement is compiled once, not for every file.
+
+    SQLAlchemy keys compiled statements by the engine's dialect. A process that opens many small
+    maps would spend half of its time on compiling the same statements again.
+    """
+
+    supports_statement_cache = True
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+
+registry.register("engramfile", __name__, _FileDialect.__name__)
+_COMPILED: LRUCache[Any, Any] = LRUCache(500)
