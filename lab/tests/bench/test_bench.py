@@ -8,7 +8,7 @@ import pytest
 from engram.errors import ConfigError
 from engram.frontend import Frontend
 from engram.odometry import Odometry
-from engram.places import DenseTable, FabMap
+from engram.places import FabMap
 from engram.ranking import policy_named
 from engram_lab.bench import STAGES, BenchReport, run_bench, runner
 from engram_lab.bench.data import BenchData, load_bench_data, scale_and_crop, synthetic_drive
@@ -18,6 +18,7 @@ from engram_lab.bench.ranking import PlainFormula
 from engram_lab.bench.report import Machine, Side, StageResult
 from engram_lab.bench.stages import prepare_attempt, prepare_frontend_odometry
 from engram_lab.bench.synthetic import SyntheticPlace
+from engram_lab.dense import DenseTable
 
 STEP_M = 0.8
 

@@ -191,7 +191,7 @@ def test_a_policy_has_one_colour_in_all_figures(
                 looks.setdefault(text.get_text(), set()).add(look)
         pyplot.close(figure)
 
-    monkeypatch.setattr("engram.viewing.curves.save", keep)
+    monkeypatch.setattr("engram_lab.charts.save", keep)
     found = collect(plan)
     draw_figures(tmp_path, [found], summary_rows(found))
     assert looks["recall"] == {("black", "-")}

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from engram.places.bag_of_words import BagOfWords
 from engram.places.chow_liu import WordStatistics
-from engram.places.dense import DenseTable
 from engram.places.fabmap import FabMap, FabMapConfig
 from engram.places.observation import DetectorModel, ObservationModel
 from engram.places.recogniser import Comparison, PlaceRecogniser, Recognition
@@ -30,7 +29,6 @@ __all__ = [
     "RECOGNISERS",
     "BagOfWords",
     "Comparison",
-    "DenseTable",
     "DetectorModel",
     "FabMap",
     "FabMapConfig",

@@ -101,10 +101,6 @@ class FabMap:
         """Log p(Z | L) (P,) of an image with these words at each place."""
         return self._places.of(self._query.weigh(words))
 
-    def log_likelihood_elsewhere(self, words: NDArray[np.int32]) -> float:
-        """Log p(Z | none of the places): the mean likelihood over sampled places."""
-        return self._judge(words)[1]
-
     def compare(self, words: NDArray[np.int32]) -> Comparison:
         """See `PlaceRecogniser`: by how much each place beats what it gives to the samples.
 

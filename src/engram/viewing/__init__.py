@@ -1,6 +1,5 @@
 """Pictures."""
 
-from engram.viewing.curves import Line, Panel, draw_bars, draw_curves
 from engram.viewing.from_above import (
     Track,
     check_picture,
@@ -11,13 +10,9 @@ from engram.viewing.from_above import (
 from engram.viewing.matches import match_picture
 
 __all__ = [
-    "Line",
-    "Panel",
     "Track",
     "check_picture",
     "draw_attempts",
-    "draw_bars",
-    "draw_curves",
     "draw_from_above",
     "draw_panels",
     "match_picture",

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from engram.frontend import BRIEF
 from engram.places import (
-    DenseTable,
     FabMap,
     TrainingConfig,
     TreeArrays,
@@ -18,6 +17,7 @@ from engram.places import (
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared
+from engram_lab.dense import DenseTable
 
 _BRANCHES = (22, 22, 22)  # 10,648 leaves, of which the last level keeps 10,000
 _WORDS = 10_000

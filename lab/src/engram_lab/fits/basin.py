@@ -18,9 +18,9 @@ import numpy as np
 from engram.frontend import Frame, Frontend, FrontendConfig, MatcherConfig, StereoPair, match_frames
 from engram.geometry import SE3
 from engram.sequences import open_sequence
-from engram.viewing import Line as Curve
-from engram.viewing import Panel, draw_curves
 from engram_lab.bench.data import scale_and_crop
+from engram_lab.charts import Line as Curve
+from engram_lab.charts import Panel, draw_curves
 from engram_lab.programs import command_line
 from engram_lab.studies.pages import write_csv
 from engram_lab.town import SimulatedDrive, campaign_named

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.measures import Drive
-from engram.viewing import Line
+from engram_lab.charts import Line
 from engram_lab.intervals import (
     Estimator,
     Interval,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.measures import Drive, route_not_localised
-from engram.viewing import Line, Panel, draw_bars, draw_curves
+from engram_lab.charts import Line, Panel, draw_bars, draw_curves
 from engram_lab.intervals import Resamples
 from engram_lab.studies.curves import CURVE_AT_M, failure_line
 from engram_lab.studies.fleet.experiments import SHARED, SINGLE, merged_name

@@ -25,7 +25,6 @@ from engram.localiser import Position
 from engram.maps import Map
 from engram.measures import Drive
 from engram.places import (
-    DenseTable,
     FabMap,
     FabMapConfig,
     decode_vocabulary,
@@ -33,6 +32,7 @@ from engram.places import (
 )
 from engram.places.words import NodeWords
 from engram.sequences import FrameLog
+from engram_lab.dense import DenseTable
 from engram_lab.studies.building import true_nodes, write_json
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm

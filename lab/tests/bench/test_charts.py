@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.viewing import Line, Panel, draw_curves
+from engram_lab.charts import Line, Panel, draw_curves
 
 
 def legend_of(
@@ -21,7 +21,7 @@ def legend_of(
             shown[text.get_text()] = (handle.get_color(), handle.get_linestyle())
         pyplot.close(figure)
 
-    monkeypatch.setattr("engram.viewing.curves.save", keep)
+    monkeypatch.setattr("engram_lab.charts.save", keep)
     line = np.arange(2.0)
     panel = Panel("", "", "", [Line(label, line, line) for label in labels])
     draw_curves([panel], Path("unused.png"), "", looks)
