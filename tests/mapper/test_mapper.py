@@ -91,7 +91,7 @@ def test_a_parallel_experience_is_in_the_neighbourhood(path: Path) -> None:
         near = graph.neighbourhood(
             graph.index(node), SE3.identity(), np.zeros((6, 6)), Search(8.0, 1.0)
         )
-        found = set(graph.node_ids(near.nodes))
+        found = {graph.node(index).id for index in near.nodes.tolist()}
         for other, world_from_other in second.saved.items():
             if (world_from_node.inverse() @ world_from_other).distance_m <= 8.0:
                 beside_count += 1

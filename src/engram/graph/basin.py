@@ -48,7 +48,7 @@ def prior_basin_m(focal_px: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BasinCounts:
-    """Remembered attempts by distance: what a map stores for one camera. Adds up.
+    """Remembered attempts by distance: what match basins are learnt from.
 
     Attributes:
         attempts: (2, BIN_COUNT) int64; row 0 along the viewing direction, row 1 across; bin k
@@ -64,9 +64,6 @@ class BasinCounts:
         """No attempts yet."""
         zeros = np.zeros((2, BIN_COUNT), dtype=np.int64)
         return BasinCounts(zeros, zeros)
-
-    def __add__(self, other: BasinCounts) -> BasinCounts:
-        return BasinCounts(self.attempts + other.attempts, self.successes + other.successes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,10 +99,6 @@ class MatchBasin:
             ]
         )
         return MatchBasin(focal_px, counts, rates)
-
-    def learnt(self, counts: BasinCounts) -> MatchBasin:
-        """The basin with more attempts counted in."""
-        return MatchBasin.of(self.focal_px, self.counts + counts)
 
     def success_rate(self, along_m: Array, across_m: Array) -> Array:
         """The rate g at offsets along and across the viewing direction, metres, of any one shape.

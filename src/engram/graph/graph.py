@@ -20,23 +20,6 @@ from engram.graph.neighbourhood import Neighbourhood, Search
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chain:
-    """The least uncertain chain between two nodes.
-
-    Attributes:
-        nodes: dense indices, both ends included.
-        edges: the edges used, one fewer than nodes; each may run either way.
-        start_from_end: pose of the last node in the first one's frame.
-        covariance: (6, 6) of `start_from_end`, left perturbation, [translation, rotation].
-    """
-
-    nodes: list[int]
-    edges: list[Edge]
-    start_from_end: SE3
-    covariance: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ChainTree:
     """Least uncertain chains from one root to all that it reaches, a struct of arrays.
 
@@ -272,10 +255,6 @@ class ExperienceGraph:
         """All edges that count (superseded ones are gone), oldest key first. Do not change it."""
         return self._edges
 
-    def node_ids(self, indices: NDArray[np.int32]) -> list[NodeId]:
-        """UUIDs of nodes, in the order given."""
-        return [self._nodes[i].id for i in indices]
-
     @property
     def sessions(self) -> NDArray[np.int32]:
         """(N,) int32: for each node the number of its session (`session_number`). A view."""
@@ -440,30 +419,16 @@ class ExperienceGraph:
         row_of = {int(node): row for row, node in enumerate(columns[0])}
         return ChainTree(root, row_of, *columns)
 
-    def shortest_chain(self, a: int, b: int) -> Chain | None:
-        """The least uncertain chain from node a to node b; None if they are not connected."""
-        tree = self.chains_from(a, goals=[b])
-        if b not in tree.row_of:
-            return None
-        rows = [tree.row_of[b]]
-        while tree.parents[rows[-1]] >= 0:
-            rows.append(int(tree.parents[rows[-1]]))
-        rows.reverse()
-        pose = tree.pose(b)
-        return Chain(
-            nodes=[int(tree.nodes[row]) for row in rows],
-            edges=[self._edges[int(tree.half_edges[row]) // 2] for row in rows[1:]],
-            start_from_end=pose,
-            covariance=tree.error(b).pivoted(pose.translation).covariance(),
-        )
-
     def predict(self, reference: int, node: int) -> tuple[SE3, NDArray[np.float64]] | None:
         """``reference_from_node`` and its (6, 6) covariance along the least uncertain chain.
 
         None if the two are not connected.
         """
-        chain = self.shortest_chain(reference, node)
-        return None if chain is None else (chain.start_from_end, chain.covariance)
+        tree = self.chains_from(reference, goals=[node])
+        if node not in tree.row_of:
+            return None
+        pose = tree.pose(node)
+        return pose, tree.error(node).pivoted(pose.translation).covariance()
 
     def _arrays(self) -> _core.GraphArrays:
         if self._bound is None:

@@ -80,17 +80,6 @@ class RunAttempts:
             self.frames,
         )
 
-    def decay(self, length_m: float) -> NDArray[np.float64]:
-        """(R,) exp(−Δs / length) of the distance driven since each attempt."""
-        return np.asarray(np.exp((self.at_m - self.driven_m) / length_m))
-
-    def failure_weights(self) -> NDArray[np.float64]:
-        """(R,) how much each failure tells against its experience: g, and 0 for successes.
-
-        A failure far from the node was to be expected; one without a prediction tells nothing.
-        """
-        return np.where(self.accepted | np.isnan(self.rates), 0.0, self.rates)
-
 
 class RunLog:
     """Collects the attempts of one session as it drives."""

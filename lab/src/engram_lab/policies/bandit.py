@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
+from engram_lab.policies.evidence import decay, failure_weights
 
 Array = NDArray[np.float64]
 
@@ -52,9 +53,9 @@ def session_tallies(context: RankingContext) -> tuple[Array, Array]:
     """Decayed successes and failures (Y,) of this run on the session that saved each candidate."""
     graph, run = context.graph, context.run
     attempted, sessions = graph.sessions_of(run.nodes), context.sessions
-    weights, count = run.decay(_MEMORY_M), graph.session_count
+    weights, count = decay(run, _MEMORY_M), graph.session_count
     successes = np.bincount(attempted, weights * run.accepted, count)[sessions]
-    failures = np.bincount(attempted, weights * run.failure_weights(), count)[sessions]
+    failures = np.bincount(attempted, weights * failure_weights(run), count)[sessions]
     return successes.astype(np.float64), failures.astype(np.float64)
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from engram.graph.model import path_id
 from engram.ranking.context import RankingContext
 from engram.ranking.reasons import Reasons
+from engram_lab.policies.evidence import decay
 from engram_lab.policies.turns import IN_TURNS, round_robin
 
 # "Decayed with distance" (SPEC §4), by as much as the bandit's memory.
@@ -46,7 +47,7 @@ class CollaborativePolicy:
         numbers, group = np.unique(context.sessions, return_inverse=True)
         share = run.inliers / np.maximum(run.landmarks, 1)
         reached = _reached(context, numbers, run.nodes) @ (
-            run.decay(_DECAY_M) * run.accepted * share
+            decay(run, _DECAY_M) * run.accepted * share
         )
         seen = _reached(context, numbers, near.nodes) @ np.exp(-near.distance_m / _DECAY_M)
         return np.asarray((reached / np.sqrt(np.maximum(seen, 1e-12)))[group])
