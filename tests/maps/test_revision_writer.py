@@ -95,7 +95,7 @@ def test_memory_does_not_grow_with_the_revision(target, source, monkeypatch):
     with begin_bulk(target) as writer:
         copy_into(writer, source)
         assert len(written) > 3
-        assert writer._waiting_bytes <= 20_000
+        assert writer._rows.size_bytes <= 20_000
 
 
 def test_readers_see_nothing_before_the_commit_and_the_writer_everything(target, location, source):

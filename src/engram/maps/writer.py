@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, delete, insert, select
+from sqlalchemy import Table
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.frontend import DescriptorKind, Frame
@@ -29,7 +28,7 @@ from engram.graph.model import (
     path_id,
 )
 from engram.maps import reading
-from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, pack, unpack
+from engram.maps.attempts import COLUMNS, AttemptTable
 from engram.maps.database import Database
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
@@ -41,20 +40,15 @@ from engram.maps.revisions import (
     open_sessions,
     revision_contents,
 )
+from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import (
-    Row,
     camera_row,
     checked_int,
-    edge_row,
-    sealed,
     session_row,
     transform_bytes,
-    verified,
 )
 from engram.maps.schema import (
-    attempts,
     cameras,
-    edges,
     frames,
     frontends,
     hidden,
@@ -67,29 +61,11 @@ from engram.maps.schema import (
     vocabularies,
 )
 from engram.maps.view import View
-from engram.maps.words import words_row, write_words
 
 # What may wait in memory of a revision that cannot be resumed.
 _BATCH_BYTES = 8 * 2**20
-# Beside the blob: a row as Python objects.
-_ROW_BYTES = 600
 # Covariances come from products with their own transposes: what is left of asymmetry is rounding.
 _ASYMMETRY_LIMIT = 1e-6
-# In the order in which rows refer to each other, so that a reader between two batches of an
-# abandoned revision never meets a reference to what is not there.
-_BUFFERED = (
-    cameras,
-    frontends,
-    sessions,
-    nodes,
-    frames,
-    paths,
-    path_entries,
-    omissions,
-    omitted_landmarks,
-    vocabularies,
-    hidden,
-)
 
 
 class RevisionWriter:
@@ -139,6 +115,7 @@ class RevisionWriter:
         self.stored = stored or StoredSession()
         self._database = database
         self._keys = keys
+        self._rows = RowBuffer(database, keys, view.own)
         self._frames = frame_reader
         self._view = view
         self._revision_key = view.own
@@ -166,7 +143,7 @@ class RevisionWriter:
         self._sequences: dict[int, set[int]] = {}
         self._omitted: set[bytes] = set()
         self._shows_again = False
-        self._clear()
+        self._held: list[NodeId] = []
 
     # -- what may be added
 
@@ -221,11 +198,12 @@ class RevisionWriter:
         key = self._shown_again(sessions, session.id.bytes)
         if key is None:
             key = self._keys.next(sessions)
-            self._put(
+            self._rows.put(
                 sessions, session_row(session, key, self._revision_key, camera_key, frontend_key)
             )
         self._sessions[session.id.bytes] = (key, camera_key, frontend_key)
         self._add_path(path_id(session.id), key, partial)
+        self._checkpoint_if_due()
         return True
 
     def add_node(self, node: Node, frame: Frame) -> None:
@@ -278,6 +256,7 @@ class RevisionWriter:
         if frame is not None:
             self._frames.hold(node.id, frame)
             self._held.append(node.id)
+        self._checkpoint_if_due()
 
     def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
         """Keep the words of a node by the vocabulary of this hash (16 bytes).
@@ -291,8 +270,8 @@ class RevisionWriter:
             InputError: the node is not in the map, or the words do not rise.
         """
         self._check_open()
-        key = self._node_key(node, "words")
-        self._words[key] = words_row(key, vocabulary, found)
+        self._rows.put_words(self._node_key(node, "words"), vocabulary, found)
+        self._checkpoint_if_due()
 
     def add_edge(self, edge: Edge) -> None:
         """Add an edge; it takes the place of an older one with the same (a, b, kind).
@@ -303,10 +282,8 @@ class RevisionWriter:
         self._check_open()
         _check_edge(edge)
         a, b = self._node_key(edge.a, "edge"), self._node_key(edge.b, "edge")
-        row = edge_row(edge, self._keys.next(edges), self._revision_key, a, b)
-        self._edges.pop((a, b, row["kind"]), None)
-        self._edges[a, b, row["kind"]] = sealed(edges, row)
-        self._grow(_ROW_BYTES)
+        self._rows.put_edge(edge, a, b)
+        self._checkpoint_if_due()
 
     def add_path_entry(self, entry: PathEntry) -> None:
         """Add a step of any session's path, in any order.
@@ -323,7 +300,7 @@ class RevisionWriter:
         taken = self._sequences_of(path_key)
         if entry.sequence in taken:
             raise InputError(f"path {entry.path} has an entry {entry.sequence} already")
-        self._new(
+        self._rows.new(
             path_entries,
             path=path_key,
             sequence=checked_int(entry.sequence, "sequence"),
@@ -332,6 +309,7 @@ class RevisionWriter:
             stamp_ns=checked_int(entry.stamp_ns, "stamp_ns"),
         )
         taken.add(entry.sequence)
+        self._checkpoint_if_due()
 
     def add_attempts(self, made: Sequence[Attempt]) -> None:
         """Remember match attempts (SPEC §3.5) of the drive being mapped, rounded to 18 bytes each.
@@ -370,8 +348,8 @@ class RevisionWriter:
             for name, kind in COLUMNS
         }
         key, *_ = self._sessions[session.bytes]
-        self._attempts[key].append(AttemptTable(columns, made.policy, made.policies))
-        self._grow(64 * len(made))
+        self._rows.put_attempts(key, AttemptTable(columns, made.policy, made.policies))
+        self._checkpoint_if_due()
 
     def add_omission(self, omission: Omission) -> None:
         """Remember that a node was not taken, and for which.
@@ -388,14 +366,16 @@ class RevisionWriter:
             transform_bytes(omission.node_from_omitted),
         )
         self._omitted.add(uuid)
-        self._new(omissions, uuid=uuid, node=node_key, node_from_omitted=node_from_omitted)
+        self._rows.new(omissions, uuid=uuid, node=node_key, node_from_omitted=node_from_omitted)
         if omission.landmark_hash is not None:
-            self._new(omitted_landmarks, uuid=uuid, landmark_hash=omission.landmark_hash)
+            self._rows.new(omitted_landmarks, uuid=uuid, landmark_hash=omission.landmark_hash)
+        self._checkpoint_if_due()
 
     def put_vocabulary(self, body: bytes) -> None:
         """Keep a vocabulary, encoded; the newest counts."""
         self._check_open()
-        self._new(vocabularies, len(body), hash=content_digest(body), body=body)
+        self._rows.new(vocabularies, len(body), hash=content_digest(body), body=body)
+        self._checkpoint_if_due()
 
     @property
     def session(self) -> Session:
@@ -419,14 +399,15 @@ class RevisionWriter:
         self._check_open()
         opens = self.resumable and self._status is RevisionStatus.ABANDONED
         with self._database.writing() as connection:
-            self._write(connection)
+            self._rows.write(connection)
             if opens:
                 change_revision(connection, self._revision_key, was=self._status, status="open")
         if opens:
             self._status = RevisionStatus.OPEN
-        if self._rows[cameras] or self._rows[frontends]:
+        written = self._rows.rows
+        if written[cameras] or written[frontends]:
             self._frames.set_view(self._view)
-        self._frames.show(self._rows[hidden])
+        self._frames.show(written[hidden])
         self._frames.release(self._held)
         self._clear()
 
@@ -441,7 +422,7 @@ class RevisionWriter:
             contents = revision_contents(connection, self._revision_key)
         with self._database.writing() as connection:
             if self.resumable:
-                self._repack_attempts(connection)
+                self._rows.repack_attempts(connection)
             revision = commit_revision(
                 connection,
                 self._revision_key,
@@ -487,73 +468,18 @@ class RevisionWriter:
             raise RevisionError("this revision is committed or abandoned already")
 
     def _clear(self) -> None:
-        self._rows: dict[Table, list[Row]] = {table: [] for table in _BUFFERED}
-        self._edges: dict[tuple[int, int, str], Row] = {}
-        self._words: dict[int, Row] = {}
-        self._attempts: dict[int, list[AttemptTable]] = defaultdict(list)
-        self._held: list[NodeId] = []
-        self._waiting_bytes = 0
+        self._rows.clear()
+        self._held.clear()
 
-    def _new(self, table: Table, size_bytes: int = 0, **values: Any) -> int:
-        """A row of this revision; returns its key."""
-        key = self._keys.next(table)
-        self._put(table, {"key": key, "revision": self._revision_key, **values}, size_bytes)
-        return key
-
-    def _put(self, table: Table, row: Row, size_bytes: int = 0) -> None:
-        self._rows[table].append(sealed(table, row))
-        self._grow(_ROW_BYTES + size_bytes)
-
-    def _grow(self, size_bytes: int) -> None:
-        self._waiting_bytes += size_bytes
+    def _checkpoint_if_due(self) -> None:
         # What is resumed must not begin in the middle of a frame's records.
-        if not self.resumable and self._waiting_bytes > _BATCH_BYTES:
+        if not self.resumable and self._rows.size_bytes > _BATCH_BYTES:
             self.checkpoint()
-
-    def _write(self, connection: Connection) -> None:
-        for table, rows in self._rows.items():
-            if rows:
-                connection.execute(insert(table), rows)
-        if self._edges:
-            key = ("a", "b", "kind", "revision")
-            connection.execute(self._database.replace(edges, key), list(self._edges.values()))
-        write_words(connection, self._database, list(self._words.values()))
-        for session_key, tables in self._attempts.items():
-            self._write_attempts(connection, session_key, tables)
-
-    def _write_attempts(
-        self, connection: Connection, session_key: int, tables: list[AttemptTable]
-    ) -> None:
-        rows = [
-            sealed(
-                attempts,
-                {
-                    "key": self._keys.next(attempts),
-                    "revision": self._revision_key,
-                    "session": session_key,
-                    "count": count,
-                    "body": body,
-                },
-            )
-            for count, body in pack(concatenate(tables))
-        ]
-        connection.execute(insert(attempts), rows)
-
-    def _repack_attempts(self, connection: Connection) -> None:
-        """Pack those of all checkpoints together: the file does not tell when they were made."""
-        written = attempts.c.revision == self._revision_key
-        found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
-        tables: dict[int, list[AttemptTable]] = defaultdict(list)
-        for row in verified(attempts, found):
-            tables[row["session"]].append(unpack(row["body"], row["count"]))
-        connection.execute(delete(attempts).where(written))
-        for session_key, made in tables.items():
-            self._write_attempts(connection, session_key, made)
 
     def _camera_key(self, camera: StereoCamera) -> int:
         if camera.id not in self._camera_keys:
             key = self._camera_keys[camera.id] = self._keys.next(cameras)
-            self._put(cameras, camera_row(camera, key))
+            self._rows.put(cameras, camera_row(camera, key))
         return self._camera_keys[camera.id]
 
     def _frontend_key(self, descriptor: DescriptorKind, frontend: str) -> int:
@@ -561,13 +487,13 @@ class RevisionWriter:
         if content not in self._frontend_keys:
             key = self._frontend_keys[content] = self._keys.next(frontends)
             row = {"key": key, "descriptor": str(descriptor), "hash": frontend}
-            self._put(frontends, row)
+            self._rows.put(frontends, row)
         return self._frontend_keys[content]
 
     def _add_path(self, path: PathId, session_key: int, partial: bool) -> None:
         key = self._shown_again(paths, path.bytes)
         if key is None:
-            key = self._new(paths, uuid=path.bytes, session=session_key, partial=int(partial))
+            key = self._rows.new(paths, uuid=path.bytes, session=session_key, partial=int(partial))
         self._path_keys[path.bytes] = key
 
     def _check_node(self, stored: StoredNode) -> None:
@@ -593,7 +519,7 @@ class RevisionWriter:
     def _insert_node(self, stored: StoredNode) -> int:
         node = stored.node
         session_key, camera_key, frontend_key = self._sessions[node.session.bytes]
-        key = self._new(
+        key = self._rows.new(
             nodes,
             uuid=node.id.bytes,
             session=session_key,
@@ -606,7 +532,7 @@ class RevisionWriter:
         )
         blobs = {"landmarks": stored.landmarks, "thumbnail": stored.thumbnail}
         size_bytes = len(stored.landmarks) + len(stored.thumbnail or b"")
-        self._put(frames, {"node": key, "revision": self._revision_key, **blobs}, size_bytes)
+        self._rows.put(frames, {"node": key, "revision": self._revision_key, **blobs}, size_bytes)
         return key
 
     def _node_key(self, node: NodeId, what: str) -> int:
@@ -640,7 +566,7 @@ class RevisionWriter:
         if again is None:
             return None
         self._shows_again = True
-        self._put(
+        self._rows.put(
             hidden, hidden_row(self._keys, self._revision_key, table, again["key"], hide=False)
         )
         return int(again["key"])

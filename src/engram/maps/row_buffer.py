@@ -1,0 +1,145 @@
+"""Rows of one revision that wait in memory to be written together."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Table, delete, insert, select
+
+from engram.graph.model import Edge
+from engram.maps.attempts import AttemptTable, concatenate, pack, unpack
+from engram.maps.database import Database
+from engram.maps.keys import KeyBook
+from engram.maps.rows import Row, edge_row, sealed, verified
+from engram.maps.schema import (
+    attempts,
+    cameras,
+    edges,
+    frames,
+    frontends,
+    hidden,
+    nodes,
+    omissions,
+    omitted_landmarks,
+    path_entries,
+    paths,
+    sessions,
+    vocabularies,
+)
+from engram.maps.words import words_row, write_words
+
+# Beside its blobs: a row as Python objects.
+_ROW_BYTES = 600
+_ATTEMPT_BYTES = 64
+# In the order in which rows refer to each other, so that a reader between two batches of an
+# abandoned revision never meets a reference to what is not there.
+_TABLES = (
+    cameras,
+    frontends,
+    sessions,
+    nodes,
+    frames,
+    paths,
+    path_entries,
+    omissions,
+    omitted_landmarks,
+    vocabularies,
+    hidden,
+)
+
+
+class RowBuffer:
+    """What waits of a revision.
+
+    Args:
+        database: where it will be written.
+        keys: from which its rows get their keys.
+        revision_key: of the revision.
+
+    Attributes:
+        rows: by table, in order of writing, but for edges, words and attempts.
+        size_bytes: about what it all takes in memory.
+    """
+
+    def __init__(self, database: Database, keys: KeyBook, revision_key: int) -> None:
+        self._database = database
+        self._keys = keys
+        self._revision_key = revision_key
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self.rows: dict[Table, list[Row]] = {table: [] for table in _TABLES}
+        self._edges: dict[tuple[int, int, str], Row] = {}
+        self._words: dict[int, Row] = {}
+        self._attempts: dict[int, list[AttemptTable]] = defaultdict(list)
+        self.size_bytes = 0
+
+    def new(self, table: Table, size_bytes: int = 0, **values: Any) -> int:
+        """Add a row of the revision; returns its key.
+
+        Args:
+            table: which table.
+            size_bytes: of its blobs.
+            values: its columns but key, revision and checksum.
+        """
+        key = self._keys.next(table)
+        self.put(table, {"key": key, "revision": self._revision_key, **values}, size_bytes)
+        return key
+
+    def put(self, table: Table, row: Row, size_bytes: int = 0) -> None:
+        """Add a row that lacks nothing but its checksum."""
+        self.rows[table].append(sealed(table, row))
+        self.size_bytes += _ROW_BYTES + size_bytes
+
+    def put_edge(self, edge: Edge, a: int, b: int) -> None:
+        """Add an edge between nodes of these keys, in place of one of the same kind that waits."""
+        row = edge_row(edge, self._keys.next(edges), self._revision_key, a, b)
+        self._edges.pop((a, b, row["kind"]), None)
+        self._edges[a, b, row["kind"]] = sealed(edges, row)
+        self.size_bytes += _ROW_BYTES
+
+    def put_words(self, node: int, vocabulary: bytes, found: NDArray[np.int32]) -> None:
+        """Add the words of the node of this key, in place of any that wait."""
+        self._words[node] = words_row(node, vocabulary, found)
+        self.size_bytes += _ROW_BYTES
+
+    def put_attempts(self, session: int, made: AttemptTable) -> None:
+        """Add attempts of the session of this key."""
+        self._attempts[session].append(made)
+        self.size_bytes += _ATTEMPT_BYTES * len(made)
+
+    def write(self, connection: Connection) -> None:
+        """Write all that waits, and keep it: the transaction may fail yet."""
+        for table, rows in self.rows.items():
+            if rows:
+                connection.execute(insert(table), rows)
+        if self._edges:
+            key = ("a", "b", "kind", "revision")
+            connection.execute(self._database.replace(edges, key), list(self._edges.values()))
+        write_words(connection, self._database, list(self._words.values()))
+        for session, tables in self._attempts.items():
+            self._write_attempts(connection, session, tables)
+
+    def repack_attempts(self, connection: Connection) -> None:
+        """Pack those of all checkpoints together: the file does not tell when they were made."""
+        written = attempts.c.revision == self._revision_key
+        found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
+        tables: dict[int, list[AttemptTable]] = defaultdict(list)
+        for row in verified(attempts, found):
+            tables[row["session"]].append(unpack(row["body"], row["count"]))
+        connection.execute(delete(attempts).where(written))
+        for session, made in tables.items():
+            self._write_attempts(connection, session, made)
+
+    def _write_attempts(
+        self, connection: Connection, session: int, tables: list[AttemptTable]
+    ) -> None:
+        rows = []
+        for count, body in pack(concatenate(tables)):
+            row = {"key": self._keys.next(attempts), "revision": self._revision_key}
+            rows.append(sealed(attempts, {**row, "session": session, "count": count, "body": body}))
+        connection.execute(insert(attempts), rows)
