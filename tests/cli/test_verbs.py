@@ -50,6 +50,19 @@ def test_the_same_drive_again_changes_nothing(engram, street: Path, town: Path) 
     assert engram("info", town, "--json").json == before
 
 
+def test_localise_remembers_a_drive_without_nodes(engram, street: Path, town: Path) -> None:
+    before = engram("info", town, "--json").json
+    ran = engram("localise", town, street, "--robot", "r2", "--remember")
+    assert ran.out.splitlines()[-1] == "kept as revision 2"
+    after = engram("info", town, "--json").json
+    assert after["nodes"] == before["nodes"]
+    assert after["path_entries"] > before["path_entries"]
+    assert after["attempts"] > before["attempts"]
+    again = engram("localise", town, street, "--robot", "r2", "--remember", "--json").json
+    assert again["summary"]["remembered"] == {"state": "committed", "revision": None}
+    assert engram("localise", town, street, "--remember", "--at", "1").status == 2
+
+
 def test_localise_gives_the_documented_json(engram, street: Path, town: Path) -> None:
     result = engram("localise", town, street, "--json").json
     assert set(result) == {"summary", "frames"}

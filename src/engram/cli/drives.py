@@ -88,6 +88,10 @@ def localise(
         float | None,
         typer.Option("--rate", metavar="HZ", help="Replay in real time; count late frames."),
     ] = None,
+    remember: Annotated[
+        bool,
+        typer.Option("--remember", help="Keep the drive's path and attempts in the map."),
+    ] = False,
     explain: Annotated[
         int | None,
         typer.Option("--explain", metavar="FRAME", min=0, help="Explain this frame's candidates."),
@@ -97,7 +101,8 @@ def localise(
 ) -> None:
     """Find a drive in a map.
 
-    The map is not changed. --explain lists why the candidates of one frame have their order and
+    The map is not changed, unless --remember keeps the drive's path and match attempts, by which
+    later drives are ranked. --explain lists why the candidates of one frame have their order and
     which of them match; the drive is localised up to that frame first.
 
     \b
@@ -106,6 +111,7 @@ def localise(
       engram localise town.engram drives/tuesday --ranking distance --lanes 1 --json
       engram localise town.engram drives/tuesday --rate 20 --deadline 40
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures matches
+      engram localise town.engram drives/tuesday --remember
       engram localise town.engram drives/tuesday --explain 120
     """
     from engram.cli.explaining import explain_and_print
@@ -123,12 +129,13 @@ def localise(
             deadline_ms=deadline,
             relocaliser=found_by,
         )
-        outputs = Outputs(trajectory, pictures, rate, as_json)
+        outputs = Outputs(trajectory, pictures, rate, as_json, remember)
         with open_map(map_path, at) as opened:
             localise_and_print(opened, sequence, resolved, asked, outputs)
         return
     given = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
+        "--remember": remember or None,
     }  # fmt: skip
     for option in (option for option, value in given.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")

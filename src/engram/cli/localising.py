@@ -28,12 +28,14 @@ class Outputs:
         pictures: folder of match pictures; None for none.
         rate_hz: replay in real time; None for as fast as it goes.
         as_json: JSON on stdout, in place of text.
+        remember: keep path and attempts in the map.
     """
 
     trajectory: Path | None
     pictures: Path | None
     rate_hz: float | None
     as_json: bool
+    remember: bool = False
 
 
 def localise_and_print(
@@ -56,7 +58,7 @@ def localise_and_print(
 
     results: list[Localisation] = []
     interrupted = False
-    with robot_on(opened, sequence, settings, asked) as robot:
+    with robot_on(opened, sequence, settings, asked, remembers=outputs.remember) as robot:
         writer = None
         if outputs.pictures is not None:
             every = max(1, len(sequence) // _PICTURES)
@@ -77,6 +79,8 @@ def localise_and_print(
         "skipped_pairs": sequence.skipped,
         "interrupted": interrupted,
     }
+    if outputs.remember:
+        summary["remembered"] = {"state": robot.saving.state, "revision": robot.saving.revision}
     frames = [result.to_dict() for result in results]
     if outputs.as_json:
         print(json.dumps({"summary": summary, "frames": frames}))
@@ -84,5 +88,7 @@ def localise_and_print(
         for warning in warnings(summary):
             typer.echo(warning, err=True)
         typer.echo(localised_text(summary, frames, opened.location))
+        if outputs.remember:
+            typer.echo(robot.saving.text())
     if interrupted:
         raise typer.Exit(130)

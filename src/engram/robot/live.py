@@ -57,6 +57,22 @@ class Saving:
     revision: int | None = None
     nodes: int = 0
 
+    def text(self) -> str:
+        """For people."""
+        match self.state:
+            case SavingState.COMMITTED if self.revision is None:
+                return "the map remembers this drive already, or there was nothing to remember"
+            case SavingState.COMMITTED:
+                return f"kept as revision {self.revision}"
+            case SavingState.SPOOLED:
+                return (
+                    f"another process writes to the map: the drive waits in {self.reason}, and "
+                    "whoever maps or remembers next commits it"
+                )
+            case SavingState.FAILED:
+                return f"saving failed: {self.reason}"
+        return f"saving is {self.state}"
+
 
 @dataclass(frozen=True, slots=True)
 class Owner:

@@ -43,6 +43,7 @@ def robot_on(
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
     session = session_of_drive(sequence)
     if remembers:
+        _check_newest(opened)
         owner = Owner(session.robot, sequence.camera, settings, options, session)
         return _keeping(owner, IntoMemory(owner, opened))
     localiser = localiser_in(
@@ -77,15 +78,24 @@ def robot_in(
         return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
     if name is None:
         raise ConfigError("a robot whose drives are kept needs a name: give name=")
+    _check_newest(opened)
+    if not maps:
+        return _keeping(owner, IntoMemory(owner, opened))
+    commit_spools(Path(opened.location))
+    return _keeping(owner, IntoMap(owner, open_map(opened.location)))
+
+
+def _check_newest(opened: Map) -> None:
+    """Drives are kept on top of the newest revision.
+
+    Raises:
+        RevisionError: the map was opened as of a certain one.
+    """
     if opened.is_pinned:
         raise RevisionError(
             f"{opened.location} is open as of revision {opened.revision}; to keep drives, open it "
             "without naming a revision"
         )
-    if not maps:
-        return _keeping(owner, IntoMemory(owner, opened))
-    commit_spools(Path(opened.location))
-    return _keeping(owner, IntoMap(owner, open_map(opened.location)))
 
 
 def _keeping(owner: Owner, into: Into) -> Robot:
