@@ -16,7 +16,7 @@ from engram.maps import Map, SessionState, open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
-from engram.robot.results import damage_warning, summarise
+from engram.robot.results import summarise
 from engram.robot.robot import Robot
 from engram.robot.saving import SavedDrive, begin_or_resume, configuration_of, node_words
 from engram.robot.session import DriveSequence, session_of_drive
@@ -65,24 +65,6 @@ class MapReport:
             "skipped_pairs": self.skipped,
             **summarise(self.results),
         }
-
-    def text(self) -> str:
-        """For people."""
-        if self.known:
-            return f"session {self.session.id} is in the map already: nothing to do"
-        summary = summarise(self.results)
-        how = "resumed, " if self.resumed else ""
-        line = (
-            f"{how}{summary['frames']} frames over {summary['driven_m']:.1f} m: "
-            f"{summary['share_localised']:.1%} localised, {self.saved} nodes saved"
-        )
-        if self.skipped:
-            line += f", {self.skipped} pairs skipped"
-        if summary["damaged_nodes"]:
-            line = f"{damage_warning(summary['damaged_nodes'])}\n{line}"
-        if self.interrupted:
-            return f"{line}\ninterrupted: what was done is saved; give the same command to resume"
-        return f"{line}, revision {self.revision}"
 
 
 def map_drive(

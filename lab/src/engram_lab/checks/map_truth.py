@@ -41,7 +41,7 @@ def map_all(drives: list[EvaluatedDrive], path: Path) -> None:
     """Adds each drive to the map."""
     for drive in drives:
         report = map_drive(path, open_drive(drive.path), Settings(), RobotOptions())
-        print(f"{drive.name:45} {report.text().splitlines()[0]}", flush=True)
+        print(f"{drive.name:45} {report.saved} nodes saved", flush=True)
 
 
 def judge(drives: list[EvaluatedDrive], path: Path) -> int:
