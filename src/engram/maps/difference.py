@@ -1,21 +1,95 @@
-"""What differs between two revisions of a map: nodes, sessions, metres, conditions, by region."""
+"""What differs between two revisions of a map: nodes, sessions, metres, conditions, by region.
+
+A map has no global frame: its regions are components, and stretches of their oldest sessions.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
 
+from engram.errors import InputError
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import Edge, EdgeKind, Node, NodeId, Session, SessionId
+from engram.graph.model import Edge, EdgeKind, Node, Session, SessionId
 from engram.maps.records import MapContents
-from engram.maps.regions import STRETCH_M, Regions, regions_of
+
+STRETCH_M = 50.0
+# Shorter ones are finer than nodes lie, and their numbers would overflow.
+_LEAST_STRETCH_M = 1.0
+# A node in the very place of another is still one step away.
+_LEAST_STEP_M = 1e-3
+
 
 UNKNOWN_HOUR = "unknown"
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Regions:
+    """Which region each node of a graph is in.
+
+    A stretch is so many metres of the oldest session of a component; a node belongs to the
+    stretch of that session's node that is nearest to it along the edges.
+
+    Attributes:
+        component: (N,) int32, numbered from 0 by first node.
+        stretch: (N,) int32, `from_m` in units of the stretch's length.
+        oldest: for each component its oldest session.
+        stretch_m: length of a stretch.
+    """
+
+    component: NDArray[np.int32]
+    stretch: NDArray[np.int32]
+    oldest: tuple[SessionId, ...]
+    stretch_m: float
+
+
+def regions_of(
+    graph: ExperienceGraph, sessions: dict[SessionId, Session], stretch_m: float = STRETCH_M
+) -> Regions:
+    """Divide a map into components and stretches.
+
+    Args:
+        graph: the map's.
+        sessions: those of its nodes.
+        stretch_m: length of a stretch, metres.
+
+    Raises:
+        InputError: the length is below 1 m, or not finite.
+    """
+    if not (np.isfinite(stretch_m) and stretch_m >= _LEAST_STRETCH_M):
+        raise InputError(
+            f"a stretch is {stretch_m} m long, must be finite and >= {_LEAST_STRETCH_M:g} m"
+        )
+    component = graph.components()
+    stretch = np.zeros(len(graph), np.int32)
+    oldest = []
+    links = edge_lengths(graph)
+    for number in range(int(component.max(initial=-1)) + 1):
+        nodes = np.flatnonzero(component == number)
+        held = {graph.session(int(at)) for at in np.unique(graph.sessions[nodes])}
+        first = min(held, key=lambda one: (sessions[one].start_ns, one.int))
+        oldest.append(first)
+        own = nodes[graph.sessions[nodes] == graph.session_number(first)]
+        _, _, nearest = dijkstra(
+            links, directed=False, indices=own, min_only=True, return_predecessors=True
+        )
+        stretch[nodes] = np.floor(graph.driven_m[nearest[nodes]] / stretch_m).astype(np.int32)
+    return Regions(component, stretch, tuple(oldest), stretch_m)
+
+
+def edge_lengths(graph: ExperienceGraph) -> csr_matrix:
+    """(N, N) sparse: length of the shortest edge between two nodes, metres, once for each pair."""
+    links = graph.lightest(lambda edge: max(edge.a_from_b.distance_m, _LEAST_STEP_M))
+    return links.matrix(len(graph))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,24 +112,27 @@ class MapDifference:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``diff --json`` prints."""
-        old, new = _keyed(self.old), _keyed(self.new)
-        added = [node for node in self.new.nodes if node.id not in old.nodes]
-        removed = [node for node in self.old.nodes if node.id not in new.nodes]
+        old, new = self.old, self.new
+        nodes = _both(old.nodes, new.nodes, lambda one: one.id)
+        edges = _both(old.edges, new.edges, lambda one: (one.a, one.b, one.kind))
+        entries = _both(old.path_entries, new.path_entries, lambda one: (one.path, one.sequence))
+        added = [node for key, node in nodes[1].items() if key not in nodes[0]]
+        removed = [node for key, node in nodes[0].items() if key not in nodes[1]]
         return {
             "before": self.before,
             "after": self.after,
-            "nodes": _counts(old.nodes, new.nodes),
+            "nodes": _counts(*nodes),
             "sessions": {
-                "added": _told(new.sessions, old.sessions, added, self.new),
-                "removed": _told(old.sessions, new.sessions, removed, self.old),
+                "added": _sessions_of_one_side(new, old, added),
+                "removed": _sessions_of_one_side(old, new, removed),
             },
-            "edges": _edge_counts(old.edges, new.edges),
-            "mapped_m": {"before": _metres(self.old), "after": _metres(self.new)},
-            "path_entries": _counts(old.entries, new.entries),
-            "attempts": {"before": len(self.old.attempts), "after": len(self.new.attempts)},
-            "components": {"before": _components(self.old), "after": _components(self.new)},
+            "edges": _edge_counts(*edges),
+            "mapped_m": {"before": _metres(old), "after": _metres(new)},
+            "path_entries": _counts(*entries),
+            "attempts": {"before": len(old.attempts), "after": len(new.attempts)},
+            "components": {"before": _components(old), "after": _components(new)},
             # A map knows no weather: only what the clocks of its sessions say.
-            "hours": {"before": hours_of_nodes(self.old), "after": hours_of_nodes(self.new)},
+            "hours": {"before": hours_of_nodes(old), "after": hours_of_nodes(new)},
             "regions": self._regions(added, removed),
         }
 
@@ -81,7 +158,7 @@ class MapDifference:
                 "nodes_before": kept_in[component, stretch],
                 "added": entry["added"],
                 "removed": entry["removed"],
-                "hours_added": _sorted_hours(entry["hours"]),
+                "hours_added": dict(sorted(entry["hours"].items())),
             }
             for (component, stretch), entry in sorted(changes.items())
         ]
@@ -114,12 +191,7 @@ def difference(
     before: int, old: MapContents, after: int, new: MapContents, stretch_m: float = STRETCH_M
 ) -> MapDifference:
     """Compare what two revisions hold."""
-    graph = ExperienceGraph()
-    for contents in (old, new):
-        for node in contents.nodes:
-            graph.add_node(node)
-    for contents in (old, new):
-        graph.add_edges(contents.edges)
+    graph = _joined(old, new)
     sessions = {one.id: one for one in (*old.sessions, *new.sessions)}
     return MapDifference(before, after, old, new, graph, regions_of(graph, sessions, stretch_m))
 
@@ -128,24 +200,13 @@ def hours_of_nodes(contents: MapContents) -> dict[str, int]:
     """How many nodes were saved in each hour of day; "unknown" where no clock tells."""
     sessions = {one.id: one for one in contents.sessions}
     hours = Counter(_hour(sessions[node.session], node.stamp_ns) for node in contents.nodes)
-    return _sorted_hours(hours)
+    return dict(sorted(hours.items()))
 
 
-@dataclass(frozen=True, slots=True)
-class _Keyed:
-    nodes: dict[NodeId, Node]
-    sessions: dict[SessionId, Session]
-    edges: dict[tuple[NodeId, NodeId, EdgeKind], Edge]
-    entries: dict[tuple[Any, int], NodeId]
-
-
-def _keyed(contents: MapContents) -> _Keyed:
-    return _Keyed(
-        {node.id: node for node in contents.nodes},
-        {session.id: session for session in contents.sessions},
-        {(edge.a, edge.b, edge.kind): edge for edge in contents.edges},
-        {(entry.path, entry.sequence): entry.node for entry in contents.path_entries},
-    )
+def _both(
+    old: Iterable[_T], new: Iterable[_T], key: Callable[[_T], Any]
+) -> tuple[dict[Any, _T], dict[Any, _T]]:
+    return {key(one): one for one in old}, {key(one): one for one in new}
 
 
 def _counts(old: dict[Any, Any], new: dict[Any, Any]) -> dict[str, int]:
@@ -175,14 +236,12 @@ def _same(one: Edge, other: Edge) -> bool:
     )
 
 
-def _told(
-    there: dict[SessionId, Session],
-    known: dict[SessionId, Session],
-    changed: Iterable[Node],
-    contents: MapContents,
+def _sessions_of_one_side(
+    here: MapContents, there: MapContents, changed: Iterable[Node]
 ) -> list[dict[str, Any]]:
     """The sessions that only one side has."""
     nodes = Counter(node.session for node in changed)
+    known = {session.id for session in there.sessions}
     return [
         {
             "session": str(session.id),
@@ -192,8 +251,8 @@ def _told(
             "hour": hour_of_day(session, session.start_ns),
             "nodes": nodes[session.id],
         }
-        for session in contents.sessions
-        if session.id not in known and session.id in there
+        for session in here.sessions
+        if session.id not in known
     ]
 
 
@@ -204,20 +263,23 @@ def _metres(contents: MapContents) -> float:
 
 
 def _components(contents: MapContents) -> int:
+    return int(_joined(contents).components().max(initial=-1)) + 1
+
+
+def _joined(*contents: MapContents) -> ExperienceGraph:
+    """All nodes, joined by all edges."""
     graph = ExperienceGraph()
-    for node in contents.nodes:
-        graph.add_node(node)
-    graph.add_edges(contents.edges)
-    return int(graph.components().max(initial=-1)) + 1
+    for one in contents:
+        for node in one.nodes:
+            graph.add_node(node)
+    for one in contents:
+        graph.add_edges(one.edges)
+    return graph
 
 
 def _hour(session: Session, stamp_ns: int) -> str:
     hour = hour_of_day(session, stamp_ns)
     return UNKNOWN_HOUR if hour is None else f"{int(hour):02d}"
-
-
-def _sorted_hours(hours: Counter[str]) -> dict[str, int]:
-    return dict(sorted(hours.items()))
 
 
 def _plus_minus(counts: dict[str, int]) -> str:

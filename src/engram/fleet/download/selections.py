@@ -16,7 +16,7 @@ from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.path_weights import count_paths, mission_epochs
 from engram.fleet.download.stock import Mask, Stock
 from engram.graph.model import PathId, path_id
-from engram.maps.regions import edge_lengths
+from engram.maps.difference import edge_lengths
 
 _HOURS = 24.0
 # Hours are told by clocks to the nanosecond; what is left over is rounding.
