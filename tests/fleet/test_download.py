@@ -19,7 +19,7 @@ from engram.fleet.download import DownloadOptions, DownloadReport, download
 from engram.fleet.download.downloading import most_that_fit
 from engram.fleet.download.selections import SELECTIONS, UNDERSTOOD
 from engram.frontend import BRIEF
-from engram.graph.model import EdgeKind, path_id
+from engram.graph.model import Amendable, EdgeKind, path_id
 from engram.maps import Map, check_file, copy_map
 from engram.places import default_vocabulary
 from engram.places.words import NodeWords
@@ -114,6 +114,26 @@ def test_merging_an_unchanged_download_changes_nothing(centre, tmp_path, policy)
     assert report.revision is None
     with Map.open(mine) as store:
         assert (store.revision, store.content_hash()) == before
+
+
+def test_amendments_go_along_and_come_back_once(centre, tmp_path):
+    mine, out = Path(shutil.copy(centre, tmp_path / "centre.engram")), tmp_path / "robot.engram"
+    with Map.open(mine) as store:
+        recorded = next(iter(store.sessions.values()))
+        store.amend(recorded.id, {Amendable.ROBOT: "lorry"}, author="tests")
+    sent(mine, out, "copy")
+    with Map.open(out) as store:
+        shown = store.sessions[recorded.id]
+        assert (shown.robot, shown.as_recorded) == ("lorry", recorded)
+        store.amend(recorded.id, {Amendable.ROBOT: "van"}, author="tests")
+    (report,) = merged(mine, out)
+    assert report.revision is not None
+    (again,) = merged(mine, out)
+    assert again.revision is None
+    with Map.open(mine) as store:
+        assert store.sessions[recorded.id].robot == "van"
+        assert [one.value for one in store.amendments] == ["lorry", "van"]
+    assert check_file(mine).problems == ()
 
 
 def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):

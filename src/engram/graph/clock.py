@@ -8,7 +8,7 @@ from typing import Protocol
 from zoneinfo import ZoneInfo
 
 from engram.errors import ConfigError
-from engram.graph.model import Clock
+from engram.graph.model import Clock, Session
 
 _NS_PER_HOUR = 3_600_000_000_000
 _HOURS_PER_DAY = 24
@@ -43,6 +43,7 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     """
     if source.clock is not Clock.UTC:
         return None
+    stamp_ns += _shift_ns(source)
     if source.longitude_deg is not None:
         hour = stamp_ns / _NS_PER_HOUR + source.longitude_deg / 15
     elif source.zone is not None:
@@ -61,7 +62,13 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
 
 def day_of(source: Clocked, stamp_ns: int) -> float | None:
     """Days since 1970 at a stamp, with their fraction; None for a clock that is not UTC."""
-    return stamp_ns / (_HOURS_PER_DAY * _NS_PER_HOUR) if source.clock is Clock.UTC else None
+    if source.clock is not Clock.UTC:
+        return None
+    return (stamp_ns + _shift_ns(source)) / (_HOURS_PER_DAY * _NS_PER_HOUR)
+
+
+def _shift_ns(source: Clocked) -> int:
+    return source.shift_ns if isinstance(source, Session) else 0
 
 
 def check_longitude(longitude_deg: float | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import lru_cache
 from typing import NewType, Protocol
@@ -42,6 +42,8 @@ class Session:
         clock: what the stamps mean.
         longitude_deg: where the drive was, for mean solar time; None if unknown.
         zone: IANA time zone, where no longitude is known; None if unknown.
+        shift_ns: what stamps lack to be UTC: other than 0 where the start was amended.
+        recorded: the session as it was mapped, where something of it was amended; else None.
     """
 
     id: SessionId
@@ -51,6 +53,57 @@ class Session:
     clock: Clock = Clock.UNKNOWN
     longitude_deg: float | None = None
     zone: str | None = None
+    shift_ns: int = 0
+    recorded: Session | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def begin_ns(self) -> int:
+        """When it began, ns, by its clock and with what was set right about it."""
+        return self.start_ns + self.shift_ns
+
+    @property
+    def as_recorded(self) -> Session:
+        """What the robot handed in, without amendments."""
+        return self.recorded or self
+
+
+class Amendable(StrEnum):
+    """What people may set right about a session afterwards."""
+
+    ROBOT = "robot"  # the name that is shown
+    ZONE = "zone"  # IANA time zone; it counts before a longitude
+    START = "start"  # of the first pair, ns, UTC
+
+
+@dataclass(frozen=True, slots=True)
+class Amendment:
+    """Something that was set right about a session; its record stays as it was.
+
+    Attributes:
+        session: which.
+        what: of it.
+        value: the new one, as text; a start in ns.
+        amended_ns: when that was said, UTC: tells it from the same said another time.
+    """
+
+    session: SessionId
+    what: Amendable
+    value: str
+    amended_ns: int
+
+    def applied(self, session: Session) -> Session:
+        """The session as this amendment has it.
+
+        Raises:
+            ValueError: a start is no number.
+        """
+        recorded = session.as_recorded
+        if self.what is Amendable.ROBOT:
+            return replace(session, robot=self.value, recorded=recorded)
+        if self.what is Amendable.ZONE:
+            return replace(session, zone=self.value, longitude_deg=None, recorded=recorded)
+        shift_ns = int(self.value) - recorded.start_ns
+        return replace(session, clock=Clock.UTC, shift_ns=shift_ns, recorded=recorded)
 
 
 @dataclass(frozen=True, slots=True)

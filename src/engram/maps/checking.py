@@ -27,6 +27,7 @@ from engram.maps.database import Database
 from engram.maps.records import CheckReport, Problem
 from engram.maps.rows import (
     Row,
+    amendment_from_row,
     camera_from_row,
     describe,
     edge_from_row,
@@ -39,6 +40,7 @@ from engram.maps.rows import (
 from engram.maps.schema import (
     NEWER,
     VERSIONED,
+    amendments,
     attempts,
     cameras,
     edges,
@@ -78,6 +80,7 @@ assert set(_ORDER) == set(metadata.sorted_tables)
 # Rotations come out of chains of products: what is left of skew is rounding.
 _ROTATION_TOLERANCE = 1e-6
 _NOBODY = NodeId(UUID(int=0))
+_NO_SESSION = SessionId(UUID(int=0))
 
 
 def check(database: Database) -> CheckReport:
@@ -356,6 +359,10 @@ def _check_statistic(_: _Checking, row: Row) -> None:
     from_json(row["body"], f"statistic {row['name']}")
 
 
+def _check_amendment(_: _Checking, row: Row) -> None:
+    amendment_from_row(row, _NO_SESSION)
+
+
 def _check_vocabulary(checking: _Checking, row: Row) -> None:
     checking.blobs += 1
     if content_digest(row["body"]) != row["hash"]:
@@ -406,6 +413,7 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     attempts: _check_attempts,
     statistics: _check_statistic,
     vocabularies: _check_vocabulary,
+    amendments: _check_amendment,
     hidden: _check_hidden,
     tags: _check_tag,
     words: _check_words,

@@ -11,11 +11,10 @@ from typing import Any
 
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock, Session
-from engram.maps.difference import MapDifference, difference, hours_of_nodes
+from engram.maps.difference import STRETCH_M, MapDifference, difference, hours_of_nodes
 from engram.maps.hiding import Reverted
 from engram.maps.map import open_map
 from engram.maps.records import MapContents, Revision
-from engram.maps.regions import STRETCH_M
 from engram.maps.tags import Tag
 
 # What a revision brought, in the order in which `log` tells it.
@@ -27,6 +26,7 @@ _TOLD = {
     "attempts": "attempts",
     "omissions": "nodes omitted",
     "vocabularies": "vocabularies",
+    "amendments": "amendments",
     "hidden": "rows hidden or shown again",
 }
 
@@ -222,7 +222,7 @@ def blame_node(path: Path, prefix: str, at: int | str | None = None) -> dict[str
         "node": str(origin.node),
         "robot": origin.robot,
         "session": str(origin.session),
-        "when": _stamp(session, origin.stamp_ns),
+        "when": stamp_text(session, origin.stamp_ns),
         "stamp_ns": origin.stamp_ns,
         "hour": None if session is None else hour_of_day(session, origin.stamp_ns),
         "driven_m": origin.driven_m,
@@ -265,9 +265,10 @@ def when(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns / 1e9, UTC).isoformat(timespec="seconds")
 
 
-def _stamp(session: Session | None, stamp_ns: int) -> str:
+def stamp_text(session: Session | None, stamp_ns: int) -> str:
+    """A stamp of a session for people; None for a session that is not seen."""
     if session is not None and session.clock is Clock.UTC:
-        return when(stamp_ns)
+        return when(stamp_ns + session.shift_ns)
     return f"{stamp_ns / 1e9:.3f} s of a clock that is not UTC"
 
 
@@ -306,7 +307,7 @@ def sessions_of(contents: MapContents) -> list[dict[str, Any]]:
         {
             "session": str(session.id),
             "robot": session.robot,
-            "start": _stamp(session, session.start_ns),
+            "start": stamp_text(session, session.start_ns),
             "hour": hour_of_day(session, session.start_ns),
             "nodes": nodes[session.id],
         }

@@ -22,8 +22,11 @@ from engram.frontend import DescriptorKind
 from engram.geometry import CameraId, StereoCamera
 from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
+from engram.graph.clock import check_zone
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
+    Amendable,
+    Amendment,
     NodeId,
     Omission,
     PathId,
@@ -35,7 +38,7 @@ from engram.maps import reading
 from engram.maps.checking import check
 from engram.maps.content import content_hash, record_hashes
 from engram.maps.database import Database, Lock, Place
-from engram.maps.difference import MapDifference, difference
+from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.keys import KeyBook
@@ -50,7 +53,6 @@ from engram.maps.records import (
     RevisionStatus,
     SessionState,
 )
-from engram.maps.regions import STRETCH_M
 from engram.maps.revisions import (
     change_revision,
     collect_abandoned,
@@ -59,7 +61,7 @@ from engram.maps.revisions import (
     session_and_revision,
     stored_session,
 )
-from engram.maps.rows import Row, checked_text, sealed, session_from_row, to_json, verified
+from engram.maps.rows import START, Row, checked_text, sealed, session_from_row, to_json, verified
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, map_path
 from engram.maps.tags import Tag, checked_tag, load_tags, resolve, write_tag
@@ -96,6 +98,7 @@ def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[
 
 # What is read anew once something was written.
 _SMALL = (
+    "amendments",
     "vocabulary",
     "descriptor",
     "frontends",
@@ -261,6 +264,24 @@ class Map:
     def sessions(self) -> dict[SessionId, Session]:
         """The drives that the map knows, by id, in the order of their coming."""
         return {one.id: one for one in self._read(reading.load_sessions)}
+
+    def named_session(self, prefix: str) -> Session:
+        """The one session whose UUID begins so.
+
+        Raises:
+            InputError: no session, or several, begin so.
+        """
+        known, wanted = self.sessions.values(), prefix.strip().lower()
+        found = [one for one in known if wanted and str(one.id).startswith(wanted)]
+        if len(found) != 1:
+            listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or known)
+            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose of: {listed}")
+        return found[0]
+
+    @cached_property
+    def amendments(self) -> tuple[Amendment, ...]:
+        """What was set right about its sessions, in the order in which it counts."""
+        return self._read(reading.load_amendments)
 
     @cached_property
     def cameras(self) -> dict[CameraId, StereoCamera]:
@@ -710,6 +731,42 @@ class Map:
         return revision
 
     @_writes
+    def amend(
+        self,
+        session: SessionId,
+        changes: Mapping[Amendable, str],
+        *,
+        author: str,
+        message: str = "",
+    ) -> Revision:
+        """Set right what is shown of a session; its record, and all ids, stay as they are.
+
+        Args:
+            session: which.
+            changes: what is wrong, and what it is: a robot's name, an IANA zone, or the UTC of the
+                session's first pair, in ns.
+            author: who.
+            message: why.
+
+        Raises:
+            InputError: the map has no such session, it is so already, or a value cannot be one.
+            ConfigError: the zone is unknown.
+            RevisionError: a session is being written.
+            StorageFullError: no space; the map is as it was.
+        """
+        now = self._checked_amendments(session, changes)
+        with self.begin_revision(
+            author=author,
+            message=message or f"amend {', '.join(now)} of session {session}",
+            configuration={"amend": {"session": str(session), **changes}},
+        ) as writer:
+            for amendment in now.values():
+                writer.add_amendment(amendment)
+            revision = writer.commit()
+        self.forget()
+        return revision
+
+    @_writes
     def tag(
         self,
         name: str,
@@ -791,6 +848,27 @@ class Map:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _checked_amendments(
+        self, session: SessionId, changes: Mapping[Amendable, str]
+    ) -> dict[Amendable, Amendment]:
+        """Those that change something."""
+        if session not in self.sessions:
+            raise InputError(f"{self.location} has no session {session}")
+        shown, now_ns = self.sessions[session], time.time_ns()
+        found = {}
+        for what, value in changes.items():
+            checked_text(value, what)
+            if what is Amendable.ZONE:
+                check_zone(value)
+            if not value or (what is Amendable.START and not START.fullmatch(value)):
+                raise InputError(f"{value!r} cannot be the {what} of a session")
+            amendment = Amendment(session, what, value, now_ns)
+            if amendment.applied(shown) != shown:
+                found[what] = amendment
+        if not found:
+            raise InputError(f"session {session} is so already: there is nothing to amend")
+        return found
 
     def _read(self, load: Callable[[Connection, View], _T]) -> _T:
         with self._database.reading() as connection:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 from uuid import UUID
 
@@ -15,6 +16,7 @@ from engram.frontend.blobs import content_digest
 from engram.geometry import CameraId, StereoCamera
 from engram.graph.attempts import Attempts
 from engram.graph.model import (
+    Amendment,
     Edge,
     EdgeKind,
     Node,
@@ -29,6 +31,7 @@ from engram.maps.attempts import AttemptTable, concatenate, unpack
 from engram.maps.records import MapContents, MapInfo, Revision
 from engram.maps.rows import (
     Row,
+    amendment_from_row,
     camera_from_row,
     edges_from_rows,
     from_json,
@@ -40,6 +43,7 @@ from engram.maps.rows import (
     verified,
 )
 from engram.maps.schema import (
+    amendments,
     attempts,
     cameras,
     edges,
@@ -86,14 +90,34 @@ def load_sessions(connection: Connection, view: View) -> tuple[Session, ...]:
     return tuple(_sessions(connection, view, load_cameras(connection)).values())
 
 
+def load_amendments(connection: Connection, view: View) -> tuple[Amendment, ...]:
+    """What was set right about the sessions that are seen; of what contradicts, the last counts."""
+    known = _sessions(connection, view, load_cameras(connection))
+    return tuple(one for _, one in _amendments(connection, view, known))
+
+
 def _sessions(
     connection: Connection, view: View, known_cameras: dict[int, StereoCamera]
 ) -> dict[int, Session]:
-    """By key."""
-    return {
+    """By key, with what was set right about them."""
+    recorded = {
         row["key"]: session_from_row(row, _camera_id(known_cameras, row, "session"))
         for row in view.rows(connection, sessions)
     }
+    for key, amendment in _amendments(connection, view, recorded):
+        recorded[key] = amendment.applied(recorded[key])
+    return recorded
+
+
+def _amendments(
+    connection: Connection, view: View, known: Mapping[int, Session]
+) -> list[tuple[int, Amendment]]:
+    """Each with the key of its session, in the order in which they count."""
+    return [
+        (row["session"], amendment_from_row(row, known[row["session"]].id))
+        for row in view.rows(connection, amendments)
+        if row["session"] in known
+    ]
 
 
 def load_cameras(connection: Connection) -> dict[int, StereoCamera]:

@@ -15,6 +15,7 @@ from engram.maps.database import Database
 from engram.maps.keys import KeyBook
 from engram.maps.rows import Row, edge_row, sealed, verified
 from engram.maps.schema import (
+    amendments,
     attempts,
     cameras,
     edges,
@@ -47,6 +48,7 @@ _TABLES = (
     omissions,
     omitted_landmarks,
     vocabularies,
+    amendments,
     hidden,
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import StrEnum
@@ -19,6 +20,8 @@ from sqlalchemy import Table
 from engram.errors import CalibrationError, InputError, MapCorruptError
 from engram.geometry import SE3, CameraId, StereoCamera
 from engram.graph.model import (
+    Amendable,
+    Amendment,
     Clock,
     Edge,
     EdgeKind,
@@ -34,6 +37,7 @@ from engram.graph.model import (
 Row = dict[str, Any]
 _Kind = TypeVar("_Kind", bound=StrEnum)
 
+START = re.compile(r"-?\d{1,19}")  # ns, as text
 _UPPER = np.triu_indices(6)
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -206,7 +210,8 @@ def camera_from_row(row: Row) -> StereoCamera:
 
 
 def session_row(session: Session, key: int, revision: int, camera: int, frontend: int) -> Row:
-    """Columns of `sessions`."""
+    """Columns of `sessions`: as it was recorded, whatever was set right since."""
+    session = session.as_recorded
     return {
         "key": key,
         "uuid": session.id.bytes,
@@ -232,6 +237,14 @@ def session_from_row(row: Row, camera: CameraId) -> Session:
         longitude_deg=row["longitude_deg"],
         zone=row["zone"],
     )
+
+
+def amendment_from_row(row: Row, session: SessionId) -> Amendment:
+    """The amendment of this session."""
+    what = _member(Amendable, row["what"], "amendments")
+    if what is Amendable.START and not START.fullmatch(row["value"]):
+        raise MapCorruptError(f"amendment of session {session}: {row['value']!r} is no start")
+    return Amendment(session, what, row["value"], row["amended_ns"])
 
 
 def node_from_row(row: Row, session: SessionId, camera: CameraId) -> Node:

@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import SchemaItem
 from sqlalchemy.types import TypeEngine
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 # SQLite's INTEGER and REAL are 64 bits wide.
 _INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
@@ -253,6 +253,18 @@ words = _table(
     _bytes("body"),
 )
 
+# What people set right about sessions: whose record stays. Of one session's rows for the same
+# `what`, the newest counts.
+amendments = _table(
+    "amendments",
+    _key(),
+    _int("revision"),
+    _int("session"),
+    _text("what"),
+    _text("value"),
+    _int("amended_ns"),
+)
+
 # In the order in which rows may refer to earlier tables.
 VERSIONED: tuple[Table, ...] = (
     sessions,
@@ -266,13 +278,14 @@ VERSIONED: tuple[Table, ...] = (
     attempts,
     statistics,
     vocabularies,
+    amendments,
     hidden,
 )
 KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)
 
 # Tables by the format that brought them; all others are of format 1. A map of an older format reads
 # as one in which they are empty.
-NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words), 3: (omitted_landmarks,)}
+NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words), 3: (omitted_landmarks,), 4: (amendments,)}
 # Tables whose columns stand since format 1, but whose constraints a later format loosened.
 LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
 

@@ -16,6 +16,7 @@ from engram.frontend.blobs import blob_hash, content_digest, encode_landmarks, e
 from engram.geometry import StereoCamera
 from engram.graph.attempts import Attempts
 from engram.graph.model import (
+    Amendment,
     Attempt,
     Edge,
     Node,
@@ -48,6 +49,7 @@ from engram.maps.rows import (
     transform_bytes,
 )
 from engram.maps.schema import (
+    amendments,
     cameras,
     frames,
     frontends,
@@ -142,6 +144,7 @@ class RevisionWriter:
             self._interrupted = open_sessions(connection)
         self._sequences: dict[int, set[int]] = {}
         self._omitted: set[bytes] = set()
+        self._amended: set[Amendment] | None = None  # read when first asked for
         self._shows_again = False
         self._held: list[NodeId] = []
 
@@ -370,6 +373,34 @@ class RevisionWriter:
         if omission.landmark_hash is not None:
             self._rows.new(omitted_landmarks, uuid=uuid, landmark_hash=omission.landmark_hash)
         self._checkpoint_if_due()
+
+    def add_amendment(self, amendment: Amendment) -> bool:
+        """Set something right about a session; what the map was told before changes nothing.
+
+        Returns:
+            Whether it was new.
+
+        Raises:
+            InputError: the map has no such session.
+        """
+        self._check_open()
+        found = self._sessions.get(amendment.session.bytes)
+        if found is None:
+            raise InputError(f"amendment: session {amendment.session} is not in the map")
+        if self._amended is None:
+            with self._database.reading() as connection:
+                self._amended = set(reading.load_amendments(connection, self._view))
+        if amendment in self._amended:
+            return False
+        self._amended.add(amendment)
+        self._rows.new(
+            amendments,
+            session=found[0],
+            what=str(amendment.what),
+            value=amendment.value,
+            amended_ns=amendment.amended_ns,
+        )
+        return True
 
     def put_vocabulary(self, body: bytes) -> None:
         """Keep a vocabulary, encoded; the newest counts."""

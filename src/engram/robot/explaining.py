@@ -250,7 +250,7 @@ def _drives(opened: Map) -> dict[SessionId, str]:
     words = {}
     for session in opened.sessions.values():
         if session.clock is Clock.UTC:
-            began = datetime.fromtimestamp(session.start_ns / 1e9, UTC)
+            began = datetime.fromtimestamp(session.begin_ns / 1e9, UTC)
             words[session.id] = f"{session.robot} {began:%Y-%m-%d %H:%M}"
         else:
             words[session.id] = f"{session.robot} {str(session.id)[:8]}"

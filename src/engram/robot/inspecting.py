@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Amendable, path_id
 from engram.maps import Map, check_file
-from engram.maps.history import sessions_of
+from engram.maps.history import stamp_text
 
 
 def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
@@ -42,31 +45,95 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
 
 
 def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The sessions of a map, for ``engram info --sessions``.
+    """The sessions of a map in the order of their coming, for ``engram info --sessions``.
 
     Raises:
-        MapError: the map cannot be read.
+        MapError: the map cannot be read, or has no such revision.
     """
     with Map.open(path, at=at) as store:
-        return sessions_of(store.load())
+        contents = store.load()
+        frontends = store.frontends
+        amended = {(one.session, str(one.what)) for one in store.amendments}
+    nodes = Counter(node.session for node in contents.nodes)
+    entries = Counter(entry.path for entry in contents.path_entries)
+    return [
+        {
+            "session": str(one.id),
+            "robot": one.robot,
+            "camera": one.camera,
+            "start": stamp_text(one, one.start_ns),
+            "start_ns": one.begin_ns,
+            "clock": str(one.clock),
+            "longitude_deg": one.longitude_deg,
+            "zone": one.zone,
+            "hour": hour_of_day(one, one.start_ns),
+            "nodes": nodes[one.id],
+            "path_entries": entries[path_id(one.id)],
+            "descriptor": str(frontends[one.id][0]),
+            "amended": sorted(what for session, what in amended if session == one.id),
+        }
+        for one in contents.sessions
+    ]
 
 
 def list_nodes(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The nodes of a map, for ``engram info --nodes``.
+    """The nodes of a map in the order of their coming, for ``engram info --nodes``.
 
     Raises:
-        MapError: the map cannot be read.
+        MapError: the map cannot be read, or has no such revision.
     """
     with Map.open(path, at=at) as store:
-        return [
-            {
-                "node": str(node.id),
-                "session": str(node.session),
-                "stamp_ns": node.stamp_ns,
-                "driven_m": node.driven_m,
-            }
-            for node in store.load().nodes
-        ]
+        graph, sessions = store.graph, store.sessions
+    components, experiences = graph.components(), graph.experiences
+    return [
+        {
+            "node": str(node.id),
+            "session": str(node.session),
+            "robot": sessions[node.session].robot,
+            "when": stamp_text(sessions[node.session], node.stamp_ns),
+            "stamp_ns": node.stamp_ns,
+            "hour": hour_of_day(sessions[node.session], node.stamp_ns),
+            "driven_m": node.driven_m,
+            "experience": int(experiences[index]),
+            "component": int(components[index]),
+        }
+        for index, node in enumerate(graph.nodes)
+    ]
+
+
+def amend_session(
+    path: Path,
+    session: str,
+    changes: Mapping[Amendable, str],
+    *,
+    author: str,
+    message: str = "",
+) -> dict[str, Any]:
+    """Sets right what is shown of a session, for ``engram amend``; see `Map.amend`.
+
+    Args:
+        path: NAME.engram.
+        session: its UUID, or enough of its beginning.
+        changes: what is wrong, and what it is.
+        author: who.
+        message: why.
+
+    Raises:
+        InputError: no session, or several, begin so; or nothing of it would change.
+        ConfigError: the zone is unknown.
+        MapError: the map cannot be written.
+    """
+    with Map.open(path) as store:
+        found = store.named_session(session).id
+        revision = store.amend(found, changes, author=author, message=message)
+        shown = store.sessions[found]
+    return {
+        "session": str(found),
+        "revision": revision.number,
+        "robot": shown.robot,
+        "start": stamp_text(shown, shown.start_ns),
+        "zone": shown.zone,
+    }
 
 
 def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:

@@ -172,7 +172,7 @@ def _mission_heights(
     if options.day is not None:
         day = float(date.fromisoformat(options.day).timetuple().tm_yday - 1)
     else:
-        day = day_of_year(max(one.start_ns for one in stock.sessions))
+        day = day_of_year(max(one.begin_ns for one in stock.sessions))
     end_h = options.start_h if options.end_h is None else options.end_h
     span = np.linspace(0.0, (end_h - options.start_h) % 24, 25)
     hours = (options.start_h + span) % 24
@@ -181,7 +181,7 @@ def _mission_heights(
 
 
 def _heights(stock: Stock, hours: Array, latitude_deg: float) -> Array:
-    days = np.array([day_of_year(one.start_ns) for one in stock.sessions], np.float64)
+    days = np.array([day_of_year(one.begin_ns) for one in stock.sessions], np.float64)
     return sun_height_deg(days, hours, latitude_deg)
 
 

@@ -334,6 +334,10 @@ def _write_sessions(writer: RevisionWriter, stock: Stock, sent: Mask) -> None:
                 frontend=frontend,
                 partial=path_id(session.id) in partial,
             )
+    told_of = {one.id for at, one in enumerate(stock.sessions) if wanted[at]}
+    for amendment in stock.store.amendments:
+        if amendment.session in told_of:
+            writer.add_amendment(amendment)
 
 
 def _sessions_of(stock: Stock, sent: Mask) -> Mask:

@@ -58,7 +58,8 @@ def check_fits(merge: Merge) -> None:
 
 def _drive(session: Session) -> tuple[str, str, int]:
     """What a session's UUID is made of; clock, longitude and zone may be told later (SPEC §2.8)."""
-    return session.robot, session.camera, session.start_ns
+    recorded = session.as_recorded
+    return recorded.robot, recorded.camera, recorded.start_ns
 
 
 def _same_record(merge: Merge, node: NodeId) -> bool:
@@ -102,10 +103,10 @@ def notes(merge: Merge, now_ns: int) -> list[str]:
         saved[node.session].append(node)
     for session in new:
         found += _backwards(session, saved[session.id])
-        if session.clock is Clock.UTC and session.start_ns > now_ns:
+        if session.clock is Clock.UTC and session.begin_ns > now_ns:
             found.append(
                 f"session {session.id} of {session.robot} begins "
-                f"{(session.start_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
+                f"{(session.begin_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
                 "was wrong"
             )
     return found + list(_overlaps(merge, new))
@@ -175,5 +176,7 @@ def _spans(merge: Merge) -> list[Span]:
     for node in (*merge.graph.nodes, *merge.robot.graph.nodes):
         last[node.session] = max(last[node.session], node.stamp_ns)
     return [
-        Span(one, one.start_ns, last[one.id]) for one in sessions.values() if one.clock is Clock.UTC
+        Span(one, one.begin_ns, last[one.id] + one.shift_ns)
+        for one in sessions.values()
+        if one.clock is Clock.UTC
     ]

@@ -69,9 +69,10 @@ def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | N
     for one in sessions:
         if one.id == own.id:
             return one
-        if (one.camera, one.start_ns) != (own.camera, own.start_ns):
+        named = one.as_recorded
+        if (named.camera, named.start_ns) != (own.camera, own.start_ns):
             continue
-        if one.id == session_id(one.robot, one.camera, one.start_ns, _first_pair(sequence)):
+        if one.id == session_id(named.robot, named.camera, named.start_ns, _first_pair(sequence)):
             return one
     return None
 

@@ -119,6 +119,7 @@ class Merge:
             or any(self.new_entry(entry) for path in paths.paths for entry in paths.entries(path))
             or any(map(self.lacks_edge, self.edges))
             or any(map(self.lacks_omission, self.robot.omissions))
+            or not set(self.robot.amendments) <= set(self.centre.amendments)
             or len(self.new_attempts(known, self.centre.attempts)) > 0
         )
 

@@ -123,6 +123,8 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
         for segment in segments[session.id]:
             merge.report.segments.append(replay.segment(session, segment))
         late += _unite_path(merge, session, replay)
+    for amendment in merge.robot.amendments:
+        merge.writer.add_amendment(amendment)
     merge.add_entries(late)
     _see_edges_again(merge)
     for edge in filter(merge.lacks_edge, merge.edges):
