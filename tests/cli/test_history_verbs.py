@@ -141,3 +141,27 @@ def test_mistakes_end_in_one_clear_line(engram, town: Path, arguments, says: str
     assert ran.err.startswith("engram: ")
     assert says in ran.err
     assert "Traceback" not in ran.err
+
+
+def test_a_session_can_be_amended_and_the_map_is_listed_so(engram, town: Path) -> None:
+    first, other = engram("info", town, "--sessions", "--json").json["session_list"]
+    when = "2026-05-01T12:00:00Z"
+    done = engram(
+        "amend", town, first["session"][:8], "--robot", "van", "--recorded-at", when, "--json"
+    ).json
+    assert (done["robot"], done["revision"]) == ("van", 3)
+    now, same = engram("info", town, "--sessions", "--json").json["session_list"]
+    assert same == other
+    assert (now["robot"], now["amended"]) == ("van", ["robot", "start"])
+    assert now["start"].startswith("2026-05-01T12:00:00")
+    assert (now["hour"], first["hour"]) == (12.0, 9.5)
+    assert engram("amend", town, first["session"]).status == 2
+    assert engram("amend", town, first["session"], "--robot", "van").status != 0
+    assert engram("revert", town, 3).status == 0
+    assert engram("info", town, "--sessions", "--json").json["session_list"] == [first, other]
+
+
+def test_nodes_are_listed_with_their_drives(engram, town: Path) -> None:
+    found = engram("info", town, "--nodes", "--json").json
+    assert len(found["node_list"]) == found["nodes"]
+    assert {one["robot"] for one in found["node_list"]} <= {"r1", "r2"}

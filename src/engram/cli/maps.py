@@ -1,4 +1,4 @@
-"""`engram info`, `plot`, `check`, `vocabulary`: what a map holds, and whether it is sound."""
+"""`engram info`, `plot`, `check`, `amend`, `vocabulary`: what a map holds; is it sound."""
 
 from __future__ import annotations
 
@@ -146,6 +146,58 @@ def _print_check(report: dict[str, Any]) -> None:
         f"{len(report['problems'])} problems in {report['rows']} rows and {report['blobs']} blobs; "
         f"{report['abandoned_rows']} abandoned rows, {report['removed_rows']} removed"
     )
+
+
+def amend(
+    map_path: options.MapPath,
+    session: Annotated[
+        str,
+        typer.Argument(metavar="SESSION", help="Its id, or the beginning; see info --sessions."),
+    ],
+    *,
+    robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot.")] = None,
+    recorded_at: Annotated[
+        str | None,
+        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive, ISO 8601, UTC."),
+    ] = None,
+    zone: Annotated[
+        str | None, typer.Option("--zone", help="Time zone of the drive: Europe/London.")
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Correct a session's robot, start or zone.
+
+    The session's record and all ids stay as they are: the correction is a revision of its own,
+    which revert takes back. The latest one counts.
+
+    \b
+    Examples:
+      engram amend town.engram 3f2a --zone Europe/London
+      engram amend town.engram 3f2a --recorded-at 2026-03-01T09:30:00Z
+    """
+    from engram.cli.history import user
+    from engram.errors import InputError
+    from engram.graph.model import Amendable
+    from engram.robot.inspecting import amend_session
+    from engram.sequences.options import parse_start
+
+    start_ns = parse_start(recorded_at)
+    given = {
+        Amendable.ROBOT: robot,
+        Amendable.START: None if start_ns is None else str(start_ns),
+        Amendable.ZONE: zone,
+    }
+    changes = {what: value for what, value in given.items() if value is not None}
+    if not changes:
+        raise InputError("say what is wrong: give --robot, --recorded-at or --zone")
+    done = amend_session(map_path, session, changes, author=user())
+    if as_json:
+        print(json.dumps(done))
+    else:
+        typer.echo(
+            f"session {done['session']}: robot {done['robot']}, start {done['start']}, "
+            f"zone {done['zone'] or 'unknown'}; revision {done['revision']}"
+        )
 
 
 def vocabulary(

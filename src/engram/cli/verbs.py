@@ -15,14 +15,20 @@ from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
 from engram.cli.fleet import build, download, merge
 from engram.cli.history import diff, log, revert, show, tag
-from engram.cli.maps import check, info, plot, vocabulary
+from engram.cli.maps import amend, check, info, plot, vocabulary
 from engram.cli.options import spread
 from engram.cli.showing import settings
 from engram.errors import InputError
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "Drives": {"map": map_, "localise": localise, "record": record},
-    "Maps": {"info": info, "plot": plot, "check": check, "vocabulary": vocabulary},
+    "Maps": {
+        "info": info,
+        "plot": plot,
+        "check": check,
+        "amend": amend,
+        "vocabulary": vocabulary,
+    },
     "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
     "Fleet": {"merge": merge, "download": download, "build": build},
     "Settings": {"settings": settings},
