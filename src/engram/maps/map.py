@@ -99,6 +99,7 @@ def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[
 # What is read anew once something was written.
 _SMALL = (
     "amendments",
+    "cameras",
     "vocabulary",
     "descriptor",
     "frontends",
