@@ -185,8 +185,6 @@ def _trial_rows(number: str, trials: Sequence[TriedDownload]) -> Iterator[Row]:
             "ms_per_frame": float(np.mean([one.ms for one in some])),
             "lookup_ms_per_frame": float(np.mean([one.lookup_ms for one in some])),
             "lookups": sum(one.lookups for one in some),
-            "query_ms": float(np.mean([one.query_ms for one in some])),
-            "dense_query_ms": float(np.mean([one.dense_ms for one in some])),
             "expected_missed": float(promised @ lengths / lengths.sum()),
             **_failure([one.drive for one in some]),
         }

@@ -6,16 +6,13 @@ the others do, and thumbnails are a tenth of a map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields
 from functools import partial
-from itertools import islice
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions
@@ -24,15 +21,7 @@ from engram.graph.model import Node, SessionId
 from engram.localiser import Position
 from engram.maps import Map
 from engram.measures import Drive
-from engram.places import (
-    FabMap,
-    FabMapConfig,
-    decode_vocabulary,
-    default_vocabulary,
-)
-from engram.places.words import NodeWords
 from engram.sequences import FrameLog
-from engram_lab.dense import DenseTable
 from engram_lab.studies.building import true_nodes, write_json
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm
@@ -50,9 +39,6 @@ TENTH = "budget 1/10"
 AS_TOD = "budget as tod"
 AS_TOD_PATHS = "budget as tod+paths"
 _BY_HOUR = (TOD, TOD_PATHS)
-_QUERIES = 50  # frames of the drive
-_BEST = 10  # places that are asked for
-_NO_WORDS = np.zeros(0, np.int32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +55,6 @@ class TriedDownload:
         ms: mean time of localising a frame.
         lookup_ms: of that, asking the relocaliser.
         lookups: frames for which it was asked.
-        query_ms, dense_ms: median of asking FAB-MAP, by the inverted index that the product has,
-            and by a row for every place.
     """
 
     name: str
@@ -83,8 +67,6 @@ class TriedDownload:
     ms: float
     lookup_ms: float
     lookups: int
-    query_ms: float
-    dense_ms: float
 
 
 def trials_path(plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive) -> Path:
@@ -131,13 +113,10 @@ def try_downloads_for(
         {one.session.id for foray in forays for one in foray}
         for forays in plan.forays(fold).values()
     ]
-    queries = _Queries(centre, drive)
     tried = [
         {
             **_plain(one),
             "united": float(np.mean([_united(one, found[0].nodes, mine) for mine in own])),
-            "query_ms": queries.ms(one.nodes),
-            "dense_ms": queries.dense_ms(one.nodes),
         }
         for one in found
     ]
@@ -151,10 +130,11 @@ def read_trials(
     kept = _kept(trials_path(plan, arm, fold, drive))
     if kept is None:
         return []
+    names = {one.name for one in fields(TriedDownload)}
     return [
         TriedDownload(
             **{
-                **one,
+                **{key: value for key, value in one.items() if key in names},
                 "drive": Drive(np.array(one["drive"][0]), np.array(one["drive"][1], np.bool_)),
             }
         )
@@ -187,47 +167,6 @@ def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: Map) -> P
     first = None if truth is None else truth.at(int(log.stamps_ns[0]))
     log.close()
     return None if first is None else true_nodes(opened, plan.training(fold)).start(first)
-
-
-class _Queries:
-    """What asking FAB-MAP where a drive is costs in parts of a map."""
-
-    def __init__(self, centre: Path, drive: EvaluatedDrive) -> None:
-        with Map.open(centre) as store:
-            body = store.vocabulary
-            self._vocabulary = (
-                default_vocabulary(drive.descriptor) if body is None else decode_vocabulary(body)
-            )
-            self._words = NodeWords.of_map(store, self._vocabulary).kept
-        log = FrameLog(drive.path)
-        every = max(len(log) // _QUERIES, 1)
-        frames = [one.frame for one in islice(log, 0, None, every)]
-        log.close()
-        self._asked = [
-            self._vocabulary.words_of(one.landmarks.descriptors, one.descriptor) for one in frames
-        ]
-
-    def ms(self, nodes: Sequence[Node]) -> float:
-        """Median of a query by the inverted index."""
-        places = FabMap(self._vocabulary)
-        for node in nodes:
-            places.add(self._words.get(node.id, _NO_WORDS))
-        return self._median(lambda words: places.recognise(words, _BEST))
-
-    def dense_ms(self, nodes: Sequence[Node]) -> float:
-        """Median of a query by a row for every place."""
-        places = DenseTable(self._vocabulary, FabMapConfig(), len(nodes))
-        for node in nodes:
-            places.add(self._words.get(node.id, _NO_WORDS))
-        return self._median(lambda words: places.best(words, min(_BEST, len(nodes))))
-
-    def _median(self, ask: Callable[[NDArray[np.int32]], object]) -> float:
-        times = []
-        for words in self._asked:
-            started = perf_counter()
-            ask(words)
-            times.append(perf_counter() - started)
-        return 1e3 * float(np.median(times))
 
 
 def _united(trial: Trial, whole: Sequence[Node], own: Collection[SessionId]) -> int:
