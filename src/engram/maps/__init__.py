@@ -13,7 +13,8 @@ from engram.maps.history import (
     show_revision,
     tag_revision,
 )
-from engram.maps.map import Map, check_file, compact_map, copy_map, open_map, publish_map
+from engram.maps.map import Map, open_map
+from engram.maps.map_files import check_file, compact_map, copy_map, publish_map
 from engram.maps.provenance import Origin
 from engram.maps.records import (
     CheckReport,

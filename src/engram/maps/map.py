@@ -2,53 +2,39 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
-from functools import cached_property, wraps
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, insert
 
 from engram import __version__
-from engram.errors import IncompatibleError, InputError, MapCorruptError, RevisionError
+from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.files import Holder
 from engram.frontend import DescriptorKind
-from engram.geometry import CameraId, StereoCamera
-from engram.graph.attempts import Attempts
-from engram.graph.basin import BasinCounts
+from engram.geometry import StereoCamera
 from engram.graph.clock import check_zone
-from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
     Amendable,
     Amendment,
     NodeId,
-    Omission,
-    PathId,
     Session,
     SessionId,
 )
-from engram.graph.paths import PathMemory
 from engram.maps import reading
-from engram.maps.checking import check
-from engram.maps.content import content_hash, record_hashes
 from engram.maps.database import Database, Lock, Place
-from engram.maps.difference import STRETCH_M, MapDifference, difference
-from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
+from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.keys import KeyBook
-from engram.maps.provenance import Origin, origin_of
+from engram.maps.map_files import open_database
+from engram.maps.map_reader import MapReader
 from engram.maps.records import (
-    CheckReport,
-    InterruptedSession,
-    MapContents,
-    MapInfo,
-    Problem,
     Revision,
     RevisionStatus,
     SessionState,
@@ -57,28 +43,20 @@ from engram.maps.revisions import (
     change_revision,
     collect_abandoned,
     commit_revision,
-    interrupted_sessions,
     session_and_revision,
     stored_session,
 )
-from engram.maps.rows import START, Row, checked_text, sealed, session_from_row, to_json, verified
+from engram.maps.rows import START, Row, checked_text, sealed, session_from_row, to_json
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, map_path
 from engram.maps.tags import Tag, checked_tag, load_tags, resolve, write_tag
 from engram.maps.view import View, head
-from engram.maps.words import load_words, words_row, write_words
+from engram.maps.words import words_row, write_words
 from engram.maps.writer import RevisionWriter
 
 if TYPE_CHECKING:
     from engram.robot.robot import Robot
     from engram.robot.settings import Settings
-
-
-def open_database(location: Path | str | Place) -> Database:
-    """The database of an existing map."""
-    if isinstance(location, Path | str):
-        return SqliteDatabase(map_path(location))
-    return location.open()
 
 
 _P = ParamSpec("_P")
@@ -96,49 +74,7 @@ def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[
     return locked
 
 
-# What is read anew once something was written.
-_SMALL = (
-    "amendments",
-    "cameras",
-    "vocabulary",
-    "descriptor",
-    "frontends",
-    "omissions",
-    "landmark_hashes",
-    "blob_sizes",
-    "partial_paths",
-)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Contents:
-    """What a map is read for once: the graph and the paths grow with what is written."""
-
-    graph: ExperienceGraph
-    path_memory: PathMemory
-    attempts: Attempts
-    basin_counts: BasinCounts
-    last_iterations: Mapping[SessionId, int]
-
-    @staticmethod
-    def of(contents: MapContents) -> _Contents:
-        graph = ExperienceGraph()
-        for node in contents.nodes:
-            graph.add_node(node)
-        graph.add_edges(contents.edges)
-        path_memory = PathMemory(graph)
-        for entry in contents.path_entries:
-            path_memory.add(entry)
-        return _Contents(
-            graph,
-            path_memory,
-            contents.attempts,
-            contents.basin_counts(graph.experiences),
-            contents.last_iterations(),
-        )
-
-
-class Map:
+class Map(MapReader):
     """A map on disk, seen as of one revision. A context manager; threads may share it.
 
     Readers never wait for the writer, nor it for them: they see the revisions that were committed
@@ -157,20 +93,13 @@ class Map:
         writes: bool = False,
         cache_bytes: int = DEFAULT_CACHE_BYTES,
     ) -> None:
-        self._database = database
         self._lock: Lock | None = database.lock_for_writing() if writes else None
         try:
-            with database.reading() as connection:
-                self._view = View(resolve(connection, at, database.name))
-            self._pinned = at is not None
+            super().__init__(database, at=at, cache_bytes=cache_bytes)
             self._key_book = KeyBook(database, self._view) if writes else None
-            self.frames = FrameReader(database, self._view, cache_bytes)
         except BaseException:
             self._release()
             raise
-        self._contents_lock = threading.RLock()
-        self._contents: _Contents | None = None
-        self._derived: dict[tuple[object, ...], Any] = {}
         self._writing: RevisionWriter | None = None
 
     @staticmethod
@@ -212,262 +141,6 @@ class Map:
             RevisionError: it has no such revision.
         """
         return Map(open_database(location), at=at, writes=writes, cache_bytes=cache_bytes)
-
-    @property
-    def location(self) -> str:
-        """Where the map lies, for messages."""
-        return self._database.name
-
-    @property
-    def is_pinned(self) -> bool:
-        """Whether it was opened as of a certain revision."""
-        return self._pinned
-
-    @property
-    def revision(self) -> int:
-        """Number of the newest revision that is seen; 0 for an empty map."""
-        return self._view.at
-
-    @property
-    def format_version(self) -> int:
-        """Of the format in which the map is stored."""
-        return self._database.format_version
-
-    @property
-    def graph(self) -> ExperienceGraph:
-        """Its experience graph."""
-        return self._read_contents().graph
-
-    @property
-    def path_memory(self) -> PathMemory:
-        """Its paths."""
-        return self._read_contents().path_memory
-
-    @property
-    def attempts(self) -> Attempts:
-        """The attempts that it remembered when the graph was read.
-
-        Sessions are places in `sessions`, nodes are indices of `graph`.
-        """
-        return self._read_contents().attempts
-
-    @property
-    def basin_counts(self) -> BasinCounts:
-        """Counts of `attempts`, from which match basins are learnt."""
-        return self._read_contents().basin_counts
-
-    @property
-    def last_iterations(self) -> Mapping[SessionId, int]:
-        """Number of the newest of `attempts` of each session that has any."""
-        return self._read_contents().last_iterations
-
-    @cached_property
-    def sessions(self) -> dict[SessionId, Session]:
-        """The drives that the map knows, by id, in the order of their coming."""
-        return {one.id: one for one in self._read(reading.load_sessions)}
-
-    def named_session(self, prefix: str) -> Session:
-        """The one session whose UUID begins so.
-
-        Raises:
-            InputError: no session, or several, begin so.
-        """
-        known, wanted = self.sessions.values(), prefix.strip().lower()
-        found = [one for one in known if wanted and str(one.id).startswith(wanted)]
-        if len(found) != 1:
-            listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or known)
-            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose of: {listed}")
-        return found[0]
-
-    @cached_property
-    def amendments(self) -> tuple[Amendment, ...]:
-        """What was set right about its sessions, in the order in which it counts."""
-        return self._read(reading.load_amendments)
-
-    @cached_property
-    def cameras(self) -> dict[CameraId, StereoCamera]:
-        """The cameras of its sessions, by id."""
-        with self._database.reading() as connection:
-            return {one.id: one for one in reading.load_cameras(connection).values()}
-
-    @cached_property
-    def vocabulary(self) -> bytes | None:
-        """The newest vocabulary of the map as it was put in; None if there is none.
-
-        Raises:
-            MapCorruptError: it does not match its hash.
-        """
-        return self._read(reading.load_vocabulary)
-
-    @cached_property
-    def descriptor(self) -> DescriptorKind | None:
-        """Kind of all descriptors of the map; None before its first session."""
-        return self._read(reading.descriptor_of)
-
-    @cached_property
-    def frontends(self) -> dict[SessionId, tuple[DescriptorKind, str]]:
-        """Descriptor kind and hash of the front-end of each session."""
-        return self._read(reading.frontends_of_sessions)
-
-    @cached_property
-    def omissions(self) -> dict[NodeId, Omission]:
-        """The nodes that merges did not take, by their ids; equivalents that are hidden left out.
-
-        Raises:
-            MapCorruptError: a row does not match its checksum.
-        """
-        return self._read(reading.load_omissions)
-
-    @cached_property
-    def landmark_hashes(self) -> dict[NodeId, bytes]:
-        """The 16 bytes that stand for each node's landmarks.
-
-        Also of nodes that were not taken, as far as it was kept.
-        """
-        return self._read(reading.landmark_hashes)
-
-    @cached_property
-    def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
-        """Bytes of each node's landmarks and of its thumbnail."""
-        return self._read(reading.blob_sizes)
-
-    @cached_property
-    def partial_paths(self) -> frozenset[PathId]:
-        """Paths of which some entries stayed elsewhere."""
-        return self._read(reading.partial_paths)
-
-    def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-        """The words (n,) of nodes by the vocabulary of this hash, rising, as far as they are kept.
-
-        What is damaged is left out: it can be worked out again from the landmarks.
-        """
-        with self._database.reading() as connection:
-            return load_words(connection, vocabulary)
-
-    def derived(
-        self, make: Callable[Concatenate[Map, _P], _T], *args: _P.args, **kwargs: _P.kwargs
-    ) -> _T:
-        """What others make of this map: made once for each set of arguments, then shared.
-
-        Args:
-            make: called with the map and the arguments, which are hashable.
-        """
-        key = (make, *args, *sorted(kwargs.items()))
-        with self._contents_lock:
-            if key not in self._derived:
-                self._derived[key] = make(self, *args, **kwargs)
-            found: _T = self._derived[key]
-        return found
-
-    def load(self) -> MapContents:
-        """All records as they are now, also what this process has checkpointed of an open session.
-
-        Raises:
-            MapCorruptError: a row does not match its checksum or points at nothing.
-        """
-        return self._read(reading.load)
-
-    def node_count(self) -> int:
-        """How many nodes the map has."""
-        return self._read(reading.node_count)
-
-    def info(self) -> MapInfo:
-        """The map in numbers."""
-        with self._database.reading() as connection:
-            return reading.info(
-                connection,
-                self._view,
-                format_version=self._database.format_version,
-                size_bytes=self._database.size_bytes(),
-            )
-
-    def statistics(self) -> dict[str, dict[str, Any]]:
-        """The newest of every statistic of the map, by name."""
-        return self._read(reading.load_statistics)
-
-    def log(self) -> list[Revision]:
-        """The committed revisions that are seen, oldest first."""
-        return self._read(reading.log)
-
-    def tags(self) -> dict[str, Tag]:
-        """The names that were given to revisions, also to those not seen from here."""
-        with self._database.reading() as connection:
-            return load_tags(connection)
-
-    def resolve(self, named: int | str | None) -> int:
-        """Number of a revision of the whole map, however it is named.
-
-        Raises:
-            RevisionError: there is none.
-        """
-        with self._database.reading() as connection:
-            return resolve(connection, named, self._database.name)
-
-    def diff(
-        self, before: int | str, after: int | str, stretch_m: float = STRETCH_M
-    ) -> MapDifference:
-        """Compare two revisions.
-
-        Args:
-            before, after: their numbers or names.
-            stretch_m: length of the stretches by which changes are listed.
-
-        Raises:
-            RevisionError: there is no such revision.
-            InputError: the length is below 1 m, or not finite.
-        """
-        numbers = self.resolve(before), self.resolve(after)
-        with self._database.reading() as connection:
-            old, new = (reading.load(connection, View(number)) for number in numbers)
-        return difference(numbers[0], old, numbers[1], new, stretch_m)
-
-    def origin(self, prefix: str) -> Origin:
-        """Where a node comes from, also one that a revert has hidden.
-
-        Args:
-            prefix: its UUID, or enough of its beginning.
-
-        Raises:
-            InputError: no node, or several, begin so.
-        """
-        with self._database.reading() as connection:
-            return origin_of(connection, self._view, prefix)
-
-    def content_hash(self) -> str:
-        """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
-        with self._database.reading() as connection:
-            return content_hash(connection, self._view.at)
-
-    def record_hashes(self) -> dict[str, str]:
-        """16 hexadecimal digits of each table's rows, free of what revisions tell of themselves."""
-        with self._database.reading() as connection:
-            return record_hashes(connection, self._view.at)
-
-    def session_state(self, session: SessionId) -> SessionState:
-        """What the map knows of a session: ask before handing one in."""
-        with self._database.reading() as connection:
-            found = session_and_revision(connection, session, self._view.at)
-        if found is None or found[1]["status"] == "abandoned":
-            return SessionState.ABSENT
-        _, revision = found
-        if revision["status"] == "committed":
-            seen = revision["number"] <= self._view.at
-            return SessionState.COMMITTED if seen else SessionState.ABSENT
-        return SessionState.OPEN if self._is_alive(revision) else SessionState.INTERRUPTED
-
-    def interrupted(self) -> list[InterruptedSession]:
-        """Sessions whose writer is gone before it committed, oldest first."""
-        query = select(revisions).where(revisions.c.status == "open").order_by(revisions.c.key)
-        with self._database.reading() as connection:
-            opened = list(verified(revisions, connection.execute(query)))
-            gone = [row for row in opened if not self._is_alive(row)]
-            return [
-                one for row in gone for one in interrupted_sessions(connection, row, self._view.at)
-            ]
-
-    def check(self) -> CheckReport:
-        """Verify the whole file to the last byte; `check_map` also takes one that does not open."""
-        return check(self._database)
 
     def robot(
         self,
@@ -537,14 +210,6 @@ class Map:
         finally:
             self._key_book = None
             self._release()
-
-    def forget(self) -> None:
-        """Read anew, when next asked for, what has been read of this map."""
-        with self._contents_lock:
-            self._contents = None
-            self._derived.clear()
-            for name in (*_SMALL, "sessions"):
-                self.__dict__.pop(name, None)
 
     def begin_session(
         self,
@@ -839,16 +504,9 @@ class Map:
         A session that is still open becomes interrupted.
         """
         try:
-            self.frames.close()
-            self._database.close()
+            super().close()
         finally:
             self._release()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _checked_amendments(
         self, session: SessionId, changes: Mapping[Amendable, str]
@@ -871,19 +529,6 @@ class Map:
             raise InputError(f"session {session} is so already: there is nothing to amend")
         return found
 
-    def _read(self, load: Callable[[Connection, View], _T]) -> _T:
-        with self._database.reading() as connection:
-            return load(connection, self._view)
-
-    def _read_contents(self) -> _Contents:
-        with self._contents_lock:
-            if self._contents is None:
-                found = self.load()
-                self._contents = _Contents.of(found)
-                # Attempts name sessions by their places: those of the same moment.
-                self.__dict__["sessions"] = {one.id: one for one in found.sessions}
-            return self._contents
-
     @property
     def _holder(self) -> Holder:
         assert self._lock is not None  # whoever asks has keys
@@ -899,10 +544,6 @@ class Map:
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-    def _is_alive(self, revision: Row) -> bool:
-        holder = self._database.writer()
-        return holder is not None and holder.token == revision["writer"]
 
     def _revision_row(self, author: str, message: str, configuration: Mapping[str, Any]) -> Row:
         return {
@@ -956,11 +597,8 @@ class Map:
         self._see(View(newest))
 
     def _see(self, view: View) -> None:
-        self._view = view
-        for name in _SMALL if self._contents else (*_SMALL, "sessions"):
-            self.__dict__.pop(name, None)
+        self._look_from(view)
         self._keys.set_view(view)
-        self.frames.set_view(view)
 
     def _check_none_open(self) -> None:
         if self._writing is None:
@@ -1019,52 +657,3 @@ def open_map(path: Path | str, at: int | str | None = None, create: bool = False
     if create and not map_path(path).exists():
         Map.create(path).close()
     return Map.open(path, at=at)
-
-
-def copy_map(source: Path, target: Path) -> None:
-    """Copies a map file as it is now, also while somebody writes to it.
-
-    Raises:
-        InputError: the target exists already, or its folder does not.
-        MapError: the source cannot be read, or the target not written.
-    """
-    with closing(SqliteDatabase(source)) as database:
-        database.copy_to(target)
-
-
-def compact_map(source: Path, target: Path) -> None:
-    """Writes a map file anew, its rows in order and without gaps.
-
-    The same rows written in the same order give the same bytes, with one version of SQLite.
-
-    Raises:
-        InputError: the target exists already, or its folder does not.
-        MapError: the source cannot be read, or the target not written.
-    """
-    with closing(SqliteDatabase(source)) as database:
-        database.compact_to(target)
-
-
-def publish_map(draft: Path, target: Path) -> None:
-    """Gives a map file that nobody has open its name, in the same file system: last of all.
-
-    Raises:
-        InputError: the target exists already, or its folder does not.
-        MapError: the name cannot be given.
-    """
-    SqliteDatabase.publish(draft, target)
-
-
-def check_file(location: Path | str | Place) -> CheckReport:
-    """Verify a map file to the last byte, also one that is too damaged to open.
-
-    Raises:
-        NotAMapError: nothing is there, or something else.
-        FormatVersionError: a newer Engram wrote it.
-    """
-    try:
-        database = open_database(location)
-    except MapCorruptError as error:
-        return CheckReport((Problem("file", "", str(error)),), 0, 0, (), 0)
-    with closing(database):
-        return check(database)

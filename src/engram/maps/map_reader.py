@@ -1,0 +1,421 @@
+"""What can be read of a map, as of one revision."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, select
+
+from engram.errors import InputError
+from engram.frontend import DescriptorKind
+from engram.geometry import CameraId, StereoCamera
+from engram.graph.attempts import Attempts
+from engram.graph.basin import BasinCounts
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import (
+    Amendment,
+    NodeId,
+    Omission,
+    PathId,
+    Session,
+    SessionId,
+)
+from engram.graph.paths import PathMemory
+from engram.maps import reading
+from engram.maps.checking import check
+from engram.maps.content import content_hash, record_hashes
+from engram.maps.database import Database
+from engram.maps.difference import STRETCH_M, MapDifference, difference
+from engram.maps.frame_reader import FrameReader
+from engram.maps.provenance import Origin, origin_of
+from engram.maps.records import (
+    CheckReport,
+    InterruptedSession,
+    MapContents,
+    MapInfo,
+    Revision,
+    SessionState,
+)
+from engram.maps.revisions import (
+    interrupted_sessions,
+    session_and_revision,
+)
+from engram.maps.rows import Row, verified
+from engram.maps.schema import revisions
+from engram.maps.tags import Tag, load_tags, resolve
+from engram.maps.view import View
+from engram.maps.words import load_words
+
+if TYPE_CHECKING:
+    pass
+
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+# What is read anew once something was written.
+_SMALL = (
+    "amendments",
+    "cameras",
+    "vocabulary",
+    "descriptor",
+    "frontends",
+    "omissions",
+    "landmark_hashes",
+    "blob_sizes",
+    "partial_paths",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Contents:
+    """What a map is read for once: the graph and the paths grow with what is written."""
+
+    graph: ExperienceGraph
+    path_memory: PathMemory
+    attempts: Attempts
+    basin_counts: BasinCounts
+    last_iterations: Mapping[SessionId, int]
+
+    @staticmethod
+    def of(contents: MapContents) -> _Contents:
+        graph = ExperienceGraph()
+        for node in contents.nodes:
+            graph.add_node(node)
+        graph.add_edges(contents.edges)
+        path_memory = PathMemory(graph)
+        for entry in contents.path_entries:
+            path_memory.add(entry)
+        return _Contents(
+            graph,
+            path_memory,
+            contents.attempts,
+            contents.basin_counts(graph.experiences),
+            contents.last_iterations(),
+        )
+
+
+class MapReader:
+    """A map as of one revision; the part of `Map` that only reads.
+
+    What is read stays in memory. The graph and the paths are read once, and grow with what this
+    process writes.
+
+    Attributes:
+        frames: the frames of its nodes: a `LandmarkSource`.
+    """
+
+    def __init__(self, database: Database, *, at: int | str | None, cache_bytes: int) -> None:
+        self._database = database
+        with database.reading() as connection:
+            self._view = View(resolve(connection, at, database.name))
+        self._pinned = at is not None
+        self.frames = FrameReader(database, self._view, cache_bytes)
+        self._contents_lock = threading.RLock()
+        self._contents: _Contents | None = None
+        self._derived: dict[tuple[object, ...], Any] = {}
+
+    def close(self) -> None:
+        """Give back files and threads."""
+        self.frames.close()
+        self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def location(self) -> str:
+        """Where the map lies, for messages."""
+        return self._database.name
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether it was opened as of a certain revision."""
+        return self._pinned
+
+    @property
+    def revision(self) -> int:
+        """Number of the newest revision that is seen; 0 for an empty map."""
+        return self._view.at
+
+    @property
+    def format_version(self) -> int:
+        """Of the format in which the map is stored."""
+        return self._database.format_version
+
+    @property
+    def graph(self) -> ExperienceGraph:
+        """Its experience graph."""
+        return self._read_contents().graph
+
+    @property
+    def path_memory(self) -> PathMemory:
+        """Its paths."""
+        return self._read_contents().path_memory
+
+    @property
+    def attempts(self) -> Attempts:
+        """The attempts that it remembered when the graph was read.
+
+        Sessions are places in `sessions`, nodes are indices of `graph`.
+        """
+        return self._read_contents().attempts
+
+    @property
+    def basin_counts(self) -> BasinCounts:
+        """Counts of `attempts`, from which match basins are learnt."""
+        return self._read_contents().basin_counts
+
+    @property
+    def last_iterations(self) -> Mapping[SessionId, int]:
+        """Number of the newest of `attempts` of each session that has any."""
+        return self._read_contents().last_iterations
+
+    @cached_property
+    def sessions(self) -> dict[SessionId, Session]:
+        """The drives that the map knows, by id, in the order of their coming."""
+        return {one.id: one for one in self._read(reading.load_sessions)}
+
+    def named_session(self, prefix: str) -> Session:
+        """The one session whose UUID begins so.
+
+        Raises:
+            InputError: no session, or several, begin so.
+        """
+        known, wanted = self.sessions.values(), prefix.strip().lower()
+        found = [one for one in known if wanted and str(one.id).startswith(wanted)]
+        if len(found) != 1:
+            listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or known)
+            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose of: {listed}")
+        return found[0]
+
+    @cached_property
+    def amendments(self) -> tuple[Amendment, ...]:
+        """What was set right about its sessions, in the order in which it counts."""
+        return self._read(reading.load_amendments)
+
+    @cached_property
+    def cameras(self) -> dict[CameraId, StereoCamera]:
+        """The cameras of its sessions, by id."""
+        with self._database.reading() as connection:
+            return {one.id: one for one in reading.load_cameras(connection).values()}
+
+    @cached_property
+    def vocabulary(self) -> bytes | None:
+        """The newest vocabulary of the map as it was put in; None if there is none.
+
+        Raises:
+            MapCorruptError: it does not match its hash.
+        """
+        return self._read(reading.load_vocabulary)
+
+    @cached_property
+    def descriptor(self) -> DescriptorKind | None:
+        """Kind of all descriptors of the map; None before its first session."""
+        return self._read(reading.descriptor_of)
+
+    @cached_property
+    def frontends(self) -> dict[SessionId, tuple[DescriptorKind, str]]:
+        """Descriptor kind and hash of the front-end of each session."""
+        return self._read(reading.frontends_of_sessions)
+
+    @cached_property
+    def omissions(self) -> dict[NodeId, Omission]:
+        """The nodes that merges did not take, by their ids; equivalents that are hidden left out.
+
+        Raises:
+            MapCorruptError: a row does not match its checksum.
+        """
+        return self._read(reading.load_omissions)
+
+    @cached_property
+    def landmark_hashes(self) -> dict[NodeId, bytes]:
+        """The 16 bytes that stand for each node's landmarks.
+
+        Also of nodes that were not taken, as far as it was kept.
+        """
+        return self._read(reading.landmark_hashes)
+
+    @cached_property
+    def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
+        """Bytes of each node's landmarks and of its thumbnail."""
+        return self._read(reading.blob_sizes)
+
+    @cached_property
+    def partial_paths(self) -> frozenset[PathId]:
+        """Paths of which some entries stayed elsewhere."""
+        return self._read(reading.partial_paths)
+
+    def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
+        """The words (n,) of nodes by the vocabulary of this hash, rising, as far as they are kept.
+
+        What is damaged is left out: it can be worked out again from the landmarks.
+        """
+        with self._database.reading() as connection:
+            return load_words(connection, vocabulary)
+
+    def derived(
+        self, make: Callable[Concatenate[Self, _P], _T], *args: _P.args, **kwargs: _P.kwargs
+    ) -> _T:
+        """What others make of this map: made once for each set of arguments, then shared.
+
+        Args:
+            make: called with the map and the arguments, which are hashable.
+        """
+        key = (make, *args, *sorted(kwargs.items()))
+        with self._contents_lock:
+            if key not in self._derived:
+                self._derived[key] = make(self, *args, **kwargs)
+            found: _T = self._derived[key]
+        return found
+
+    def load(self) -> MapContents:
+        """All records as they are now, also what this process has checkpointed of an open session.
+
+        Raises:
+            MapCorruptError: a row does not match its checksum or points at nothing.
+        """
+        return self._read(reading.load)
+
+    def node_count(self) -> int:
+        """How many nodes the map has."""
+        return self._read(reading.node_count)
+
+    def info(self) -> MapInfo:
+        """The map in numbers."""
+        with self._database.reading() as connection:
+            return reading.info(
+                connection,
+                self._view,
+                format_version=self._database.format_version,
+                size_bytes=self._database.size_bytes(),
+            )
+
+    def statistics(self) -> dict[str, dict[str, Any]]:
+        """The newest of every statistic of the map, by name."""
+        return self._read(reading.load_statistics)
+
+    def log(self) -> list[Revision]:
+        """The committed revisions that are seen, oldest first."""
+        return self._read(reading.log)
+
+    def tags(self) -> dict[str, Tag]:
+        """The names that were given to revisions, also to those not seen from here."""
+        with self._database.reading() as connection:
+            return load_tags(connection)
+
+    def resolve(self, named: int | str | None) -> int:
+        """Number of a revision of the whole map, however it is named.
+
+        Raises:
+            RevisionError: there is none.
+        """
+        with self._database.reading() as connection:
+            return resolve(connection, named, self._database.name)
+
+    def diff(
+        self, before: int | str, after: int | str, stretch_m: float = STRETCH_M
+    ) -> MapDifference:
+        """Compare two revisions.
+
+        Args:
+            before, after: their numbers or names.
+            stretch_m: length of the stretches by which changes are listed.
+
+        Raises:
+            RevisionError: there is no such revision.
+            InputError: the length is below 1 m, or not finite.
+        """
+        numbers = self.resolve(before), self.resolve(after)
+        with self._database.reading() as connection:
+            old, new = (reading.load(connection, View(number)) for number in numbers)
+        return difference(numbers[0], old, numbers[1], new, stretch_m)
+
+    def origin(self, prefix: str) -> Origin:
+        """Where a node comes from, also one that a revert has hidden.
+
+        Args:
+            prefix: its UUID, or enough of its beginning.
+
+        Raises:
+            InputError: no node, or several, begin so.
+        """
+        with self._database.reading() as connection:
+            return origin_of(connection, self._view, prefix)
+
+    def content_hash(self) -> str:
+        """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
+        with self._database.reading() as connection:
+            return content_hash(connection, self._view.at)
+
+    def record_hashes(self) -> dict[str, str]:
+        """16 hexadecimal digits of each table's rows, free of what revisions tell of themselves."""
+        with self._database.reading() as connection:
+            return record_hashes(connection, self._view.at)
+
+    def session_state(self, session: SessionId) -> SessionState:
+        """What the map knows of a session: ask before handing one in."""
+        with self._database.reading() as connection:
+            found = session_and_revision(connection, session, self._view.at)
+        if found is None or found[1]["status"] == "abandoned":
+            return SessionState.ABSENT
+        _, revision = found
+        if revision["status"] == "committed":
+            seen = revision["number"] <= self._view.at
+            return SessionState.COMMITTED if seen else SessionState.ABSENT
+        return SessionState.OPEN if self._is_alive(revision) else SessionState.INTERRUPTED
+
+    def interrupted(self) -> list[InterruptedSession]:
+        """Sessions whose writer is gone before it committed, oldest first."""
+        query = select(revisions).where(revisions.c.status == "open").order_by(revisions.c.key)
+        with self._database.reading() as connection:
+            opened = list(verified(revisions, connection.execute(query)))
+            gone = [row for row in opened if not self._is_alive(row)]
+            return [
+                one for row in gone for one in interrupted_sessions(connection, row, self._view.at)
+            ]
+
+    def check(self) -> CheckReport:
+        """Verify the whole file to the last byte; `check_map` also takes one that does not open."""
+        return check(self._database)
+
+    def forget(self) -> None:
+        """Read anew, when next asked for, what has been read of this map."""
+        with self._contents_lock:
+            self._contents = None
+            self._derived.clear()
+            for name in (*_SMALL, "sessions"):
+                self.__dict__.pop(name, None)
+
+    def _look_from(self, view: View) -> None:
+        """See the map as of another revision; the graph and the paths stay as they have grown."""
+        self._view = view
+        for name in _SMALL if self._contents else (*_SMALL, "sessions"):
+            self.__dict__.pop(name, None)
+        self.frames.set_view(view)
+
+    def _read(self, load: Callable[[Connection, View], _T]) -> _T:
+        with self._database.reading() as connection:
+            return load(connection, self._view)
+
+    def _read_contents(self) -> _Contents:
+        with self._contents_lock:
+            if self._contents is None:
+                found = self.load()
+                self._contents = _Contents.of(found)
+                # Attempts name sessions by their places: those of the same moment.
+                self.__dict__["sessions"] = {one.id: one for one in found.sessions}
+            return self._contents
+
+    def _is_alive(self, revision: Row) -> bool:
+        holder = self._database.writer()
+        return holder is not None and holder.token == revision["writer"]
