@@ -19,15 +19,14 @@ from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.files import Holder
 from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
-from engram.graph.clock import check_zone
 from engram.graph.model import (
     Amendable,
-    Amendment,
     NodeId,
     Session,
     SessionId,
 )
 from engram.maps import reading
+from engram.maps.amending import checked_amendments
 from engram.maps.database import Database, Lock, Place
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 from engram.maps.hiding import Reverted, compare, hide_revision
@@ -46,10 +45,10 @@ from engram.maps.revisions import (
     session_and_revision,
     stored_session,
 )
-from engram.maps.rows import START, Row, checked_text, sealed, session_from_row, to_json
+from engram.maps.rows import Row, checked_text, sealed, session_from_row, to_json
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, map_path
-from engram.maps.tags import Tag, checked_tag, load_tags, resolve, write_tag
+from engram.maps.tags import Tag, set_tag, take_tag_away
 from engram.maps.view import View, head
 from engram.maps.words import words_row, write_words
 from engram.maps.writer import RevisionWriter
@@ -420,7 +419,9 @@ class Map(MapReader):
             RevisionError: a session is being written.
             StorageFullError: no space; the map is as it was.
         """
-        now = self._checked_amendments(session, changes)
+        if session not in self.sessions:
+            raise InputError(f"{self.location} has no session {session}")
+        now = checked_amendments(self.sessions[session], changes, time.time_ns())
         with self.begin_revision(
             author=author,
             message=message or f"amend {', '.join(now)} of session {session}",
@@ -455,26 +456,10 @@ class Map(MapReader):
             InputError: the name cannot be one.
             RevisionError: there is no such revision, or another one has the name.
         """
-        checked_tag(name)
         with self._database.writing() as connection:
-            number = resolve(connection, named, self._database.name)
-            if number == 0:
-                newest = resolve(connection, None, self._database.name)
-                raise RevisionError(
-                    f"{self._database.name} has revisions 1 to {newest}; 0 is before the first and "
-                    "cannot be tagged"
-                    if newest
-                    else f"{self._database.name} has no revision yet to tag"
-                )
-            known = load_tags(connection).get(name)
-            if known is not None and known.number != number and not move:
-                raise RevisionError(
-                    f"revision {known.number} of {self._database.name} is tagged {name!r} already; "
-                    "choose another name, or move the tag"
-                )
-            if known is None or known.number != number:
-                write_tag(connection, self._keys, name, number, author, message)
-            return load_tags(connection)[name]
+            return set_tag(
+                connection, self._keys, self.location, name, named, author, message, move=move
+            )
 
     @_writes
     def untag(self, name: str, *, author: str) -> Tag:
@@ -484,12 +469,7 @@ class Map(MapReader):
             RevisionError: there is no such tag.
         """
         with self._database.writing() as connection:
-            known = load_tags(connection)
-            if name not in known:
-                told = ", ".join(known) or "none"
-                raise RevisionError(f"{self._database.name} has no tag {name!r}; its tags: {told}")
-            write_tag(connection, self._keys, name, None, author, "")
-        return known[name]
+            return take_tag_away(connection, self._keys, self.location, name, author)
 
     @_writes
     def clean(self) -> int:
@@ -507,27 +487,6 @@ class Map(MapReader):
             super().close()
         finally:
             self._release()
-
-    def _checked_amendments(
-        self, session: SessionId, changes: Mapping[Amendable, str]
-    ) -> dict[Amendable, Amendment]:
-        """Those that change something."""
-        if session not in self.sessions:
-            raise InputError(f"{self.location} has no session {session}")
-        shown, now_ns = self.sessions[session], time.time_ns()
-        found = {}
-        for what, value in changes.items():
-            checked_text(value, what)
-            if what is Amendable.ZONE:
-                check_zone(value)
-            if not value or (what is Amendable.START and not START.fullmatch(value)):
-                raise InputError(f"{value!r} cannot be the {what} of a session")
-            amendment = Amendment(session, what, value, now_ns)
-            if amendment.applied(shown) != shown:
-                found[what] = amendment
-        if not found:
-            raise InputError(f"session {session} is so already: there is nothing to amend")
-        return found
 
     @property
     def _holder(self) -> Holder:

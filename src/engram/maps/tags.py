@@ -92,21 +92,56 @@ def _number(connection: Connection, named: str, newest: int, where: str) -> int:
     return known[base].number - back
 
 
-def checked_tag(name: str) -> str:
-    """A name that a tag may have.
+def set_tag(
+    connection: Connection,
+    keys: KeyBook,
+    where: str,
+    name: str,
+    named: int | str | None,
+    author: str,
+    message: str,
+    *,
+    move: bool,
+) -> Tag:
+    """See `Map.tag`; `where` is the map's name, for messages."""
+    _check_tag(name)
+    number = resolve(connection, named, where)
+    if number == 0:
+        newest = head(connection)
+        raise RevisionError(
+            f"{where} has revisions 1 to {newest}; 0 is before the first and cannot be tagged"
+            if newest
+            else f"{where} has no revision yet to tag"
+        )
+    known = load_tags(connection).get(name)
+    if known is not None and known.number != number and not move:
+        raise RevisionError(
+            f"revision {known.number} of {where} is tagged {name!r} already; choose another name, "
+            "or move the tag"
+        )
+    if known is None or known.number != number:
+        _write_tag(connection, keys, name, number, author, message)
+    return load_tags(connection)[name]
 
-    Raises:
-        InputError: it may not.
-    """
+
+def take_tag_away(connection: Connection, keys: KeyBook, where: str, name: str, author: str) -> Tag:
+    """See `Map.untag`; `where` is the map's name, for messages."""
+    known = load_tags(connection)
+    if name not in known:
+        raise RevisionError(f"{where} has no tag {name!r}; its tags: {', '.join(known) or 'none'}")
+    _write_tag(connection, keys, name, None, author, "")
+    return known[name]
+
+
+def _check_tag(name: str) -> None:
     if not _TAG.fullmatch(name) or name.lower() == HEAD:
         raise InputError(
             f"{name!r} cannot be a tag: a letter, then letters, digits and . _ / + -, 100 at "
             f"most, and not {HEAD!r}"
         )
-    return name
 
 
-def write_tag(
+def _write_tag(
     connection: Connection, keys: KeyBook, name: str, number: int | None, author: str, message: str
 ) -> None:
     """A name for a revision, or with None the name taken away."""

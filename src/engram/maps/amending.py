@@ -1,0 +1,34 @@
+"""What may be set right about a session."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from engram.errors import InputError
+from engram.graph.clock import check_zone
+from engram.graph.model import Amendable, Amendment, Session
+from engram.maps.rows import START, checked_text
+
+
+def checked_amendments(
+    shown: Session, changes: Mapping[Amendable, str], now_ns: int
+) -> dict[Amendable, Amendment]:
+    """Those that change what is shown of a session.
+
+    Raises:
+        InputError: none does, or a value cannot be one.
+        ConfigError: the zone is unknown.
+    """
+    found = {}
+    for what, value in changes.items():
+        checked_text(value, what)
+        if what is Amendable.ZONE:
+            check_zone(value)
+        if not value or (what is Amendable.START and not START.fullmatch(value)):
+            raise InputError(f"{value!r} cannot be the {what} of a session")
+        amendment = Amendment(shown.id, what, value, now_ns)
+        if amendment.applied(shown) != shown:
+            found[what] = amendment
+    if not found:
+        raise InputError(f"session {shown.id} is so already: there is nothing to amend")
+    return found
