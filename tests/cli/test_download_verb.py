@@ -30,7 +30,7 @@ def test_it_writes_a_map_and_says_what_it_promises(engram, centre: Path, tmp_pat
     assert told["nodes"] == told["of_nodes"] > 0
     assert engram("info", out, "--json").json["content_hash"] == told["content_hash"]
     text = engram("download", centre, tmp_path / "r2.engram", "--select", "copy").out
-    assert "expected share of the way without a match" in text
+    assert "expected share of the route without a match" in text
 
 
 def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: Path) -> None:

@@ -148,7 +148,7 @@ def test_a_build_that_began_with_the_best_first_goes_on_as_such(tmp_path, logs, 
     with pytest.raises(KilledError):
         build(centre, logs, "ab", judge=by)
     monkeypatch.setattr(building, "merge", merge)
-    with pytest.raises(ConfigError, match="which was found otherwise"):
+    with pytest.raises(ConfigError, match="which other options found"):
         build(centre, logs, "ab", judge=judge(logs["held-out"]))
     report = build(centre, logs, "ab", judge=by)
     assert report.best.tried is Orders.FIRST

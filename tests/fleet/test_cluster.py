@@ -142,8 +142,8 @@ def test_a_scheduler_that_is_lost_is_told(scheduler, tmp_path, logs, monkeypatch
 @pytest.mark.parametrize(
     ("address", "says"),
     [
-        ("nonsense", "'nonsense' is no address of a scheduler"),
-        ("carrier-pigeon://10.0.0.5:8786", "is no address of a scheduler"),
+        ("nonsense", "'nonsense' is not a valid scheduler address"),
+        ("carrier-pigeon://10.0.0.5:8786", "is not a valid scheduler address"),
         ("tcp://127.0.0.1:1", "does not answer"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Building a map fast: groups mapped side by side, then merged one after another (SPEC §7)."""
+"""Building a map in parallel: groups are mapped side by side, then merged in turn (SPEC §7)."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ class BuildOptions:
     """How a map is built.
 
     Attributes:
-        workers: processes of this machine at a time.
+        workers: parallel processes on this machine.
         groups: how many the drives are split into.
         grouping: key of `GROUPINGS`, or path of a file of groups.
         seed: of the grouping.
         mapping: how each drive is mapped.
         merging: how the groups' maps are merged.
-        scheduler: address of a Dask scheduler in place of processes of this machine.
-        judge: how the best order of merging is found; None merges in the order of the groups.
+        scheduler: address of a Dask scheduler; None to use processes on this machine.
+        judge: how the best order of merging is found; None to merge in the order of the groups.
     """
 
     workers: int = 2
@@ -63,23 +63,22 @@ class BuildOptions:
         if self.workers < 1:
             raise ConfigError(f"build: {self.workers} workers, must be 1 or more")
         if self.mapping.deadline_ms is not None:
-            raise ConfigError("a build has budgets by count: a deadline would give chance maps")
+            raise ConfigError("a build needs budgets by count; maps by deadline are not repeatable")
 
 
 @dataclass(slots=True)
 class BuildReport:
-    """What a build came to.
+    """The result of a build.
 
     Attributes:
         centre: the map.
-        left_out: names of the drives that the centre had before.
+        left_out: names of the drives that the fleet map has already.
         groups: names of the drives of each group, in the order of merging.
-        mapped: what mapping each group came to.
-        merges: one report per merge of this run; the first group's map becomes a centre that is
-            new.
+        mapped: the result of mapping each group.
+        merges: one report per merge of this run; the first group's map becomes a new fleet map.
         merged_before_s: time of the merges of earlier runs of this build, seconds.
-        best: how the order was found, where that was asked.
-        notes: what somebody should look at.
+        best: how the order was found; None if it was given.
+        notes: warnings.
         interrupted: whether it was stopped; the same command goes on.
         content_hash: of the map.
         seconds: wall time of this run.
@@ -108,23 +107,23 @@ class BuildReport:
 
     @property
     def parallel_s(self) -> float:
-        """Time with a worker per group: the slowest group, then the merges one after another."""
+        """Wall time with a worker per group: the slowest group, then all merges, seconds."""
         slowest = max((one.seconds for one in self.mapped), default=0.0)
         return slowest + self.merged_s
 
     @property
     def merged_s(self) -> float:
-        """Time of all merges, those of earlier runs too."""
+        """Wall time of all merges, those of earlier runs included, seconds."""
         return self.merged_before_s + sum(one.seconds for one in self.merges)
 
     def text(self) -> str:
-        """For people."""
+        """The report as text."""
         if self.interrupted:
-            return "interrupted: what was done is kept; give the same command to go on"
+            return "interrupted: finished work is kept; run the same command to continue"
         lines = []
         if self.left_out:
             known = ", ".join(self.left_out)
-            lines.append(f"left out, since {self.centre} has them already: {known}")
+            lines.append(f"left out, already in {self.centre}: {known}")
         if not self.groups:
             return "\n".join([*lines, f"{self.centre}: nothing new; content {self.content_hash}"])
         for names, one in zip(self.groups, self.mapped, strict=True):
@@ -144,7 +143,7 @@ class BuildReport:
         return "\n".join(lines)
 
     def _costs(self) -> str:
-        """What trying orders cost, beside the models of all of them."""
+        """The cost of trying orders, compared with the cost models."""
         assert self.best is not None
         mapped_s = sum(one.seconds for one in self.mapped)
         group_s = mapped_s / len(self.mapped)
@@ -152,13 +151,13 @@ class BuildReport:
         copy_s = self.best.spent.copy_s / max(self.best.spent.copies, 1)
         spent_s = mapped_s + self.best.spent.merge_s + self.best.spent.copy_s
         took = (
-            f"  mapping, and merging in {len(self.best.results)} orders, took {spent_s:.1f} s "
+            f"  mapping and trying {len(self.best.results)} orders took {spent_s:.1f} s "
             f"(T_G {group_s:.1f} s, T_M {merge_s:.1f} s, T_C {copy_s:.2f} s)"
         )
         if self.best.tried is not Orders.ALL:
             return took
         if self.best.rooted:
-            return f"{took}; the models of it are of centres that are new"
+            return f"{took}; the cost models apply to new fleet maps only"
         costs = order_costs(len(self.mapped), group_s, merge_s, copy_s)
         return (
             f"{took}: {spent_s / costs.sequential_s:.2%} of building each order "
@@ -177,28 +176,28 @@ def build_map(
     keep: bool = False,
     monitor: Monitor = QUIET,
 ) -> BuildReport:
-    """Maps groups of drives side by side and merges them into a centre.
+    """Maps groups of drives side by side and merges them into a fleet map.
 
-    Intermediate maps lie in ``CENTRE.build`` beside the centre until the build is complete: the
-    same call after an interruption goes on from there, and comes to the same map. A centre that
-    exists takes in all groups, and the drives that it has are left out (not those of which it has
-    a part of the path only); one that does not exist begins as the first group's map.
+    Intermediate maps are kept in ``CENTRE.build`` beside the fleet map until the build is complete:
+    the same call after an interruption continues from there and gives the same map. An existing
+    fleet map takes all groups, without the drives that it has in full. A new one begins as the
+    first group's map.
 
     Args:
         centre: NAME.engram.
         drives: paths or fsspec URLs of frame logs or images.
         settings: the resolved configuration.
-        options: how.
-        keep: leave the groups' maps, until the next build into this centre.
-        monitor: hears how it goes.
+        options: workers, groups, mapping and merging.
+        keep: keep the groups' maps until the next build into this fleet map.
+        monitor: receives progress.
 
     Raises:
         ConfigError: the groups do not fit the drives, another build lies there unfinished, there
             are too many groups for all orders, or a drive that judges them is not held out.
-        InputError: the folder of the centre is not there.
-        MapLockedError: somebody else builds into this centre.
-        WorkerError: workers died again and again.
-        EngramError: a drive or a map cannot be used, or what is done not be kept.
+        InputError: the folder of the fleet map does not exist.
+        MapLockedError: another process builds into this fleet map.
+        WorkerError: workers died repeatedly.
+        EngramError: a drive or a map cannot be used, or the results cannot be stored.
     """
     started = time.perf_counter()
     check_parent(centre)
@@ -218,7 +217,7 @@ def _build(
     *,
     keep: bool,
 ) -> BuildReport:
-    """The build, where nobody else builds into the centre."""
+    """The build, under the lock of the fleet map."""
     scratch = Scratch(centre)
     known = _known_sessions(scratch)
     grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
@@ -258,7 +257,7 @@ def _look_at(sources: Sequence[str]) -> list[Drive]:
 
 
 def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
-    """The drives that the centre had when the build began, partial paths left aside."""
+    """The drives that the fleet map had in full when the build began."""
     if scratch.unfinished is not None:
         return frozenset(SessionId(UUID(one)) for one in scratch.unfinished.known)
     if not scratch.centre.exists():
@@ -269,8 +268,8 @@ def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
 
 
 def _check_judges(judge: JudgeOptions, drives: Sequence[Drive], centre: Path) -> None:
-    """Before hours of mapping: what judges the orders must be held out."""
-    mapped = [(one.session, f"{one.source}, which is to be built from") for one in drives]
+    """Checks before mapping, which takes hours, that the judging drives are held out."""
+    mapped = [(one.session, f"{one.source}, a drive of this build") for one in drives]
     if centre.exists():
         with Map.open(centre) as store:
             mapped += [(one, f"in {centre} already") for one in store.sessions.values()]
@@ -303,10 +302,10 @@ def _map_and_merge(
     monitor: Monitor,
     report: BuildReport,
 ) -> None:
-    """What a build comes to, as far as this run takes it.
+    """The build, as far as this run takes it.
 
     Raises:
-        KeyboardInterrupt: while groups were mapped or orders tried.
+        KeyboardInterrupt: the user stopped the mapping or the trying of orders.
     """
     mapped = _map(scratch, grouped, settings, options, monitor)
     begun = _settled_order(scratch, len(grouped), settings, options, monitor)
@@ -324,7 +323,7 @@ def _map(
     options: BuildOptions,
     monitor: Monitor,
 ) -> list[GroupResult]:
-    """Maps the groups that are not mapped yet; remembers how long each took."""
+    """Maps the groups that are not mapped yet, and stores their results."""
     tasks = [
         GroupTask(
             number, scratch.group(number), [one.source for one in group], settings, options.mapping
@@ -341,13 +340,13 @@ def _map(
             map_groups_on_cluster(missing, options.scheduler, stage, scratch.remember)
         else:
             _map_here(missing, options.workers, stage, scratch)
-        asked.check()  # also where the last groups were done as Ctrl-C was pressed
+        asked.check()  # Ctrl-C may have come while the last groups finished
     results = [scratch.result(task.number) for task in tasks]
     return [result for result in results if result is not None]
 
 
 def _map_here(tasks: Sequence[GroupTask], workers: int, monitor: Monitor, scratch: Scratch) -> None:
-    """Maps groups in processes of this machine."""
+    """Maps groups in processes on this machine."""
 
     def done(name: str, result: GroupResult, retries: int) -> None:
         del name
@@ -360,10 +359,10 @@ def _map_here(tasks: Sequence[GroupTask], workers: int, monitor: Monitor, scratc
 def _settled_order(
     scratch: Scratch, groups: int, settings: Settings, options: BuildOptions, monitor: Monitor
 ) -> MergingBegun:
-    """The order of merging, written down before the first merge: it is not changed half way.
+    """The order of merging, stored before the first merge so that it cannot change half way.
 
     Raises:
-        ConfigError: merging has begun in an order that was found otherwise.
+        ConfigError: merging has begun in an order that other options found.
     """
     judge = options.judge
     judged_by = None if judge is None else _judged_by(judge)
@@ -372,7 +371,7 @@ def _settled_order(
         if begun.judge != judged_by:
             raise ConfigError(
                 f"the groups of {scratch.folder} are being merged already, in the order "
-                f"{' '.join(map(str, begun.order))}, which was found otherwise; finish it with the "
+                f"{' '.join(map(str, begun.order))}, which other options found; finish it with the "
                 "same --order, --validate and build.max_gap_m, or delete the folder"
             )
         return begun
@@ -394,7 +393,7 @@ def _settled_order(
 
 
 def _judged_by(judge: JudgeOptions) -> str:
-    """How an order was found: by which judges, and among which orders."""
+    """Hash of the judging drives and the orders tried: the way in which an order was found."""
     return judge.hash() + ("" if judge.orders is Orders.ALL else f"-{judge.orders}")
 
 
@@ -408,8 +407,8 @@ def _merge(
 ) -> None:
     """Merges the groups' maps into the centre, in their order.
 
-    A centre that is there takes in all of them, also the first: an earlier run may have made it
-    as a copy of that, or somebody else meanwhile. Handing in again changes nothing.
+    An existing fleet map takes all of them, the first too: an earlier run may have made it as a
+    copy of that, or another process meanwhile. Merging again changes nothing.
     """
     order = begun.order
     if not scratch.centre.exists():
@@ -434,10 +433,10 @@ def _merge(
 
 
 def _not_as_judged(report: BuildReport) -> list[str]:
-    """Says so where the map is not the one by which its order was chosen."""
+    """Adds a note if the map is not the one that was judged."""
     if report.best is None or report.content_hash == report.best.results[0].content_hash:
         return []
     return [
         f"{report.centre} is not the map that was judged, content "
-        f"{report.best.results[0].content_hash}: somebody else wrote to it meanwhile"
+        f"{report.best.results[0].content_hash}: another process wrote to it meanwhile"
     ]

@@ -1,4 +1,4 @@
-"""Groups mapped on a Dask cluster: an extra, imported only where a scheduler is named."""
+"""Maps groups on a Dask cluster. Dask is an extra, imported only if a scheduler is given."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 _CONNECT_S = 30
 
-# A group's map and the last words on it, or what is wrong with a drive.
+# A group's map and result, or the error of a drive.
 _Outcome: TypeAlias = tuple[GroupResult, bytes, list[str]] | EngramError
 
 
 class _GivenUpError(Exception):
-    """In a worker: nobody waits for this group any more."""
+    """Raised in a worker: the client no longer waits for this group."""
 
 
 def map_groups_on_cluster(
@@ -35,29 +35,29 @@ def map_groups_on_cluster(
     monitor: Monitor,
     mapped: Callable[[GroupResult], None],
 ) -> None:
-    """Maps groups on the workers of a cluster, which read the drives by themselves.
+    """Maps groups on the workers of a cluster, which read the drives themselves.
 
-    Their maps come back through the scheduler's network, whole: no disk is shared.
+    Whole maps come back over the network: no shared disk is needed.
 
     Args:
         tasks: the groups.
         scheduler: address of the Dask scheduler.
-        monitor: hears of each frame; what its `check` raises ends the work, on the workers too.
-        mapped: told of each group that is done.
+        monitor: receives progress per frame; an exception of its `check` stops the workers too.
+        mapped: called with each finished group.
 
     Raises:
         MissingExtraError: Dask is not installed.
-        WorkerError: the scheduler cannot be reached or is lost, or a group's workers died again
-            and again.
+        WorkerError: the scheduler cannot be reached or is lost, or a group's workers died
+            repeatedly.
         EngramError: a group cannot be mapped.
     """
     heard: queue.SimpleQueue[list[str] | Future] = queue.SimpleQueue()
     topic = f"engram-build-{uuid4().hex}"
-    with _connected(scheduler) as client:  # whose end tells the workers that nobody waits for them
+    with _connected(scheduler) as client:  # closing it stops the workers
         client.subscribe_topic(topic, lambda event: heard.put(list(event[1])))
         groups: dict[Future, GroupTask] = {}
         for task in tasks:
-            # A pure function of its task, but what it does is work: each is submitted once.
+            # Not a cached pure function: each task is submitted once.
             future = client.submit(_map_on_worker, task, topic, pure=False, retries=MAX_RETRIES)
             groups[future] = task
             future.add_done_callback(heard.put)
@@ -78,13 +78,13 @@ def map_groups_on_cluster(
 
 
 def check_scheduler(scheduler: str) -> None:
-    """Asks a scheduler whether it is there, before anything is begun.
+    """Checks that a scheduler answers, before any work begins.
 
-    No client is made for that: one that was made in vain tries for half a minute to say goodbye.
+    Without a Dask client: one that fails to connect takes half a minute to close.
 
     Raises:
         MissingExtraError: Dask is not installed.
-        WorkerError: the address is none, or nobody answers there.
+        WorkerError: the address is not valid, or no scheduler answers there.
     """
     try:
         from distributed import Security
@@ -98,20 +98,20 @@ def check_scheduler(scheduler: str) -> None:
         await comm.close()
 
     try:
-        # On a thread of its own: the caller's may run an event loop, as in a notebook.
+        # On its own thread: the caller's may run an event loop, as in a notebook.
         with ThreadPoolExecutor(1) as thread:
             thread.submit(lambda: asyncio.run(greet())).result()
     except OSError as error:
         raise _silent(scheduler, error) from error
-    except Exception as error:  # each of Dask's ways to connect has errors of its own
+    except Exception as error:  # each of Dask's transports has its own errors
         raise WorkerError(
-            f"{scheduler!r} is no address of a scheduler that can be used ({error}); one is like "
+            f"{scheduler!r} is not a valid scheduler address ({error}); an example is "
             "tcp://10.0.0.5:8786"
         ) from error
 
 
 def _connected(scheduler: str) -> Client:
-    """A client of its own, which is nobody's default.
+    """A client of its own, not registered as Dask's default.
 
     Raises:
         MissingExtraError: Dask is not installed.
@@ -136,13 +136,13 @@ def _missing() -> MissingExtraError:
 
 def _silent(scheduler: str, error: Exception) -> WorkerError:
     return WorkerError(
-        f"the scheduler at {scheduler} does not answer ({error}); look whether it runs and can be "
+        f"the scheduler at {scheduler} does not answer ({error}); check that it runs and can be "
         "reached from here"
     )
 
 
 def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
-    """In the worker; errors of a drive come back as values, since they would only come again."""
+    """Runs in the worker. Errors of a drive are returned, not raised: a retry would repeat them."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -163,23 +163,23 @@ def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
 
 
 def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, bytes, list[str]]:
-    """What came of a group; its map is fetched from the worker.
+    """The result of a group; fetches its map from the worker.
 
     Raises:
-        WorkerError: nothing came, because of the cluster.
+        WorkerError: the cluster failed.
         EngramError: a drive cannot be mapped.
     """
     try:
         outcome: _Outcome = future.result()
     except CancelledError as error:
         raise WorkerError(
-            f"the scheduler at {scheduler} was lost, and group {group} with it ({error}); groups "
-            "that were done are kept: give the same command again"
+            f"the scheduler at {scheduler} was lost, and group {group} with it ({error}); finished "
+            "groups are kept: run the same command again"
         ) from error
-    except Exception as error:  # whatever Dask or a machine of the cluster may raise
+    except Exception as error:  # anything that Dask or a worker may raise
         raise WorkerError(
-            f"group {group} was not mapped on the cluster, whose workers try {MAX_RETRIES + 1} "
-            f"times: {type(error).__name__}: {error}; groups that were done are kept: give the "
+            f"group {group} was not mapped on the cluster after {MAX_RETRIES + 1} tries: "
+            f"{type(error).__name__}: {error}; finished groups are kept: run the "
             "same command again, with fewer workers if memory was short"
         ) from error
     if isinstance(outcome, EngramError):
@@ -188,9 +188,9 @@ def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, b
 
 
 def _keep(path: Path, content: bytes) -> None:
-    """The group's map, whole or not at all, in place of what another worker left half done."""
+    """Writes the group's map atomically, replacing one that another worker left unfinished."""
     with keeping(path.parent):
-        for suffix in ("-wal", "-shm"):  # another map's log would be taken for its own
+        for suffix in ("-wal", "-shm"):  # a log of another map would be applied to this one
             path.with_name(f"{path.name}{suffix}").unlink(missing_ok=True)
         with write_whole(path) as draft:
             draft.write_bytes(content)

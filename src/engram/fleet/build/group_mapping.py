@@ -1,4 +1,4 @@
-"""Mapping one group of sessions: what a worker of a build does."""
+"""Mapping one group of sessions: the work of one build worker."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ class GroupTask:
 
 @dataclass(slots=True)
 class GroupResult:
-    """What mapping a group came to.
+    """The result of mapping a group.
 
     Attributes:
         number: of the group.
         seconds: wall time of the runs that mapped it; the last run only, after a worker died.
-        cpu_s: processor time of the same.
-        sessions: one summary each, as of ``map --json``.
+        cpu_s: processor time of the same runs.
+        sessions: one summary each, as in ``map --json``.
         nodes: of the group's map.
-        retries: how often a worker died over it.
+        retries: number of workers that died on it.
     """
 
     number: int
@@ -57,14 +57,14 @@ class GroupResult:
 
 
 def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
-    """Maps a group's sessions into a map, which is made if there is none.
+    """Maps a group's sessions into a map, which is created if missing.
 
-    Sessions that the map holds are passed over; one that was interrupted is begun anew, so that a
-    group whose worker died comes out as it would have otherwise.
+    Sessions that the map holds are skipped. An interrupted session is mapped again from its start,
+    so the death of a worker does not change the result.
 
     Args:
         task: what to map, and where.
-        monitor: hears of each frame.
+        monitor: receives progress per frame.
 
     Raises:
         MapError: the map cannot be written.
@@ -77,9 +77,7 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
             store.resume_session(one.session.id).abandon()
     for source in task.sources:
         with fetched(source) as drive:
-            report = map_drive(
-                task.path, open_drive(drive), task.settings, task.options, monitor
-            )
+            report = map_drive(task.path, open_drive(drive), task.settings, task.options, monitor)
         if report.interrupted:
             raise KeyboardInterrupt
         result.sessions.append({"source": source, **report.to_dict()})
@@ -102,7 +100,7 @@ def map_group_far_away(task: GroupTask, monitor: Monitor = QUIET) -> tuple[Group
 
 @contextmanager
 def fetched(source: str) -> Iterator[Path]:
-    """Where a drive can be read here: its path, or a copy of what a URL names.
+    """Local path of a drive; one at a URL is copied.
 
     Raises:
         MissingExtraError: a URL, and fsspec is not installed.
@@ -122,6 +120,6 @@ def fetched(source: str) -> Iterator[Path]:
         try:
             files, path = fsspec.core.url_to_fs(source)
             files.get(path, str(copy), recursive=files.isdir(path))
-        except Exception as error:  # every kind of file system has errors of its own
+        except Exception as error:  # each file system has its own errors
             raise SequenceError(f"{source} cannot be fetched: {error}") from error
         yield copy

@@ -20,8 +20,8 @@ class Drive:
 
     Attributes:
         source: path or URL of its frame log or images.
-        session: as it will stand in the map.
-        frames: how many there are.
+        session: its record in the map.
+        frames: number of frames.
     """
 
     source: str
@@ -30,12 +30,12 @@ class Drive:
 
     @property
     def name(self) -> str:
-        """What a file of groups calls it."""
+        """Its name in a file of groups."""
         return PurePosixPath(self.source.rstrip("/")).name
 
 
 def look_at_drive(path: Path, source: str) -> Drive:
-    """What grouping needs to know of a drive.
+    """Reads what grouping needs of a drive.
 
     Args:
         path: where it can be read here.
@@ -60,9 +60,9 @@ def group_drives(
     Args:
         drives: all of them, each once.
         grouping: key of `GROUPINGS`, or path of a file of groups (`read_groups`).
-        groups: how many; of no account where a file says so.
+        groups: number of groups; ignored if a file gives them.
         seed: of `random`.
-        leave_out: sessions that go into no group; fewer drives than groups get one each.
+        leave_out: sessions to leave out; if fewer drives than groups remain, each is a group.
 
     Raises:
         ConfigError: more groups than drives, a drive twice, or a file that does not fit.
@@ -93,14 +93,14 @@ def read_groups(path: Path, drives: Sequence[Drive]) -> list[list[Drive]]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
-            f"grouping {str(path)!r} is none of {', '.join(GROUPINGS)} and cannot be read as a "
+            f"grouping {str(path)!r} is not one of {', '.join(GROUPINGS)}, and cannot be read as a "
             f"file of groups: {error}"
         ) from error
     named = [words for line in lines if (words := line.split("#")[0].split())]
     by_name = {drive.name: drive for drive in drives}
     names = [name for group in named for name in group]
     if len(by_name) < len(drives):
-        raise ConfigError("two drives have the same file name; a file of groups cannot tell them")
+        raise ConfigError("a file of groups needs drives with different file names; two are alike")
     if sorted(names) != sorted(by_name):
         missing, strange = sorted(set(by_name) - set(names)), sorted(set(names) - set(by_name))
         twice = sorted({name for name in names if names.count(name) > 1})
@@ -123,7 +123,7 @@ def _random(drives: Sequence[Drive], seed: int) -> list[Drive]:
 
 
 def _by_condition(drives: Sequence[Drive], seed: int) -> list[Drive]:
-    """By the light: from noon to midnight, morning and evening alike (SPEC §2.8)."""
+    """By light: distance from noon, so that morning and evening are alike (SPEC §2.8)."""
     del seed
     hours = [hour_of_day(drive.session, drive.session.start_ns) for drive in drives]
     unknown = [drive.name for drive, hour in zip(drives, hours, strict=True) if hour is None]
@@ -139,7 +139,7 @@ def _by_condition(drives: Sequence[Drive], seed: int) -> list[Drive]:
 
 
 def _split(ordered: Sequence[Drive], groups: int) -> list[list[Drive]]:
-    """Runs of the order, sizes within one."""
+    """Consecutive parts of the order, whose sizes differ by at most one."""
     size, larger = divmod(len(ordered), groups)
     borders = [0]
     for number in range(groups):

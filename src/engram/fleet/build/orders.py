@@ -1,4 +1,4 @@
-"""Orders of merging: which are tried, by what they are judged, how they fare, what trying costs.
+"""Orders of merging: which are tried, how they are judged, their results and costs.
 
 Source: [G16] §VI-E, eq. (8); SPEC §7.
 """
@@ -22,7 +22,7 @@ from engram.maps import Map
 from engram.measures import Drive
 from engram.robot import DriveSequence, RobotOptions, Settings, open_drive, session_of_drive
 
-# 5,040 orders of 7 groups are a matter of days.
+# 7 groups have 5,040 orders, which take days.
 _MOST_GROUPS = 6
 
 
@@ -38,7 +38,7 @@ class Orders(StrEnum):
         return left if self is Orders.ALL or not prefix else left[:1]
 
     def of(self, groups: int) -> int:
-        """How many orders there are."""
+        """Number of orders."""
         return math.factorial(groups) if self is Orders.ALL else groups
 
 
@@ -47,17 +47,17 @@ Localise: TypeAlias = Callable[[Map, DriveSequence, Settings, RobotOptions], Dri
 
 @dataclass(frozen=True, slots=True)
 class JudgeOptions:
-    """By what an order is judged.
+    """How an order is judged.
 
     Attributes:
-        drives: validation sessions; no part of the groups, and of no report of quality.
-        judge_at_m: distance x that the operator can bear on dead reckoning: the order with the
+        drives: validation sessions, held out of the groups and of every reported figure.
+        judge_at_m: longest acceptable distance x without a match, metres: the order with the
             lowest P(X ≥ x) is best.
         localising: policy and budget of the validation.
-        reported: further sessions, which choose nothing: how they fare tells how good the chosen
-            order is.
-        localise: how a drive is localised in a map; None for `measure`. Results that a
-            search finds from earlier are taken to be by the same.
+        reported: test sessions, not used for the choice: they measure the quality of the chosen
+            order.
+        localise: how a drive is localised in a map; None for `measure`. Stored results are
+            assumed to come from the same function.
         orders: which are tried.
     """
 
@@ -77,9 +77,9 @@ class JudgeOptions:
             raise ConfigError(f"judge_at_m is {self.judge_at_m}, must be finite and >= 0")
 
     def hash(self) -> str:
-        """Changes when any order could be judged otherwise: by drives, distance or localising.
+        """Hash of all that a judgement depends on: drives, distance, localising.
 
-        Not by which orders are tried: those that were judged need not be again.
+        It leaves out which orders are tried, so that known judgements are reused.
 
         Raises:
             SequenceError: a drive cannot be read.
@@ -92,11 +92,11 @@ class JudgeOptions:
 
 
 def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -> None:
-    """Refuses to judge a map by what it was made of, or by one drive twice.
+    """Refuses judging drives that are in a map, or given twice.
 
     Args:
         judge: the drives that must be held out.
-        mapped: the sessions that none of them must be, and where each is, in words.
+        mapped: the sessions of the maps, each with its place in words.
 
     Raises:
         ConfigError: a drive is not held out; names it.
@@ -109,21 +109,21 @@ def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -
         held = held_as(sequence, known)
         if held is not None:
             raise ConfigError(
-                f"{path} judges the orders of merging, but is {where[held.id]} (session {held.id} "
-                f"of {held.robot}); judge by drives that are in no map, and name each once"
+                f"{path} is given to --validate, but is {where[held.id]} (session {held.id} "
+                f"of {held.robot}); give drives that are in no map, each once"
             )
         known.append(session_of_drive(sequence))
         where[known[-1].id] = f"the same drive as {path}"
 
 
 def check_countable(groups: int, orders: Orders) -> None:
-    """Refuses more groups than all orders of them could be tried.
+    """Refuses more groups than orders can be tried for.
 
     Raises:
         ConfigError: there are too many, or none.
     """
     if groups < 1:
-        raise ConfigError("there are no groups to be merged in any order")
+        raise ConfigError("there are no groups to merge")
     if orders is Orders.ALL and groups > _MOST_GROUPS:
         raise ConfigError(
             f"{groups} groups have {math.factorial(groups):,} orders; at most {_MOST_GROUPS} "
@@ -133,18 +133,18 @@ def check_countable(groups: int, orders: Orders) -> None:
 
 @dataclass(frozen=True, slots=True)
 class OrderResult:
-    """One order and how the validation drives fare in its map.
+    """One order and the results of the validation drives in its map.
 
     Attributes:
         order: numbers of the groups.
         judged: P(X ≥ x) at the distance judged by.
         area_m: area under the failure curve to 50 m.
-        at_m: P(X ≥ x) at 5, 10 and 20 m, by distance.
+        at_m: P(X ≥ x) by distance x, at 5, 10 and 20 m.
         nodes: of the map.
         content_hash: of the map.
-        reported: P(X ≥ x) of the sessions that choose nothing, every half metre from 0 to 50;
-            empty where there are none.
-        reported_missed: share of their way without a match.
+        reported: P(X ≥ x) of the test sessions, every half metre from 0 to 50; empty
+            without such sessions.
+        reported_missed: share of their route without a match.
     """
 
     order: tuple[int, ...]
@@ -158,19 +158,19 @@ class OrderResult:
 
     @property
     def rank(self) -> tuple[float, float, tuple[int, ...]]:
-        """Best first; the order itself where two are alike."""
+        """Sort key: best first, ties by the order itself."""
         return self.judged, self.area_m, self.order
 
 
 @dataclass(frozen=True, slots=True)
 class Spent:
-    """What steps of the search took; those of earlier runs count like those of this one.
+    """Cost of the search, steps of earlier runs included.
 
     Attributes:
         merges, copies: made.
         merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
-        replayed, attempts, proposed, lookups: nodes that were replayed in merging, match attempts,
-            those of them at proposed nodes, and nodes for which the relocaliser was asked.
+        replayed, attempts, proposed, lookups: nodes replayed in merging, match attempts,
+            attempts at proposed nodes, and nodes for which the relocaliser ran.
     """
 
     merges: int = 0
@@ -189,14 +189,14 @@ class Spent:
 
 @dataclass(slots=True)
 class BestOrder:
-    """Orders of some groups, and how they fare.
+    """Orders of some groups, and their results.
 
     Attributes:
         results: one per order, best first.
-        judge_at_m: what they were judged by.
+        judge_at_m: distance x at which they were judged, metres.
         tried: which orders of the groups.
-        rooted: whether every order began with a centre that was there, not with its first group.
-        spent: in this search, in all its runs; what an interruption undid is counted once.
+        rooted: whether every order began with an existing fleet map, not with its first group.
+        spent: cost of this search over all its runs; work undone by an interruption counts once.
     """
 
     results: list[OrderResult] = field(default_factory=list)
@@ -207,11 +207,11 @@ class BestOrder:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """The best."""
+        """The best order: numbers of the groups."""
         return self.results[0].order
 
     def spread(self) -> dict[str, dict[str, float]]:
-        """P(X ≥ x) at 5, 10 and 20 m over the orders: least, median, most, and of the best."""
+        """P(X ≥ x) at 5, 10 and 20 m over the orders: lowest, median, highest, best order."""
         found = {}
         for at in self.results[0].at_m:
             values = [one.at_m[at] for one in self.results]
@@ -236,7 +236,7 @@ class BestOrder:
         }
 
     def text(self) -> str:
-        """For people."""
+        """The result as text."""
         told = " ".join(map(str, self.order))
         lines = [
             f"best of {len(self.results)} orders: {told}, P(no match within "
@@ -257,11 +257,11 @@ class OrderCosts:
     """What trying all orders costs, seconds.
 
     Attributes:
-        model_s: numerator of (8): every order's merges made afresh.
-        sequential_s: its denominator: every order built by mapping sequentially, but for the copy
-            of the first group.
-        tree_s: merges of a common prefix made once.
-        sequential_tree_s: sequential building that shares its prefixes likewise.
+        model_s: numerator of (8): all merges of every order.
+        sequential_s: its denominator: every order mapped sequentially, the first group
+            copied.
+        tree_s: the same as `model_s`, merges of a common prefix made once.
+        sequential_tree_s: the same as `sequential_s`, common prefixes mapped once.
     """
 
     model_s: float
@@ -275,9 +275,9 @@ def order_costs(groups: int, group_s: float, merge_s: float, copy_s: float) -> O
 
     Args:
         groups: k.
-        group_s: T_G, mapping one group.
-        merge_s: T_M, merging one group's map.
-        copy_s: T_C, copying an intermediate map.
+        group_s: T_G, mapping one group, seconds.
+        merge_s: T_M, merging one group's map, seconds.
+        copy_s: T_C, copying an intermediate map, seconds.
     """
     k, orders = groups, math.factorial(groups)
     inner = sum(orders // math.factorial(k - depth) for depth in range(2, k + 1))

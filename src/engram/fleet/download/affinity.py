@@ -1,6 +1,6 @@
-"""How well what one session saved serves drives like another.
+"""Affinity of sessions: how often nodes that one session saved match drives like another.
 
-Learnt from remembered attempts, and from the matches on a path where no attempts were kept.
+Estimated from remembered attempts, or from the matches on a path if no attempts were kept.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from engram.graph.model import PathEntryKind, path_id
 
 Array = NDArray[np.float64]
 
-# A first study of the towns: a map decays with the hour, inliers 138 to 28 within five hours.
+# Hours over which affinity falls to 1/e: inliers fall from 138 to 28 within five hours.
+# Source: lab/reports/constants-fleet.md.
 _DECAY_H = 5.0
 _HOUR_BINS = 13
-# So many attempts' worth of belief in the average, before a pair of sessions speaks for itself.
+# Pseudo-counts: the weight of each prior, in attempts.
 _PAIR_PRIOR = 4.0
 _HOUR_PRIOR = 20.0
 _WORTH_PRIOR = 20.0
@@ -28,11 +29,11 @@ _MOST = 0.98
 
 
 def affinities(stock: Stock, basin: MatchBasin) -> Array:
-    """(S, S) a(s, e): how well what session e saved serves one like session s, in (0, 1).
+    """(S, S) a(s, e): the affinity of a session like s to the nodes of session e, in (0, 1).
 
-    From remembered attempts, and from the matches on a path where no attempts were kept. What a
-    pair lacks is taken from the average for its difference in hours, and from how the others got
-    on with e: drives in rain or at night, with which nobody ever matched, serve nobody.
+    Estimated from remembered attempts, or from the matches on a path if no attempts were kept. A
+    pair with few attempts falls back on the average for its difference in hours, scaled by how
+    well e served the others. Thus drives in rain or at night that nobody matched get a low value.
     """
     count = len(stock.sessions)
     won, expected = tallies(stock, basin)
@@ -44,21 +45,21 @@ def affinities(stock: Stock, basin: MatchBasin) -> Array:
     average = np.where(known, by_hour[bins], _overall(won, expected, others))
     prior = np.minimum(average * _worth(won, expected * average, others), _MOST)
     found = (won + _PAIR_PRIOR * prior) / (expected + _PAIR_PRIOR)
-    # What a session saved itself was matched by nobody yet: it says little about the next drive in
-    # its light. With 0.8 the promise is nearer, and a quarter of the bytes worth less (`village`).
+    # No drive has tested a session's nodes on itself, so its own attempts say little about the
+    # # next drive in its light.
     found[~others] = _OWN_AFFINITY
     return np.asarray(np.clip(found, 1.0 - _MOST, _MOST))
 
 
 def _worth(won: Array, expected: Array, others: Mask) -> Array:
-    """(S,) how well what each session saved served the others, over the average of such pairs."""
+    """(S,) success of the others on each session's nodes, relative to the average of such pairs."""
     wins = np.where(others, won, 0.0).sum(axis=0)
     tries = np.where(others, expected, 0.0).sum(axis=0)
     return np.asarray((wins + _WORTH_PRIOR * _UNKNOWN_AFFINITY) / (tries + _WORTH_PRIOR))
 
 
 def tallies(stock: Stock, basin: MatchBasin) -> tuple[Array, Array]:
-    """(S, S) successes of s on nodes of e, and how many g alone would have given."""
+    """(S, S) successes of s on nodes of e, and the number that the basin g alone predicts."""
     count = len(stock.sessions)
     won, expected = np.zeros((count, count)), np.zeros((count, count))
     made = stock.attempts
@@ -79,7 +80,7 @@ def tallies(stock: Stock, basin: MatchBasin) -> tuple[Array, Array]:
 
 
 def hours_apart(stock: Stock) -> Array:
-    """(S, S) difference in hour of day, NaN where one is not known."""
+    """(S, S) difference in hour of day, 0 to 12 hours; NaN if either is unknown."""
     hours = np.array(
         [
             np.nan if (hour := hour_of_day(one, one.start_ns)) is None else hour
@@ -92,7 +93,7 @@ def hours_apart(stock: Stock) -> Array:
 
 
 def _by_hour(won: Array, expected: Array, apart: Array, others: Mask) -> Array:
-    """(13,) the average affinity of two sessions so many hours apart."""
+    """(13,) average affinity of two sessions by their difference in hours, 0 to 12."""
     prior = _MOST * np.exp(-np.arange(_HOUR_BINS) / _DECAY_H)
     counted = others & np.isfinite(apart)
     bins = apart[counted].round().astype(np.int64)

@@ -1,25 +1,22 @@
-"""What a subset of a map promises to a mission: the expected share of its way with a match.
+"""The expected share of a mission's route with a match, given a subset of a map.
 
-Past drives stand for the drive to come. Each went along places of the map and was, at each, in the
-light and weather of its own day. Whether a node would match there is told by two things: whether
-its session looks alike there at all, with probability a(s, e) for the past session s and the
-session e that saved the node; and, if so, whether this very attempt succeeds, with probability
-g(d) at the node's distance d. Nodes of one session look alike or do not together; given that they
-do, each is an attempt of its own; sessions are taken as independent:
+Past drives model the mission: each passed places of the map in the light and weather of its own
+day. A node matches there under two conditions. First, its session looks alike, with probability
+a(s, e) for the past session s and the session e that saved the node. Second, this attempt succeeds,
+with probability g(d) at the node's distance d, metres. The first event is common to all nodes of
+a session, the second is independent for each node, and sessions are independent of each other:
 
     P(match) = 1 − Π_e (1 − a(s, e) · (1 − Π_{n of e} (1 − g(d_n)))).
 
-Past drives count by how near in daylight they are to the mission (`daylight`), each with the
-places that it itself came past: a place that one drive alone came past counts as little as it.
+Each past drive is weighted by how closely its daylight resembles the mission's (`daylight`), and
+counts only at the places that it passed.
 
-a is learnt from remembered attempts (`affinity`): successes of s on nodes of e over what g alone
-would have given, held to the average for their difference in hour of day, and that to how others
-got on with e. g has the shape of the shipped basin. The one learnt from the map's attempts will
-not do here: far nodes are attempted where near ones have failed, so that it falls off a cliff.
+a is estimated from remembered attempts (`affinity`): the successes of s on nodes of e over the
+number that g alone predicts. g is the shipped basin. The basin learnt from the map's attempts is
+biased here, since far nodes are attempted only after near ones have failed.
 
-Adding a node never lowers P, and helps the less the more is there already (monotone and
-submodular), so taking the best node per byte again and again comes close to the best subset there
-is (Leskovec et al., "Cost-effective outbreak detection in networks", 2007).
+P is monotone and submodular in the set of nodes, so the greedy choice of the best node per byte is
+near-optimal (Leskovec et al., "Cost-effective outbreak detection in networks", 2007).
 """
 
 from __future__ import annotations
@@ -44,25 +41,26 @@ Array = NDArray[np.float64]
 
 # Places a metre apart, the spacing of saved nodes (SPEC §5).
 _PLACE_M = 1.0
-# Nodes farther than this share of the basin give nothing that counts.
+# Nodes farther than this many basin widths are ignored.
 _REACH = 2.0
 _GATE_RAD = float(np.deg2rad(60.0))
-# A node is near where it is expected: no slack.
+# Nodes lie near their expected position: no slack.
 _STRICT = SearchConfig(slack_sigmas=0.0, slack_m=0.0)
-# Attempts on nodes of one session that looks alike fail together oftener than by chance: P(second
-# matches | first did not) was 0.2 to 0.3 where g says 0.5 (`village`, 12 drives with all nodes).
+# Attempts on nodes of one session fail together more often than independent ones:
+# P(second matches | first did not) is 0.2 to 0.3 where g gives 0.5.
+# Source: lab/reports/constants-fleet.md.
 _APART = 0.6
 _LEAST_GAIN = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Demand:
-    """Where and as whom the mission may find itself.
+    """Where the mission may go, weighted by the past drives that model it.
 
     Attributes:
         places: (L,) dense indices of the nodes that stand for places.
-        weight: (L, S) how much being there as session s counts: the same at all places that the
-            session came past and the mission may come to, 0 elsewhere.
+        weight: (L, S) weight of being there as session s: the same at all places that the
+            session passed and the mission may reach, 0 elsewhere.
     """
 
     places: NDArray[np.int64]
@@ -70,7 +68,7 @@ class Demand:
 
     @property
     def total(self) -> float:
-        """What there is to miss."""
+        """Total weight of all places: the value of a mission without any match."""
         return float(self.weight.sum())
 
     @staticmethod
@@ -94,7 +92,7 @@ class Demand:
 
 
 def _places(stock: Stock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Nodes no closer to each other than a metre, and for each node the place that it is at."""
+    """Nodes at least a metre apart, and for each node the place that it is at."""
     place_of = np.full(len(stock), -1, np.int64)
     distance_m = np.full(len(stock), np.inf)
     places: list[int] = []
@@ -113,7 +111,7 @@ def _places(stock: Stock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 class Coverage:
-    """The expected share of a mission's way with a match, as nodes are added one by one.
+    """The expected share of a mission's route with a match, as nodes are added one by one.
 
     Args:
         stock: the centre.
@@ -133,14 +131,14 @@ class Coverage:
         self.clear()
 
     def clear(self) -> None:
-        """No node is sent any more."""
+        """Empties the subset."""
         # (L, S): weight × the chance of no match so far.
         self._missed = self.demand.weight.copy()
-        # (L, S_e): the chance that a node of session e that was added matches, if they look alike.
+        # (L, S_e): the chance that an added node of session e matches, if they look alike.
         self._alike = np.zeros(self.demand.weight.shape)
 
     def _reach(self, stock: Stock, basin: MatchBasin) -> dict[int, tuple[NDArray[np.int64], Array]]:
-        """For each node the places that it may be matched at, and g there."""
+        """For each node the places at which it may match, and g there."""
         found: dict[int, tuple[list[int], list[float]]] = defaultdict(lambda: ([], []))
         wanted = np.flatnonzero(self.demand.weight.sum(axis=1) > 0)
         for place in wanted.tolist():
@@ -157,7 +155,7 @@ class Coverage:
         return {node: (np.array(at), np.array(g)) for node, (at, g) in found.items()}
 
     def gain(self, node: int) -> float:
-        """By how many places the expected number with a match would rise."""
+        """Increase in the expected number of places with a match if the node were added."""
         if node not in self._reached:
             return 0.0
         places, rates, before = self._state(node)
@@ -165,7 +163,7 @@ class Coverage:
         return float((missed * (1 - self._less(node, rates, before))).sum())
 
     def add(self, node: int) -> None:
-        """The node is sent."""
+        """Adds a node to the subset."""
         if node not in self._reached:
             return
         places, rates, before = self._state(node)
@@ -173,7 +171,7 @@ class Coverage:
         self._alike[places, self._session_of[node]] = _either(rates, before)
 
     def _less(self, node: int, rates: Array, before: Array) -> Array:
-        """(K, S) by what factor the chance of no match falls at the places that a node reaches."""
+        """(K, S) factor on the chance of no match at the K places that a node reaches."""
         affinity = self._affinity[:, self._session_of[node]]
         now = _either(rates, before)
         return np.asarray((1 - affinity * now[:, None]) / (1 - affinity * before[:, None]))
@@ -184,15 +182,15 @@ class Coverage:
 
     @property
     def expected_missed(self) -> float:
-        """Expected share of the mission's way without a match, of what was added so far.
+        """Expected share of the mission's route without a match, given the nodes added so far.
 
-        1 where the mission has no way at all.
+        1 if the mission has no route at all.
         """
         return float(self._missed.sum() / self.demand.total) if self.demand.total else 1.0
 
 
 def _either(first: Array, second: Array) -> Array:
-    """The chance that one of two things happens."""
+    """P(A or B) of independent events."""
     return 1 - (1 - first) * (1 - second)
 
 
@@ -207,14 +205,14 @@ def expected_missed(coverage: Coverage, sent: Mask) -> float:
 def greedy_order(
     coverage: Coverage, size_bytes: Array, spare: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """(N,) all nodes: by gain per byte, each given those before it; then what nothing asks for.
+    """(N,) all nodes: by gain per byte, each given those before it; then those without gain.
 
-    Lazy: gains only fall, so a node whose gain is still the highest after it was worked out anew
-    is the best. Ties go to the lower index.
+    Lazy: gains only fall, so a node whose recomputed gain is still the highest is the best. Ties go
+    to the lower index.
 
     Args:
-        coverage: of the mission; what it holds is replaced.
-        size_bytes: (N,) what each node takes.
+        coverage: of the mission; its subset is replaced.
+        size_bytes: (N,) float64, size of each node.
         spare: (N,) all nodes in the order in which they fill up what is left.
     """
     coverage.clear()

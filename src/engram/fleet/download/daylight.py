@@ -1,11 +1,9 @@
-"""How well past drives stand for a mission: by the hour of day, and by the height of the sun.
+"""Weights of past drives for a mission, by the hour of day and the height of the sun.
 
-The same hour is day in June and night in November, so drives of other seasons are told by how high
-the sun stood. That takes a latitude, which maps do not hold; but they hold which drives got on with
-what which others had saved, and that hangs on light: the latitude is the one under which
-differences in the sun's height explain those successes best. It need not be exact. Where they do
-not explain them better than hours do (drives of one month, none at night, none remembered), the
-hour alone decides.
+The same hour is day in June and night in November, so drives of other seasons are compared by the
+height of the sun. Maps hold no latitude. It is estimated as the one under which differences in the
+sun's height best explain which sessions matched which nodes. It need not be exact. If hours explain
+the successes as well (drives of one month, none at night, no attempts), only the hour counts.
 """
 
 from __future__ import annotations
@@ -25,40 +23,37 @@ from engram.graph.sun import day_of_year, sun_height_deg
 
 Array = NDArray[np.float64]
 
-# A drive three hours away counts 60 % of one at the same hour, any a little: the hour does not tell
-# the weather. Chosen on one fold of `village` among 1.5 and 3 h, 0.02, 0.1 and 0.3.
+# A drive three hours away counts 60 % of one at the same hour, and every drive a little, since the
+# hour does not determine the weather. Source: lab/reports/constants-fleet.md.
 _MISSION_H = 3.0
 _LEAST_WEIGHT = 0.1
-# Where the sun's height is known the hour tells only on which side it stands. Chosen on drives 12
-# to 23 of `village@2`, each in the map of those before it, among sd 10° and 15°, with the hour and
-# without.
+# Standard deviations if the sun's height is known: the hour then only separates morning from
+# evening. Source: lab/reports/constants-fleet.md.
 _SUN_DEG = 10.0
 _SIDE_H = 4.0
 _LEAST_SIDE = 0.3
 _LEAST_SUN_WEIGHT = 0.05
-# Heights beyond these are all the same.
+# Heights are clipped to these.
 _NIGHT_DEG, _NOON_DEG = -10.0, 45.0
-# What decides whether two sessions match at all: from civil dusk to a low sun. Within these the
-# heights explain successes far better than hours do (log likelihood -409 against -533 on
-# `village@2`, whose sun they place at 52.5° of true 51.8°), up to 45° they do not (-538).
+# The range of heights that decides whether two sessions match at all: from civil dusk to a low sun.
+# Source: lab/reports/constants-fleet.md.
 _DUSK_DEG, _LOW_DEG = -6.0, 10.0
 _LATITUDES_DEG = (-60.0, -52.5, -45.0, -37.5, -30.0, -15.0, 0.0, 15.0, 30.0, 37.5, 45.0, 52.5, 60.0)
-# So many attempts of one pair of sessions speak; the rest are of the same light again.
+# Most attempts of one pair of sessions that count: more repeat the same light.
 _PAIR_ATTEMPTS = 20.0
-# Hours apart beyond this count as this.
+# Differences in hours are clipped to this.
 _FAR_H = 8.0
-# By how much its log likelihood must be better than that of the difference in hours. It was 27 and
-# more on `village@2` once there were drives at night; where only drives that got on with each other
-# are remembered (a fold of `village`), any latitude explains them as badly, and worse than hours.
+# Least advantage in log likelihood over the model by hours, for which a latitude is accepted.
+# Source: lab/reports/constants-fleet.md.
 _LEAST_EVIDENCE = 10.0
-# Sessions of which most is remembered: the fit grows with their cube.
+# Most sessions in the fit, those with most attempts first: its cost grows with their cube.
 _JUDGED_SESSIONS = 120
 _ROUNDS = 15
 _PRIORS = (0.01, 0.04, 1.0)  # precisions: level, slope, each session's own
 
 
 def importance(stock: Stock, options: DownloadOptions) -> Array:
-    """(S,) how much each past session counts for a mission; 1 each where no time is said."""
+    """(S,) weight of each past session for a mission; all 1 if the mission has no time."""
     if options.start_h is None:
         return np.ones(len(stock.sessions))
     hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
@@ -73,20 +68,20 @@ def importance(stock: Stock, options: DownloadOptions) -> Array:
 
 
 def latitude_of(stock: Stock, options: DownloadOptions) -> float | None:
-    """Where the fleet drives: as said, else as its drives' successes tell; None if they do not."""
+    """Latitude of the fleet: as given, else estimated from successes; None if they do not tell."""
     if options.latitude_deg is not None:
         return options.latitude_deg
     return learnt_latitude(stock)
 
 
 def learnt_latitude(stock: Stock) -> float | None:
-    """The latitude under which the sun's height explains best who got on with whose nodes.
+    """The latitude under which the sun's height best explains which sessions matched which nodes.
 
-    For each latitude a logistic model of the successes of every pair of sessions is fitted: a term
-    for each of the two, and one for how far apart the sun stood.
+    For each latitude, a logistic model of the successes of all pairs of sessions is fitted, with a
+    term for each of the two and one for their difference in the sun's height.
 
     Returns:
-        Degrees, one of a dozen; None where hours explain it as well.
+        Degrees, one of a dozen; None if hours explain the successes as well.
     """
     if not stock.sessions:
         return None
@@ -112,7 +107,7 @@ def learnt_latitude(stock: Stock) -> float | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """Successes of sessions on the nodes of others: receiver, donor, how many of how many."""
+    """Successes of sessions on nodes of others: receiver, donor, successes, attempts."""
 
     sessions: int
     receiver: NDArray[np.intp]
@@ -129,10 +124,10 @@ class _Pairs:
         return _Pairs(len(won), receiver, donor, share * count, count)
 
     def fit(self, apart: Array) -> tuple[float, float]:
-        """Penalised log likelihood, and how fast successes fall, by Newton's method.
+        """Penalised log likelihood, and the slope of the successes, by Newton's method.
 
         Args:
-            apart: (S, S) how different two sessions are, about 0 to 1.
+            apart: (S, S) difference of two sessions, about 0 to 1.
         """
         rows = np.arange(len(self.tried))
         terms = np.zeros((len(rows), 2 + 2 * self.sessions))
@@ -155,7 +150,7 @@ class _Pairs:
 
 
 def _near_in_hours(hours: Array, options: DownloadOptions, spread_h: float) -> Array:
-    """(S,) 1 within the mission's hours, falling off with the distance from them; 0 if unknown."""
+    """(S,) 1 within the mission's hours, falling with the distance from them; 0 if unknown."""
     assert options.start_h is not None
     end_h = options.start_h if options.end_h is None else options.end_h
     length_h = (end_h - options.start_h) % 24

@@ -1,8 +1,8 @@
 """DOWNLOAD: a smaller map for one robot and one mission, complete in itself (SPEC §7, [G16] §V-B).
 
-The same revision of the same centre and the same options give the same bytes: records go in in an
-order that only their content decides, the revision bears the time of the centre's newest one and
-no host, and the file is compacted at the end.
+The same revision of the same fleet map and the same options give the same bytes: the order of
+records depends only on their content, the revision carries the time of the fleet map's newest one
+and no host, and the file is compacted at the end.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ from engram.graph.model import Edge, PathId, path_id
 from engram.maps import Map, RevisionWriter, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
-# What a node takes beside its blobs: rows and indices of it, its edges and path entries; measured
-# on maps of `hamlet`. Only where the search for the budget begins: the file itself is measured.
+# Bytes of a node beside its blobs: rows and indices of it, its edges and path entries. Only the
+# start of the search for a budget: the file is measured. Source: lab/reports/constants-fleet.md.
 _ROWS_BYTES = 2500
 _PAGE_BYTES = 4096
 _TRIES = 8
-# A try that leaves less than this free is good enough.
+# A file that leaves less than this share of the budget free ends the search.
 _FULL_ENOUGH = 0.99
-# So full a file is aimed at.
+# The share of the budget that the search aims at.
 _AIM = 0.995
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DownloadReport:
-    """What was sent, and what it promises.
+    """What was sent, and its forecast.
 
     Attributes:
         out: the file.
-        policy: by which it was chosen.
+        policy: key of `SELECTIONS`.
         revision: of the centre.
-        source_hash, content_hash: of the centre and of what was sent.
+        source_hash, content_hash: of the fleet map and of the file.
         nodes, of_nodes: sent, and all.
-        sessions, partial_paths: sent; how many paths left entries behind.
+        sessions, partial_paths: sent; paths of which entries were left out.
         edges, bridges: sent; how many of them were composed.
-        components: of what was sent; the centre joins the same nodes into as many.
-        size_bytes, of_bytes: of the file, and of the centre's.
-        why: what the policy found out.
-        expected_missed, copy_missed: expected share of the mission's way without a match, with
-            what was sent and with everything.
+        components: connected components; as many as the same nodes have in the fleet map.
+        size_bytes, of_bytes: of the file, and of the fleet map's.
+        why: facts of the policy, as plain data.
+        expected_missed, copy_missed: expected share of the mission's route without a match,
+            with the nodes sent and with all nodes.
     """
 
     out: Path
@@ -81,7 +81,7 @@ class DownloadReport:
         return values
 
     def text(self) -> str:
-        """For people."""
+        """The report as text."""
         share = self.nodes / self.of_nodes if self.of_nodes else 1.0
         lost = self.expected_missed - self.copy_missed
         lines = [
@@ -89,9 +89,9 @@ class DownloadReport:
             f"{self.size_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB, "
             f"of revision {self.revision}",
             f"{self.sessions} sessions, {self.edges} edges ({self.bridges} bridges), "
-            f"{self.components} components, {self.partial_paths} paths in part",
-            f"expected share of the way without a match: {self.expected_missed:.1%} "
-            f"({self.copy_missed:.1%} with everything, {lost:+.1%} by what is left out)",
+            f"{self.components} components, {self.partial_paths} partial paths",
+            f"expected share of the route without a match: {self.expected_missed:.1%} "
+            f"({self.copy_missed:.1%} with all nodes: {lost:+.1%} from nodes left out)",
         ]
         if self.why.get("epochs"):
             lines.append(
@@ -100,13 +100,11 @@ class DownloadReport:
             )
         if everything_bytes := self.why.get("everything_bytes"):
             lines.append(
-                f"{self.size_bytes / everything_bytes:.1%} of the {everything_bytes / 1e6:.1f} MB "
-                "that all nodes take, sent alike"
+                f"{self.size_bytes / everything_bytes:.1%} of a full download in the same form "
+                f"({everything_bytes / 1e6:.1f} MB)"
             )
         if self.why.get("nodes_without_hour"):
-            lines.append(
-                f"{self.why['nodes_without_hour']} nodes have no known hour of day and stayed"
-            )
+            lines.append(f"{self.why['nodes_without_hour']} nodes left out: hour of day unknown")
         return "\n".join(lines)
 
 
@@ -118,21 +116,21 @@ def download(
     at: int | str | None = None,
     monitor: Monitor = QUIET,
 ) -> DownloadReport:
-    """Write a part of a centre as a map of its own.
+    """Writes a part of a fleet map as a map of its own.
 
     Args:
-        centre: the map, or its address.
+        centre: the fleet map, or its address.
         out: NAME.engram, which must not be there yet.
         options: which part.
-        at: revision of the centre; None for the newest.
+        at: revision of the fleet map; None for the newest.
         monitor: hears of each node that is written.
 
     Raises:
-        ConfigError: an option is missing, out of range, or means nothing to the policy.
-        InputError: nothing fits the options, or `out` exists already.
-        MapError: the centre cannot be read, or `out` not be written.
+        ConfigError: an option is missing, out of range, or not used by the policy.
+        InputError: no node fits the options, or `out` exists.
+        MapError: the fleet map cannot be read, or `out` cannot be written.
 
-    Whatever is raised, `out` is not there: it gets its name last of all.
+    After any error `out` does not exist: the file is renamed to it last.
     """
     check_options(options)
     if out.exists() or out.is_symlink():
@@ -165,7 +163,7 @@ class _Sent:
 def _fitting(
     stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, monitor: Monitor
 ) -> _Sent:
-    """Write the draft; for a budget as many nodes as fit, found by writing and measuring."""
+    """Writes the draft; for a budget, with as many nodes as fit."""
     if selection.order is None:
         return _write_draft(stock, selection, options, folder, monitor)
     landmarks, thumbnails = stock.sizes
@@ -193,21 +191,21 @@ def _fitting(
 def most_that_fit(
     measure: Callable[[int], int], expected_bytes: NDArray[np.float64], budget_bytes: int
 ) -> int:
-    """How many nodes fit into a budget, found by writing files and measuring them.
+    """Finds how many nodes fit into a budget, by writing files and measuring them.
 
-    Every file holds something that does not shrink with the nodes: vocabulary, statistics. How much
-    is learnt from the file of one node. From there on sizes are taken to grow as expected, until
-    one file was too large; then as a line from the largest that fits to the smallest that does not.
+    The file of one node gives the fixed size: vocabulary, statistics. Sizes are then predicted from
+    `expected_bytes` until a file is too large, and after that by a line from the largest file that
+    fits to the smallest that does not.
 
     Args:
-        measure: writes the file of the first so many nodes and returns its bytes.
-        expected_bytes: (N,) what the first 1, 2, … N nodes are expected to take; rises.
-        budget_bytes: what the file may take.
+        measure: writes the file of the first n nodes and returns its size, bytes.
+        expected_bytes: (N,) expected size of the first 1, 2, … N nodes; rising.
+        budget_bytes: largest size of the file.
 
     Raises:
         InputError: not even one node fits.
 
-    Source: regula falsi, with the Illinois algorithm's halving where one end stays (Dowell and
+    Source: regula falsi, with the Illinois algorithm's halving if one end stays (Dowell and
     Jarratt, BIT 11, 1971): sizes bend where later nodes bring fewer edges.
     """
     fits, fits_bytes = 1, measure(1)
@@ -296,7 +294,7 @@ def _write(
     options: DownloadOptions,
     monitor: Monitor,
 ) -> None:
-    """All that belongs to the nodes that are sent, owners first."""
+    """All records of the sent nodes, owners first."""
     _write_sessions(writer, stock, sent)
     nodes = [stock.nodes[at] for at in np.flatnonzero(sent)]
     for stored in stock.store.frames.stored(nodes):
@@ -320,7 +318,7 @@ def _write(
 
 
 def _write_sessions(writer: RevisionWriter, stock: Stock, sent: Mask) -> None:
-    """Those that saved, passed or tried what is sent; all for a whole map."""
+    """Sessions that saved, passed or attempted a sent node; all for a whole map."""
     frontends = stock.store.frontends
     partial = _partial_paths(stock, sent)
     wanted = _sessions_of(stock, sent)
@@ -355,13 +353,13 @@ def _sessions_of(stock: Stock, sent: Mask) -> Mask:
 
 
 def _partial_paths(stock: Stock, sent: Mask) -> set[PathId]:
-    """Paths of which some entries stay, here or before."""
+    """Paths of which some entries are left out, now or by an earlier download."""
     left = {path for path, nodes in stock.on_path.items() if not sent[nodes].all()}
     return left | set(stock.store.partial_paths)
 
 
 def _attempts_between(stock: Stock, sent: Mask) -> NDArray[np.intp]:
-    """Rows of attempts whose both ends are sent."""
+    """Rows of attempts of which both nodes are sent."""
     made = stock.attempts
     return np.flatnonzero(sent[made.reference] & sent[made.node])
 
@@ -382,7 +380,7 @@ def _report(
     out: Path,
     options: DownloadOptions,
 ) -> DownloadReport:
-    """What was written to a file that is to be called `out`."""
+    """The report of a file that will be named `out`."""
     sent = done.selection.sent
     with Map.open(file) as written:
         info = written.info()

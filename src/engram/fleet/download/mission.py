@@ -1,4 +1,4 @@
-"""What a robot asks of the centre before it sets out: when, where, and how much it can carry."""
+"""A mission: when and where a robot drives, and how much map it can carry."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ _Minutes = Annotated[float, Meta(ge=0, le=720)]
 
 @dataclass(frozen=True, slots=True)
 class DownloadOptions:
-    """What to download; kept with the map that is sent.
+    """What to download; stored in the map that is sent.
 
     Attributes:
         policy: key of `SELECTIONS`.
         start_h, end_h: the mission's hours of day; None if not given.
-        day: the mission's date, "2026-11-17"; None for that of the centre's newest drive. It tells
-            how high the sun stands at those hours.
-        latitude_deg: where the fleet drives, north positive; None to learn it from which drives
-            matched which nodes.
+        day: the mission's date, "2026-11-17"; None for that of the fleet map's newest drive. It
+            gives the height of the sun at those hours.
+        latitude_deg: where the fleet drives, north positive; None to estimate it from which
+            sessions matched which nodes.
         window_min: `tod`: how far a node's time of day may be from the mission's start, minutes.
             180: [G16] §VI-D.
         epoch_min: `paths`: length Δt of an epoch, minutes. 60: SPEC §7.
         best_percent: `paths`: share of the paths of each epoch that is sent. 50: [G16] §VI-D.
         buffer_min: widens the mission at both ends, minutes.
-        budget_bytes: `budget`: what the file may take.
-        budget_percent: `budget`: the same as a share of what all nodes would take.
+        budget_bytes: `budget`: largest size of the file.
+        budget_percent: `budget`: the same, in per cent of a file with all nodes.
         near: `region`: beginnings of UUIDs of nodes.
-        route: `route`, and `budget` if it is to serve one: beginning of the UUID of a session
-            that drove it.
+        route: `route`, and optionally `budget`: beginning of the UUID of a session that
+            drove it.
         radius_m: of regions and routes, along the edges, metres.
-        thumbnails: whether pictures for people go along; None for all policies but `budget`.
+        thumbnails: whether thumbnails are sent; None for all policies but `budget`.
     """
 
     policy: str = "copy"
@@ -75,7 +75,7 @@ class DownloadOptions:
 
     @property
     def with_thumbnails(self) -> bool:
-        """Whether pictures for people go along."""
+        """Whether thumbnails are sent."""
         return self.policy != "budget" if self.thumbnails is None else self.thumbnails
 
 
@@ -83,7 +83,7 @@ def hour_from_text(text: str | None, name: str) -> float | None:
     """Hour of day of "9", "9:30" or "09:30"; None of None.
 
     Raises:
-        ConfigError: it is no time of day.
+        ConfigError: the text is not a time of day.
     """
     if text is None:
         return None
@@ -94,10 +94,12 @@ def hour_from_text(text: str | None, name: str) -> float | None:
 
 
 def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
-    """Bytes of "200MB", "1.5 GiB" or "4096", or per cent of "25%"; the other is None, both of None.
+    """Bytes of "200MB", "1.5 GiB" or "4096", or per cent of "25%"; the other is None.
+
+    Both are None if `text` is.
 
     Raises:
-        ConfigError: it is neither a size nor a share.
+        ConfigError: the text is neither a size nor a share.
     """
     if text is None:
         return None, None

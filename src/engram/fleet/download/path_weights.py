@@ -16,7 +16,7 @@ from engram.errors import InputError
 from engram.graph.model import PathId
 
 MINUTES_PER_DAY = 1440.0
-# A stamp on a boundary may come out a hair before it: 60 µs are within no frame's exposure.
+# Minutes (60 µs): rounding may put a stamp on a boundary just before it.
 _ROUNDING_MIN = 1e-6
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathCounts:
-    """PCM: how many nodes of each path stem from each epoch of the day (Algorithm 2).
+    """PCM: number of nodes of each path by epoch of the day (Algorithm 2).
 
     Attributes:
         paths: in the order of their UUIDs.
@@ -43,9 +43,9 @@ class PathCounts:
         return np.asarray(self.counts / np.maximum(totals, 1), np.float64)
 
     def best(self, epoch: int, percent: float) -> list[int]:
-        """The best share of an epoch's paths, as rows: those with most nodes, ties by UUID.
+        """Rows of the best share of an epoch's paths: those with most nodes, ties by UUID.
 
-        Of n paths with any node in the epoch max(1, ⌈percent·n/100⌉); none of none.
+        Of n > 0 paths with a node in the epoch, max(1, ⌈percent·n/100⌉).
         """
         column = self.counts[:, epoch]
         used = sorted(np.flatnonzero(column).tolist(), key=lambda row: (-int(column[row]), row))
@@ -100,11 +100,11 @@ def mission_epochs(
     end_h: float | None,
     buffer_min: float = 0.0,
 ) -> list[int]:
-    """The epochs of a mission in which there is data. [G16] Algorithm 3, lines 1 to 6; SPEC §7.
+    """The epochs of a mission that have data. [G16] Algorithm 3, lines 1 to 6; SPEC §7.
 
-    A start that is missing or lies before the first epoch with data becomes that epoch, an end
-    that is missing or lies after the last one becomes that. A start later than the end runs over
-    midnight, and nothing is clamped. The buffer widens what was said before all this.
+    A start that is missing or before the first epoch with data becomes that epoch; an end that is
+    missing or after the last one becomes that one. A start later than the end runs over midnight
+    and is not clamped. The buffer is applied first.
 
     Raises:
         InputError: no epoch of the mission has data.
@@ -133,7 +133,7 @@ def _between(
     epoch_min: float,
     filled: NDArray[np.intp],
 ) -> list[int]:
-    """The mission's epochs in the order in which it passes them."""
+    """The mission's epochs in the order of time."""
     if start_h is not None and end_h is not None:
         span_min = (end_h - start_h) * 60 % MINUTES_PER_DAY + 2 * buffer_min
         start_min = (start_h * 60 - buffer_min) % MINUTES_PER_DAY
@@ -158,7 +158,7 @@ def _over_midnight(start_min: float, span_min: float, epoch_min: float) -> list[
 
 
 def _epoch_at(hour: float | None, shift_min: float, epoch_min: float) -> int | None:
-    """The epoch of a time of day, shifted within its day; None of None."""
+    """The epoch of a time of day, shifted within its day; None if `hour` is."""
     if hour is None:
         return None
     minutes = min(max(hour * 60 + shift_min, 0.0), MINUTES_PER_DAY)

@@ -19,20 +19,20 @@ from engram.graph.model import PathId, path_id
 from engram.maps.difference import edge_lengths
 
 _HOURS = 24.0
-# Hours are told by clocks to the nanosecond; what is left over is rounding.
+# Stamps are exact to the nanosecond; this covers rounding, hours.
 _ROUNDING_H = 1e-9
 _DEFAULTS = asdict(DownloadOptions())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
-    """The nodes of a download, and why.
+    """The nodes of a download.
 
     Attributes:
-        sent: (N,) which nodes of the stock are sent.
-        why: what the policy found out, plain data.
-        order: for `budget`: nodes by what they promise, of which a beginning is sent; else None.
-        coverage: what the mission needs, where the policy went by it; else None.
+        sent: (N,) bool, which nodes of the stock are sent.
+        why: facts of the policy, as plain data.
+        order: for `budget`: (N,) nodes by gain, of which a first part is sent; else None.
+        coverage: the forecast that the policy used; else None.
     """
 
     sent: Mask
@@ -45,7 +45,7 @@ Policy: TypeAlias = Callable[[Stock, DownloadOptions], Selection]
 
 
 def select_copy(stock: Stock, _: DownloadOptions) -> Selection:
-    """Everything. [G16] (3)."""
+    """All nodes. [G16] (3)."""
     return Selection(stock.everything(), {})
 
 
@@ -73,7 +73,7 @@ def select_tod_and_paths(stock: Stock, options: DownloadOptions) -> Selection:
 
 
 def select_region(stock: Stock, options: DownloadOptions) -> Selection:
-    """What lies around some nodes, along the edges."""
+    """Nodes within `radius_m` of some nodes, along the edges."""
     if not options.near:
         raise ConfigError("policy region needs --near NODE, the beginning of a node's UUID")
     seeds = [stock.named_node(prefix) for prefix in options.near]
@@ -81,14 +81,14 @@ def select_region(stock: Stock, options: DownloadOptions) -> Selection:
 
 
 def select_route(stock: Stock, options: DownloadOptions) -> Selection:
-    """What lies along the way of one session, along the edges."""
+    """Nodes within `radius_m` of the path of one session, along the edges."""
     if options.route is None:
         raise ConfigError("policy route needs --route SESSION, the beginning of a session's UUID")
     return Selection(along_route(stock, options.route, options.radius_m), {})
 
 
 def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
-    """Nodes in the order in which they promise to spare the mission most failures per byte.
+    """Nodes by the failures that they are expected to spare the mission, per byte.
 
     How many of them fit into the budget is found when the map is written.
     """
@@ -113,8 +113,7 @@ SELECTIONS: dict[str, Policy] = {
     "budget": select_budget,
 }
 
-# What each policy goes by, beside when the mission is, for which every forecast is made, and
-# whether thumbnails go along.
+# The options that each policy uses. All use the mission's time (for the forecast) and `thumbnails`.
 UNDERSTOOD: dict[str, frozenset[str]] = {
     "copy": frozenset(),
     "tod": frozenset(),
@@ -130,16 +129,16 @@ _FLAGS = {
     "near": "--near",
     "route": "--route",
 }
-# Where a mission may have an end and no beginning: it begins with the first epoch that has data.
+# Policies whose mission may have an end and no start: it starts with the first epoch with data.
 _OPEN_START = frozenset({"paths", "tod+paths"})
 
 
 def check_options(options: DownloadOptions) -> None:
-    """Refuses what a policy would pass over in silence.
+    """Refuses options that a policy would ignore.
 
     Raises:
-        ConfigError: the policy is unknown, or an option that is not its default means nothing to it
-            or nothing without another one.
+        ConfigError: the policy is unknown, does not use an option that was given, or lacks another
+            option that it needs with it.
     """
     policy = options.policy
     if policy not in SELECTIONS:
@@ -164,7 +163,7 @@ def _check_where(options: DownloadOptions) -> None:
 
 
 def _check_no_mission(options: DownloadOptions) -> None:
-    """What tells more of a mission's time says nothing where it has none."""
+    """Refuses options about a mission's time if it has no start."""
     if options.end_h is not None and options.policy not in _OPEN_START:
         raise ConfigError(f"selection {options.policy} needs --depart with --arrive")
     if options.day is not None:
@@ -172,7 +171,7 @@ def _check_no_mission(options: DownloadOptions) -> None:
 
 
 def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
-    """What a mission is expected to need, and what each node gives it."""
+    """The forecast for a mission: what it is expected to need, and what each node adds."""
     where = None
     if options.route is not None:
         where = along_route(stock, options.route, options.radius_m)
@@ -182,7 +181,7 @@ def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
 
 
 def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
-    """(N,) the nodes within a distance of any seed, along the edges."""
+    """(N,) bool, the nodes within a distance of any seed, along the edges."""
     distance_m = dijkstra(
         edge_lengths(stock.graph), directed=False, indices=seeds, min_only=True, limit=radius_m
     )
@@ -190,15 +189,15 @@ def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
 
 
 def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
-    """(N,) the nodes within a distance of the way of a session.
+    """(N,) bool, the nodes within a distance of a session's path, along the edges.
 
     Raises:
-        InputError: no session, or several, begin so, or it came past no node.
+        InputError: no session or several match the prefix, or its path has no node.
     """
     found = stock.named_session(session)
     seeds = stock.on_path.get(path_id(found.id))
     if seeds is None:
-        raise InputError(f"session {found.id} of {found.robot} came past no node of the map")
+        raise InputError(f"session {found.id} of {found.robot} has no node on its path")
     return within(stock, np.unique(seeds), radius_m)
 
 
@@ -237,7 +236,7 @@ def _nodes_on(stock: Stock, paths: list[PathId]) -> Mask:
 
 
 def _spare_order(stock: Stock, options: DownloadOptions) -> NDArray[np.int64]:
-    """All nodes, those nearest in time of day first: for room that nothing else asks for."""
+    """All nodes, those nearest in time of day first: they fill the rest of a budget."""
     if options.start_h is None:
         return np.arange(len(stock))
     apart = np.abs(stock.hours - options.start_h)
