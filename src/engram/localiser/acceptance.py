@@ -20,35 +20,25 @@ from engram.graph.neighbourhood import Neighbourhood
 class AcceptanceConfig:
     """When a match counts as a localisation.
 
-    What is said below of lost robots was judged on 1,050 frames of five `village` drives, each
-    matched with the nodes near it (4,500 right matches) and the likeliest others (50,000 wrong).
+    Source of the values: SPEC §3, and trials on simulated drives (`lab/reports/constants.md`).
 
     Attributes:
-        min_inliers: fewest inliers. Source: SPEC §3, 20.
-        min_inliers_lost: fewest inliers where no prediction speaks for the match: a wrong place
-            must not pass. The best wrong match that passes the two tests below had 46 there, and
-            50 in another town.
-        min_inliers_plausible: fewest inliers of a lost robot's match that is believed once a second
-            one, some way on, agrees with it (`Hypotheses`).
-        min_spread_lost: least share of the image over which the inliers spread where no prediction
-            speaks for the match. One facade's windows or one car match as well as two views of one
-            place. 0.5 % of the right matches have less than 0.28.
-        min_height_lost: least share over which they spread there of the height over which all
-            landmarks of the frame do. Parked cars of one make, and the texture of a road, are found
-            in many streets, and are low. Of 1,233 other right matches of 35 to 80 inliers 2.4 %
-            have less than 0.4. A share, since indoors everything is low.
-        reach_m: how far from a node a robot without a prediction may be found. A straight road is
-            recognised from 30 m away, but a robot found there is outside the neighbourhood of the
-            node, and would be lost again. Source: SPEC §3, search radius 8 m.
-        max_sigma_m: how uncertain the position of a match may be (root of the summed variances).
-            A match that hangs on few or distant landmarks tells the heading at best: of 1,220
-            such matches of five `village@2` drives 235 were more than 1 m off, of 39,600 others
-            1.5 %. None of them was the only match of more than 0.05 % of the route.
-        slack_m, slack_rad: disagreement with the prediction that is forgiven on top of three
-            standard deviations. They were 1 m and 10° at first. Of 83,471
-            unguided matches of five `village@2` drives that were accepted so, 298 were more than
-            1 m or 5° off; with these two 102 are, and 84 right ones are lost. Between 0.5 and 1 m
-            two matches of three are wrong, however many inliers they have.
+        min_inliers: fewest inliers of a match with a prediction.
+        min_inliers_lost: fewest inliers of a match without a prediction; above every wrong match
+            that passes the other tests.
+        min_inliers_plausible: fewest inliers of a lost robot's match that counts only after a
+            second match farther along agrees with it (`Hypotheses`).
+        min_spread_lost: least share of the image that the inliers of a match without a prediction
+            cover. One facade or one car is not a place.
+        min_height_lost: least vertical extent of these inliers, as a share of that of all
+            landmarks in the frame. Parked cars and road texture recur in many streets, and are
+            low. A share, because indoors everything is low.
+        reach_m: farthest from a node that a robot without a prediction may be found, metres. A
+            robot found beyond the search radius of the node would be lost again.
+        max_sigma_m: largest uncertainty of a match's position (root of the summed variances),
+            metres. A match on few or distant landmarks determines the heading at best.
+        slack_m, slack_rad: disagreement with the prediction allowed beyond three standard
+            deviations. At larger values most additional matches are wrong.
     """
 
     min_inliers: int = 20
@@ -73,8 +63,8 @@ class Prediction:
     """Where the live camera is expected, seen from one candidate node.
 
     Attributes:
-        node_from_live: expected pose.
-        sigma_m, sigma_yaw_rad: its standard deviations.
+        node_from_live: expected pose of the live camera in the node's camera.
+        sigma_m, sigma_yaw_rad: its standard deviations of position and heading.
     """
 
     node_from_live: SE3
@@ -83,7 +73,7 @@ class Prediction:
 
     @staticmethod
     def of(neighbourhood: Neighbourhood, row: int) -> Prediction:
-        """That of one candidate of a neighbourhood."""
+        """The prediction for one candidate, a row of a neighbourhood."""
         matrix = neighbourhood.node_from_live[row]
         return Prediction(
             SE3(matrix[:3, :3], matrix[:3, 3]),
@@ -94,12 +84,12 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How much of what the cameras see agrees: first to last tenth of a match's inliers.
+    """Extent of a match's inliers, from their 10th to their 90th percentile.
 
     Attributes:
-        image: share of the image, the geometric mean of that of the width and that of the height.
+        image: share of the image: geometric mean of the shares of its width and its height.
         height: extent along the camera's y axis, as a share of that of all landmarks of the frame.
-        depth_m: how far in front of the camera their median is.
+        depth_m: median depth in front of the camera, metres.
     """
 
     image: float
@@ -108,7 +98,7 @@ class Spread:
 
 
 def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bool:
-    """Whether a match is a localisation: enough inliers, where it was expected, and certain.
+    """Whether a match is a localisation: enough inliers, the expected pose, low uncertainty.
 
     Args:
         match: the match of the live frame with one node.
@@ -121,31 +111,31 @@ def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bo
 
 
 def agrees(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig) -> bool:
-    """Whether a pose is where it was expected."""
+    """Whether a pose lies within three standard deviations and the slack of its prediction."""
     predicted = prediction.node_from_live
     apart_m = node_from_live.translation - predicted.translation
     if apart_m @ apart_m > (config.slack_m + 3 * prediction.sigma_m) ** 2:
         return False
-    # tr(PᵀF) is the sum of the products of their entries; its angle as in SE3.angle_rad, which is
-    # exacter near 0 and slower: evaluations come by here a hundred million times.
+    # tr(PᵀF) is the sum of the products of their entries. SE3.angle_rad is more exact near 0 but
+    # slower, and evaluations call this most often.
     cosine = 0.5 * (float(np.vdot(predicted.rotation, node_from_live.rotation)) - 1.0)
     turn_rad = math.acos(min(max(cosine, -1.0), 1.0))
     return turn_rad <= config.slack_rad + 3 * prediction.sigma_yaw_rad
 
 
 def accept_lost(match: Match, spread: Callable[[], Spread], config: AcceptanceConfig) -> bool:
-    """Whether a match is a localisation though nothing was expected.
+    """Whether a match without a prediction is a localisation.
 
     Args:
         match: the match of the live frame with one node.
-        spread: gives `inlier_spread` of the match; asked only where it decides.
+        spread: computes `inlier_spread` of the match; called only if it decides.
         config: the thresholds.
     """
     return match.inliers >= config.min_inliers_lost and plausible(match, spread, config)
 
 
 def plausible(match: Match, spread: Callable[[], Spread], config: AcceptanceConfig) -> bool:
-    """Whether a match would be a localisation if a second one agreed with it."""
+    """Whether a match without a prediction would be a localisation if a second one agreed."""
     pose = match.reference_from_live
     if pose is None or match.inliers < config.min_inliers_plausible:
         return False
@@ -156,14 +146,14 @@ def plausible(match: Match, spread: Callable[[], Spread], config: AcceptanceConf
 
 
 def _certain(match: Match, config: AcceptanceConfig) -> bool:
-    """Whether a match that has a pose says well enough where the robot is."""
+    """Whether the position of a match that has a pose is certain enough."""
     assert match.covariance is not None
     x, y, z = match.covariance.diagonal()[:3].tolist()
     return bool(x + y + z <= config.max_sigma_m**2)
 
 
 def inlier_spread(match: Match, reference: Frame, live: Frame) -> Spread:
-    """Over how much the inliers spread, the smaller of the two images'."""
+    """The extent of a match's inliers; of each measure, the smaller of the two frames."""
     if match.inliers == 0:
         return Spread(0.0, 0.0, 0.0)
     spreads = []
@@ -179,7 +169,7 @@ def inlier_spread(match: Match, reference: Frame, live: Frame) -> Spread:
 
 
 def _extent(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """From the first to the last tenth, along the first axis."""
+    """From the 10th to the 90th percentile, along the first axis."""
     low, high = np.percentile(values, [10, 90], axis=0)
     extent: NDArray[np.floating] = high - low
     return extent

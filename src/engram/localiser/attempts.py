@@ -1,4 +1,4 @@
-"""Match attempts: whether the live frame matches with a node, and whether that is believed."""
+"""Match attempts: matching the live frame with a node, and accepting the match."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Candidate:
         index: its dense index in the experience graph.
         node: its UUID.
         prediction: where the live camera is expected; None when relocalising.
-        guided: whether matching uses the prediction (a named step of its own, SPEC §3.2).
+        guided: whether matching uses the prediction (SPEC §3.2).
         row: its row in the neighbourhood; None when relocalising.
-        doubted: whether the prediction may be wrong: the robot is lost, and knows its place by no
-            nodes of its own.
+        doubted: whether the prediction may be wrong: the robot is lost, and has no nodes of its
+            own that confirm its position.
     """
 
     index: int
@@ -50,15 +50,15 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """What became of one attempt.
+    """The outcome of one attempt.
 
     Attributes:
-        candidate: what was attempted.
+        candidate: the attempted node.
         rank: its place in the order, from 0.
-        match: with what it has in common with the live frame.
-        accepted: whether that is a localisation.
-        plausible: whether it would be one if another frame agreed; only of lost robots.
-        damaged: whether the node's landmarks could not be read, so that there is nothing to match.
+        match: its match with the live frame.
+        accepted: whether the match is a localisation.
+        plausible: whether it would be one if another frame agreed; only for lost robots.
+        damaged: whether the node's landmarks are unreadable, which leaves nothing to match.
     """
 
     candidate: Candidate
@@ -74,7 +74,7 @@ class Matcher(Protocol):
 
     @property
     def threads(self) -> bool:
-        """Whether attempts gain by running on threads of their own."""
+        """Whether attempts run faster on separate threads."""
         ...
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
@@ -86,7 +86,7 @@ class Matcher(Protocol):
         ...
 
     def prefetch(self, nodes: list[NodeId]) -> None:
-        """Hint that these are likely to be matched next. Returns at once."""
+        """Announces the nodes likely to be matched next. Returns at once."""
         ...
 
 
@@ -96,8 +96,8 @@ class FrameMatcher:
     Args:
         frames: the landmarks.
         config: settings.
-        threads: see `Matcher`. Not where processes share the cores anyway: every hand-over waits
-            for its turn there.
+        threads: see `Matcher`. False if other processes use the cores: each hand-over between
+            threads would wait for a core.
     """
 
     def __init__(
@@ -148,18 +148,18 @@ class Attempter:
         self._matcher = matcher
 
     def prefetch(self, nodes: list[NodeId]) -> None:
-        """Hint that these are likely to be attempted next."""
+        """Announces the nodes likely to be attempted next."""
         (self._frames if self._matcher is None else self._matcher).prefetch(nodes)
 
     def attempt(self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate) -> Outcome:
         """The outcome of matching one candidate.
 
-        A node whose landmarks are damaged is passed over, and its outcome says so: a robot can do
-        without one node of its map.
+        A node with damaged landmarks is reported in its outcome instead of raising: a robot can
+        do without one node of its map.
 
         Args:
             live: the live frame.
-            live_id: its UUID, which with the node's seeds the matcher.
+            live_id: its UUID; with the node's UUID it seeds the matcher.
             rank: place of the candidate in the order.
             candidate: what to attempt.
         """
@@ -200,13 +200,13 @@ class Attempter:
 
 
 def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64] | None]:
-    """The pose by which matching is guided, and its (6, 6) covariance."""
+    """The pose that guides matching, and its (6, 6) covariance."""
     if guide is None:
         return None, None
     return guide.node_from_live, np.diag([guide.sigma_m**2] * 3 + [guide.sigma_yaw_rad**2] * 3)
 
 
 def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:
-    """The success with the most inliers; among equals the one that ranked higher (SPEC §3.2)."""
+    """The accepted outcome with the most inliers, then the best rank (SPEC §3.2)."""
     successes = [outcome for outcome in outcomes if outcome.accepted]
     return min(successes, key=lambda o: (-o.match.inliers, o.rank), default=None)

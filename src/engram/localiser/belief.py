@@ -1,13 +1,13 @@
 """Where a lost robot may be, judged by several frames: a Bayes filter over the nodes of a graph.
 
-One frame may look like several places, several frames along a stretch of road seldom do. Each
-frame's evidence is added to what the frames before it said, carried along the edges of the graph by
-odometry; a failed match attempt speaks against its node and those beside it. The filter keeps the
+One frame may look like several places; several frames along a stretch of road seldom do. The filter
+adds each frame's evidence to that of earlier frames, which odometry carries along the edges of the
+graph. A failed match attempt counts against its node and the nodes beside it. The filter keeps the
 best explanation of each node (Viterbi), not the sum over all: a sum over paths would favour nodes
-with many edges. What it yields is an order for attempts: only a match is believed.
+with many edges. It only orders the attempts; a match decides.
 
-Evidence is counted in standard deviations over all nodes. Likelihoods of FAB-MAP take neighbouring
-features as independent and differ by hundreds between places; taken as they are, the first frame
+Evidence is measured in standard deviations over all nodes. FAB-MAP treats neighbouring features as
+independent, so its log-likelihoods differ by hundreds between places: unscaled, the first frame
 would decide alone.
 
 Source: SPEC §6; Cummins & Newman, FAB-MAP, IJRR 27(6), 2008, §4.6 carries the belief by a motion
@@ -33,14 +33,14 @@ class BeliefConfig:
     """Settings of `PlaceBelief`.
 
     Attributes:
-        step_m: the belief is carried along once the robot has moved so far; frames in between
-            weigh by their distance, so that standing still is no new evidence. Source: nodes are
-            saved every metre.
-        slack_m: standard deviation of where a robot is matched with a node from.
-        reach_m: edges to nodes further away are no steps.
-        leap: a robot may be where no edge leads to; that costs so much.
-        refuted: what a failed attempt costs its node.
-        refuted_beside: and each node that an edge joins to it.
+        step_m: distance after which the belief moves along the edges, metres. Evidence in between
+            is weighted by distance, so that a standing robot gains none. Source: the spacing of
+            saved nodes.
+        slack_m: standard deviation of the distance between a robot and the node it matches, metres.
+        reach_m: longest edge that counts as a step, metres.
+        leap: largest deficit of a node against the best one, for places that no edge leads to.
+        refuted: cost of a failed attempt to its node.
+        refuted_beside: cost of a failed attempt to each node joined to it by an edge.
     """
 
     step_m: float = 1.0
@@ -52,10 +52,10 @@ class BeliefConfig:
 
 
 class PlaceBelief:
-    """Adds up what live frames say of each node of a graph.
+    """Adds up the evidence of live frames for each node of a graph.
 
     Args:
-        graph: may grow meanwhile.
+        graph: the experience graph; may grow between calls.
         config: settings.
     """
 
@@ -66,13 +66,13 @@ class PlaceBelief:
         self.forget()
 
     def forget(self) -> None:
-        """What was seen before says nothing any more."""
+        """Discards the evidence of earlier frames."""
         self._belief: Array = np.zeros(0)
         self._moved_m: Array = np.zeros(3)
         self._since_m = np.inf
 
     def carry_on(self, motion: SE3 | None) -> None:
-        """The robot moved on; None if nobody knows how."""
+        """Moves the belief by `motion`, prev_from_curr; None, if unknown, discards it."""
         if motion is None:
             self.forget()
         elif len(self._belief):
@@ -82,13 +82,13 @@ class PlaceBelief:
                 self._carry()
 
     def observe(self, evidence: Array) -> Array:
-        """Takes in what one frame says.
+        """Adds the evidence of one frame.
 
         Args:
             evidence: (N,) float64, how well the frame fits each node, on any linear scale.
 
         Returns:
-            (N,) float64, how likely each node is now: log-probabilities up to scale and constant.
+            (N,) float64, the likelihood of each node: log-probabilities up to scale and constant.
         """
         spread = float(evidence.std()) if len(evidence) else 0.0
         scaled = (evidence - evidence.mean()) / spread if spread > 0 else np.zeros_like(evidence)
@@ -100,7 +100,7 @@ class PlaceBelief:
         return now
 
     def refute(self, nodes: Sequence[int]) -> None:
-        """Attempts to match the last frame with these nodes failed."""
+        """Counts failed attempts to match the last frame against these nodes, by dense index."""
         config = self.config
         for node in nodes:
             if node < len(self._belief):
@@ -109,7 +109,7 @@ class PlaceBelief:
                 self._belief[beside[beside < len(self._belief)]] -= config.refuted_beside
 
     def _of_all(self, count: int) -> Array:
-        """The belief, with nodes that joined the graph meanwhile as unlikely as the least."""
+        """The belief, extended by new nodes of the graph at its minimum."""
         new = count - len(self._belief)
         least = self._belief.min(initial=0.0)
         return np.concatenate([self._belief, np.full(new, least)]) if new else self._belief
@@ -129,7 +129,7 @@ class PlaceBelief:
         self._moved_m = np.zeros(3)
 
     def _edges(self) -> HalfEdges:
-        """Those short enough to be steps, between nodes that the belief knows."""
+        """Edges short enough to be steps, between nodes that the belief covers."""
         if self._steps is None or self._steps.of_edges != len(self._graph.edges):
             self._steps = self._graph.half_edges(self.config.reach_m)
         known = len(self._belief)

@@ -1,10 +1,9 @@
-"""Where a lost robot may be by matches that are not believed one by one.
+"""Matches of a lost robot that need a second match to be accepted.
 
-They are too weak, or contradict where the robot believes to be: that speaks against strong ones
-too. Such a match may be right, and it may be two cars that stand alike in two streets. Right ones
-agree with each other while the robot drives on: the position of the first, carried on by odometry,
-predicts where the second is found. So it waits, the nodes near it are attempted with the
-frames to come, and when another match some way on agrees, that one is believed.
+Such a match is too weak, or contradicts the estimated position. It may be correct, or two cars
+parked alike in two streets. Correct matches agree with each other while the robot drives on: the
+position of the first, carried on by odometry, predicts that of the second. So the match waits,
+later frames attempt the nodes near it, and the next match that agrees with it is accepted.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import Position
 from engram.odometry import OdometryStep
 
-# From places this far apart not the same two parked cars are seen alike; 2 m were not enough.
+# Distance between two matches from which one false cause no longer explains both.
 _BASE_LINE_M = 4.0
-# By then what a weak match saw is out of sight, and odometry has drifted.
+# Beyond this distance the scene of a weak match is out of sight, and odometry has drifted.
 _FORGOTTEN_AFTER_M = 15.0
-# So many wait at a time; the oldest goes.
+# Most hypotheses kept; the oldest is dropped.
 _MOST = 8
 
 
@@ -40,8 +39,8 @@ class Hypotheses:
 
     Args:
         graph: the experience graph.
-        search: its `neighbourhood`, with what does not change filled in: the nodes near a position.
-        acceptance: when two positions agree.
+        search: finds the nodes near a position.
+        acceptance: thresholds by which two positions agree.
     """
 
     def __init__(
@@ -56,11 +55,11 @@ class Hypotheses:
         self._waiting: list[_Hypothesis] = []
 
     def forget(self) -> None:
-        """The robot was found, or nobody knows how it moved."""
+        """Drops all: the robot was found, or its motion is unknown."""
         self._waiting.clear()
 
     def carry_on(self, odometry: OdometryStep) -> None:
-        """The robot moved on."""
+        """Carries all positions on by one step of odometry."""
         motion, covariance = odometry.prev_from_curr, odometry.covariance
         if motion is None or covariance is None:
             self.forget()
@@ -71,7 +70,7 @@ class Hypotheses:
         self._waiting = [one for one in self._waiting if one.driven_m <= _FORGOTTEN_AFTER_M]
 
     def nodes_near(self, count: int) -> list[int]:
-        """Nodes, by dense index, that could confirm one of them, the nearest first."""
+        """Nodes, by dense index, that could confirm one: `count` for each, nearest first."""
         nodes: list[int] = []
         for one in reversed(self._waiting):
             near = self._search(one.position)
@@ -80,10 +79,10 @@ class Hypotheses:
         return nodes
 
     def judge(self, outcomes: list[Outcome]) -> list[Outcome]:
-        """Accepts the plausible matches with which an earlier one agrees; the others wait.
+        """Accepts plausible matches that agree with an earlier one; the others wait.
 
         Args:
-            outcomes: of this frame's attempts; where one was accepted already, nothing is to do.
+            outcomes: of this frame's attempts; returned unchanged if one is already accepted.
 
         Returns:
             The same outcomes, in their order.

@@ -1,4 +1,4 @@
-"""What becomes of what a robot finds: the one thing in which the uses of its loop differ."""
+"""What happens to each localisation: the one part in which the uses of the robot's loop differ."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from engram.odometry import Motion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hint:
-    """What a keeper knows of a frame before it is localised.
+    """What a keeper knows about a frame before it is localised.
 
     Attributes:
         position: where the robot is; None leaves it to the localiser.
-        open_loop_m: how far it has come since it last matched what the map knew before; None
-            leaves it as it was counted.
-        guessed_m: standard deviation of the motion guessed since then; infinite where the robot
-            is somewhere near, and must be found again.
-        found: what was found of this very frame already; it is not localised again.
+        open_loop_m: distance driven since the last match with the map, metres; None keeps the
+            localiser's own count.
+        guessed_m: standard deviation of the motion guessed since then, metres; infinite if the
+            robot is only roughly known and must be found again.
+        found: an earlier result for this frame, which is then not localised again.
     """
 
     position: Position | None = None
@@ -29,36 +29,35 @@ class Hint:
 
 
 class Keeper:
-    """Keeps what a robot finds. This one keeps nothing.
+    """Keeps the results of a robot. This base class keeps nothing.
 
-    For each frame `hint` is called, then `keep`. Before a match is certain for good it may be
-    withdrawn: `withdrawn` is called with what `keep` had returned. Whatever a keeper makes of a
-    localisation that a withdrawal could undo becomes permanent only after it can no longer come;
-    until then the keeper holds it back.
+    For each frame the robot calls `hint`, then `keep`. It may later withdraw a match: it calls
+    `withdrawn` with the result of `keep`. A keeper holds back whatever a withdrawal would undo
+    until a withdrawal is no longer possible.
     """
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """What is known before the frame is localised; its motion led there."""
+        """What is known before the frame is localised; `motion` led to it."""
         del live, motion
         return None
 
     def may_propose(self, *, certain: bool) -> bool:
-        """Whether places all over the map are tried; `certain` says the robot knows its place."""
+        """Whether to try places all over the map; `certain` if the position is known."""
         del certain
         return True
 
     def may_propose_own(self, *, certain: bool) -> bool:
-        """The same of nodes that the session itself saved."""
+        """The same for nodes that the session itself saved."""
         del certain
         return True
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """Takes what was found of a frame; returns it with what became of it."""
+        """Keeps the result for a frame; returns it, completed by what was stored."""
         del live
         return found
 
     def withdrawn(self, found: Localisation) -> None:
-        """A later frame disproved it: it is to be as if the frame had not been localised."""
+        """A later frame disproved the match: treat the frame as not localised."""
 
     def finish(self) -> None:
         """The drive is over."""

@@ -1,4 +1,4 @@
-"""What the localiser is asked (`Budget`) and what it answers (`Localisation`)."""
+"""Input and output of the localiser: `Budget`, `Position`, `Localisation`."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ class Budget:
     """How much matching one live frame may cost (SPEC §1: Np × Nr).
 
     Attributes:
-        lanes: Np, attempts that run at the same time, each on a thread of its own.
-        rounds: Nr, how often that many are started for one frame.
-        lost_rounds: the same for a robot that does not know where it is: most of what it tries is
-            another place, which costs a quarter of a match (0.27 ms), and it has nothing else to
-            do.
-        deadline_ms: no attempt starts later than this after the frame was handed in; None for
-            no limit. The last attempt may overrun it, never more than one per lane.
+        lanes: Np, attempts that run at the same time, each on its own thread.
+        rounds: Nr, how often that many attempts start for one frame.
+        lost_rounds: the same for a lost robot. Larger, because most of its attempts fail early
+            and cost a quarter of a match.
+        deadline_ms: latest start of an attempt after the frame arrived; None for no limit. At
+            most one attempt per lane overruns it.
     """
 
     lanes: int = 2
@@ -49,12 +48,12 @@ class Budget:
 
     @property
     def lost_attempts(self) -> int:
-        """The most attempts for one frame of a robot that does not know where it is."""
+        """The most attempts for one frame of a lost robot."""
         return self.lanes * max(self.rounds, self.lost_rounds)
 
 
 class LocalisationStatus(StrEnum):
-    """Where the robot stands after one frame (SPEC §3)."""
+    """State of the robot after one frame (SPEC §3)."""
 
     LOCALISED = "localised"
     DEAD_RECKONING = "dead_reckoning"
@@ -79,11 +78,11 @@ class Position:
 
     @staticmethod
     def at(node: NodeId) -> Position:
-        """The position of the very frame that was saved as a node."""
+        """The position of the frame that was saved as `node`."""
         return Position(node, SE3.identity(), np.zeros((6, 6)))
 
     def carried_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> Position:
-        """The position after one more step of odometry; `covariance` (6, 6) is that step's."""
+        """The position after one more step of odometry with its (6, 6) covariance."""
         return Position(
             self.node,
             self.node_from_live @ prev_from_curr,
@@ -98,32 +97,32 @@ class Position:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Localisation:
-    """The answer for one live frame. Not localising is an answer too.
+    """The result for one live frame. Not localising is a result too.
 
     Attributes:
-        stamp_ns: stamp of the live frame.
+        stamp_ns: stamp of the live frame, UTC.
         status: whether the frame was matched, and if not, what is known.
         node: the matched node; None unless `LOCALISED`.
         node_stamp_ns: stamp of that node.
         node_from_live: measured pose of the live camera in it; None unless `LOCALISED`.
-        covariance: (6, 6) of `node_from_live`, left perturbation, [translation, rotation].
+        covariance: (6, 6) float64 of `node_from_live`, left perturbation, [translation, rotation].
         inliers: landmarks that agree with the pose, 0 unless `LOCALISED`.
         attempts: match attempts made for this frame.
-        proposed: how many of them where nothing was expected, at nodes proposed to a lost robot;
-            they cost a quarter of the others (`LocaliserConfig.lost_max_samples`).
-        candidates: nodes that could have been tried.
-        open_loop_m: distance driven on odometry alone since the last match.
-        motion: how the robot moved since the usable frame before, as far as it is known.
+        proposed: attempts without a prediction, at nodes proposed to a lost robot. They cost a
+            quarter of the others (`LocaliserConfig.lost_max_samples`).
+        candidates: nodes in reach that could have been attempted.
+        open_loop_m: distance driven on odometry alone since the last match, metres.
+        motion: motion since the previous usable frame, as far as it is known.
         position: the best estimate, measured or carried on by odometry; None while `LOST` with
             no estimate.
-        looked_up: whether the relocaliser was asked which places look like the frame.
-        damaged: nodes that were to be attempted and whose landmarks cannot be read, each told once;
-            the localiser passes them over from then on. ``engram check`` tells more.
-        saved: the node that the frame was saved as, where the robot maps.
-        resumed: whether an interrupted run had dealt with this frame already: nothing was
-            attempted, the robot was only carried on.
-        late: whether the answer came after the deadline.
-        stage_ms: time of each stage; "places" only where the relocaliser was asked.
+        looked_up: whether place recognition ran for this frame.
+        damaged: candidates whose landmarks cannot be read, each reported once; the localiser skips
+            them from then on. ``engram check`` gives details.
+        saved: the node that the frame was saved as, if the robot maps.
+        resumed: whether an interrupted run had processed this frame: no attempt was made, only the
+            motion counts.
+        late: whether the result came after the deadline.
+        stage_ms: duration of each stage; "places" only if place recognition ran.
     """
 
     stamp_ns: int
@@ -153,7 +152,7 @@ class Localisation:
 
     @property
     def ms(self) -> float:
-        """Time of all stages together."""
+        """Duration of all stages together."""
         return sum(self.stage_ms.values())
 
     def to_dict(self) -> dict[str, Any]:
@@ -187,7 +186,7 @@ class StageClock:
         self.stage_ms: dict[str, float] = {}
 
     def lap(self, stage: str) -> None:
-        """The stage ends here."""
+        """Ends a stage, and records its duration under its name."""
         now = perf_counter()
         self.stage_ms[stage] = (now - self._last) * 1e3
         self._last = now

@@ -53,37 +53,37 @@ from engram.ranking import (
 )
 
 _PREFETCH = 16
-# Nodes near each weak match of a lost robot that are tried first: they would confirm it.
+# Nodes near each weak match of a lost robot to try first: they would confirm it.
 _CONFIRMING = 6
-# Stands for a drive that is not identified: equal input gives equal results there too.
+# For a drive without an id: equal input still gives equal results.
 UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
 
 
 class Localiser:
     """Localises the frames of one session, one after another.
 
-    Not thread-safe: one session, one localiser. The graph and the path memory may grow between
-    two calls.
+    Not thread-safe: each session has its own localiser. The graph and the path memory may grow
+    between calls.
 
     Args:
         graph: the experience graph.
         paths: the path memory.
         frames: where the landmarks of nodes come from.
         policy: orders the candidates.
-        budget: how much may be attempted per frame.
-        relocaliser: finds a lost robot; None leaves it to the nodes near its dead reckoning, within
-            a growing radius.
+        budget: how many attempts a frame may make.
+        relocaliser: proposes nodes to a lost robot; with None it tries the nodes near its dead
+            reckoning, within a growing radius.
         basin: the match basin of this session's camera.
         live: the live session; its UUID seeds the matcher, so that the same drive gives the same
             results.
-        saves: whether the session is being mapped: then its own recent nodes are no candidates.
+        saves: whether the session is being mapped: then its own recent nodes are not candidates.
         config: settings.
         matcher: the first half of an attempt; None matches with the landmarks of `frames`.
-        threads: whether lanes run on threads; a `matcher` that is given says so itself.
-        search: finds the candidates; None for the graph's own `neighbourhood`. Localisers in step
-            with each other, in a graph that does not grow, may share one that remembers.
-        background: what policies may know of the map beyond its graph and paths.
-        clock: what the live frames' stamps mean, and where the robot is; None if unknown.
+        threads: whether lanes run on threads; a given `matcher` decides this itself.
+        search: finds the candidates; None for the graph's own `neighbourhood`. Localisers of one
+            drive on a fixed graph may share a search with a cache.
+        background: what policies may know about the map beyond its graph and paths.
+        clock: time zone and location of the live frames' stamps; None if unknown.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class Localiser:
         # Variance of the motion guessed since the robot last knew where it was, m².
         self._guessed_m2 = 0.0
         self._outcomes: list[Outcome] = []
-        # What the last frame's attempts were made from.
+        # Reference node and neighbourhood of the last frame's attempts.
         self._reference: NodeId | None = None
         self._near: Neighbourhood | None = None
         self._looked_up = False
@@ -149,12 +149,12 @@ class Localiser:
 
     @property
     def graph(self) -> ExperienceGraph:
-        """The experience graph that it works on."""
+        """The experience graph."""
         return self._graph
 
     @property
     def relocaliser(self) -> Relocaliser | None:
-        """What finds a lost robot."""
+        """What proposes nodes to a lost robot."""
         return self._relocaliser
 
     def close(self) -> None:
@@ -169,11 +169,11 @@ class Localiser:
 
     @property
     def outcomes(self) -> list[Outcome]:
-        """What became of the attempts for the last frame, in ranked order."""
+        """Outcomes of the attempts for the last frame, in ranked order."""
         return self._outcomes
 
     def attempts(self) -> list[Attempt]:
-        """The attempts for the last frame that had a prediction, to be remembered (SPEC §3.5)."""
+        """The last frame's attempts that had a prediction, as a map stores them (SPEC §3.5)."""
         near, reference = self._near, self._reference
         if near is None or reference is None:
             return []
@@ -199,13 +199,13 @@ class Localiser:
     def place_at(
         self, position: Position, open_loop_m: float | None = 0.0, guessed_m: float = 0.0
     ) -> None:
-        """Tells a robot where it is, as an operator or another localiser would.
+        """Sets the position, as an operator or another localiser would.
 
         Args:
-            position: where it is.
-            open_loop_m: how far it has come since it last matched what the map knew before; None
-                leaves it as it was counted.
-            guessed_m: standard deviation of the motion guessed since then.
+            position: where the robot is.
+            open_loop_m: distance driven since the last match with the map, metres; None keeps
+                the count.
+            guessed_m: standard deviation of the motion guessed since then, metres.
         """
         self.position = position
         if open_loop_m is not None:
@@ -213,14 +213,14 @@ class Localiser:
         self._guessed_m2 = guessed_m**2
 
     def lose(self) -> None:
-        """The robot was switched on anew or carried elsewhere: nothing is known of its place."""
+        """Discards the position: the robot was restarted or carried elsewhere."""
         self.position = None
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
 
     def begin(self, session: Session) -> None:
-        """The frames to come are of this session: a live robot knows it with its first frame."""
+        """Sets the session of the coming frames; a live robot knows it from its first frame."""
         self._background = replace(
             self._background, sessions={**self._background.sessions, session.id: session}
         )
@@ -230,22 +230,22 @@ class Localiser:
         self.live = session.id
 
     def resume(self, driven_m: float, next_iteration: int) -> None:
-        """The frames to come are those of the session from there on (SPEC §7 MERGE 3).
+        """Continues a session at a later frame (SPEC §7 MERGE 3).
 
         Args:
-            driven_m: odometry distance from the session's start to the first of them.
-            next_iteration: number of their first iteration.
+            driven_m: odometry distance from the session's start to that frame, metres.
+            next_iteration: number of the first iteration.
         """
         self._driven_m = driven_m
         self._recent = RecentAttempts(self.config.recent, next_iteration)
 
     @property
     def iteration(self) -> int:
-        """Number of the running iteration."""
+        """Number of the current iteration."""
         return self._recent.iteration
 
     def settle_in(self, node: NodeId) -> None:
-        """The live frame was saved as `node`: the robot is in it by construction (SPEC §4)."""
+        """Sets the position to `node`, as which the live frame was just saved (SPEC §4)."""
         self.position = Position.at(node)
         self._guessed_m2 = 0.0
 
@@ -259,10 +259,10 @@ class Localiser:
         """One iteration of SPEC §3: gather candidates, rank, attempt, settle.
 
         Args:
-            live: the live frame; `move` was told how the robot came there.
-            deadline: `time.perf_counter` value after which no attempt starts; None for none.
-            keeper: says where a robot that knows its place may look beside it.
-            clock: takes the time of each stage.
+            live: the live frame; `move` has been called with the motion that led to it.
+            deadline: `time.perf_counter` value after which no attempt starts; None for no limit.
+            keeper: decides whether places beyond the neighbourhood may be tried.
+            clock: measures the duration of each stage.
 
         Raises:
             IncompatibleError: the map was made with another kind of descriptor.
@@ -294,7 +294,7 @@ class Localiser:
         return self._result(live, success, clock.stage_ms)
 
     def _conclude(self, outcomes: list[Outcome]) -> Outcome | None:
-        """The robot is where the best match says, or nearer to being lost."""
+        """Sets the position to that of the best match; without one, reports the failures."""
         self._outcomes = outcomes
         self._reference = None if self.position is None else self.position.node
         success = best_success(outcomes)
@@ -313,9 +313,9 @@ class Localiser:
     def move(self, motion: Motion) -> None:
         """Propagates the position by the motion that led to the next frame (SPEC §3).
 
-        A frame that odometry could not use changes nothing: the next usable one brings the motion
-        since the last. Past `LocaliserConfig.greatest_gap_m` of uncertainty in motion that was
-        guessed the robot is lost.
+        A frame that odometry could not use changes nothing: the next usable one carries the motion
+        since the last. The robot is lost once the uncertainty of guessed motion exceeds
+        `LocaliserConfig.greatest_gap_m`.
         """
         self._motion = motion
         if motion.prev_from_curr is None or motion.covariance is None:
@@ -334,7 +334,7 @@ class Localiser:
 
     @property
     def certain(self) -> bool:
-        """Whether the position is known: motion since the last match was measured, but for gaps."""
+        """Whether the position is known: odometry since the last match had only short gaps."""
         return self.position is not None and self._guessed_m2 <= self.config.greatest_gap_m**2
 
     @property
@@ -384,7 +384,7 @@ class Localiser:
         return self._policy.rank(context)
 
     def _foresee(self, live: Frame, neighbourhood: Neighbourhood) -> Foreseen:
-        """The outcome of attempting each candidate, without attempting it for the record."""
+        """The outcome of attempting each candidate; these attempts are not recorded."""
         attempt = partial(self._attempter.attempt, live, node_id(self.live, live.stamp_ns))
         outcomes = [
             attempt(row, self._predicted(neighbourhood, row)) for row in range(len(neighbourhood))
@@ -408,8 +408,8 @@ class Localiser:
     ) -> list[Candidate]:
         """What to attempt, best first.
 
-        A lost robot alternates nodes of its neighbourhood and proposed ones; one that knows of no
-        node near it spends its budget on proposed ones before it counts as lost.
+        A lost robot alternates proposed nodes and nodes of its neighbourhood. A robot with no node
+        near it spends its budget on proposed ones, even before it counts as lost.
         """
         budget = self._budget.attempts
         ranked = []
@@ -438,7 +438,7 @@ class Localiser:
         return _alternate(proposed, ranked)[:budget]
 
     def _proposals(self, live: Frame, count: int, keeper: Keeper) -> list[int]:
-        """The relocaliser's nodes, without those of this session that say nothing new."""
+        """The relocaliser's nodes, without known ones of this session."""
         assert self._relocaliser is not None
         self._looked_up = True
         own = keeper.may_propose_own(certain=self.certain)
@@ -449,11 +449,11 @@ class Localiser:
         )
 
     def _is_known_own(self, index: int, *, own: bool) -> bool:
-        """Whether a node is this session's own, and was just saved or is for the mapper to find.
+        """Whether a node is this session's own, and recent or left to loop closure.
 
-        Nodes saved a moment ago are no candidates (SPEC §3.1). While every motion is measured the
-        robot knows how it stands to its own nodes, but for drift: a match with one of them is a
-        loop, or a look-alike. A mapper that closes loops asks for a second witness.
+        Recent nodes are not candidates (SPEC §3.1). While all motion is measured, the robot knows
+        its pose relative to its own nodes up to drift: a match with one of them is a loop or a
+        look-alike, and loop closure asks for a second match.
         """
         node = self._graph.node(index)
         if node.session != self._own_session:
@@ -467,12 +467,12 @@ class Localiser:
             prediction.sigma_m < self.config.guide_below_m
             and prediction.sigma_yaw_rad < self.config.guide_below_rad
         )
-        # A robot that saves nodes knows its place by them: to close loops asks for better proof.
+        # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
         doubted = self._lost and not (self.certain and self._own_session is not None)
         return Candidate(index, self._graph.node(index).id, prediction, guided, row, doubted)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
-        """Those of nodes that can be read; the others are told, and not attempted again."""
+        """Outcomes of readable nodes; the others are reported, and not attempted again."""
         damaged = [outcome.candidate for outcome in outcomes if outcome.damaged]
         self._new_damaged = tuple(candidate.node for candidate in damaged)
         self._damaged.update(candidate.index for candidate in damaged)
@@ -481,7 +481,7 @@ class Localiser:
     def _remember(
         self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
     ) -> None:
-        """What policies learn from while driving."""
+        """Records what policies learn from during the drive."""
         self._recent.add(
             [outcome.candidate.index for outcome in outcomes],
             [outcome.accepted for outcome in outcomes],
@@ -510,7 +510,7 @@ class Localiser:
         )
 
     def _settle(self, success: Outcome) -> None:
-        """The position becomes (n, ``T_n_q``), the open loop 0 (SPEC §3.3)."""
+        """Sets the position to (n, ``T_n_q``) and the open loop to 0 (SPEC §3.3)."""
         node_from_live, covariance = success.match.reference_from_live, success.match.covariance
         assert node_from_live is not None
         assert covariance is not None
@@ -560,7 +560,7 @@ class Localiser:
 
 
 def _alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:
-    """first[0], second[0], first[1], … and what is left of the longer one."""
+    """first[0], second[0], first[1], … and the rest of the longer one."""
     shorter = min(len(first), len(second))
     paired = [item for pair in zip(first, second, strict=False) for item in pair]
     return paired + first[shorter:] + second[shorter:]

@@ -18,10 +18,10 @@ from engram.places import RECOGNISERS, PlaceRecogniser, Vocabulary
 from engram.places.book import PlaceBook
 from engram.places.words import NodeWords
 
-# Neighbours in the order of saving show the same place: where one was not matched, others of that
-# place mostly are not either. Source: nodes are saved every metre, and matched up to 3 to 4 m away.
+# Neighbours in saving order that show the same place: if one does not match, the others mostly do
+# not either. Source: nodes are saved every metre, and match up to 3 to 4 m away.
 _NEIGHBOURS = 3
-# A node that failed is not tried again for so many frames, unless nothing else is left.
+# Frames for which a failed node is not tried again, unless nothing else is left.
 _PATIENCE = 10
 
 
@@ -35,7 +35,7 @@ class Relocaliser(Protocol):
 
     @property
     def new_place(self) -> float | None:
-        """Probability that the last frame showed nothing of the map; None if it cannot tell."""
+        """Probability that the last frame shows a place outside the map; None if unknown."""
         ...
 
     def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
@@ -55,37 +55,37 @@ class Relocaliser(Protocol):
         ...
 
     def carry_on(self, motion: SE3 | None) -> None:
-        """The robot moved on since the last frame; None if nobody knows how."""
+        """Takes the motion since the last frame, prev_from_curr; None if unknown."""
         ...
 
     def failed(self, nodes: Sequence[int]) -> None:
-        """Attempts to match the last frame with these nodes, by dense index, failed."""
+        """Takes the nodes, by dense index, whose match with the last frame failed."""
         ...
 
     def forget(self) -> None:
-        """The robot was found, or is another one: earlier frames say nothing any more."""
+        """Discards the evidence of earlier frames: the robot was found or carried elsewhere."""
         ...
 
 
 class Exhaustive:
-    """Goes through all nodes of the map, over as many live frames as that takes.
+    """Tries all nodes of the map, over as many live frames as needed.
 
-    Neighbouring nodes show the same place, so the order first strides over the map in wide steps
-    and then fills the gaps: the bit-reversed count (van der Corput) covers every scale evenly.
-    Nodes that join the map meanwhile are met in the next pass.
+    Neighbouring nodes show the same place, so the order first covers the map in wide steps and
+    then fills the gaps: the bit-reversed count (van der Corput) covers every scale evenly. New
+    nodes follow in the next pass.
     """
 
     name = "exhaustive"
     new_place = None
 
     def __init__(self, graph: ExperienceGraph, words: NodeWords) -> None:
-        del words  # it does without
+        del words  # not needed
         self._graph = graph
         self._order: list[int] = []
         self._next = 0
 
     def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
-        """See `Relocaliser`; `live` is of no interest to it."""
+        """See `Relocaliser`; does not use `live`."""
         del live
         if self._next >= len(self._order):
             self._order, self._next = van_der_corput_order(len(self._graph)), 0
@@ -94,26 +94,25 @@ class Exhaustive:
         return [index for index in proposed if allowed(index)]
 
     def carry_on(self, motion: SE3 | None) -> None:
-        """See `Relocaliser`; of no interest to it."""
+        """See `Relocaliser`; has no effect."""
 
     def failed(self, nodes: Sequence[int]) -> None:
-        """See `Relocaliser`; it does not come back to them before the next pass."""
+        """See `Relocaliser`; has no effect, as each pass tries a node once."""
 
     def forget(self) -> None:
-        """See `Relocaliser`; the pass over the map goes on where it was."""
+        """See `Relocaliser`; has no effect: the pass continues."""
 
 
 class ByAppearance:
-    """Asks a place recogniser which nodes look like the live frames (SPEC §6).
+    """Proposes nodes that look like the live frames, by a place recogniser (SPEC §6).
 
-    The evidence of several frames is added up (`PlaceBelief`), so that one that could be of many
-    places does not decide. A frame's attempts go to different places first, and over several
-    frames to places further down the list: a place that looks right and is not costs an attempt,
-    not the whole budget.
+    `PlaceBelief` adds up the evidence of several frames, so that a frame that fits many places does
+    not decide alone. The attempts of one frame go to different places first, and over several
+    frames to less likely ones: a look-alike costs one attempt, not the whole budget.
 
     Args:
-        graph: the nodes; may grow.
-        words: their words, read when this is made.
+        graph: the experience graph; may grow.
+        words: the visual words of its nodes.
         name: key in `RELOCALISERS`.
         recogniser: makes the recogniser for a vocabulary.
     """
@@ -139,7 +138,7 @@ class ByAppearance:
         self.new_place = compared.new_place
         self._frames_seen += 1
         likely = self._belief.observe(compared.evidence)
-        # All that were tried lately may stand in front.
+        # Recently tried places may all come first.
         most = (_PATIENCE + 2) * count
         places = [place for place in best_places(self.book, likely, most) if allowed(place)]
         fresh = [
@@ -168,13 +167,22 @@ class ByAppearance:
 
 
 def best_places(book: PlaceBook, likely: NDArray[np.float64], most: int) -> list[int]:
-    """The most likely nodes, best first, without those whose words nobody could read."""
+    """The most likely nodes, best first, without those whose words are unreadable.
+
+    Args:
+        book: the words of the nodes.
+        likely: (N,) float64, likelihood of each node on any scale.
+        most: how many to consider.
+
+    Returns:
+        Dense indices into the graph.
+    """
     best = _core.best_scores(likely, most)
     return [int(place) for place in best if int(place) not in book.unreadable]
 
 
 def spread(places: list[int], count: int) -> list[int]:
-    """The first `count` places of which no two are neighbours, then the rest in order."""
+    """The first `count` of `places` in an order that puts neighbours of earlier ones last."""
     apart: list[int] = []
     near: set[int] = set()
     for place in places:

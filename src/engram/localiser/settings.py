@@ -11,8 +11,8 @@ from engram.frontend.matching import MatcherConfig
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.ranking import RecentConfig
 
-# Raise it whenever drives are localised or mapped otherwise with equal settings: studies that were
-# kept under another one are not gone on with.
+# Raise it when equal settings give different results: stored studies of another version are not
+# continued.
 METHOD_VERSION = 3
 
 
@@ -21,23 +21,22 @@ class LocaliserConfig:
     """Settings of the localiser.
 
     Attributes:
-        search_radius_m: least radius of the neighbourhood. Source: SPEC §3, 8 m.
-        max_search_radius_m: largest, however uncertain the position; the match basin where that is
-            wider. Past it a robot is found by its relocaliser, not by trying everything around.
-        view_gate_rad: largest difference of heading to a candidate. Source: SPEC §3, 60°.
-        own_exclusion_m: own nodes saved within the last so many metres are no candidates.
-            Source: SPEC §3.1, 30 m.
-        lost_after_m: open loop distance past which the robot is lost. Source: SPEC §3.4, 10 m.
-        greatest_gap_m: largest standard deviation of motion that odometry did not measure. Past it
-            since the last match or saved node the robot is lost; past it at a stretch an
+        search_radius_m: least radius of the neighbourhood. Source: SPEC §3.
+        max_search_radius_m: largest radius of the neighbourhood, unless the match basin is wider.
+            Beyond it the relocaliser finds the robot.
+        view_gate_rad: largest difference of heading to a candidate. Source: SPEC §3.
+        own_exclusion_m: own nodes saved within this last distance are not candidates. Source:
+            SPEC §3.1.
+        lost_after_m: open-loop distance beyond which the robot is lost. Source: SPEC §3.4.
+        greatest_gap_m: largest standard deviation of motion that odometry did not measure. Beyond
+            it since the last match or saved node the robot is lost; beyond it in one gap an
             experience ends.
-        guide_below_m, guide_below_rad: an attempt is guided by the prediction where its standard
-            deviations lie below both; 0 turns guidance off.
-        lost_max_samples, lost_max_hypotheses: bounds of the matcher's for the attempts of a lost
-            robot. Nearly all of them are in vain, and cost 1.1 ms without, 0.27 ms with these
-            bounds; matches that it would believe have so many inliers that 98.8 % of them are
-            found all the same (measured as in `AcceptanceConfig`).
-        recent: what the ranking remembers of this session's attempts.
+        guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
+            are below both; 0 turns guidance off.
+        lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
+            They make a failed attempt four times cheaper and keep 98.8 % of the matches it would
+            accept. Source: `lab/reports/constants.md`.
+        recent: how the ranking weights this session's recent attempts.
         matcher, acceptance: settings of the two halves of an attempt.
     """
 

@@ -1,4 +1,4 @@
-"""The EBN loop: localise, else save an experience. Saving runs on a thread of its own."""
+"""The EBN loop: localise, else save an experience. Saving runs on its own thread."""
 
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopConfig, LoopSearch

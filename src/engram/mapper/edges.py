@@ -15,17 +15,19 @@ from engram.localiser.attempts import Outcome
 def match_edges(
     graph: ExperienceGraph, outcomes: Sequence[Outcome], config: AcceptanceConfig
 ) -> list[Edge]:
-    """Edges between nodes that were matched by the same live frame: their relation was measured.
+    """Edges between nodes that one live frame matched: their relative pose is measured.
 
-    Not where that contradicts the way that is known between them: one of the two matches is of
-    something else then, a house of the same kind, say. An edge from it would fold the map for all
-    who come after. A robot that has lost its place tries nodes far apart, and all that it knows
-    agrees with either.
+    A measurement that contradicts the known path between two nodes gives no edge: one of the two
+    matches is then wrong, and its edge would fold the map permanently. This happens when a lost
+    robot tries nodes far apart.
 
     Args:
         graph: has all nodes of the outcomes.
-        outcomes: of one live frame. All edges end in the node of the best match.
-        config: how far a relation may be off what is known, as for a match.
+        outcomes: of one live frame. All edges start at the node of the best match.
+        config: allowed disagreement with the known path, as for a match.
+
+    Returns:
+        Edges of kind `MATCH`, the best match's node as `a`.
     """
     best_first = sorted(outcomes, key=lambda outcome: -outcome.match.inliers)
     seen_from = [
@@ -40,7 +42,7 @@ def match_edges(
 
 
 def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
-    """The edge between two nodes from which the same live camera is seen."""
+    """The edge from `a.node` to `b.node`, of which each sees the same live camera."""
     a_from_b = a.node_from_live @ b.node_from_live.inverse()
     adjoint = a_from_b.adjoint()
     covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
@@ -48,7 +50,7 @@ def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
 
 
 def _fits(graph: ExperienceGraph, edge: Edge, config: AcceptanceConfig) -> bool:
-    """Whether an edge lies within what is known of its ends; all fits what is not connected."""
+    """Whether an edge agrees with the known path between its ends; True without a path."""
     known = graph.predict(graph.index(edge.a), graph.index(edge.b))
     if known is None:
         return True

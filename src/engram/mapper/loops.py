@@ -1,13 +1,12 @@
-"""Closing large loops: each saved node asks once whether the map knows its place (SPEC §5).
+"""Closing large loops: each saved node is looked up once among all places (SPEC §5).
 
-Odometry drifts: after a long loop the nodes that truly stand beside the robot may lie outside of
-its search radius. So the frame of every saved node is looked up among all places, and the most
-likely ones are matched with it. That happens on a thread of its own, off the path of the live
-frames, and the answer is taken some frames later, always the same number: what comes of it depends
-on the drive alone, not on the speed of the machine.
+Odometry drifts: after a long loop the nodes next to the robot may lie outside its search radius.
+So place recognition looks up the frame of every saved node, and the most likely places are matched
+with it. This runs on its own thread. The result is used a fixed number of frames later, so that it
+depends on the drive alone, not on the speed of the machine.
 
-One match closes no loop: a wrong edge would spoil the map for good, and two streets may show the
-same parked cars. It waits until another one, some way on, agrees with it.
+One match closes no loop: a wrong edge would damage the map permanently, and two streets may show
+the same parked cars. A match waits until another one, farther along, agrees with it.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from engram.localiser import (
 )
 from engram.places.book import PlaceBook
 
-# Places of which those to attempt are chosen, apart from each other.
+# Most likely places, from which those to attempt are chosen apart from each other.
 _SHORTLIST = 256
 
 
@@ -48,21 +47,20 @@ class LoopConfig:
     """Settings of `LoopSearch`.
 
     Attributes:
-        attempts: places matched with each saved node. Off the frames' path there is time for more
-            than a live frame has.
-        answer_after_frames: live frames after which an answer is taken. A query and its attempts
-            take a few milliseconds: at 20 frames a second it is there long before.
-        near_m: nodes within this distance are candidates of the localiser anyway. Source: SPEC §3,
-            the search radius.
-        own_exclusion_m: own nodes saved within the last so many metres close no loop. Source:
+        attempts: places matched with each saved node; more than a live frame has time for.
+        answer_after_frames: live frames after which a result is used. A lookup takes a few
+            milliseconds, far less than this many frames.
+        near_m: nodes within this distance are candidates of the localiser anyway, metres. Source:
+            the search radius, SPEC §3.
+        own_exclusion_m: own nodes saved within this last distance close no loop, metres. Source:
             SPEC §3.1.
-        confirm_after_m: two matches confirm each other when they were made at least this far apart,
-            or, where the first one saw what is farther away, as far as that. What stands beside one
-            of them is then out of the other's sight: half of all landmarks of a street are within
-            10 m, but two corner houses of a kind may be seen alike from 30 m away on.
-        confirm_after_most_m: as far apart at most.
-        confirm_within_m: a match that nothing confirmed so far past this is dropped.
-        certain_m: standard deviation past which the chains between two matches confirm nothing.
+        confirm_after_m: least distance between two matches that confirm each other, metres; the
+            depth of the first one's inliers if that is larger. The scene of one match is then out
+            of sight of the other.
+        confirm_after_most_m: upper limit of that distance, metres.
+        confirm_within_m: distance beyond it after which an unconfirmed match is dropped, metres.
+        certain_m: largest standard deviation of the path between two matches that confirm each
+            other, metres.
     """
 
     attempts: int = 8
@@ -88,7 +86,7 @@ class LoopConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Question:
-    """A saved node, its frame, and (N,) bool: which nodes would be news."""
+    """A saved node, its frame, and (N,) bool: which nodes would close a loop."""
 
     node: NodeId
     frame: Frame
@@ -97,7 +95,7 @@ class _Question:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Match:
-    """An edge that would close a loop, its inliers, and how far away what they saw is."""
+    """An edge that would close a loop, the number of its inliers, and their depth."""
 
     edge: Edge
     inliers: int
@@ -105,13 +103,13 @@ class _Match:
 
 
 class LoopSearch:
-    """Looks for the places of saved nodes, on a thread of its own. A context manager.
+    """Finds loops at saved nodes, on its own thread. A context manager.
 
     Args:
         graph: the experience graph; searched by the calling thread only.
         book: the words of its nodes.
         matcher: the first half of an attempt.
-        acceptance: the second half, as for a lost robot: no prediction speaks for a match.
+        acceptance: thresholds of the second half, as for a lost robot: there is no prediction.
         config: settings.
     """
 
@@ -140,17 +138,17 @@ class LoopSearch:
         self.close()
 
     def close(self) -> None:
-        """Ends the thread; questions that nobody waits for any more are dropped."""
+        """Ends the thread and drops pending lookups."""
         self._thread.shutdown(cancel_futures=True)
 
     def ask(self, node: Node, frame: Frame) -> None:
-        """Looks up a node that was just saved and added to the graph; returns at once."""
+        """Starts the lookup of a node that was just saved and added to the graph."""
         self._book.learn_new_nodes()
         question = _Question(node.id, frame, self._news(node))
         self._asked.append((self._frames, self._thread.submit(self._answer, question)))
 
     def closed(self) -> list[Edge]:
-        """The loops that are closed by now, each from the known node to the new one.
+        """Edges of newly closed loops, each from the known node to the new one.
 
         Call it once per live frame.
         """
@@ -158,7 +156,7 @@ class LoopSearch:
         return self._answers_to(self._frames - self.config.answer_after_frames)
 
     def finish(self) -> list[Edge]:
-        """Waits for all answers."""
+        """Waits for all lookups; returns the edges of the loops that they close."""
         return self._answers_to(self._frames)
 
     def _answers_to(self, frame: int) -> list[Edge]:
@@ -170,7 +168,7 @@ class LoopSearch:
         return edges
 
     def _confirmed(self, match: _Match) -> list[_Match]:
-        """The match and those that waited for it; or none, and it waits itself."""
+        """The match and the waiting ones that agree with it; none if it must wait itself."""
         here_m, within_m = self._driven_m(match.edge), self.config.confirm_within_m
         passed_m = {one: here_m - self._driven_m(one.edge) for one in self._waiting}
         self._waiting = [
@@ -188,16 +186,16 @@ class LoopSearch:
         return [*agreeing, match]
 
     def _base_line_m(self, match: _Match) -> float:
-        """How far on another match must be that confirms it."""
+        """Least distance to another match that confirms this one."""
         least_m, most_m = self.config.confirm_after_m, self.config.confirm_after_most_m
         return max(least_m, min(match.depth_m, most_m))
 
     def _driven_m(self, edge: Edge) -> float:
-        """How far the robot had come when it saved the new node."""
+        """Distance driven when the robot saved the new node."""
         return float(self._graph.driven_m[self._graph.index(edge.b)])
 
     def _agree(self, first: Edge, second: Edge) -> bool:
-        """Whether two matches put the robot where it drove from one to the other."""
+        """Whether the motion between two matches agrees with the map."""
         graph = self._graph
         driven = graph.predict(graph.index(first.b), graph.index(second.b))
         known = graph.predict(graph.index(first.a), graph.index(second.a))
@@ -208,12 +206,12 @@ class LoopSearch:
         sigma_m = Position(first.a, carried.node_from_live, covariance).sigma_m
         sigma_yaw_rad = float(np.sqrt(covariance[4, 4]))
         prediction = Prediction(carried.node_from_live, sigma_m, sigma_yaw_rad)
-        # Places that a long chain joins would agree with anything.
+        # A long chain is too uncertain to contradict anything.
         certain = sigma_m <= self.config.certain_m
         return certain and agrees(known[0] @ second.a_from_b, prediction, self._acceptance)
 
     def _news(self, node: Node) -> NDArray[np.bool_]:
-        """Nodes that are neither near the node, by all that is known, nor just saved."""
+        """(N,) bool: nodes neither known to be near this node nor just saved."""
         graph = self._graph
         index = graph.index(node.id)
         own = graph.sessions == graph.sessions[index]
@@ -229,7 +227,7 @@ class LoopSearch:
         return news
 
     def _answer(self, question: _Question) -> _Match | None:
-        """The best match among the most likely places; None if none is believed."""
+        """The best accepted match among the most likely places."""
         if not question.news.any():
             return None
         compared = self._book.compare(self._book.words_of(question.frame))
@@ -242,7 +240,7 @@ class LoopSearch:
         return max(believed, key=lambda found: found.inliers, default=None)
 
     def _matched(self, question: _Question, place: int) -> _Match | None:
-        """The match with a place, if it is believed."""
+        """The match with a place, if it is accepted."""
         known = self._graph.node(place).id
         try:
             match = self._matcher.match(question.frame, question.node, known, None)

@@ -35,12 +35,12 @@ class MapperConfig:
 
     Attributes:
         save_every_m, save_every_rad: motion since the last saved node after which a frame that
-            did not localise is saved. Source: SPEC §5, 1 m and 15°.
+            did not localise is saved. Source: SPEC §5.
         tie_within_m: a new experience is also tied to the session's last saved node within this
-            distance; the search radius.
+            distance, metres. Source: the search radius, SPEC §3.
         checkpoint_every: live frames between two checkpoints of the map.
-        memory_bytes: how large the memory of a drive that saves no nodes may become before it is
-            committed; what comes later is not remembered. About a day at 20 frames a second.
+        memory_bytes: largest memory of a drive that saves no nodes, bytes; later frames are not
+            remembered. About a day at 20 frames per second.
     """
 
     save_every_m: float = 1.0
@@ -59,19 +59,18 @@ class MapperConfig:
 
 
 class Mapper(Memory):
-    """Maps one session: while localisation succeeds nothing is saved, else an experience grows.
+    """Maps one session: saves nothing while localisation succeeds, else grows an experience.
 
-    It remembers the drive's path and attempts as well. Frames that an interrupted run had mapped
-    already are only followed; it goes on behind the last saved node or match, whichever is later.
+    It also remembers the drive's path and attempts. Frames that an interrupted run had mapped are
+    only followed; mapping continues after the last saved node or match, whichever is later.
 
     Args:
         graph: the experience graph; grows.
-        localiser: the session's localiser, which works on the same graph.
-        saver: writes what is added.
+        localiser: the session's localiser, on the same graph.
+        saver: writes the additions.
         session: the drive.
         config: settings.
-        loops: looks for the places of saved nodes beside the drive; None leaves that to the
-            localiser's relocaliser.
+        loops: closes loops beside the drive; None leaves them to the localiser's relocaliser.
         stored: what an interrupted run had stored of the session; None for a new one.
     """
 
@@ -88,7 +87,7 @@ class Mapper(Memory):
         super().__init__(localiser, saver, path_id(session.id), stored)
         self.config = config or MapperConfig()
         self._loops = loops
-        # Whether what is being saved hangs together with the rest of the map.
+        # Whether the nodes being saved are connected to the rest of the map.
         self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
         self._graph = graph
         self._session = session
@@ -102,7 +101,7 @@ class Mapper(Memory):
         self._closures: list[Edge] = []
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`: loops that were found by now are closed before the frame is localised."""
+        """See `Keeper`: closes the loops found so far before the frame is localised."""
         self._move_on(motion)
         followed = super().hint(live, motion)
         if followed is not None:
@@ -113,8 +112,8 @@ class Mapper(Memory):
     def may_propose(self, *, certain: bool) -> bool:
         """See `Keeper`.
 
-        A robot that hangs together with the map is not lost, however far it drifts: its loops are
-        looked for beside the drive.
+        A robot whose nodes are connected to the map is not lost, however far it drifts: loop
+        closure runs beside the drive.
         """
         return not certain or self._loops is None or not self._joined
 
@@ -123,7 +122,7 @@ class Mapper(Memory):
         return not certain or self._loops is None
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """Saves a frame that was not localised, and ties experiences to their neighbours.
+        """Saves a frame that was not localised; ties experiences to their neighbours.
 
         Raises:
             MapError: an earlier frame could not be written.
@@ -152,7 +151,7 @@ class Mapper(Memory):
         return replace(found, saved=saved.id)
 
     def finish(self) -> None:
-        """See `Keeper`: waits for the places of the nodes saved last.
+        """See `Keeper`: waits for the lookups of the last saved nodes.
 
         Raises:
             MapError: an earlier frame could not be written.
@@ -162,7 +161,7 @@ class Mapper(Memory):
             self._saver.put(Records(edges=edges))
 
     def _follow(self, followed: Hint, live: Frame) -> Hint:
-        """Where the mapper stood after a frame that an interrupted run had mapped."""
+        """Restores the mapper's state after a frame that an interrupted run had mapped."""
         assert self._stored is not None
         if self._stored.nodes and live.stamp_ns == self._stored.nodes[-1].stamp_ns:
             saved = self._stored.nodes[-1].id
@@ -174,7 +173,7 @@ class Mapper(Memory):
         return followed
 
     def _move_on(self, motion: Motion) -> None:
-        """Carries the last saved node on as the robot moved; None after too long a gap."""
+        """Carries the pose in the last saved node on; drops it after too long a gap."""
         if motion.prev_from_curr is None or motion.covariance is None:
             return
         self._gap_m2 = self._gap_m2 + motion.guessed_m**2 if motion.guessed_m else 0.0
@@ -188,9 +187,9 @@ class Mapper(Memory):
             )
 
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
-        """A usable frame, far enough from the last saved one (SPEC §5).
+        """Whether a frame is usable and far enough from the last saved one (SPEC §5).
 
-        In the midst of a long gap of odometry none is: a node that hangs on nothing serves nobody.
+        During a long gap of odometry none is: a node without an edge has no use.
         """
         if live.status is not FrameStatus.OK:
             return False
@@ -214,7 +213,7 @@ class Mapper(Memory):
         self._graph.add_node(node)
         edges = []
         if self._since_saved is None:
-            self._joined = len(self._graph) == 1  # nobody knows how the robot came here
+            self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
         elif not self._experience and position is not None and self._localiser.certain:
@@ -229,7 +228,7 @@ class Mapper(Memory):
         return node, edges
 
     def _close_loops(self, closures: list[Edge]) -> list[Edge]:
-        """Edges to places that were found again; from now on their surroundings are candidates."""
+        """Adds edges to recognised places; the nodes around them become candidates."""
         edges = list(closures)
         self._graph.add_edges(closures)
         for closure in closures:
@@ -238,10 +237,10 @@ class Mapper(Memory):
         return edges
 
     def _edge_to_last_saved(self, position: Position, node: NodeId) -> list[Edge]:
-        """Ties a new experience to this session's last one too, where that is still near.
+        """Also ties a new experience to this session's last one if that is still near.
 
-        Between them the robot was localised for a moment only, perhaps in a node far away: without
-        this edge the two would be neighbours that do not know of each other.
+        In between the robot was localised only briefly, perhaps in a distant node: without this
+        edge the two would be unconnected neighbours.
         """
         last = self._since_saved
         if last is None or last.node == position.node:
@@ -251,7 +250,7 @@ class Mapper(Memory):
         return [_edge(last, node, EdgeKind.TIE)]
 
     def _end_experience(self, localisation: Localisation) -> list[Edge]:
-        """Localised again: the last node of the experience is tied to the matched one."""
+        """Ties the last node of the experience to the matched node."""
         experience, self._experience = self._experience, []
         if not experience or self._since_saved is None:
             return []
@@ -263,5 +262,5 @@ class Mapper(Memory):
 
 
 def _edge(position: Position, node: NodeId, kind: EdgeKind) -> Edge:
-    """The edge to the node that the live frame was saved as."""
+    """The edge from the position's node to the node that the live frame was saved as."""
     return Edge(position.node, node, kind, position.node_from_live, position.covariance)

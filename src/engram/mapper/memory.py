@@ -14,13 +14,13 @@ from engram.mapper.saver import Records, Saver
 from engram.maps import StoredSession
 from engram.odometry import Motion
 
-# A resumed robot was matched with a node from somewhere within a wide match basin.
+# Uncertainty of a resumed robot's pose in the node it last matched: the match basin is wide.
 _RESUMED_SIGMA_M = 3.0
 _RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
 
 
 class Walk:
-    """Collects the entries of one session's path: one whenever its node changes (SPEC §3.3)."""
+    """Collects the entries of one session's path: one for each change of node (SPEC §3.3)."""
 
     def __init__(self, path: PathId, first_sequence: int = 0, node: NodeId | None = None) -> None:
         self.path = path
@@ -29,7 +29,7 @@ class Walk:
         self._new: list[PathEntry] = []
 
     def visit(self, node: NodeId, kind: PathEntryKind, stamp_ns: int) -> None:
-        """Adds an entry if the node is another one than before."""
+        """Adds an entry if the node differs from the last one."""
         if node == self._node:
             return
         self._new.append(PathEntry(self.path, self._sequence, node, kind, stamp_ns))
@@ -45,12 +45,12 @@ class Walk:
 class Memory(Keeper):
     """Remembers a drive without saving a node: its path and its attempts.
 
-    Later drives rank by them, as `path` and `recall` do. Where an interrupted run had remembered
-    a part of the drive, its frames are only followed, and the memory goes on behind them.
+    The policies `path` and `recall` use them in later drives. Frames that an interrupted run had
+    remembered are only followed; the memory continues after them.
 
     Args:
         localiser: the drive's localiser.
-        saver: writes what is remembered.
+        saver: writes path and attempts.
         path: the drive's path.
         stored: what an interrupted run had stored of the drive; None for a new one.
     """
@@ -67,7 +67,7 @@ class Memory(Keeper):
             localiser.resume(0.0, stored.next_iteration)
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`: frames that were dealt with already are not localised again."""
+        """See `Keeper`: frames of an interrupted run are not localised again."""
         if not self._is_stored(live.stamp_ns):
             return None
         assert self._stored is not None
@@ -88,7 +88,7 @@ class Memory(Keeper):
         return found
 
     def _is_stored(self, stamp_ns: int) -> bool:
-        """Whether an interrupted run dealt with the frame."""
+        """Whether an interrupted run processed the frame."""
         last_ns = None if self._stored is None else self._stored.last_stamp_ns
         return last_ns is not None and stamp_ns <= last_ns
 

@@ -1,4 +1,4 @@
-"""Saving on a thread of its own, so that it never holds up the next frame ([L15] Fig. 3)."""
+"""Saving on its own thread, so that it never delays the next frame ([L15] Fig. 3)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from engram.frontend import Frame
 from engram.graph.model import Attempt, Edge, Node, NodeId, PathEntry
 from engram.places.words import NodeWords
 
-# Frames that may wait to be written, about 40 MB of them: past that a slow disk slows the drive.
+# Most frames that wait to be written, about 40 MB; beyond it a slow disk slows the drive.
 _QUEUE_LENGTH = 1000
 
 
 class FrameHolder(Protocol):
-    """Where frames can be read while they are on their way to the disk."""
+    """Keeps frames readable while they wait to be written."""
 
     def hold(self, node: NodeId, frame: Frame) -> None:
         """Keeps a frame readable until its node has been written."""
@@ -32,11 +32,17 @@ class RecordWriter(Protocol):
     """Where a session's records go; `engram.maps.RevisionWriter` is one."""
 
     def add_node(self, node: Node, frame: Frame) -> None:
-        """Adds a node with the frame that it was."""
+        """Adds a node with its frame."""
         ...
 
     def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Adds the words of a node."""
+        """Adds the visual words of a node.
+
+        Args:
+            node: the node.
+            vocabulary: hash of the vocabulary.
+            found: (W,) int32, numbers of its words.
+        """
         ...
 
     def add_edge(self, edge: Edge) -> None:
@@ -77,17 +83,17 @@ class _Stop:
 
 @dataclass(slots=True)
 class Saver:
-    """Writes records in the order in which they come, and checkpoints every so many frames.
+    """Writes records in order, and checkpoints at intervals.
 
-    An error of the writer is raised by the next call of `put` or by `finish`; records behind it
-    are dropped, since a map with holes in a session would be worse than a shorter session.
+    The next call of `put` or `finish` raises an error of the writer. Later records are dropped: a
+    shorter session is better than one with holes.
 
     Attributes:
         writer: where the records go.
         frames: keeps frames readable until they are written.
-        checkpoint_every: live frames between two checkpoints; what a crash may lose.
-        words: those of saved nodes, which are kept with them; None keeps none.
-        waits: whether a full queue holds up the caller; else it is an error.
+        checkpoint_every: live frames between two checkpoints; a crash loses at most these.
+        words: finds the words stored with saved nodes; None stores none.
+        waits: whether a full queue blocks the caller; else it raises.
     """
 
     writer: RecordWriter
@@ -104,9 +110,9 @@ class Saver:
         self._thread.start()
 
     def put(self, records: Records) -> None:
-        """Hands over what one frame adds; returns at once.
+        """Queues what one frame adds to the map.
 
-        The frame of a node can be read from then on, also where it is not saved.
+        The frame of a node is readable from then on, even if it is never written.
 
         Raises:
             MapError: an earlier write failed, or too many wait to be written.
@@ -122,7 +128,7 @@ class Saver:
             ) from None
 
     def finish(self) -> None:
-        """Writes what is left, checkpoints and ends the thread.
+        """Writes the rest, checkpoints and ends the thread.
 
         Raises:
             MapError: a write failed.
@@ -150,7 +156,7 @@ class Saver:
                     if stopping or since_checkpoint >= self.checkpoint_every:
                         self.writer.checkpoint()
                         since_checkpoint = 0
-                except BaseException as error:  # carried to the thread that drives
+                except BaseException as error:  # raised again in the caller's thread
                     self._error = error
             if stopping:
                 return

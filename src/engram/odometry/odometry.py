@@ -1,4 +1,4 @@
-"""Visual odometry: frames in the order of time → the motion between them (SPEC §2.4)."""
+"""Visual odometry: frames in temporal order → the motion between them (SPEC §2.4)."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class OdometryConfig:
     Attributes:
         matcher: how frames are matched.
         window: the joint optimisation.
-        min_inliers: a motion that fewer landmarks agree on is no motion.
-        acceleration_m_s2, angular_acceleration_rad_s2: standard deviations of what constant
-            velocity leaves out. A car brakes with up to 8 m/s²; a head or a handlebar turns by
+        min_inliers: fewest landmarks that must agree on a motion.
+        acceleration_m_s2, angular_acceleration_rad_s2: standard deviations of the motion model,
+            constant velocity. A car brakes with up to 8 m/s²; a head or a handlebar turns with
             10 rad/s² and more.
-        max_prediction_s: over a longer interval the whole frame is searched.
-        keyframe_flow_px: a frame becomes a keyframe once its landmarks have moved so far in the
-            image (median). Below that, noise would outweigh motion.
-        keyframe_share: or once fewer than this share of the keyframe's landmarks is seen.
+        max_prediction_s: over a longer interval matching searches the whole frame.
+        keyframe_flow_px: a frame becomes a keyframe once its landmarks have moved this far in the
+            image (median). Below it noise outweighs motion.
+        keyframe_share: or once it shows less than this share of the keyframe's landmarks.
     """
 
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
@@ -50,9 +50,9 @@ class OdometryConfig:
 class Odometry:
     """Estimates the motion of one camera from frame to frame.
 
-    Frames are matched to the last *keyframe* rather than to the previous frame: while the camera
-    rests or creeps the two differ, and then errors do not add up. The motion between successive
-    frames follows by composition.
+    Frames are matched to the last *keyframe*, not to the previous frame, so that errors do not add
+    up while the camera rests or moves slowly. The motion between successive frames follows by
+    composition.
     """
 
     def __init__(self, config: OdometryConfig | None = None) -> None:
@@ -60,11 +60,11 @@ class Odometry:
         self._track: _Track | None = None
 
     def step(self, frame: Frame) -> OdometryStep:
-        """The motion since the last usable frame; see `OdometryStep` for what a failure means.
+        """The motion since the last usable frame; see `OdometryStep` for failures.
 
         Raises:
-            IncompatibleError: the camera or the kind of descriptors is not that of the frame
-                before.
+            IncompatibleError: the camera or the kind of descriptors differs from that of the
+                previous frame.
 
         Source: SPEC §2.4; [G16] §III-A.
         """
@@ -96,11 +96,11 @@ class _Track:
 
     @property
     def offset_px(self) -> float:
-        """The camera's disparity offset as learnt so far: a broken chain does not forget it."""
+        """The camera's estimated disparity offset, px; kept when the chain breaks."""
         return self._window.offset_px
 
     def match(self, frame: Frame) -> Match:
-        """Match to the keyframe, and where that fails to the previous frame."""
+        """Match to the keyframe; if that fails, to the previous frame."""
         if frame.camera != self._window.keyframe.camera:
             raise IncompatibleError(
                 "the camera changed within a drive; begin another odometry for another camera"
@@ -142,7 +142,7 @@ class _Track:
         return step
 
     def _match_to_keyframe(self, frame: Frame) -> Match:
-        """Guided by constant velocity, and where that fails unguided."""
+        """Guided by constant velocity; if that fails, unguided."""
         key, matcher = self._window.keyframe, self._config.matcher
         seed = frame.stamp_ns % 2**64
         prediction = self._predict(frame)

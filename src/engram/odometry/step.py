@@ -1,4 +1,4 @@
-"""What visual odometry says about one frame."""
+"""The result of visual odometry for one frame."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class OdometryStatus(StrEnum):
 class OdometryStep:
     """Motion since the previous frame of the sequence; a failure carries no made-up motion.
 
-    An unusable frame is passed over: the next usable one is matched to what came before the gap,
-    and its `prev_from_curr` spans the gap. `prev` is thus the previous frame of the sequence whose
-    status is not `UNUSABLE_FRAME`, and the chain of all motions loses and invents nothing. After
-    `TOO_FEW_MATCHES` or `NO_CONSENSUS` the chain is broken: how this frame lies to those before it
-    is unknown, and the next motion starts from this one.
+    An unusable frame is skipped: the next usable one is matched to the frame before the gap, and
+    its `prev_from_curr` spans the gap. So `prev` is the previous frame of the sequence whose
+    status is not `UNUSABLE_FRAME`, and the chain of motions is complete. After `TOO_FEW_MATCHES`
+    or `NO_CONSENSUS` the chain is broken: the motion to this frame is unknown, and the next one
+    starts here.
 
     Attributes:
-        status: `OK`, `FIRST` for the first usable frame of a drive, or the reason of the failure.
+        status: `OK`, `FIRST` for the first usable frame of a drive, or the reason for a failure.
         prev_from_curr: pose of this frame in the previous usable one; None unless `OK`.
         covariance: (6, 6) float64 of `prev_from_curr`, left perturbation,
             [translation, rotation]; None unless `OK`.

@@ -20,13 +20,12 @@ class WindowConfig:
     """Settings of the joint optimisation.
 
     Attributes:
-        frames: frames optimised together, the newest included. More than seven gain little.
-        landmarks: at most so many, those with the longest tracks first; bounds the time.
-        iterations: at most so many. The start is good: one or two usually suffice. 0 leaves the
-            window as matching put it.
-        offset_sigma_px: how far the disparity offset of a rectified camera may wander between
-            successive windows. Each window takes the last one's estimate for its start, so that
-            the offset is learnt within some ten frames and kept while nothing moves.
+        frames: frames optimised together, including the newest. More than seven gain little.
+        landmarks: most landmarks, longest tracks first; bounds the time.
+        iterations: most iterations; one or two usually suffice. 0 skips the optimisation.
+        offset_sigma_px: standard deviation of the change of a rectified camera's disparity offset
+            between successive windows. Each window starts from the last estimate, which converges
+            within about ten frames.
     """
 
     frames: int = 7
@@ -48,8 +47,8 @@ class _Placed:
 
     Attributes:
         frame: the frame.
-        world_from_cam: its pose.
-        tracks: (N,) int32, the track of each landmark, `_UNSEEN` where no other frame shares it.
+        world_from_cam: its pose in the window's world.
+        tracks: (N,) int32, the track of each landmark, `_UNSEEN` if no other frame shares it.
         stereo: (N, 3) float32, left u, left v, disparity, px.
         pixel_sigma_px, disparity_sigma_px: (N,) float32, between views.
     """
@@ -63,9 +62,9 @@ class _Placed:
 
 
 class Window:
-    """Poses live in a world of the window's own: the camera of the frame it was begun with.
+    """Keyframes and the newest frame, with poses in the camera of the window's first frame.
 
-    The oldest pose is held, the others move. The newest frame gives way to the next one unless
+    The oldest pose is fixed, the others move. The next frame replaces the newest one unless
     `keep_newest` was called, so that the window spans motion, not time.
     """
 
@@ -81,7 +80,7 @@ class Window:
 
     @property
     def offset_px(self) -> float:
-        """By how much the camera's disparities are found to be too large, px."""
+        """Estimated excess of the camera's disparities, px."""
         return self._offset_px
 
     @property
@@ -91,11 +90,11 @@ class Window:
 
     @property
     def has_newest(self) -> bool:
-        """Whether the newest frame is none of the keyframes."""
+        """Whether the newest frame is not a keyframe."""
         return self._newest is not None
 
     def add(self, frame: Frame, match: Match) -> None:
-        """Put a frame that was matched to `keyframe` in the place of the newest one."""
+        """Replace the newest frame by one that was matched to `keyframe`."""
         assert match.reference_from_live is not None
         key = self._keyframes[-1]
         tracks = key.tracks.copy()
@@ -116,8 +115,8 @@ class Window:
         """Adjust all poses but the oldest, and all landmarks.
 
         Returns:
-            keyframe_from_newest and its covariance (6, 6); as `match` has them where the landmarks
-            do not determine the window.
+            keyframe_from_newest and its (6, 6) float64 covariance; those of `match` if the
+            landmarks do not determine the window.
 
         Source: SPEC §2.4.
         """
@@ -134,7 +133,7 @@ class Window:
             for each, matrix in zip(placed, matrices, strict=True)
         ]
         self._keyframes, self._newest = moved[:-1], moved[-1]
-        # As in a match: landmarks share errors, so that many do not average them out.
+        # As in a match: landmarks share errors, which do not average out.
         shared = 1 + match.inliers / self._matcher.independent_landmarks
         keyframe_from_world = moved[-2].world_from_cam.inverse()
         carry = keyframe_from_world.adjoint()
