@@ -48,5 +48,10 @@ format: setup
 	$(BIN)/ruff format src lab tests
 	$(BIN)/ruff check --fix src lab tests
 
+docs: setup
+	$(BIN)/python -m pip install --quiet -c constraints.txt --group docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
+	@echo "build/docs/index.html"
+
 clean:
 	rm -rf $(VENV) build lab/build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -186,9 +186,7 @@ def attempt(
 
 # --- ordering
 
-def order_rows(
-    uuid_words: NDArray[np.uint64], *keys: NDArray[np.float64]
-) -> NDArray[np.int64]: ...
+def order_rows(uuid_words: NDArray[np.uint64], *keys: NDArray[np.float64]) -> NDArray[np.int64]: ...
 def success_rates(
     rates: NDArray[np.float64],
     bin_m: float,

@@ -32,6 +32,8 @@ def mapped_text(report: Mapping[str, Any], map_path: Path | str) -> str:
     if report["revision"] is not None:
         head += f", revision {report['revision']}"
     lines = [head, *_frames(report)]
+    if share <= _NEW and saved:
+        lines.append("  (in a new area there is nothing to localise in: lost frames are expected)")
     if report["interrupted"]:
         return _lines(*lines, "interrupted: what was done is saved; the same command resumes it")
     return _lines(*lines, f"next: {_after_mapping(report, map_path)}")

@@ -68,7 +68,7 @@ class MapReport:
 
 
 def map_drive(
-    map_path: Path,
+    map_path: Path | str,
     sequence: DriveSequence,
     settings: Settings | None = None,
     options: RobotOptions | None = None,
@@ -97,6 +97,7 @@ def map_drive(
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; what came before is saved.
     """
+    map_path = Path(map_path)
     settings, options = settings or Settings(), options or RobotOptions()
     if descriptor is not None and isinstance(sequence, FrameLog):
         mend = f"record it again with --descriptor {descriptor}"

@@ -21,7 +21,9 @@ def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple
     try:
         import matplotlib
     except ImportError as error:
-        raise MissingExtraError("pictures need Matplotlib: pip install 'engram[plots]'") from error
+        raise MissingExtraError(
+            "pictures need Matplotlib: pip install 'engram-localisation[plots]'"
+        ) from error
     matplotlib.use("Agg")
     from matplotlib import pyplot
 

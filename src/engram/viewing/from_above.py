@@ -125,7 +125,7 @@ def _matplotlib() -> ModuleType:
         import matplotlib.figure
     except ImportError as error:
         raise MissingExtraError(
-            "pictures of maps need Matplotlib: pip install 'engram[plots]'"
+            "pictures of maps need Matplotlib: pip install 'engram-localisation[plots]'"
         ) from error
     return matplotlib
 

@@ -1,0 +1,72 @@
+"""References that the code knows: every verb's help, every setting, the public Python names."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import typer
+
+import engram
+from engram.cli.app import app
+from engram.cli.settings import AllSettings, every_setting
+from engram.cli.verbs import GROUPS
+
+
+def write_references(folder: Path) -> None:
+    """Writes one Markdown file for each reference."""
+    folder.mkdir(exist_ok=True)
+    for name, text in (
+        ("commands", commands()),
+        ("settings", settings()),
+        ("python", public_names()),
+    ):
+        (folder / f"{name}.md").write_text(text, encoding="utf-8")
+
+
+def commands() -> str:
+    """The help of every verb, by group."""
+    program: Any = typer.main.get_command(app)
+    parts = []
+    for title, verbs in GROUPS.items():
+        parts.append(f"### {title}")
+        for name in verbs:
+            with program.make_context("engram", [name], resilient_parsing=True) as context:
+                verb = program.commands[name]
+                with verb.make_context(name, [], parent=context, resilient_parsing=True) as inner:
+                    parts += [f"#### {name}", f"```text\n{verb.get_help(inner)}\n```"]
+    return "\n\n".join(parts) + "\n"
+
+
+def settings() -> str:
+    """A table of all settings with their defaults."""
+    rows = ["| setting | default | bounds | meaning |", "| --- | --- | --- | --- |"]
+    rows += [
+        f"| `{one.key}` | `{one.value}` | {one.bounds} | {one.description} |"
+        for one in every_setting(AllSettings())
+    ]
+    return "\n".join(rows).replace("<", "&lt;") + "\n"
+
+
+def public_names() -> str:
+    """What `import engram` offers: signatures and docstrings."""
+    parts = []
+    for name in engram.__all__:
+        thing = getattr(engram, name)
+        if name.startswith("__"):
+            continue
+        parts.append(f"### `{name}`")
+        parts.append(f"```text\n{inspect.getdoc(thing) or ''}\n```")
+        if not inspect.isclass(thing):
+            continue
+        for method, value in vars(thing).items():
+            documented = inspect.getdoc(value)
+            if method.startswith("_") or not callable(value) or documented is None:
+                continue
+            try:
+                signature = str(inspect.signature(value))
+            except ValueError:
+                continue
+            parts.append(f"```text\n{method}{signature}\n\n{documented}\n```")
+    return "\n\n".join(parts) + "\n"
