@@ -1,4 +1,4 @@
-"""Why the candidates of one frame stand in the order in which they do: `engram explain`."""
+"""Reasons for the order of one frame's candidates: `engram explain`."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from engram.robot.starting import robot_on
 
 @dataclass(frozen=True, slots=True)
 class ExplainOptions:
-    """What is explained.
+    """Options of `explain_frame`.
 
     Attributes:
         frame: number of the frame in the drive, from 0.
         policy: key of `POLICIES`.
-        lanes, rounds: the budget of each frame, up to this one and in it.
+        lanes, rounds: the budget of each frame up to and including this one.
         relocaliser: key of `RELOCALISERS`; None for none.
         at: number or tag of the map's revision; None for the newest.
     """
@@ -61,17 +61,17 @@ class ExplainedCandidate:
     """One candidate of the frame.
 
     Attributes:
-        node, session: which.
-        drive: the session in words: robot and start.
-        distance_m, along_m, across_m, yaw_rad: where the live camera is expected from the node.
-        success_rate: g, how likely a match is at that distance if the appearance is alike.
-        chance: of success, as the policy reckons; None if it reckons no chances.
-        by_turn: whether it stands here because its turn has come, whatever its chance: a robot
-            that has lost its place tries others, too, than those it thinks the best.
-        terms: what the policy's score is made of.
+        node, session: ids of the node and of its session.
+        drive: robot and start of the session, as text.
+        distance_m, along_m, across_m, yaw_rad: expected pose of the live camera in the node.
+        success_rate: g, probability of a match at that distance if the appearance is compatible.
+        chance: probability of success by the policy; None if it estimates none.
+        by_turn: whether its place is by rotation, not by its score: a lost robot also tries nodes
+            that it does not rank best.
+        terms: parts of the policy's score.
         attempted: whether the budget reached it.
         would_match: whether it matched, or would have.
-        inliers: of that match.
+        inliers: inliers of that match.
     """
 
     node: NodeId
@@ -117,12 +117,12 @@ class Explanation:
 
     Attributes:
         frame: number of the frame.
-        stamp_ns: its stamp.
-        policy: which ordered them.
-        status: how the frame was localised.
-        meaning: what the terms are, one line each.
-        rule: how they make the order; empty where the policy says no more than its name.
-        candidates: best first; none where the robot had no position, or the frame was unusable.
+        stamp_ns: its stamp, UTC.
+        policy: name of the ranking policy.
+        status: localisation status of the frame.
+        meaning: description of each term, one line each.
+        rule: how the terms give the order; empty if the policy's name says it.
+        candidates: best first; empty if the robot had no position or the frame was unusable.
     """
 
     frame: int
@@ -147,7 +147,7 @@ class Explanation:
 
 
 class _Watching:
-    """Ranks as another policy does and keeps what it was asked, and what would have matched."""
+    """Wraps a policy, and keeps its last context and what would have matched."""
 
     def __init__(self, policy: RankingPolicy) -> None:
         self._policy = policy
@@ -166,19 +166,19 @@ class _Watching:
 def explain_frame(
     map_path: Path, sequence: DriveSequence, settings: Settings, options: ExplainOptions
 ) -> Explanation:
-    """Localises a drive up to a frame, and tells why its candidates stand as they do.
+    """Localises a drive up to a frame, and explains the order of its candidates.
 
-    Every candidate of the frame is attempted, to see which would have matched; on the way there
-    only what the budget allows.
+    At that frame every candidate is attempted, to see which would match; before it only what the
+    budget allows.
 
     Args:
         map_path: NAME.engram.
         sequence: the drive.
         settings: the resolved configuration.
-        options: which frame, policy and budget.
+        options: frame, policy and budget.
 
     Raises:
-        ConfigError: the drive has no such frame, or there is no such policy.
+        ConfigError: the drive has no such frame, or the policy is unknown.
         MapError: the map cannot be read.
         SequenceError: the drive's images cannot be used.
     """
@@ -246,7 +246,7 @@ def _explained(
 
 
 def _drives(opened: Map) -> dict[SessionId, str]:
-    """Each session in words."""
+    """Robot and start of each session, as text."""
     words = {}
     for session in opened.sessions.values():
         if session.clock is Clock.UTC:

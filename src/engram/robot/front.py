@@ -1,4 +1,4 @@
-"""What reaches a robot: images or logged frames, decoded ahead, in real time or at once."""
+"""Input of a robot: images or logged frames, decoded ahead, in real time or at once."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from engram.sequences import FrameSequence, LoggedFrame, StereoSequence
 T = TypeVar("T")
 Arrived: TypeAlias = StereoPair | LoggedFrame
 
-# Decoded pairs that wait ahead of the front-end: about 8 MB at KITTI's size.
+# Decoded pairs that wait for the front-end: about 8 MB at KITTI's size.
 _READ_AHEAD = 8
 
 
 class Front:
-    """From images to a frame and its motion: front-end, odometry, gaps filled.
+    """From images to a frame and its motion: front-end, odometry, gap filling.
 
-    A frame log brings frame and odometry along.
+    A frame log already contains frame and odometry.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -38,13 +38,13 @@ class Front:
         motion: Motion | None = None,
         clock: StageClock | None = None,
     ) -> tuple[Frame, Motion]:
-        """The frame and how the camera moved since the usable one before.
+        """The frame and the camera's motion since the previous usable one.
 
         Args:
             arrived: a pair of images, or a frame of a log.
-            motion: measured by something else; it takes the place of odometry. Then give it for
-                all frames of the drive.
-            clock: takes the time of front-end and odometry.
+            motion: an external measurement that replaces odometry; give it for all frames of the
+                drive or for none.
+            clock: measures the duration of front-end and odometry.
         """
         if isinstance(arrived, LoggedFrame):
             if motion is None:
@@ -62,8 +62,8 @@ class Front:
 def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]]:
     """Each item with the time at which it arrives: at once, or at the given rate.
 
-    At a rate, items arrive on schedule whether or not the consumer is ready, as on a robot: one
-    that comes back late finds the next item already waiting.
+    At a rate, items arrive on schedule whether or not the consumer is ready, as on a robot: a late
+    consumer finds the next item waiting.
     """
     first: float | None = None
     for count, item in enumerate(items):
@@ -79,17 +79,17 @@ def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]
 
 
 def arriving(sequence: StereoSequence | FrameSequence) -> Generator[Arrived]:
-    """What a drive holds, decoded ahead of who takes it; see `read_ahead`."""
+    """The pairs or logged frames of a drive, decoded ahead of the consumer; see `read_ahead`."""
     items: Iterable[Arrived] = sequence
     return read_ahead(items, _READ_AHEAD)
 
 
 def read_ahead(items: Iterable[T], depth: int) -> Generator[T]:
-    """Iterates on a thread of its own, up to `depth` items ahead of the consumer.
+    """Iterates on its own thread, up to `depth` items ahead of the consumer.
 
-    An error of the iteration is raised where the item would have come. Close the generator where
-    it is left early: that ends the thread. After an error its traceback would keep the thread
-    alive to the end of the process, and one in the midst of C++ takes the process down with it.
+    An error of the iteration is raised in place of the item. Close the generator when you leave it
+    early: this ends the thread. Otherwise an error's traceback keeps the thread alive until the
+    process ends, which crashes if the thread is inside C++ code.
     """
     queue: Queue[tuple[T | None, BaseException | None, bool]] = Queue(depth)
     stopped = Event()

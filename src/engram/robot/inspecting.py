@@ -1,4 +1,4 @@
-"""What a map holds and whether it is sound, as plain values."""
+"""Content and integrity of a map, as plain values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from engram.maps.history import stamp_text
 
 
 def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
-    """A map in numbers, for ``engram info``.
+    """Counts and properties of a map, for ``engram info``.
 
     Raises:
         MapError: the map cannot be read.
@@ -45,7 +45,7 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
 
 
 def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The sessions of a map in the order of their coming, for ``engram info --sessions``.
+    """The sessions of a map in order of arrival, for ``engram info --sessions``.
 
     Raises:
         MapError: the map cannot be read, or has no such revision.
@@ -77,7 +77,7 @@ def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any
 
 
 def list_nodes(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The nodes of a map in the order of their coming, for ``engram info --nodes``.
+    """The nodes of a map in order of arrival, for ``engram info --nodes``.
 
     Raises:
         MapError: the map cannot be read, or has no such revision.
@@ -109,17 +109,17 @@ def amend_session(
     author: str,
     message: str = "",
 ) -> dict[str, Any]:
-    """Sets right what is shown of a session, for ``engram amend``; see `Map.amend`.
+    """Corrects the robot, zone or start of a session, for ``engram amend``; see `Map.amend`.
 
     Args:
         path: NAME.engram.
-        session: its UUID, or enough of its beginning.
-        changes: what is wrong, and what it is.
-        author: who.
-        message: why.
+        session: its UUID, or an unambiguous prefix.
+        changes: field → its correct value.
+        author: author of the revision.
+        message: reason, shown by ``engram log``.
 
     Raises:
-        InputError: no session, or several, begin so; or nothing of it would change.
+        InputError: the prefix matches no session or several, or nothing would change.
         ConfigError: the zone is unknown.
         MapError: the map cannot be written.
     """
@@ -137,10 +137,10 @@ def amend_session(
 
 
 def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
-    """What is wrong with a map, for ``engram check``.
+    """Checks a map for damage, for ``engram check``.
 
     Raises:
-        MapError: the file is no map, of a newer format, or too damaged to be store.
+        MapError: the file is not a map, has a newer format, or is too damaged to open.
     """
     removed = 0
     if clean:
@@ -161,7 +161,7 @@ def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
 
 
 def seal_map(path: Path) -> list[dict[str, Any]]:
-    """Commits what interrupted sessions had saved, for ``engram seal``.
+    """Commits the saved part of interrupted sessions, for ``engram seal``.
 
     Raises:
         MapError: the map cannot be written.

@@ -1,4 +1,4 @@
-"""Keeping while driving: a live robot's map or memory grows beside its loop, never at its cost."""
+"""Saving during a live drive: map or memory grow beside the robot's loop without delaying it."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import Spool, commit_spools
 from engram.sequences import SequenceInfo, first_pair_hash, session_of
 
-# Stamps since 1973 in nanoseconds: those of a clock, not those since a robot was switched on.
+# Stamps from here (1973) on come from a clock; smaller ones count from the robot's start.
 _CLOCK_FROM_NS = 10**17
 
 
 class SavingState(StrEnum):
-    """What becomes of what a robot finds."""
+    """State of the saving of a live drive."""
 
     OFF = "off"
     ON = "on"
@@ -39,16 +39,16 @@ class SavingState(StrEnum):
 
 @dataclass(slots=True)
 class Saving:
-    """Whether what a robot finds is saved.
+    """Whether and where a live drive is saved.
 
     Attributes:
-        state: `FAILED` once something could not be written: the robot drives on and localises,
-            and what it had saved so far stays; `SPOOLED` where another process writes to the map,
-            so that the drive's memory waits in a file beside it.
+        state: `FAILED` after a write error: the robot continues to localise, and what it had saved
+            is kept; `SPOOLED` if another process writes to the map, so that the drive's memory
+            waits in a file beside it.
         reason: why saving failed, or where the memory waits.
         session: the drive.
-        revision: number of the revision that it became.
-        nodes: nodes saved.
+        revision: number of the revision that holds the drive.
+        nodes: number of saved nodes.
     """
 
     state: SavingState = SavingState.OFF
@@ -76,14 +76,14 @@ class Saving:
 
 @dataclass(frozen=True, slots=True)
 class Owner:
-    """Whose drive is kept.
+    """The robot whose drive is kept.
 
     Attributes:
-        name: of the robot.
+        name: name of the robot.
         camera: its camera.
         settings: the resolved configuration.
         options: how it localises.
-        recorded: the session, where it is known before the first frame.
+        recorded: the session, if known before the first frame.
     """
 
     name: str | None
@@ -93,7 +93,7 @@ class Owner:
     recorded: Session | None = None
 
     def made_by(self, first: Arrived) -> tuple[DescriptorKind, str]:
-        """Kind of descriptors, and hash of the front-end; a logged frame brings its own along."""
+        """Kind of descriptors and hash of the front-end, those of the log for a logged frame."""
         if isinstance(first, StereoPair):
             return self.settings.frontend.descriptor, Frontend(self.settings.frontend).hash
         return first.frame.descriptor, first.frame.frontend
@@ -131,28 +131,32 @@ class Into(Protocol):
         ...
 
     def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
-        """The keeper of the drive, whose frames have these descriptors by this front-end.
+        """Begins the drive; returns its keeper.
+
+        Args:
+            session: the drive.
+            made_by: kind of its descriptors, and hash of the front-end.
 
         Raises:
-            MapError: it cannot be begun.
+            MapError: the session cannot be begun.
         """
         ...
 
     def end(self, saving: Saving, *, well: bool) -> None:
-        """Makes a revision of it; `well` says that all of it was written so far."""
+        """Commits the drive as a revision; `well` if everything was written so far."""
         ...
 
     def close(self) -> None:
-        """Lets go of files and threads."""
+        """Releases files and threads."""
         ...
 
 
 class IntoMap:
-    """A drive that is mapped, through the robot's own view of the map, which grows.
+    """Maps a drive, through the robot's own view of the map, which grows.
 
     Args:
-        owner: whose drive it is.
-        opened: that view.
+        owner: the robot.
+        opened: its view of the map.
     """
 
     def __init__(self, owner: Owner, opened: Map) -> None:
@@ -183,7 +187,7 @@ class IntoMap:
         return self._drive.mapper
 
     def end(self, saving: Saving, *, well: bool) -> None:
-        """See `Into`; of a drive that was not all written, what was is committed."""
+        """See `Into`; commits what was written, even if a later write failed."""
         drive = self._drive
         if drive is None:
             return
@@ -203,10 +207,10 @@ class IntoMap:
 
 
 class IntoMemory:
-    """A drive of which only path and attempts are kept; see `engram.robot.spool`.
+    """Keeps only path and attempts of a drive; see `engram.robot.spool`.
 
     Args:
-        owner: whose drive it is.
+        owner: the robot.
         opened: the map.
     """
 
@@ -258,12 +262,12 @@ class IntoMemory:
 
 
 class LiveKeeper(Keeper):
-    """Keeps a live drive by another keeper, and ends that where something cannot be written.
+    """Keeps a live drive by another keeper, and stops keeping after a write error.
 
-    The session begins with the first frame: only then is it known which drive it is.
+    The session begins with the first frame, which identifies the drive.
 
     Args:
-        owner: whose drive it is.
+        owner: the robot.
         into: where the session goes.
     """
 
@@ -274,7 +278,7 @@ class LiveKeeper(Keeper):
         self._keeper = KEEPS_NOTHING
 
     def begin(self, first: Arrived) -> None:
-        """The drive begins with this pair or logged frame."""
+        """Begins the drive with this pair or logged frame."""
         session = self._owner.session(first)
         self._into.localiser.begin(session)
         self.saving.session = session.id
@@ -284,10 +288,10 @@ class LiveKeeper(Keeper):
             self._fail(error)
 
     def close(self) -> None:
-        """The drive is over: what was kept becomes a revision.
+        """Ends the drive and commits it as a revision.
 
         Raises:
-            MapError: it cannot be written, though nothing failed while the robot drove.
+            MapError: it cannot be written, though no earlier write failed.
         """
         failed = self.saving.state is SavingState.FAILED
         try:
@@ -313,7 +317,7 @@ class LiveKeeper(Keeper):
         return self._keeper.may_propose_own(certain=certain)
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """See `Keeper`; what cannot be written ends the saving, not the drive."""
+        """See `Keeper`; a write error ends the saving, not the drive."""
         try:
             found = self._keeper.keep(live, found)
         except MapError as error:

@@ -1,4 +1,4 @@
-"""Localisers in a map: they share what they learn of it."""
+"""Localisers in a map; they share what is derived from it."""
 
 from __future__ import annotations
 
@@ -54,20 +54,20 @@ def localiser_in(
 
     Args:
         opened: the map.
-        camera: the live camera, which need not be one of the map's.
+        camera: the live camera; it may differ from those of the map.
         settings: the resolved configuration.
-        policy: key of `POLICIES`, or a policy of the caller's own.
-        budget: by default 2 lanes × 2 rounds.
+        policy: key of `POLICIES`, or a policy.
+        budget: attempts per frame; None for 2 lanes × 2 rounds.
         relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
         live: the live session.
-        saves: whether it is being mapped.
+        saves: whether the session is being mapped.
         threads: whether lanes run on threads.
-        matcher, search: in place of the usual ones; see `Localiser`.
-        clock: what its stamps mean, and where it is; None if unknown.
-        path_memory: in place of the map's.
+        matcher, search: replace the default ones; see `Localiser`.
+        clock: time zone and location of its stamps; None if unknown.
+        path_memory: replaces that of the map.
 
     Raises:
-        ConfigError: there is no such policy or relocaliser.
+        ConfigError: the policy or the relocaliser is unknown.
     """
     ranking = policy_named(policy) if isinstance(policy, str) else policy
     descriptor = settings.frontend.descriptor
@@ -97,15 +97,15 @@ def localiser_in(
 
 
 def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Relocaliser:
-    """What finds a lost robot in a map.
+    """The relocaliser of a map.
 
     Args:
         opened: the map.
         name: key of `RELOCALISERS`.
-        descriptor: kind of the live frames' descriptors; counts while the map is empty.
+        descriptor: kind of the live frames' descriptors; used while the map is empty.
 
     Raises:
-        ConfigError: there is no such relocaliser.
+        ConfigError: the relocaliser is unknown.
         MapCorruptError: the vocabulary or a node's landmarks are damaged.
     """
     if name not in RELOCALISERS:
@@ -114,12 +114,12 @@ def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Reloca
 
 
 def drives_of(opened: Map) -> dict[SessionId, Session]:
-    """Its sessions, and those that are being added, by id: for `Map.derived`."""
+    """Sessions of a map by id, including those being added; for `Map.derived`."""
     return dict(opened.sessions)
 
 
 def lessons_of(opened: Map, focal_px: float) -> Lessons:
-    """What its drives learnt, for a live camera of this focal length, px: for `Map.derived`."""
+    """`Lessons` of a map, for a live camera of this focal length, px; for `Map.derived`."""
     made, basin = opened.attempts, MatchBasin.of(focal_px, opened.basin_counts)
     along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
     rates = basin.success_rate(along_m, across_m)

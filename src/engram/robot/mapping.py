@@ -27,14 +27,14 @@ from engram.sequences import FrameLog
 
 @dataclass(slots=True)
 class MapReport:
-    """What mapping a drive came to.
+    """Result of mapping a drive.
 
     Attributes:
         session: the drive.
         revision: number of the revision that holds it; None if it was interrupted.
-        known: whether the map held this very drive already; then nothing was done.
-        resumed: whether it went on where an earlier run had stopped.
-        interrupted: whether it was stopped; what was done is saved, and can be resumed.
+        known: whether the map already held this drive, so that nothing was done.
+        resumed: whether the run continued an earlier one.
+        interrupted: whether the run was stopped; its progress is saved and can be resumed.
         skipped: pairs left out under `skip_bad`.
         results: one per live frame.
     """
@@ -76,26 +76,26 @@ def map_drive(
     start: Callable[[Map], Position | None] | None = None,
     descriptor: str | None = None,
 ) -> MapReport:
-    """Adds a drive to a map, which is made if there is none.
+    """Adds a drive to a map; creates the map if there is none.
 
-    A drive that the map holds already changes nothing; one that was interrupted is resumed.
-    Ctrl-C ends it with what was done saved.
+    A drive that the map already holds changes nothing; an interrupted one is resumed. Ctrl-C stops
+    the run and keeps its progress.
 
     Args:
         map_path: NAME.engram.
         sequence: the drive.
         settings: the resolved configuration, kept with the revision; None for the defaults.
-        options: how it is mapped; None for the defaults.
-        monitor: hears what became of each frame, and may stop the drive.
-        start: asked, with the map open, where the robot stands before its first frame; None where
-            nobody knows. A drive that is resumed knows better.
-        descriptor: kind of descriptor that somebody insists on; None for the frame log's, the
-            map's or that of the settings, whichever is known first.
+        options: how to map it; None for the defaults.
+        monitor: receives the status of each frame, and may stop the drive.
+        start: gives the robot's position before its first frame, from the open map; None, or a
+            result of None, if unknown. Not used when a drive is resumed.
+        descriptor: required kind of descriptor; None for that of the frame log, the map or the
+            settings, whichever is known first.
 
     Raises:
-        ConfigError: the frame log or the map has another kind of descriptor than was insisted on.
+        ConfigError: the frame log or the map has another kind of descriptor than required.
         MapError: the map cannot be read or written; what was checkpointed is intact.
-        SequenceError: the drive's images cannot be used; what came before is saved.
+        SequenceError: the drive's images cannot be used; the earlier frames are saved.
     """
     map_path = Path(map_path)
     settings, options = settings or Settings(), options or RobotOptions()
@@ -119,10 +119,10 @@ def map_drive(
 
 
 def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend: str) -> None:
-    """What somebody insists on is not passed over in silence.
+    """Refuses a required kind of descriptor that differs from the existing one.
 
     Raises:
-        ConfigError: there is another kind already.
+        ConfigError: they differ.
     """
     if found is not None and found != asked:
         raise ConfigError(
@@ -140,7 +140,7 @@ def _map(
     start: Callable[[Map], Position | None] | None,
     report: MapReport,
 ) -> None:
-    """Drives through the sequence; commits at the end, or leaves the session to be resumed."""
+    """Drives through the sequence; commits at the end, or leaves the session for a later run."""
     settings = settings.for_descriptor(opened.descriptor)
     session = report.session
     writer = begin_or_resume(
@@ -183,7 +183,7 @@ def _map(
 
 
 def _made_by(sequence: DriveSequence, settings: Settings) -> tuple[DescriptorKind, str]:
-    """Kind of descriptor, and hash of the front-end; frame logs tell which one made them."""
+    """Kind of descriptor and hash of the front-end; a frame log states its own."""
     if isinstance(sequence, FrameLog):
         return sequence.header.descriptor, sequence.header.frontend
     return settings.frontend.descriptor, Frontend(settings.frontend).hash

@@ -26,17 +26,17 @@ from engram.sequences import (
 
 @dataclass(slots=True)
 class ExtractReport:
-    """What recording a drive came to.
+    """Result of recording a drive.
 
     Attributes:
         log: the file.
         frames: frames recorded by this run.
         already_recorded: frames that an earlier run had recorded.
-        unusable: frames of no use on their own: dark, covered, too few landmarks.
+        unusable: unusable frames: dark, covered, too few landmarks.
         without_motion: frames whose odometry failed.
         skipped: pairs left out under `skip_bad`.
         bytes: size of the file.
-        interrupted: whether it was stopped; the same command goes on.
+        interrupted: whether the run was stopped; the same command continues it.
     """
 
     log: str
@@ -73,18 +73,17 @@ def extract_log(
 ) -> ExtractReport:
     """Runs a drive's images through front-end and odometry and records the result.
 
-    An interrupted log is gone on with: odometry depends on what came before, so all frames are
-    run again and those that are recorded already are not written twice. The log of a run that was
-    interrupted is equal to that of one that was not.
+    An interrupted log is continued: odometry depends on earlier frames, so all frames run again,
+    and recorded ones are not written twice. The result equals that of an uninterrupted run.
 
     Args:
-        sequence: the drive; images.
+        sequence: a drive of images.
         out: NAME.framelog.
-        settings: of front-end and odometry.
-        monitor: hears how each frame went, and may stop the recording.
+        settings: settings of front-end and odometry.
+        monitor: receives the status of each frame, and may stop the recording.
 
     Raises:
-        SequenceError: the drive is a frame log already, or its images cannot be used.
+        SequenceError: the drive is already a frame log, or its images cannot be used.
         IncompatibleError: the file is the log of another drive or of other frames.
         MapError: the log cannot be written; what was recorded is intact.
     """
@@ -118,7 +117,7 @@ def extract_log(
         report.interrupted = True
     finally:
         if writer is not None:
-            writer.close()  # after an error or an interruption: what was done is kept
+            writer.close()  # also after an error or an interruption: progress is kept
     report.skipped = sequence.skipped
     report.bytes = out.stat().st_size if out.exists() else 0
     return report

@@ -1,4 +1,4 @@
-"""What a localised drive comes to: one result per frame, and a summary."""
+"""Results of a localised drive: one per frame, and a summary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def localise_drive(
     options: RobotOptions | None = None,
     monitor: Monitor = QUIET,
 ) -> list[Localisation]:
-    """Localises a whole drive in a map that stays as it is; one result per frame."""
+    """Localises a whole drive in an unchanged map; one result per frame."""
     with (
         robot_on(opened, sequence, settings or Settings(), options) as robot,
         closing(robot.drive(sequence, monitor)) as found,
@@ -40,15 +40,15 @@ def measure(
     options: RobotOptions,
     monitor: Monitor = QUIET,
 ) -> Drive:
-    """Localises a drive in a map that stays as it is; what the measures of SPEC §8 need of it."""
+    """Localises a drive in an unchanged map; returns the input of the measures of SPEC §8."""
     return measured(localise_drive(opened, sequence, settings, options, monitor))
 
 
 def measured(found: Sequence[Localisation]) -> Drive:
-    """What the measures need of a drive's localisations.
+    """The input of the measures, from a drive's localisations.
 
-    Steps that odometry could not measure are guessed, and those past frames of no use are shared
-    among them: without these the worst stretches of a drive would count as nothing.
+    Steps that odometry could not measure are guessed, and the motion past unusable frames is
+    shared among them: otherwise the worst stretches of a drive would not count.
     """
     steps_m = driven_steps_m([one.motion for one in found], [one.stamp_ns for one in found])
     localised = [one.localised for one in found]
@@ -77,7 +77,7 @@ def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
 
 
 def damage_warning(damaged: Sequence[str]) -> str:
-    """What people are told of the nodes that could not be read; needs at least one."""
+    """The warning about unreadable nodes, of which there is at least one."""
     return (
         f"warning: {len(damaged)} damaged nodes of the map were passed over, such as "
         f"{damaged[0]}: engram check tells more"

@@ -1,4 +1,4 @@
-"""The one loop: `Robot.step` takes what arrived, localises it, and keeps what was found."""
+"""The one loop: `Robot.step` takes a frame, localises it, and keeps the result."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _REMEMBERED = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What a robot saw last, for those who show it.
+    """The robot's last frame, for display.
 
     Attributes:
         arrived: the images, or the logged frame.
-        frame: what the front-end made of them.
-        outcomes: what became of the attempts, in ranked order.
+        frame: the frame extracted from them.
+        outcomes: outcomes of the attempts, in ranked order.
     """
 
     arrived: Arrived
@@ -50,17 +50,16 @@ class Seen:
 class Robot:
     """One robot on one drive: image pairs in, `Localisation`s out. A context manager.
 
-    One thread calls a robot's methods, whichever it is. A robot runs others of its own: a lane for
-    each attempt at the same time (`Budget.lanes`); in `drive` one that reads ahead; and where it
-    keeps what it finds one that writes, and one that looks for loops. No more than
-    `Budget.lanes` + 3. Several robots in one process share nothing but the map they were made by,
-    and each may run on a thread of its own.
+    One thread at a time calls a robot's methods. A robot runs up to `Budget.lanes` + 3 threads of
+    its own: one for each lane; one that reads ahead in `drive`; and if it keeps its results, one
+    that writes and one that closes loops. Robots in one process share only the map that made them;
+    each may run on its own thread.
 
     Args:
         front: front-end and odometry.
-        localiser: of this drive.
-        keeper: what becomes of what is found.
-        deadline_ms: of each frame; None for none.
+        localiser: localiser of this drive.
+        keeper: keeps the results.
+        deadline_ms: latest start of an attempt after its frame arrived; None for no limit.
     """
 
     def __init__(
@@ -88,11 +87,10 @@ class Robot:
         self.close()
 
     def close(self) -> None:
-        """Ends the drive, and the robot's threads; what a live robot keeps becomes a revision.
+        """Ends the drive and the robot's threads; commits what a live robot keeps.
 
         Raises:
-            MapError: it cannot be written, though nothing had failed while the robot drove; see
-                `saving`.
+            MapError: it cannot be written, though no earlier write failed; see `saving`.
         """
         live, self._live = self._live, None
         try:
@@ -103,12 +101,12 @@ class Robot:
 
     @property
     def outcomes(self) -> list[Outcome]:
-        """What became of the attempts for the last frame, in ranked order."""
+        """Outcomes of the attempts for the last frame, in ranked order."""
         return self._localiser.outcomes
 
     @property
     def saving(self) -> Saving:
-        """Whether what a live robot finds is saved, and where it came to."""
+        """Whether and where a live robot's results are saved."""
         return self._saving
 
     def step(
@@ -119,24 +117,24 @@ class Robot:
         deadline_ms: float | None = None,
         arrived_s: float | None = None,
     ) -> Localisation:
-        """Localises what arrived; call it for every pair, in the order of time.
+        """Localises one pair or logged frame; call it for each, in temporal order.
 
         Args:
             arrived: a pair of images, (h, w) uint8 grey, rectified, synchronised; or a frame of
                 a frame log.
-            motion: how the camera moved since the usable frame before, where something else than
-                visual odometry measured it; then give it for all frames.
-            deadline_ms: no match attempt starts later than this after the images arrived; by
-                default the robot's own deadline.
+            motion: the camera's motion since the previous usable frame, if measured by something
+                other than visual odometry; give it for all frames or for none.
+            deadline_ms: latest start of an attempt after the images arrived; None for the
+                robot's own deadline.
             arrived_s: `time.perf_counter` when they arrived; None for now.
 
         Returns:
-            Where the robot is, as far as it is known. `node_from_live` (metres, x right, y down,
-            z forward) is set only where the frame was matched.
+            The localisation. `node_from_live` (metres; x right, y down, z forward) is set only if
+            the frame was matched.
 
         Raises:
-            InputError: the stamp is not later than that of the frame before.
-            MapError: the map's landmarks cannot be read, or what is kept not be written.
+            InputError: the stamp is not later than that of the previous frame.
+            MapError: landmarks cannot be read, or the results cannot be written.
         """
         clock = StageClock(arrived_s)
         if deadline_ms is None:
@@ -164,14 +162,14 @@ class Robot:
     ) -> Generator[Localisation]:
         """Drives through a sequence, frame by frame, decoding ahead of the robot.
 
-        Close the generator where it is left early: that ends the thread that reads ahead. While it
+        Close the generator when you leave it early: this ends the thread that reads ahead. While it
         is open, Ctrl-C waits for the end of the frame (`deferred_interrupt`).
 
         Args:
             sequence: images or a frame log.
-            monitor: hears what became of each frame, and may stop the drive between two.
+            monitor: receives the status of each frame, and may stop the drive between two.
             rate_hz: replay in real time at this rate; frames are late after the deadline or,
-                without one, when the next one arrives. None for as fast as it goes.
+                without one, once the next one arrives. None for maximum speed.
 
         Raises:
             ConfigError: the rate is not above 0.
@@ -191,26 +189,26 @@ class Robot:
                 raise_if_asked()
 
     def follow(self, arrived: Arrived, *, motion: Motion | None = None) -> None:
-        """Carries on over what arrived without localising it."""
+        """Carries the position on by the motion to this frame, without localising it."""
         _, motion = self._front.take(self._checked(arrived), motion)
         self._localiser.move(motion)
 
     def place_at(self, hint: Position) -> None:
-        """Tells the robot where it is before its next step: an operator's belief, or last night's.
+        """Sets the position before the next step, such as an operator's or a stored one.
 
-        It counts as any position does: nodes around are tried first, and once the robot has come
-        too far without a match it is lost.
+        It counts like any position: the nodes around it are tried first, and after too long a
+        distance without a match the robot is lost.
         """
         self._localiser.place_at(hint)
 
     def lose(self) -> None:
-        """The robot was carried elsewhere: it knows nothing of its place."""
+        """Discards the position: the robot was carried elsewhere."""
         self._localiser.lose()
 
     def withdraw(self, found: Localisation) -> None:
-        """A later frame disproved what was found: the keeper hears of it, and no pose rests on it.
+        """Withdraws a result that a later frame disproved: no pose rests on it any more.
 
-        Nothing in the loop withdraws yet; it is for whoever knows better.
+        Callers that know better use it; the loop itself does not.
         """
         self._track = deque(
             ((at, replace(one, position=None) if one is found else one) for at, one in self._track),
@@ -219,14 +217,14 @@ class Robot:
         self._keeper.withdrawn(found)
 
     def pose_at(self, stamp_ns: int) -> Position | None:
-        """Where the robot was at a time between its last frames, as when an image was taken.
+        """The position at a time between the robot's last frames, such as that of an image.
 
         Args:
-            stamp_ns: a time since the robot's last 200 frames, on the clock of their stamps.
+            stamp_ns: a time within the robot's last 200 frames, on the clock of their stamps.
 
         Returns:
-            The position of the frame before, carried on along the motion to the frame after; None
-            where that is not known, or the time lies outside of what is remembered.
+            The position of the previous frame, carried on along the motion to the next one; None
+            if unknown or outside these frames.
         """
         usable = [(at, found) for at, found in self._track if found.motion.usable]
         after = bisect_left([at for at, _ in usable], stamp_ns)
@@ -249,7 +247,7 @@ class Robot:
         return found.position.carried_on(back, (1 - share) * motion.covariance)
 
     def _known(self, frame: Frame, motion: Motion) -> Localisation | None:
-        """What the keeper knows of the frame: the robot is placed there, or needs no looking."""
+        """Applies the keeper's hint; returns its result if the frame needs no localising."""
         hint = self._keeper.hint(frame, motion)
         if hint is None:
             return None
@@ -258,16 +256,16 @@ class Robot:
         return hint.found
 
     def _checked(self, arrived: Arrived) -> Arrived:
-        """The same; time only goes on. With the first one the drive of a live robot begins.
+        """The same item, checked for increasing stamps; the first one begins a live drive.
 
         Raises:
-            InputError: it does not.
+            InputError: the stamp is not later than the last one.
         """
         pair = arrived if isinstance(arrived, StereoPair) else arrived.frame
         if self._stamp_ns is not None and pair.stamp_ns <= self._stamp_ns:
             raise InputError(
                 f"stamp {pair.stamp_ns} ns is not later than {self._stamp_ns} ns, that of the "
-                "frame before; give the frames of a drive in the order of time, each once"
+                "previous frame; give the frames of a drive in temporal order, each once"
             )
         if self._stamp_ns is None and self._live is not None:
             self._live.begin(arrived)
@@ -276,7 +274,7 @@ class Robot:
 
 
 def _word(found: Localisation) -> str:
-    """What became of a frame, in a word."""
+    """The status of a frame, in one word."""
     if found.resumed:
         return "resuming"
     return "saved" if found.saved else found.status.value

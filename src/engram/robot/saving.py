@@ -1,4 +1,4 @@
-"""A drive on its way into a map: begun or resumed, saved while it goes, committed at its end."""
+"""Saving a drive in a map: begun or resumed, written as it goes, committed at its end."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from engram.robot.settings import RobotOptions, Settings
 
 
 class SavedDrive:
-    """Saves one drive with a mapper, on a thread of its own, and commits it.
+    """Saves one drive with a mapper, on its own thread, and commits it.
 
     Args:
         opened: the map, open for writing; its graph grows.
-        writer: of the session.
-        localiser: of the drive, in the same map.
-        settings: of the mapper.
-        words: how the words of nodes are found, see `node_words`.
-        waits: whether a slow disk holds up the drive; else it ends the saving.
+        writer: writer of the session.
+        localiser: localiser of the drive, in the same map.
+        settings: settings of the mapper.
+        words: finds the words of nodes, see `node_words`.
+        waits: whether a slow disk slows the drive; else it ends the saving.
 
     Attributes:
         mapper: the drive's keeper.
@@ -62,14 +62,14 @@ class SavedDrive:
         )
 
     def finish(self) -> None:
-        """The drive is over: what its last frames still bring is saved."""
+        """Ends the drive and saves what its last frames still add."""
         self.mapper.finish()
 
     def close(self) -> None:
-        """Writes what was handed over, and ends the threads. The session can be resumed.
+        """Writes what is queued, and ends the threads. The session can be resumed.
 
         Raises:
-            MapError: something could not be written.
+            MapError: a write failed.
         """
         with self._stack:
             self._saver.finish()
@@ -88,19 +88,19 @@ def begin_or_resume(
     message: str,
     author: str | None = None,
 ) -> RevisionWriter:
-    """The writer of a drive: of a new session, or of one that was interrupted.
+    """The writer of a drive: for a new session, or an interrupted one.
 
     Args:
         opened: the map, open for writing.
         session: the drive.
         camera: its camera.
-        made_by: kind of its descriptors, and hash of the front-end that makes them.
+        made_by: kind of its descriptors, and hash of the front-end.
         configuration: see `configuration_of`.
-        message: what `log` shows.
-        author: who maps; None for the robot.
+        message: message of the revision, shown by ``engram log``.
+        author: author of the revision; None for the robot.
 
     Raises:
-        MapError: the map holds the drive already, or cannot be written.
+        MapError: the map already holds the drive, or cannot be written.
     """
     if opened.session_state(session.id) is SessionState.INTERRUPTED:
         return opened.resume_session(session.id)
@@ -116,7 +116,7 @@ def begin_or_resume(
 
 
 def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any]:
-    """The resolved configuration, which every revision keeps (STYLE: reproducible)."""
+    """The resolved configuration, which every revision keeps."""
     return {
         "settings": to_dict(settings),
         "options": to_dict(options),
@@ -126,7 +126,7 @@ def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any
 
 
 def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> NodeWords | None:
-    """How the words of saved nodes are found; those that older nodes lack are filled in first."""
+    """Finds the words of saved nodes; first adds those missing from older nodes."""
     if relocaliser not in RECOGNISERS:
         return None
     words = opened.derived(words_of, settings.frontend.descriptor)
@@ -137,7 +137,7 @@ def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> Node
 def loop_search(
     opened: Map, localiser: Localiser, settings: Settings
 ) -> LoopSearch | nullcontext[None]:
-    """Looks for loops by the words that the relocaliser knows; None where it knows none."""
+    """Loop search by the words of the relocaliser; a null context if it has none."""
     finder = localiser.relocaliser
     if not isinstance(finder, ByAppearance):
         return nullcontext()

@@ -24,11 +24,11 @@ def open_drive(path: Path, **options: Any) -> ImageSequence | FrameLog:
 
     Args:
         path: a folder of stereo images, or a frame log.
-        **options: of `open_sequence`.
+        **options: options of `open_sequence`.
 
     Raises:
         SequenceError: the drive cannot be used.
-        CalibrationError: its calibration cannot.
+        CalibrationError: its calibration cannot be used.
         ConfigError: an option is out of range.
     """
     return open_sequence(path, **options)

@@ -25,12 +25,12 @@ class Settings:
     mapper: MapperConfig = field(default_factory=MapperConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
-        """These settings for a map's kind of descriptor; None for the one they have.
+        """These settings for a map's kind of descriptor; None keeps their own.
 
-        What is not set of matching becomes what suits the kind.
+        Matcher settings that are not set explicitly become the defaults of that kind.
 
         Raises:
-            ConfigError: the kind is unknown here.
+            ConfigError: the kind is unknown.
         """
         before = self.frontend.descriptor
         frontend = self.frontend
@@ -49,16 +49,16 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class RobotOptions:
-    """How a robot ranks and how much it may attempt.
+    """Ranking policy and budget of a robot.
 
     Attributes:
         policy: key of `POLICIES`.
         lanes, rounds: the budget of each frame.
-        deadline_ms: no attempt starts later than this after its frame arrived. None counts alone,
-            so that the same input gives the same results.
+        deadline_ms: latest start of an attempt after its frame arrived. With None only the counts
+            limit it, so that equal input gives equal results.
         relocaliser: key of `RELOCALISERS`, for a lost robot; None for none.
         threads: whether the lanes run on threads; without a deadline the results are the same.
-        author: who maps; None for the robot.
+        author: author of revisions; None for the robot.
     """
 
     policy: str = "recall"
@@ -75,7 +75,7 @@ class RobotOptions:
 
     @property
     def budget(self) -> Budget:
-        """What each frame may cost."""
+        """The budget of each frame."""
         return Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)
 
 
@@ -84,7 +84,7 @@ def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:
 
     Args:
         path: the file; None for the defaults.
-        descriptor: kind of descriptor that takes the place of the file's; None leaves it.
+        descriptor: kind of descriptor that replaces the file's; None keeps it.
 
     Raises:
         ConfigError: the file cannot be read, or a setting is unknown or out of range.

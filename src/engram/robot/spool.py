@@ -1,11 +1,12 @@
 """A drive's memory in a file beside the map, until the map's writer is free.
 
-A robot that only remembers needs the map's writer for a moment at the end of its drive, not for
-all of it: others map meanwhile. So its path and attempts go into a file of their own, which also
-survives a crash, and whoever finds the writer free commits them as a session.
+A robot that only remembers needs the map's writer at the end of its drive, not throughout: others
+may map meanwhile. So its path and attempts go to a separate file, which also survives a crash. The
+next process that finds the writer free commits them as a session.
 
-The file is a row of chunks: length and CRC-32 of the body, each a little-endian uint32, then the
-body, compressed MessagePack. The first chunk is the header. A chunk torn by a crash ends the file.
+The file is a sequence of chunks: length and CRC-32 of the body, each a little-endian uint32, then
+the body, compressed MessagePack. The first chunk is the header. A chunk torn by a crash ends the
+file.
 """
 
 from __future__ import annotations
@@ -52,12 +53,12 @@ class Spool:
     """Writes one drive's memory; a `RecordWriter` of a session without nodes.
 
     Args:
-        map_path: the map beside which it lies.
+        map_path: the map; the file lies beside it.
         session: the drive.
         camera: its camera.
-        made_by: kind of its descriptors, and hash of the front-end that makes them.
+        made_by: kind of its descriptors, and hash of the front-end.
         configuration: kept with the revision.
-        most_bytes: how large it may become; what comes later is not remembered.
+        most_bytes: largest size; later records are dropped.
 
     Raises:
         MapError: the file cannot be written.
@@ -91,7 +92,7 @@ class Spool:
 
     @property
     def full(self) -> bool:
-        """Whether it has become so large that nothing more is remembered."""
+        """Whether it has reached its largest size and drops further records."""
         return self._file.tell() >= self._most_bytes
 
     def add_path_entry(self, entry: PathEntry) -> None:
@@ -110,7 +111,7 @@ class Spool:
         self._entries, self._attempts = [], []
 
     def close(self) -> None:
-        """From now on it may be committed."""
+        """Closes the file; from now on it may be committed."""
         self._file.close()
 
     def add_node(self, node: Node, frame: Frame) -> None:
@@ -134,14 +135,14 @@ class Spool:
 
 
 def commit_spools(map_path: Path) -> list[Revision]:
-    """Commits the memories that lie beside a map, each as a session without nodes.
+    """Commits the memories beside a map, each as a session without nodes.
 
-    Those of drives that still go on are left alone. Entries and attempts of nodes that the map no
-    longer shows are left out.
+    Memories of running drives are left alone. Entries and attempts of nodes that the map no longer
+    shows are left out.
 
     Raises:
         MapLockedError: another process writes to the map; the memories wait.
-        MapError: the map cannot be written, or a memory not be read.
+        MapError: the map cannot be written, or a memory cannot be read.
     """
     spools = sorted(map_path.parent.glob(f"{glob.escape(map_path.name)}-memory-*"))
     if not spools:
@@ -158,10 +159,10 @@ def commit_spools(map_path: Path) -> list[Revision]:
 
 
 def _commit(opened: Map, chunks: Iterator[dict[str, Any]], path: Path) -> Revision | None:
-    """The revision; None where there is nothing to remember, or all of it is in the map."""
+    """The revision; None if the memory is empty or already in the map."""
     header = next(chunks, None)
     if header is None:
-        return None  # killed before it was begun
+        return None  # killed before the header was written
     if header["version"] != _VERSION:
         raise MapError(f"{path} was written by a newer Engram; upgrade to commit it")
     graph, session = opened.graph, _session(header["session"])
@@ -211,7 +212,7 @@ def _session(values: dict[str, Any]) -> Session:
 
 
 def _chunks(file: IO[bytes], path: Path) -> Iterator[dict[str, Any]]:
-    """What is whole of a memory."""
+    """The intact chunks of a memory."""
     while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
         length, checksum = _CHUNK.unpack(head)
         body = file.read(length)
@@ -220,7 +221,7 @@ def _chunks(file: IO[bytes], path: Path) -> Iterator[dict[str, Any]]:
         try:
             yield msgspec.msgpack.decode(zlib.decompress(body))
         except (msgspec.DecodeError, zlib.error) as error:
-            raise MapCorruptError(f"{path} is no memory of a drive: {error}") from error
+            raise MapCorruptError(f"{path} is not a memory of a drive: {error}") from error
 
 
 def _opened(path: Path, flags: int) -> IO[bytes]:

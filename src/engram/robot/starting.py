@@ -32,12 +32,12 @@ def robot_on(
         opened: the map.
         sequence: the drive, for `Robot.drive`.
         settings: the resolved configuration.
-        options: how; None for the defaults.
-        policy: in place of that of the options.
+        options: ranking policy and budget; None for the defaults.
+        policy: replaces that of the options.
         remembers: whether path and attempts are kept as a session; see `Map.robot`.
 
     Raises:
-        ConfigError: there is no such policy or relocaliser.
+        ConfigError: the policy or the relocaliser is unknown.
         SequenceError: the drive has no usable frame.
     """
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
@@ -77,7 +77,7 @@ def robot_in(
         localiser = owner.localiser_in(opened, saves=False)
         return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
     if name is None:
-        raise ConfigError("a robot whose drives are kept needs a name: give name=")
+        raise ConfigError("a robot that keeps its drives needs a name: give name=")
     _check_newest(opened)
     if not maps:
         return _keeping(owner, IntoMemory(owner, opened))
@@ -86,14 +86,14 @@ def robot_in(
 
 
 def _check_newest(opened: Map) -> None:
-    """Drives are kept on top of the newest revision.
+    """Refuses to keep drives in a map opened at an older revision.
 
     Raises:
-        RevisionError: the map was opened as of a certain one.
+        RevisionError: the map was opened at a named revision.
     """
     if opened.is_pinned:
         raise RevisionError(
-            f"{opened.location} is open as of revision {opened.revision}; to keep drives, open it "
+            f"{opened.location} is open at revision {opened.revision}; to keep drives, open it "
             "without naming a revision"
         )
 

@@ -1,4 +1,4 @@
-"""A map's vocabulary: trained from maps and drives, kept in the map, described."""
+"""A map's vocabulary: training it from maps and drives, storing and describing it."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ MAP_SUFFIX = ".engram"
 
 @dataclass(frozen=True, slots=True)
 class VocabularyReport:
-    """What a map's vocabulary is.
+    """Properties of a map's vocabulary.
 
     Attributes:
         descriptor: kind of its words.
-        words: their number.
-        images: training frames.
-        hash: 32 hexadecimal digits that name it.
-        trained_on: what it was trained on, in words.
-        default: whether it is the one that ships with the package.
-        revision: number of the revision that brought it; None where nothing was stored.
+        words: number of words.
+        images: number of training frames.
+        hash: 32 hexadecimal digits that identify it.
+        trained_on: description of the training data.
+        default: whether it is the vocabulary that ships with the package.
+        revision: number of the revision that stored it; None if none was stored.
     """
 
     descriptor: str
@@ -72,7 +72,7 @@ class VocabularyReport:
 
 
 def describe_vocabulary(map_path: Path, at: int | str | None = None) -> VocabularyReport:
-    """The vocabulary by which robots find themselves in a map.
+    """Describes the vocabulary that relocalises robots in a map.
 
     Args:
         map_path: the map.
@@ -94,19 +94,19 @@ def train_map_vocabulary(
     author: str,
     monitor: Monitor = QUIET,
 ) -> VocabularyReport:
-    """Trains a vocabulary and keeps it in a map, in a revision of its own.
+    """Trains a vocabulary and stores it in a map, as a revision of its own.
 
     Args:
         map_path: the map.
-        sources: maps and drives to train on; the map itself where there are none.
-        config: how it is trained.
-        author: who asked for it.
-        monitor: sees each part of the work.
+        sources: maps and drives to train on; if empty, the map itself.
+        config: settings of the training.
+        author: author of the revision.
+        monitor: receives each stage of the work.
 
     Raises:
-        InputError: too few descriptors for so many words.
+        InputError: too few descriptors for this number of words.
         IncompatibleError: a source has another kind of descriptor than the map.
-        MapError: a map cannot be read, or this one not written.
+        MapError: a source cannot be read, or the map cannot be written.
     """
     with Map.open(map_path) as store:
         kind = store.descriptor
@@ -145,20 +145,20 @@ def use_vocabulary(
     author: str,
     monitor: Monitor = QUIET,
 ) -> VocabularyReport:
-    """Gives a map the vocabulary of another one, in a revision of its own.
+    """Stores the vocabulary of another map in a map, as a revision of its own.
 
     Maps of a fleet that share a vocabulary share the words of their nodes.
 
     Args:
         map_path: the map.
         source: a map with a vocabulary, or an encoded vocabulary.
-        author: who asked for it.
-        monitor: sees each part of the work.
+        author: author of the revision.
+        monitor: receives each stage of the work.
 
     Raises:
         InputError: the source has no vocabulary of its own.
-        IncompatibleError: its words are of another kind of descriptor than the map's.
-        MapError: a map cannot be read, or this one not written.
+        IncompatibleError: its words are for another kind of descriptor than the map's.
+        MapError: the source cannot be read, or the map cannot be written.
     """
     vocabulary = _read_vocabulary(source)
     with Map.open(map_path, writes=True) as writable:
@@ -217,7 +217,7 @@ def _report(
 
 
 def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
-    """The frames of a map's nodes, or those of a drive that are of use."""
+    """The frames of a map's nodes, or the usable frames of a drive."""
     if source.suffix == MAP_SUFFIX:
         with Map.open(source) as store:
             return [store.frames.frame(node.id) for node in store.load().nodes]
