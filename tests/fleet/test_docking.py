@@ -141,12 +141,12 @@ class TestRefused:
 
     def test_a_node_with_the_uuid_of_another(self, tmp_path, centre, fleet):
         robot, node = swapped(fleet["first"][0], tmp_path / "r.engram")
-        self.refuses(centre, robot, IncompatibleError, str(node), "another in the centre")
+        self.refuses(centre, robot, IncompatibleError, str(node), "another in the fleet map")
 
     def test_a_node_that_was_omitted_and_comes_with_other_landmarks(self, tmp_path, centre, fleet):
         node = omitted_from(centre, fleet["same"][0])
         robot, _ = swapped(fleet["same"][0], tmp_path / "r.engram", node)
-        self.refuses(centre, robot, IncompatibleError, str(node), "another in the centre")
+        self.refuses(centre, robot, IncompatibleError, str(node), "another in the fleet map")
 
     def test_an_omission_of_what_the_centre_has_with_other_landmarks(self, tmp_path, centre, fleet):
         """Another centre omitted a node under the UUID of one that this one took."""
@@ -160,7 +160,7 @@ class TestRefused:
                 writer.add_omission(omission)
                 writer.commit()
         shutil.copy(fleet["same"][0], centre)
-        self.refuses(centre, theirs, IncompatibleError, str(node), "another in the centre")
+        self.refuses(centre, theirs, IncompatibleError, str(node), "another in the fleet map")
 
     def test_maps_of_format_2_did_not_keep_what_they_omitted(self, tmp_path, centre, fleet):
         """Nothing can be said of such nodes, so nothing is refused."""
@@ -351,7 +351,7 @@ class TestReported:
     def test_the_report_says_all_of_it_in_text_and_json(self, centre, fleet):
         (report,) = merged(centre, fleet["longer"][0])
         assert "nodes added" in report.text()
-        assert "no place of the map looks like it" in report.text()
+        assert "no similar place in the map" in report.text()
         values = report.to_dict()
         assert values["revision"] == 2
         (segment,) = values["segments"]
@@ -367,7 +367,7 @@ class TestReported:
         report = MergeReport("r1.engram", "", ["r1"], revision=2, taken=50, segments=segments)
         (line,) = [line for line in report.text().splitlines() if "5621beba" in line]
         assert "50 added, 4 already covered, in 51 segments, 50 not found" in line
-        assert "nothing known is near (50)" in line
+        assert "no known node nearby (50)" in line
 
 
 def test_a_dry_run_says_what_would_be_and_leaves_the_centre_alone(tmp_path, centre, fleet):

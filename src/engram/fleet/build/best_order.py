@@ -1,6 +1,6 @@
-"""The best order of merging k groups: all k! of them, over a prefix tree ([G16] §VI-E, SPEC §7).
+"""The best order of merging k groups: all k! orders over a prefix tree ([G16] §VI-E, SPEC §7).
 
-Or only which of them comes first, on which most depends (lab/reports/fleet.md).
+Or only the choice of the first group, which has the largest effect (lab/reports/fleet.md).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from engram.measures import failure_curve, failure_route, route_not_localised
 from engram.monitor import Monitor
 from engram.robot import Settings, measure, open_drive
 
-# [G16] §VI-E compares whole curves; ties at the distance judged by fall to the area to here.
+# [G16] §VI-E compares whole curves; the area up to here breaks ties at the judging distance.
 _AREA_TO_M = 50.0
 _AREA_STEP_M = 0.5
 _SPREAD_AT_M = (5.0, 10.0, 20.0)
@@ -55,22 +55,22 @@ def find_best_order(
 
     Merges of a common prefix are made once and copied: k! orders of k groups take
     Σ k!/(k−d)! over d = 2 … k merges, 60 for k = 4; with a root over d = 1 … k, 64. The search
-    walks the tree depth first, so that no more than k maps lie on the disk; results are kept with
-    all that they depend on, so that it can be interrupted.
+    walks the tree depth first and keeps at most k maps on the disk. Results are stored with
+    all that they depend on, so an interrupted search continues.
 
     Args:
         maps: the groups' maps, by number.
         folder: for intermediate maps and results.
         settings: of the localiser.
         merging: policy and budget of the merges.
-        judge: by what the best is told.
-        monitor: hears of each order.
-        root: the map that all orders begin with; None where each begins with its first group's.
+        judge: how an order is judged.
+        monitor: receives progress per order.
+        root: the map that all orders begin with; None if each begins with its first group's.
 
     Raises:
-        ConfigError: more groups than all orders of them could be tried, or a drive that judges is
-            in one of the maps.
-        MapError: the root was written to meanwhile, or the folder cannot be written.
+        ConfigError: there are too many groups to try all orders, or a judging drive is in one of
+            the maps.
+        MapError: another process wrote to the root, or the folder cannot be written.
         StorageFullError: no space is left.
         KeyboardInterrupt: a merge was interrupted.
     """
@@ -90,7 +90,7 @@ class _Step:
     """One node of the prefix tree: its map was made, and judged if it has all groups.
 
     Attributes:
-        depends: hash of all that it was made and judged by.
+        depends: hash of all inputs of its map and its judgement.
     """
 
     depends: str
@@ -135,10 +135,10 @@ class _Search:
         with keeping(folder):
             remove_left_drafts(folder, "order-*")
             for left in folder.glob("order-*.engram*"):
-                left.unlink()  # by a run that was killed
+                left.unlink()  # left by a killed run
 
     def below(self, prefix: tuple[int, ...], merged: Path | None, monitor: Monitor) -> None:
-        """All orders that begin so; `merged` is the map of the prefix."""
+        """Tries all orders with this prefix; `merged` is the map of the prefix."""
         for number in self._judge.orders.following(prefix, len(self._maps)):
             order = (*prefix, number)
             if (known := self._known_from(order)) is not None:
@@ -152,14 +152,14 @@ class _Search:
                 self.below(order, place, monitor)
 
     def check_root(self) -> None:
-        """The maps that were judged are those that merging would give now."""
+        """Checks that the judged maps are those that merging would give now."""
         if self._root is None:
             return
         with Map.open(self._root) as store:
             if store.content_hash() != self._root_hash:
                 raise MapError(
-                    f"{self._root} was written to while the orders were tried, so that they were "
-                    "judged by what would not be built; give the same command again"
+                    f"{self._root} was written to while the orders were tried; the judgements do "
+                    "not apply to it; run the same command again"
                 )
 
     def _step(self, order: tuple[int, ...], place: Path, prefix: Path | None) -> _Step:
@@ -221,7 +221,7 @@ class _Search:
             monitor.advance(" ".join(map(str, step.order)))
 
     def _known_from(self, prefix: tuple[int, ...]) -> list[_Step] | None:
-        """All steps from a prefix on, if earlier runs made them by the same; else None."""
+        """All steps from a prefix on, if earlier runs made them from the same inputs; else None."""
         known = []
         for order in _tree(prefix, len(self._maps), self._judge.orders):
             step = self._known(order)
@@ -231,9 +231,9 @@ class _Search:
         return known
 
     def _known(self, order: tuple[int, ...]) -> _Step | None:
-        """A step of an earlier run; None without one, and where its file cannot be made sense of.
+        """A step of an earlier run; None if there is none, or its file is not valid.
 
-        A computer that lost power may leave a file empty or in part: the step is made again.
+        A power cut may leave an empty or partial file: the step is then made again.
         """
         path = self._path(order)
         if not path.exists():
@@ -252,7 +252,7 @@ class _Search:
 
 
 class _Intermediate:
-    """A map that exists for as long as a part of the tree is walked."""
+    """A map that exists while its part of the tree is walked."""
 
     def __init__(self, folder: Path, order: tuple[int, ...]) -> None:
         self._path = folder / f"order-{'-'.join(map(str, order))}.engram"

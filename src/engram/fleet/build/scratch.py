@@ -1,4 +1,4 @@
-"""What a build keeps on the disk beside its centre: wherever it is killed, it can go on."""
+"""The files of a build beside its fleet map: a killed build continues from them."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ Kept = TypeVar("Kept")
 
 @dataclass(frozen=True, slots=True)
 class BuildPlan:
-    """What a build depends on up to its merges; equal plans have equal groups' maps.
+    """All that a build depends on up to its merges; equal plans give equal maps of the groups.
 
     Attributes:
         groups: sessions of each group, in the order of mapping.
-        known: sessions that the centre had when the build began, rising.
+        known: sessions that the fleet map had when the build began, sorted.
         settings: hash of the resolved configuration.
         mapping: how each drive is mapped.
         merging: how the groups' maps are merged.
-        complete: whether the centre has all groups; then the folder holds nothing of worth but
-            to those who asked for it.
-        kept: whether the groups' maps stay when the build is complete.
+        complete: whether the fleet map has all groups; the folder is then needed only if `kept`.
+        kept: whether the groups' maps are kept after the build.
     """
 
     groups: list[list[str]]
@@ -45,27 +44,27 @@ class BuildPlan:
     kept: bool = False
 
     def same_build(self, other: BuildPlan) -> bool:
-        """Whether one goes on where the other stopped."""
+        """Whether one build continues the other."""
         return self.same_groups(other) and (self.known, self.merging) == (
             other.known,
             other.merging,
         )
 
     def same_groups(self, other: BuildPlan) -> bool:
-        """Whether the groups' maps of one are those of the other."""
+        """Whether both builds have the same maps of the groups."""
         mine, theirs = ((one.groups, one.settings, one.mapping) for one in (self, other))
         return mine == theirs
 
 
 @dataclass(frozen=True, slots=True)
 class MergingBegun:
-    """The order of merging, settled before the centre is touched.
+    """The order of merging, fixed before the first merge.
 
     Attributes:
         order: numbers of the groups.
-        judge: what judged the orders, as `JudgeOptions.hash`; None where none were tried.
-        best: how the order was found.
-        seconds: of each group's merge that stands, by its number as text.
+        judge: `JudgeOptions.hash` of the judgement; None if no orders were tried.
+        best: the orders tried and their results.
+        seconds: wall time of each group's committed merge, by its number as text.
     """
 
     order: list[int]
@@ -76,7 +75,7 @@ class MergingBegun:
 
 @contextmanager
 def keeping(folder: Path) -> Iterator[None]:
-    """Turns the file system's errors, in what reads and writes in a build's folder, into Engram's.
+    """Converts file system errors in a build's folder into Engram's.
 
     Raises:
         StorageFullError: no space is left.
@@ -95,19 +94,19 @@ def keeping(folder: Path) -> Iterator[None]:
 
 
 def build_folder(centre: Path) -> Path:
-    """Where the intermediate maps of a build lie."""
+    """The folder of a build's intermediate maps."""
     return centre.with_name(f"{centre.name}.build")
 
 
 @contextmanager
 def sole_builder(centre: Path) -> Iterator[None]:
-    """Nobody else builds into a centre meanwhile: two would map into the same groups' maps.
+    """Locks a fleet map against other builds, which would write to the same groups' maps.
 
-    The lock lies beside the folder, not in it, for the folder comes and goes; it is gone with its
-    process, so that a build that was killed can go on at once.
+    The lock file is beside the folder, since the folder is removed and made again. The lock ends
+    with its process, so a killed build can continue at once.
 
     Raises:
-        MapLockedError: somebody else does; names process and host.
+        MapLockedError: another process builds into it; names process and host.
         MapError: the lock cannot be made there.
     """
     folder = build_folder(centre)
@@ -127,11 +126,10 @@ def sole_builder(centre: Path) -> Iterator[None]:
 class Scratch:
     """The folder of a build.
 
-    Its plan is the first thing that is written and the last that is removed, so that what lies
-    beside it is always known to belong to it.
+    The plan is written first and removed last, so every other file in the folder belongs to it.
 
-    All that it does raises MapError where the folder cannot be read or written, and
-    StorageFullError where no space is left.
+    All methods raise MapError if the folder cannot be read or written, and StorageFullError if no
+    space is left.
     """
 
     def __init__(self, centre: Path) -> None:
@@ -141,19 +139,19 @@ class Scratch:
 
     @property
     def unfinished(self) -> BuildPlan | None:
-        """The plan of a build that is not complete."""
+        """The plan of an incomplete build; None without one."""
         return None if self.plan is None or self.plan.complete else self.plan
 
     def begin(self, plan: BuildPlan) -> None:
-        """Starts a build, or goes on with it; groups' maps that were kept are used again.
+        """Starts or continues a build; kept maps of the groups are used again.
 
         Raises:
-            ConfigError: the folder holds something else that might be wanted.
+            ConfigError: the folder holds other data, which might be needed.
         """
         if (unfinished := self.unfinished) is not None:
             if not unfinished.same_build(plan):
                 raise ConfigError(
-                    f"{self.folder} is of another build that is not complete; finish it with its "
+                    f"{self.folder} belongs to another, incomplete build; finish it with its "
                     "own command, or delete the folder"
                 )
             self._check_left_out(plan)
@@ -170,10 +168,10 @@ class Scratch:
         self._write_plan(plan)
 
     def finish(self) -> None:
-        """The build is complete: removes its maps, unless they are to be kept.
+        """Marks the build as complete and removes its maps unless they are to be kept.
 
         Raises:
-            MapError: the centre lacks a drive of the groups; then nothing is removed.
+            MapError: the fleet map lacks a drive of the groups; nothing is removed.
         """
         assert self.plan is not None
         missing = _missing(self.centre, self.plan)
@@ -186,7 +184,7 @@ class Scratch:
         self.remove_leftovers()
 
     def remove_leftovers(self) -> None:
-        """What a complete build was killed before removing."""
+        """Removes what a complete build was killed before removing."""
         if self.plan is not None and self.plan.complete and not self.plan.kept:
             self._clear()
             with keeping(self.folder):
@@ -204,27 +202,27 @@ class Scratch:
         return self.folder / "orders"
 
     def remember(self, result: GroupResult) -> None:
-        """A group is mapped."""
+        """Stores the result of a mapped group."""
         write_kept(self._result_path(result.number), result)
 
     def result(self, number: int) -> GroupResult | None:
-        """What mapping a group came to; None if that is still to be done."""
+        """The result of mapping a group; None if it is not mapped yet."""
         path = self._result_path(number)
         if not (path.exists() and self.group(number).exists()):
             return None
         return read_kept(path, GroupResult)
 
     def merging_begun(self) -> MergingBegun | None:
-        """The order that an earlier run merges by; None if it did not come so far.
+        """The order of an earlier run; None if it has not begun to merge.
 
-        Without a centre nothing is merged yet, whatever was settled.
+        Without a fleet map nothing is merged yet, whatever was stored.
         """
         if not (self.centre.exists() and self._merging_path.exists()):
             return None
         return read_kept(self._merging_path, MergingBegun)
 
     def remember_merging(self, begun: MergingBegun) -> None:
-        """The order is settled, or one more merge stands."""
+        """Stores the order and the merges done."""
         write_kept(self._merging_path, begun)
 
     @property
@@ -246,17 +244,17 @@ class Scratch:
         self.plan = plan
 
     def _check_left_out(self, plan: BuildPlan) -> None:
-        """Drives are left out because the centre has them: it must have them still."""
+        """Checks that the fleet map still has the drives that are left out because it had them."""
         gone = sorted(set(plan.known) - sessions_of(self.centre))
         if gone:
             raise ConfigError(
                 f"{self.centre} no longer has {len(gone)} of the {len(plan.known)} sessions that "
                 f"it had when this build began ({gone[0]}); restore it, or delete {self.folder} "
-                "to build what it has not"
+                "to build without them"
             )
 
     def _check_empty(self) -> None:
-        """Nothing that a new build would take for its own."""
+        """Checks that the folder has no files that a new build would take for its own."""
         with keeping(self.folder):
             if not self.folder.exists():
                 return
@@ -268,7 +266,7 @@ class Scratch:
             )
 
     def _check_in_centre(self, plan: BuildPlan) -> None:
-        """Maps that were kept make room for those of another build only if nothing is lost."""
+        """Checks that the fleet map has all sessions of kept maps before they are removed."""
         missing = _missing(self.centre, plan)
         if missing:
             raise ConfigError(
@@ -278,7 +276,7 @@ class Scratch:
             )
 
     def _clear(self) -> None:
-        """Everything but the plan; results before the maps that they tell of."""
+        """Removes everything but the plan, results before their maps."""
         with keeping(self.folder):
             for path in sorted(self.folder.iterdir(), key=lambda one: one.suffix != ".json"):
                 if path.is_dir():
@@ -288,7 +286,7 @@ class Scratch:
 
 
 def sessions_of(centre: Path) -> frozenset[str]:
-    """All sessions of a map, those of which it has a part only too; none of a map that is not."""
+    """All sessions of a map, partial ones included; none if the map does not exist."""
     if not centre.exists():
         return frozenset()
     with Map.open(centre) as store:
@@ -302,10 +300,10 @@ def _missing(centre: Path, plan: BuildPlan) -> list[str]:
 
 
 def read_kept(path: Path, kind: type[Kept]) -> Kept:
-    """What a build wrote down.
+    """Reads a file of a build.
 
     Raises:
-        ConfigError: the file cannot be read, or holds something else.
+        ConfigError: the file cannot be read, or has other content.
     """
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
@@ -314,6 +312,6 @@ def read_kept(path: Path, kind: type[Kept]) -> Kept:
 
 
 def write_kept(path: Path, values: Any) -> None:
-    """In one step: a killed build leaves no half file."""
+    """Writes a file of a build atomically."""
     with keeping(path.parent), write_whole(path) as draft:
         draft.write_bytes(msgspec.json.encode(values))

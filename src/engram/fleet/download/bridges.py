@@ -1,11 +1,9 @@
-"""Edges across what a download leaves out, so that it stays as connected as the centre (SPEC §7).
+"""Edges across omitted nodes, so that a download stays as connected as the fleet map (SPEC §7).
 
-Every node that is left out belongs to the sent node from which it is reached along the surest
-chain. Where two such basins touch, the chain from one sent node to the other is a candidate. Those
-basins' borders join all that the graph joins, so a spanning tree of candidates closes every gap;
-short candidates are sent beyond that, since a map needs to be metric near by, not just in one
-piece: two experiences that were tied every few metres through a third one stay tied every few
-metres.
+Every omitted node belongs to the basin of the sent node that reaches it along the chain of least
+variance. If two basins touch, the chain between their two sent nodes is a candidate. A spanning
+tree of candidates closes every gap. Short candidates are sent as well: two experiences that were
+tied every few metres through a third one stay tied every few metres.
 """
 
 from __future__ import annotations
@@ -25,9 +23,9 @@ from engram.graph.model import Edge, EdgeKind, NodeId
 
 Array = NDArray[np.float64]
 
-# Beyond what a neighbourhood search looks at (`SearchConfig.margin_m`), a bridge shortens nothing.
+# Beyond the reach of a neighbourhood search (`SearchConfig.margin_m`), a bridge shortens nothing.
 _NEAR_M = 12.0
-# One radian counts as much as so many metres: a landmark's usual distance.
+# Metres per radian in the cost of a chain: the usual distance of a landmark.
 _LEVER_M = 10.0
 # Chains of perfectly known edges still prefer fewer edges.
 _LEAST_COST = 1e-12
@@ -36,12 +34,12 @@ _LEAST_COST = 1e-12
 def close_gaps(
     nodes: Sequence[NodeId], edges: Sequence[Edge], sent: NDArray[np.bool_]
 ) -> list[Edge]:
-    """Bridges between sent nodes, composed through nodes that are left out.
+    """Bridges between sent nodes, composed through omitted nodes.
 
     Args:
         nodes: all nodes of the graph.
         edges: all its edges.
-        sent: (N,) which nodes are sent.
+        sent: (N,) bool, which nodes are sent.
 
     Returns:
         Edges of kind `bridge`, with summed covariances, ordered by their ends. With them the sent
@@ -51,7 +49,7 @@ def close_gaps(
         return []
     index = {node: at for at, node in enumerate(nodes)}
     ends = np.array([(index[edge.a], index[edge.b]) for edge in edges], np.int64).reshape(-1, 2)
-    # One edge of several between two nodes: the surest.
+    # Of several edges between two nodes, the one of least variance.
     steps = Links.lightest(ends, np.array([_variance(edge.covariance) for edge in edges]))
     search = _Search(nodes, edges, ends, steps, sent)
     needed, near = search.candidates()
@@ -75,7 +73,7 @@ def _variance(covariance: Array) -> float:
 
 
 class _Search:
-    """Chains from sent nodes outwards through nodes that are left out."""
+    """Chains from sent nodes outwards through omitted nodes."""
 
     def __init__(
         self,
@@ -100,7 +98,7 @@ class _Search:
         self._reach()
 
     def _reach(self) -> None:
-        """The surest chain from any sent node to each node that is left out."""
+        """The chain of least variance from any sent node to each omitted node."""
         steps, through = self._steps, self._through
         links = steps.matrix(len(self._nodes), through)
         self._cost, self._before, self._source = dijkstra(
@@ -115,8 +113,8 @@ class _Search:
         """Pairs of sent nodes that a bridge may join.
 
         Returns:
-            A spanning tree over the gaps; and for each node the surest pair to every other piece
-            of an experience.
+            A spanning tree over the gaps; and for each node the pair of least variance to every
+            other piece of an experience.
         """
         steps, through = self._steps, self._through
         self._border: dict[tuple[int, int], tuple[float, int]] = {}
@@ -133,7 +131,7 @@ class _Search:
         return self._spanning(ordered), self._nearest(ordered)
 
     def _spanning(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Kruskal's tree over the components of what is sent."""
+        """Kruskal's tree over the components of the sent nodes."""
         root = {int(label): int(label) for label in np.unique(self._joined)}
 
         def find(label: int) -> int:
@@ -151,7 +149,7 @@ class _Search:
         return needed
 
     def _nearest(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Candidates that are the surest from either end to the other's piece."""
+        """Candidates of least variance from either end to the other's piece."""
         taken: dict[int, set[int]] = defaultdict(set)
         kept = []
         for a, b in ordered:

@@ -1,4 +1,4 @@
-"""What a centre has to give: its records in an order that only its content decides."""
+"""The records of a fleet map, in an order that depends only on its content."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _LISTED = 3
 
 
 class Stock:
-    """A centre as of one revision, for choosing from it.
+    """A fleet map as of one revision, for selections.
 
     Attributes:
         store: the map.
-        contents: its records as the store gives them.
+        contents: its records in the order of the store.
         sessions: in the order of their starts, then UUIDs.
         nodes: by session, then stamp, then UUID.
         index: place of each node in `nodes`.
@@ -67,12 +67,12 @@ class Stock:
 
     @cached_property
     def content_hash(self) -> str:
-        """Of the centre at this revision."""
+        """Content hash of the fleet map at this revision."""
         return self.store.content_hash()
 
     @cached_property
     def words(self) -> NodeWords | None:
-        """Words of the nodes; None while the centre is empty."""
+        """Words of the nodes; None while the fleet map is empty."""
         kind = self.store.descriptor
         return None if kind is None else words_of(self.store, kind)
 
@@ -83,16 +83,16 @@ class Stock:
 
     @cached_property
     def hours(self) -> Array:
-        """(N,) hour of day of each node (SPEC §2.8), NaN where no clock tells."""
+        """(N,) hour of day of each node (SPEC §2.8), NaN if unknown."""
         by_id = {one.id: one for one in self.sessions}
         known = (hour_of_day(by_id[node.session], node.stamp_ns) for node in self.nodes)
         return np.array([np.nan if hour is None else hour for hour in known], np.float64)
 
     def known_hours(self) -> Array:
-        """`hours`, some of which are known.
+        """`hours`, at least one of which is known.
 
         Raises:
-            InputError: none is.
+            InputError: all are unknown.
         """
         if not np.isfinite(self.hours).any():
             without = [one for one in self.sessions if hour_of_day(one, one.start_ns) is None]
@@ -107,7 +107,7 @@ class Stock:
 
     @cached_property
     def on_path(self) -> dict[PathId, NDArray[np.int64]]:
-        """The nodes on each path, in its order, each as often as the path comes there."""
+        """Dense indices of the nodes on each path, in its order, each once per visit."""
         found: dict[PathId, list[int]] = {}
         for entry in self.contents.path_entries:
             found.setdefault(entry.path, []).append(self.index[entry.node])
@@ -135,7 +135,7 @@ class Stock:
 
     @cached_property
     def basin_counts(self) -> BasinCounts:
-        """From which match basins are learnt."""
+        """Counts from which match basins are learnt."""
         places = [self.graph.index(node.id) for node in self.contents.nodes]
         return self.contents.basin_counts(self.graph.experiences[places])
 
@@ -147,27 +147,27 @@ class Stock:
         return both[:, 0], both[:, 1]
 
     def named_node(self, prefix: str) -> int:
-        """The one node whose UUID begins so.
+        """Dense index of the one node whose UUID begins with `prefix`.
 
         Raises:
-            InputError: no node, or several, begin so, or it was taken back.
+            InputError: no node or several match, or a revert has hidden it.
         """
         origin = self.store.origin(prefix)
         if origin.node not in self.index:
-            raise InputError(f"node {origin.node} was taken back in revision {origin.told[-1][0]}")
+            raise InputError(f"node {origin.node} was reverted in revision {origin.told[-1][0]}")
         return self.index[origin.node]
 
     def named_session(self, prefix: str) -> Session:
-        """The one session whose UUID begins so.
+        """The one session whose UUID begins with `prefix`.
 
         Raises:
-            InputError: no session, or several, begin so.
+            InputError: no session or several match.
         """
         wanted = prefix.strip().lower()
         found = [one for one in self.sessions if str(one.id).startswith(wanted)]
         if not wanted or len(found) != 1:
             listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or self.sessions)
-            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose of: {listed}")
+            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose from: {listed}")
         return found[0]
 
     def place_of(self, session: SessionId) -> int:

@@ -1,8 +1,8 @@
-"""Finding a robot again where its own map falls apart.
+"""Relocates a robot behind a gap of its odometry.
 
-Odometry loses track in a bend, in the rain, for a second or two, and what the robot saved behind
-such a gap hangs together with nothing before it. How it drove tells about where it was a second
-later: near enough to look for it there, as a live robot does, before all places are asked.
+Odometry may fail for a second or two, in a bend or in rain, and the nodes behind such a gap are
+not connected to those before it. The robot's speed predicts its position behind the gap well enough
+to match there, as a live robot does, before place recognition searches the whole map.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.robot import Robot
 from engram.sequences import LoggedFrame
 
-# A guess over a longer way is none. Source: SPEC §3.4, after which a robot counts as lost.
+# Longest gap for a guess. Source: SPEC §3.4, the distance after which a robot is lost.
 _GUESS_WITHIN_M = 10.0
-# So far along a segment it is looked for. Source: the distance after which own nodes are
+# Longest part of a segment that is searched. Source: the distance after which own nodes are
 # neighbours again (SPEC §3.1).
 _LOOK_WITHIN_M = 30.0
-# Two matches that agree find a lost robot when they are so far apart (`Hypotheses`).
+# Least distance of two agreeing matches that relocate a robot (`Hypotheses`).
 _BASE_LINE_M = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ahead:
-    """A node of a segment that was localised before its turn came.
+    """A node of a segment that was localised ahead of its turn.
 
     Attributes:
-        found: what was found of it.
-        outcomes: of the attempts for it.
+        found: its localisation.
+        outcomes: outcomes of its attempts.
     """
 
     found: Localisation
@@ -40,7 +40,7 @@ class Ahead:
 
 
 def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Position | None:
-    """Where a segment begins if the robot drove on as it did.
+    """Predicts the start of a segment from the robot's speed before the gap.
 
     Args:
         end: position of the last node of the segment before.
@@ -48,8 +48,8 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
         segment: the one behind the gap.
 
     Returns:
-        The guess with its covariance (`GapFiller`); None where the speed is not known, or where
-        the robot would have driven more than 10 m.
+        The guess with its covariance (`GapFiller`); None if the speed is unknown, or if the robot
+            would have driven more than 10 m.
     """
     gaps = GapFiller()
     gaps.motion(OdometryStep(OdometryStatus.FIRST), before.nodes[0].stamp_ns)
@@ -65,15 +65,14 @@ def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Pos
 
 
 def look_along(robot: Robot, frames: Iterable[LoggedFrame]) -> tuple[Ahead | None, int]:
-    """Looks for the first frames of a segment from a guess of where it begins.
+    """Tries to localise the first frames of a segment from a guess of its start.
 
     Args:
-        robot: placed where the first frame is thought to be; it looks nowhere else.
+        robot: placed at the guess; it tries nowhere else.
         frames: of the segment, in the order of time.
 
     Returns:
-        The first of two frames at least 4 m apart that are matched; None where there are no two.
-        And how many attempts that took.
+        The first of two matched frames at least 4 m apart, or None; and the number of attempts.
     """
     first: Ahead | None = None
     driven_m = first_at_m = 0.0

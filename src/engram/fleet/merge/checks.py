@@ -1,4 +1,4 @@
-"""Whether a map may be merged at all, and what about it somebody should look at."""
+"""Checks whether a map may be merged, and collects warnings about it."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from engram.graph.model import Clock, Node, NodeId, Session, SessionId
 from engram.maps import Map
 
 _NS_PER_S = 1_000_000_000
-# Stamps count as running backwards only where odometry says that the robot drove on by as much.
+# Stamps run backwards only if odometry reports at least this much driven meanwhile.
 _DRIVEN_SLACK_M = 0.5
-# Pairs of drives at the same time that are named for each robot: a name shared by two makes many.
+# Most pairs of overlapping drives named for each robot: two robots of one name make many.
 _NAMED_OVERLAPS = 5
 
 
 def check_fits(merge: Merge) -> None:
-    """Refuse a map that would spoil the centre.
+    """Refuses a map that would damage the fleet map.
 
     Raises:
-        IncompatibleError: it has another kind of descriptors; or it has a node or a session under
-            the UUID of one of the centre's, and another content.
+        IncompatibleError: it has another kind of descriptors, or a node or session whose UUID the
+            fleet map has with other content.
     """
     robot, known = merge.robot, merge.centre.sessions
     kind, theirs = merge.centre.descriptor, robot.descriptor
     if None not in {kind, theirs} and kind is not theirs:
         raise IncompatibleError(
-            f"{robot.location} holds {theirs} descriptors, the centre {kind}; the two cannot "
+            f"{robot.location} holds {theirs} descriptors, the fleet map {kind}; the two cannot "
             "be matched: extract and map the drives again"
         )
     for session in merge.sessions:
@@ -38,8 +38,8 @@ def check_fits(merge: Merge) -> None:
         if ours is not None and _drive(ours) != _drive(session):
             raise IncompatibleError(
                 f"session {session.id} is a drive of {session.robot} in {robot.location} and "
-                f"another one, of {ours.robot}, in the centre: one of the two maps is not what it "
-                "says"
+                f"another one, of {ours.robot}, in the fleet map: one of the two maps is "
+                "wrong"
             )
     landmarks = merge.centre.landmark_hashes
     for node, brought in robot.landmark_hashes.items():
@@ -51,19 +51,19 @@ def check_fits(merge: Merge) -> None:
                 which = f" (session {record.session}, stamp {record.stamp_ns})"
             raise IncompatibleError(
                 f"node {node}{which} has one content in {robot.location} and another in the "
-                f"centre, landmarks {brought.hex()} and {held.hex()}: a node never changes, so "
-                "one of the two maps is not what it says"
+                f"fleet map, landmarks {brought.hex()} and {held.hex()}: a node never changes, so "
+                "one of the two maps is wrong"
             )
 
 
 def _drive(session: Session) -> tuple[str, str, int]:
-    """What a session's UUID is made of; clock, longitude and zone may be told later (SPEC §2.8)."""
+    """The parts of a session's UUID; clock, longitude and zone may be set later (SPEC §2.8)."""
     recorded = session.as_recorded
     return recorded.robot, recorded.camera, recorded.start_ns
 
 
 def _same_record(merge: Merge, node: NodeId) -> bool:
-    """Whether a node that both have is of the same drive, moment and camera."""
+    """Whether both maps have the node with the same drive, stamp and camera."""
     graphs = merge.graph, merge.robot.graph
     if not all(node in graph for graph in graphs):
         return True
@@ -73,19 +73,19 @@ def _same_record(merge: Merge, node: NodeId) -> bool:
 
 
 def check_readable(robot: Map, nodes: Sequence[Node]) -> None:
-    """Reads all landmarks that may be taken once, before a byte of the centre is written.
+    """Reads all landmarks that may be taken once, before the fleet map is written.
 
     Raises:
-        MapError: something of them was damaged on the way.
+        MapError: some of them are damaged.
     """
     for _ in robot.frames.stored(list(nodes)):
         pass
 
 
 def notes(merge: Merge, now_ns: int) -> list[str]:
-    """What is odd about a map and does not stand in the way of a merge.
+    """Warnings about a map that do not prevent a merge.
 
-    Drives that the centre has are left out: what is odd about them was reported when they came.
+    Drives that the fleet map has are left out: their warnings were reported when they were merged.
 
     Args:
         merge: before anything is added.
@@ -94,7 +94,7 @@ def notes(merge: Merge, now_ns: int) -> list[str]:
     robot = merge.robot
     found = [
         f"session {one.session.id} of {one.session.robot} was interrupted in {robot.location}: it "
-        "is not handed in before it is resumed or sealed there"
+        "is not merged before it is resumed or sealed there"
         for one in robot.interrupted()
     ]
     new = [one for one in merge.sessions if one.id not in merge.centre.sessions]
@@ -113,7 +113,7 @@ def notes(merge: Merge, now_ns: int) -> list[str]:
 
 
 def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
-    """Stamps that fall while the distance driven rises."""
+    """Warns of stamps that fall while the distance driven rises."""
     back = [
         (before.driven_m - after.driven_m, before, after)
         for before, after in pairwise(nodes)
@@ -130,7 +130,7 @@ def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
 
 
 def _overlaps(merge: Merge, new: Sequence[Session]) -> Iterator[str]:
-    """Drives of one robot at the same time: two robots of one name, or a clock that was wrong."""
+    """Warns of drives of one robot at the same time: a shared name or a wrong clock."""
     spans = _spans(merge)
     ids = {session.id for session in new}
     for name in sorted({session.robot for session in new}):
@@ -158,7 +158,7 @@ def overlapping(
 ) -> Iterator[tuple[Session, Session]]:
     """The pairs of sessions that overlap in time, at least one of them new; the earlier first.
 
-    One sweep over the starts, beside which only the sessions that have not ended are kept.
+    One sweep over the starts that keeps only sessions that have not ended.
     """
     running: list[Span] = []
     for span in sorted(spans, key=lambda one: (one.first_ns, one.session.id)):
@@ -170,7 +170,7 @@ def overlapping(
 
 
 def _spans(merge: Merge) -> list[Span]:
-    """Of every session whose clock is UTC."""
+    """Spans of all sessions whose clock is UTC."""
     sessions = {**merge.centre.sessions, **merge.robot.sessions}
     last = {one.id: one.start_ns for one in sessions.values()}
     for node in (*merge.graph.nodes, *merge.robot.graph.nodes):

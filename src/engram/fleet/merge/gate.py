@@ -1,4 +1,4 @@
-"""A gate before the centre: held-out drives must not localise worse in what a merge made of it."""
+"""A gate before a merge: held-out drives must not localise worse in the merged map."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from engram.sequences import FrameLog, first_pair_hash
 # SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
 _JUDGED_M = np.arange(0.0, 20.5, 0.5)
 _LONGEST_GAP_RATIO = 1.5
-# Where reports tell the failure curve (SPEC §8).
+# Distances at which reports give the failure curve, metres (SPEC §8).
 _TOLD_M = (5, 10, 20)
-# Sums of the same gaps in another order differ by this much.
+# Rounding of sums of the same gaps in another order.
 _ROUNDING = 1e-9
 
 
@@ -33,20 +33,20 @@ def check_held_out(
     where: Path | str,
     option: str,
 ) -> None:
-    """Refuses to judge by what is judged: a drive localises well in a map of itself.
+    """Refuses drives that a map holds: a drive localises well in a map of itself.
 
-    A drive that was mapped under another robot's name has another session, and is told all the
-    same: by camera, first stamp and the images of its first frame. First stamps alone would not
-    do, since many data sets count from 0.
+    A drive mapped under another robot's name has another session. It is recognised by camera,
+    first stamp and the images of its first frame. The stamp alone does not suffice, since many
+    data sets count from 0.
 
     Args:
-        drives: that judge, each with what people call it.
-        sessions: of a map that is judged, or takes part in it.
+        drives: the judging drives, each with its name for messages.
+        sessions: of a map that takes part.
         where: the map.
-        option: by which the drives were given.
+        option: the option that gave the drives, for messages.
 
     Raises:
-        ConfigError: one of them is one of the drives.
+        ConfigError: a map holds one of the drives.
         SequenceError: a drive cannot be read.
     """
     sessions = list(sessions)
@@ -60,7 +60,7 @@ def check_held_out(
 
 
 def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
-    """The session that this drive became, whatever the robot was called; None if it became none.
+    """The session of this drive, whatever the robot was called; None if the map lacks it.
 
     Raises:
         SequenceError: the drive cannot be read.
@@ -78,17 +78,17 @@ def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | N
 
 
 def _first_pair(sequence: DriveSequence) -> str:
-    """`first_pair_hash` of a drive of which `session_of_drive` found that it has a frame."""
+    """`first_pair_hash` of a drive that has a frame."""
     if isinstance(sequence, FrameLog):
         return sequence.first_pair_hash
     return first_pair_hash(next(iter(sequence)))
 
 
 class Gate:
-    """Compares how held-out drives localise in the centre before and after.
+    """Compares the localisation of held-out drives in the fleet map before and after a merge.
 
     Args:
-        drives: folders of images or frame logs; no part of what is merged.
+        drives: folders of images or frame logs, in none of the maps.
         settings: of localiser and odometry.
         options: policy and budget.
 
@@ -119,17 +119,17 @@ class Gate:
         check_held_out(drives, sessions, where, "--require-better")
 
     def look_at(self, centre: Path, monitor: Monitor) -> None:
-        """The centre as it is; once, before the first merge."""
+        """Measures the drives in the fleet map as it is, once before the first merge."""
         with Map.open(centre) as store:
             self._before = self._localise(store, monitor)
 
     def __call__(self, store: Map, robot: str, monitor: Monitor) -> HeldOutReport:
-        """The centre as it would become.
+        """Measures the drives in the merged map.
 
         Args:
-            store: with what is being merged.
-            robot: name of the map that is.
-            monitor: is asked between two frames whether to go on.
+            store: the fleet map, within the merge.
+            robot: name of the map being merged.
+            monitor: its `check` is called between two frames.
 
         Raises:
             RefusedError: the drives localise worse in it.
@@ -141,20 +141,20 @@ class Gate:
         if worse:
             raise RefusedError(
                 f"{robot} is refused: {', '.join(names)} localise worse in the result: {worse}; "
-                "the centre is as it was before this map"
+                "the fleet map is unchanged by it"
             )
         self._before = after
         return HeldOutReport(names, _figures(before), _figures(after))
 
     def _localise(self, store: Map, monitor: Monitor) -> list[Drive]:
-        store.forget()  # in the midst of a merge its graph is the merge's, not the file's
+        store.forget()  # during a merge the graph in memory is the merge's, not the file's
         return [
             measure(store, one, self._settings, self._options, monitor) for one in self._sequences
         ]
 
 
 def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
-    """Where one map is worse than another (SPEC §8, "A beats B"); "" if it is not.
+    """How one map is worse than another (SPEC §8, "A beats B"); "" if it is not.
 
     Args:
         after, before: the same drives in both maps.

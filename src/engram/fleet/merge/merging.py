@@ -1,4 +1,4 @@
-"""Robots hand in their maps to the fleet's, one after another."""
+"""Merging several robots' maps into the fleet map, one after another."""
 
 from __future__ import annotations
 
@@ -35,36 +35,35 @@ def merge(
     require_better: Sequence[Path] = (),
     picture: Path | None = None,
 ) -> list[MergeReport]:
-    """Merges robots' maps into the fleet's, in the order given; it is made if there is none.
+    """Merges robots' maps into the fleet map, in the order given; creates it if missing.
 
-    Each robot's map is one merge: one revision, all or nothing. What was handed in before changes
-    nothing, so an interrupted command is simply given again. Ctrl-C waits for the end of the node
-    or of the held-out frame, and undoes the merge that it meets.
+    Each robot's map is one merge: one revision, all or nothing. Merging again changes nothing, so
+    an interrupted command is run again. Ctrl-C takes effect after the current node or
+    held-out frame, and undoes the current merge.
 
     Args:
         centre: the fleet's map, NAME.engram.
-        robots: maps handed in.
+        robots: the maps to merge.
         options: policy and budget.
-        monitor: sees how it goes; hears each report as soon as its map is merged, whatever becomes
-            of the next.
+        monitor: receives progress, and each report as soon as its map is merged.
         settings: the resolved configuration, kept with the revision; None for the defaults.
-        dry_run: merge into a copy of the fleet's map, which is thrown away.
+        dry_run: merge into a copy of the fleet map and discard it.
         require_better: held-out drives that must not localise worse in the result.
-        picture: an image file for the fleet's map before and after, from above.
+        picture: an image file for a plan view of the fleet map before and after.
 
     Returns:
         One report for each map, up to the one in which the command was interrupted.
 
     Raises:
-        InputError: the fleet's map itself is handed in, a drive is none, or the picture cannot be
-            drawn there. Nothing was merged.
+        InputError: the fleet map itself is among `robots`, a held-out path is not a drive, or the
+            picture cannot be written there. Nothing was merged.
         ConfigError: a drive is not held out. Nothing was merged.
-        IncompatibleError: a map does not fit the fleet's.
+        IncompatibleError: a map does not fit the fleet map.
         RefusedError: held-out drives localise worse in the result.
         MapError: a map cannot be read or written. If a map cannot be opened or its records are
             damaged, nothing was merged; otherwise earlier merges are kept.
-        KeyboardInterrupt: Ctrl-C met no merge that could be undone: it came before the first one,
-            or when the last one was done.
+        KeyboardInterrupt: Ctrl-C came before the first merge or after the last one, so there was
+            none to undo.
     """
     options, settings = options or MergeOptions(), settings or Settings()
     if picture is not None:
@@ -76,7 +75,7 @@ def merge(
         place = drafted
         with Map.open(place) as store:
             before = store.revision
-        # One for all robots: a Ctrl-C when a merge is just done must not be forgotten with it.
+        # One for all robots, so that a Ctrl-C at the end of a merge is not lost.
         with interruptible(monitor) as watched:
             if gate is not None:
                 gate.look_at(place, watched)
@@ -97,11 +96,11 @@ def merge(
 
 
 def _check_given(centre: Path, robots: Sequence[Path], gate: Gate | None) -> None:
-    """Looks at all that was given before anything is made or changed."""
+    """Checks all arguments before anything is made or changed."""
     for robot in robots:
         with Map.open(robot) as store:
             if centre.exists() and robot.samefile(centre):
-                raise InputError(f"{robot} is the centre itself; hand in other maps")
+                raise InputError(f"{robot} is the fleet map itself; name other maps to merge")
             sessions = store.load().sessions
         if gate is not None:
             gate.check_held_out(sessions, robot)
@@ -118,7 +117,7 @@ def _merged(
     gate: Gate | None,
     monitor: Monitor,
 ) -> MergeReport:
-    """One merge in a freshly opened map, so that it does not matter what came before it."""
+    """One merge in a freshly opened map, so that the result does not depend on earlier ones."""
     started = time.perf_counter()
     with Map.open(path) as robot:
         try:
@@ -138,10 +137,7 @@ def _merged(
 
 
 def _check_before_raising(place: Path, robot: Map) -> None:
-    """A map of an older format becomes one of the newest when it is opened for writing.
-
-    A robot's map that is refused shall not do even that.
-    """
+    """Opening a map for writing upgrades its format; a robot's map is only read."""
     with Map.open(place) as store:
         if store.format_version < FORMAT_VERSION:
             check_fits(Merge(store, robot))
@@ -150,7 +146,7 @@ def _check_before_raising(place: Path, robot: Map) -> None:
 
 @contextmanager
 def _place(centre: Path, *, dry_run: bool) -> Iterator[Path]:
-    """The fleet's map; a copy of it that is thrown away; or the draft of one that is new."""
+    """The fleet map, a copy of it for a dry run, or the draft of a new one."""
     if centre.exists() and not dry_run:
         yield centre
     elif dry_run:

@@ -1,4 +1,4 @@
-"""A centre from above, before and after a merge."""
+"""A plan view of the fleet map, before and after a merge."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from engram.viewing import Track, draw_panels
 
 
 def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
-    """Draws the nodes of a centre by robot, as of a revision and now.
+    """Draws the nodes of the fleet map by robot, as of a revision and now.
 
     Args:
         centre: the map.

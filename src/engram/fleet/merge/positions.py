@@ -1,4 +1,4 @@
-"""Edges and positions carried over from a robot's nodes to their equivalents in the centre."""
+"""Transfers edges and positions from a robot's nodes to their equivalents in the fleet map."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def seen_from(edge: Edge, node: NodeId) -> tuple[NodeId, SE3, Array]:
 
 
 def beyond(known: Position, edge: Edge, node: NodeId) -> Position:
-    """Where a node is, by its edge to another whose position is known.
+    """Position of a node, by its edge to another node whose position is known.
 
     Args:
         known: position of the edge's other end.
@@ -35,13 +35,13 @@ def beyond(known: Position, edge: Edge, node: NodeId) -> Position:
 
 
 def recomposed(edge: Edge, a: Position, b: Position) -> Edge | None:
-    """An edge between two nodes handed in, as one between their equivalents (SPEC §7 MERGE 3).
+    """An edge between two of the robot's nodes, as one between their equivalents (SPEC §7 MERGE 3).
 
-    An edge that was moved is no odometry of one experience any more: it ties.
+    A moved odometry edge becomes a tie, since it no longer links nodes of one experience.
 
     Args:
-        edge: as it was handed in.
-        a, b: where its ends are in the centre.
+        edge: as in the robot's map.
+        a, b: positions of its ends in the fleet map.
 
     Returns:
         The edge; None if both ends have the same equivalent.
@@ -59,5 +59,5 @@ def recomposed(edge: Edge, a: Position, b: Position) -> Edge | None:
 
 
 def uncertainty_m2(covariance: Array) -> float:
-    """Sum of the translational variances: by which of two estimates the surer is told."""
+    """Sum of the translational variances, m²: the measure by which two estimates are compared."""
     return float(np.trace(covariance[:3, :3]))

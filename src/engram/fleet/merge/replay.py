@@ -1,4 +1,4 @@
-"""Replaying a robot's segments in the centre as if they were live streams (SPEC §7 MERGE 3)."""
+"""Replays a robot's segments in the fleet map as if they were live streams (SPEC §7 MERGE 3)."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in, relocaliser_in
 from engram.sequences import LoggedFrame
 
-# A segment is seeded from a neighbour this far along it: farther, places are looked up instead.
+# A segment is seeded from a neighbour at most this far along it; beyond, by place recognition.
 # Source: the distance after which own nodes are neighbours again (SPEC §3.1).
 _SEED_WITHIN_M = 30.0
-# What measured a relation, and did not dead-reckon it.
+# Kinds of edges that measure a relation, rather than dead-reckon it.
 _MEASURED = frozenset({EdgeKind.ODOMETRY, EdgeKind.MATCH, EdgeKind.TIE, EdgeKind.BRIDGE})
-# Iterations between two segments of a session: a match in one vouches for nothing in the other.
+# Iterations between two segments of a session: matches of one are no evidence for the other.
 _ITERATION_GAP = 100
 
 
@@ -67,10 +67,10 @@ class MergeOptions:
 
     Attributes:
         policy: key of `POLICIES`.
-        lanes, rounds: the budget of each replayed frame, lost or not; a count, never a deadline,
-            so that the same input gives the same map.
+        lanes, rounds: the budget of each replayed frame, lost or not: a count, so that the same
+            input gives the same map.
         relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
-        author: who merges; None for the robots whose drives are added to.
+        author: who merges; None for the robots whose drives bring something new.
         sure_inliers: see its description.
     """
 
@@ -83,16 +83,16 @@ class MergeOptions:
         int,
         msgspec.Meta(
             ge=0,
-            description="a node that other drives of the robot's map matched is omitted only for a "
-            "match of so many inliers: what localised by the node need not localise by another "
-            "that the node itself barely matches. 0 omits for every match, as [G16] does",
+            description="inliers needed before omitting a node that other drives in the robot's "
+            "map matched: frames that match the node need not match another that the node itself "
+            "barely matches. 0 omits on every match, as [G16] does",
         ),
     ] = 40
 
     def __post_init__(self) -> None:
         check_bounds(self)
         check_for_robot(self.policy)
-        Budget(self.lanes, self.rounds)  # refuses what is no budget
+        Budget(self.lanes, self.rounds)  # refuses an invalid budget
         if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
             raise ConfigError(
                 f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
@@ -100,19 +100,19 @@ class MergeOptions:
 
 
 class Replay(Keeper):
-    """Replays segments one after another and adds what the centre lacks.
+    """Replays segments one after another and adds what the fleet map lacks.
 
-    Each segment is a drive of `Robot.step`, of which this is the keeper.
+    Each segment is a drive of `Robot.step`, with this object as the keeper.
 
     Args:
-        merge: what is known and added.
+        merge: the known and added records.
         settings: of localiser and mapper.
         options: policy and budget.
-        monitor: hears of each node what became of it, and is asked behind each whether to go on.
+        monitor: receives the outcome of each node; its `check` is called after each.
 
     Attributes:
-        attempts: those to be remembered, by session, in the order of iterations.
-        entries: what the replay matched, by session, in the order of time; not yet numbered.
+        attempts: attempts to remember, by session, in the order of iterations.
+        entries: matches of the replay, by session, in the order of time; not yet numbered.
     """
 
     def __init__(
@@ -126,22 +126,22 @@ class Replay(Keeper):
         self._monitor = monitor
         self._taken: set[NodeId] = set()
         self._iterations: dict[SessionId, int] = {}
-        # How far each drive had come when the centre last knew it.
+        # Distance driven of each drive at its last known node.
         self._matched_at_m: dict[SessionId, float] = {}
-        self._last: Segment | None = None  # the one that was replayed last
-        # Of the segment that is being replayed:
+        self._last: Segment | None = None  # the latest replayed segment
+        # State of the current segment:
         self._localiser: Localiser
         self._stored: StoredNode
-        self._start: Position | None = None  # where its first node is, where that is known
-        self._ahead: Ahead | None = None  # found behind a gap, before its turn came
-        self._run: list[int] = []  # nodes taken one after another, by their dense indices
+        self._start: Position | None = None  # position of its first node, if known
+        self._ahead: Ahead | None = None  # found behind a gap, ahead of its turn
+        self._run: list[int] = []  # nodes taken in a row, by their dense indices
         self._visited: NodeId | None = None  # matched or taken last
         self._kept: list[KeptNode] = []
 
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
-        """Replays one segment: what localises is omitted, the rest is taken (SPEC §7 MERGE 3).
+        """Replays one segment: omits nodes that localise, takes the rest (SPEC §7 MERGE 3).
 
-        Taken is, too, what others rely on and the centre barely shows; see `MergeOptions`.
+        Also takes nodes that other drives use and that match only weakly; see `MergeOptions`.
         """
         seed, self._ahead, self._visited, self._kept = Seed.NONE, None, None, []
         self._start = self._seed(segment)
@@ -163,7 +163,7 @@ class Replay(Keeper):
         return SegmentReport.of(session, seed, self._kept)
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`: where the robot itself measured how a frame lies to a known node."""
+        """See `Keeper`: the position of a frame that the robot itself measured to a known node."""
         del motion
         node, (known, self._start) = self._stored.node, (self._start, None)
         if self._ahead is not None and self._ahead.found.stamp_ns == live.stamp_ns:
@@ -172,7 +172,7 @@ class Replay(Keeper):
             known = self._known_neighbour(node.id, _MEASURED, self._run[0])
         if known is None:
             return None
-        # A robot that only its own nodes vouch for is as lost as it was when it saved them.
+        # Matches with its own nodes are no evidence: the robot is as lost as when it saved them.
         open_loop_m = 0.0
         if self._merge.is_apart(known.node):
             open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
@@ -188,7 +188,7 @@ class Replay(Keeper):
             self._remember(node, found)
         reason = self._reason(node, live, found)
         if reason is None:
-            # The centre shows this place alike already.
+            # The fleet map covers this place already.
             self._merge.omit(node.id, _measured(found), stored.landmark_hash)
             self._link(node.id)
         else:
@@ -208,7 +208,7 @@ class Replay(Keeper):
 
     @cached_property
     def _relocaliser(self) -> Relocaliser | None:
-        """One for all segments; learning all nodes takes a while."""
+        """One for all segments, since indexing all nodes is slow."""
         name, descriptor = self._options.relocaliser, self._settings.frontend.descriptor
         return None if name is None else relocaliser_in(self._merge.centre, name, descriptor)
 
@@ -221,8 +221,8 @@ class Replay(Keeper):
             robot.cameras[segment.nodes[0].camera],
             self._settings,
             policy=options.policy,
-            # The lost get no more, for the next node asks again, from a step on: four times as
-            # many attempts find one to three nodes more in a hundred.
+            # A lost robot gets no more attempts, since the next node tries again.
+            # Source: lab/reports/constants-fleet.md.
             budget=Budget(options.lanes, options.rounds, lost_rounds=options.rounds),
             relocaliser=relocaliser,
             live=session.id,
@@ -236,7 +236,7 @@ class Replay(Keeper):
         return localiser
 
     def _stream(self, segment: Segment) -> Iterator[tuple[StoredNode, LoggedFrame]]:
-        """The nodes in the order of time, each as a frame log would give it."""
+        """The nodes in the order of time, as frames of a log."""
         frames = self._merge.robot.frames
         steps = [
             OdometryStep(OdometryStatus.FIRST),
@@ -246,7 +246,7 @@ class Replay(Keeper):
             yield stored, LoggedFrame(frames.decode(stored), step)
 
     def _look_behind_gap(self, session: Session, segment: Segment) -> Ahead | None:
-        """What of a segment is found from where the one before it ended; see `behind_gaps`."""
+        """Looks for a segment from the end of the one before it; see `behind_gaps`."""
         before = self._last
         if before is None or before.nodes[0].session != session.id:
             return None
@@ -262,7 +262,7 @@ class Replay(Keeper):
         return found
 
     def _seed(self, segment: Segment) -> Position | None:
-        """Where the first frame is, by the nearest node of the segment with a known neighbour."""
+        """Position of the first frame, by the nearest node with a known neighbour."""
         from_first = Position.at(segment.nodes[0].id)
         for node, motion in zip(segment.nodes, (None, *segment.motions), strict=True):
             if motion is not None:
@@ -281,13 +281,13 @@ class Replay(Keeper):
     def _known_neighbour(
         self, node: NodeId, kinds: frozenset[EdgeKind], before: int | None = None
     ) -> Position | None:
-        """Where a node is, by the surest of its edges to nodes that the centre knows.
+        """Position of a node, by its edge of least variance to nodes that the fleet map knows.
 
         Args:
             node: of the robot's map.
-            kinds: of the edges that count.
-            before: nodes from this dense index on do not count: those of the run being taken,
-                which say no more than odometry does.
+            kinds: kinds of edges that count.
+            before: nodes from this dense index on do not count: those of the current run, which
+                carry no more information than odometry.
         """
         found = []
         for edge in self._merge.edges_of(node):
@@ -301,7 +301,7 @@ class Replay(Keeper):
     # -- what becomes of a frame
 
     def _remember(self, node: Node, found: Localisation) -> None:
-        """Attempts and matches of a frame, for the session's attempts and its path."""
+        """Records the attempts and matches of a frame."""
         self.attempts[node.session] += self._localiser.attempts()
         if found.node is not None and found.node != self._visited:
             self._visited = found.node
@@ -310,7 +310,7 @@ class Replay(Keeper):
             self.entries[node.session].append(entry)
 
     def _reason(self, node: Node, frame: Frame, found: Localisation) -> Reason | None:
-        """Why a node is taken; None where what it matched will do for all that localised by it."""
+        """Why a node is taken; None if its match can replace it for all drives that use it."""
         if found.localised:
             is_sure = found.inliers >= self._options.sure_inliers
             relied_on = node.id in self._merge.relied_on
@@ -322,7 +322,7 @@ class Replay(Keeper):
         return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
     def _take(self, stored: StoredNode, frame: Frame, found: Localisation) -> None:
-        """A node that the centre is lacking, with its own edges and that to what it matched."""
+        """Takes a node, with its own edges and the one to its match."""
         node = stored.node
         index = self._merge.take(stored, frame)
         self._taken.add(node.id)
@@ -337,7 +337,7 @@ class Replay(Keeper):
         self._visited = node.id
 
     def _matched(self, node: Node, outcomes: Sequence[Outcome]) -> None:
-        """The robot knows where it is: a run ends, and what one frame matched lies together."""
+        """Ends a run at a localised frame, and ties the nodes that it matched."""
         self._matched_at_m[node.session] = node.driven_m
         self._end_run()
         acceptance = self._settings.localiser.acceptance
@@ -345,7 +345,7 @@ class Replay(Keeper):
             self._merge.add_edge(edge)
 
     def _link(self, node: NodeId) -> None:
-        """The robot's edges from a node to what is resolved already, to the equivalents of both."""
+        """The robot's edges from a node to resolved nodes, moved to the equivalents of both."""
         for edge in self._merge.edges_of(node):
             a, b = self._merge.equivalent(edge.a), self._merge.equivalent(edge.b)
             if a is None or b is None or not {edge.a, edge.b} & self._taken:
@@ -355,14 +355,14 @@ class Replay(Keeper):
                 self._merge.add_edge(moved)
 
     def _end_run(self) -> None:
-        """Nodes were taken one after another up to here: their far end is tied now, or never."""
+        """Ends a run of taken nodes and ties its far end."""
         run, self._run = self._run, []
         if run:
             self._merge.write_edges(tighten_chain(self._merge.graph, run))
 
 
 def _measured(found: Localisation) -> Position:
-    """Where a frame that localised is."""
+    """Position of a localised frame."""
     assert found.node is not None
     assert found.node_from_live is not None
     assert found.covariance is not None

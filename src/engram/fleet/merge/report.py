@@ -1,4 +1,4 @@
-"""What a merge came to: per segment what was taken and omitted, and why a run did not localise."""
+"""The result of a merge: nodes taken and omitted per segment, and why a run did not localise."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from engram.config import plain
 from engram.graph.model import Session
 from engram.maps import Map
 
-# Lines of drives that people are shown; JSON has all, segment by segment.
+# Drives listed in the text; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
 
 
 class Seed(StrEnum):
-    """How the replay of a segment knew where it was."""
+    """How the replay of a segment got its start position."""
 
     NEIGHBOUR = "neighbour"
     GAP = "gap"
@@ -37,23 +37,23 @@ class Reason(StrEnum):
 
 
 _WORDS = {
-    Reason.UNUSABLE_FRAME: "frames of no use on their own",
-    Reason.NOTHING_NEAR: "nothing known is near",
-    Reason.NO_PLACE: "no place of the map looks like it",
-    Reason.NO_MATCH: "what is near does not match",
-    Reason.WEAK_MATCH: "what other drives rely on barely matches",
+    Reason.UNUSABLE_FRAME: "unusable frames",
+    Reason.NOTHING_NEAR: "no known node nearby",
+    Reason.NO_PLACE: "no similar place in the map",
+    Reason.NO_MATCH: "nearby nodes do not match",
+    Reason.WEAK_MATCH: "weak match of a node that other drives use",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """Nodes of a segment, one after another, that were taken.
+    """Consecutive nodes of a segment that were taken.
 
     Attributes:
-        first_stamp_ns: of the first of them.
+        first_stamp_ns: stamp of the first.
         nodes: how many.
         length_m: odometry distance from first to last.
-        reason: the most frequent; of equals the first in `Reason`.
+        reason: the most frequent reason; of equals the first in `Reason`.
     """
 
     first_stamp_ns: int
@@ -64,7 +64,7 @@ class RunReport:
 
 @dataclass(frozen=True, slots=True)
 class KeptNode:
-    """What became of one node in a replay.
+    """The outcome of one node in a replay.
 
     Attributes:
         stamp_ns: of the node.
@@ -79,13 +79,13 @@ class KeptNode:
 
 @dataclass(frozen=True, slots=True)
 class SegmentReport:
-    """What became of one segment.
+    """The outcome of one segment.
 
     Attributes:
         session: UUID of the drive.
         robot: name of the robot.
         first_stamp_ns: stamp of its first node.
-        seed: how the replay knew where it was.
+        seed: how the replay got its start position.
         taken, omitted: nodes.
         runs: the nodes taken, run by run.
     """
@@ -125,13 +125,13 @@ class SegmentReport:
 
 _SEED_WORDS = {
     Seed.GAP: "found behind a gap",
-    Seed.PLACE: "found by looks",
+    Seed.PLACE: "found by place recognition",
     Seed.NONE: "not found",
 }
 
 
 def _drive_text(segments: Sequence[SegmentReport]) -> str:
-    """One line for all segments of a drive: lost odometry leaves hundreds of a node each."""
+    """One line for all segments of a drive: lost odometry can leave hundreds of single nodes."""
     first = segments[0]
     taken, omitted = sum(one.taken for one in segments), sum(one.omitted for one in segments)
     line = f"  {first.robot} {first.session[:8]}: {taken} added, {omitted} already covered"
@@ -154,8 +154,8 @@ class HeldOutFigures:
     """How held-out drives localise in a map.
 
     Attributes:
-        route_not_localised: share of their way without a match.
-        longest_gap_m: longest way without one.
+        route_not_localised: share of their route without a match.
+        longest_gap_m: longest stretch without a match, metres.
         p_no_match: P(no match within x metres), by x.
     """
 
@@ -166,7 +166,7 @@ class HeldOutFigures:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutReport:
-    """What a gate saw of a merge that it let pass.
+    """The figures of a gate for a merge that it accepted.
 
     Attributes:
         drives: names of the held-out drives.
@@ -178,7 +178,7 @@ class HeldOutReport:
     after: HeldOutFigures
 
     def text(self) -> str:
-        """One line for people."""
+        """The report as one line of text."""
         was, now = self.before, self.after
         curve = ", ".join(
             f"P(no match within {within_m} m) {was.p_no_match[within_m]:.2%} → {p:.2%}"
@@ -193,29 +193,29 @@ class HeldOutReport:
 
 @dataclass(slots=True)
 class MergeReport:
-    """What handing in one robot's map came to.
+    """The result of merging one robot's map.
 
     Attributes:
         source: the robot's map.
         source_hash: its content hash.
-        robots: whose drives it holds.
-        revision: number of the new revision; None where nothing changed, and in a dry run.
-        dry_run: whether the centre was left as it was on purpose.
-        interrupted: whether it was stopped; the centre is as it was before this map.
-        content_hash: of the centre afterwards; of what would have been in a dry run.
-        sessions: drives that were new to the centre.
-        known, known_omissions: nodes that the centre had, and had omitted before.
+        robots: names of the robots whose drives it holds.
+        revision: number of the new revision; None if nothing changed, and in a dry run.
+        dry_run: whether the fleet map was left unchanged on purpose.
+        interrupted: whether it was stopped; the fleet map is then unchanged by it.
+        content_hash: of the fleet map afterwards; in a dry run, of the map that would result.
+        sessions: number of drives new to the fleet map.
+        known, known_omissions: nodes that the fleet map had, or had omitted before.
         taken, omitted: nodes.
         edges, path_entries: how many were added.
-        attempts: remembered ones of the robot's that were new to the centre.
-        match_attempts: match attempts of the replay, what the merge costs.
-        proposed_attempts: how many of them at nodes proposed to the lost; they cost a quarter.
-        lookups: frames of the replay for which the relocaliser was asked.
+        attempts: number of remembered attempts new to the fleet map.
+        match_attempts: match attempts of the replay: the cost of the merge.
+        proposed_attempts: those at nodes proposed by place recognition; each costs a quarter.
+        lookups: frames of the replay for which the relocaliser ran.
         seconds: wall time.
-        components: connected components of the centre afterwards.
-        held_out: how held-out drives localise before and after; None where no gate was asked.
+        components: connected components of the fleet map afterwards.
+        held_out: localisation of held-out drives before and after; None without a gate.
         segments: one report each, in the order of replay.
-        notes: what somebody should look at.
+        notes: warnings.
     """
 
     source: str
@@ -244,13 +244,13 @@ class MergeReport:
 
     @staticmethod
     def of(robot: Map) -> MergeReport:
-        """Of a map of which nothing is merged yet."""
+        """An empty report for a map."""
         robots = sorted({session.robot for session in robot.sessions.values()})
         return MergeReport(robot.location, robot.content_hash(), robots)
 
     @property
     def changed(self) -> bool:
-        """Whether the centre has learnt anything."""
+        """Whether the fleet map changed."""
         learnt = (
             self.sessions,
             self.taken,
@@ -266,7 +266,7 @@ class MergeReport:
         return {**plain(self), "changed": self.changed}
 
     def text(self) -> str:
-        """For people."""
+        """The report as text."""
         lines = [f"{self.source} ({', '.join(self.robots) or 'no drives'}): {self._outcome()}"]
         if self.changed and not self.interrupted:
             lines.append(
@@ -293,7 +293,7 @@ class MergeReport:
 
     def _outcome(self) -> str:
         if self.interrupted:
-            return "interrupted: nothing of it is in the fleet map; give the same command again"
+            return "interrupted: the fleet map is unchanged by it; run the same command again"
         if not self.changed:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"

@@ -1,4 +1,4 @@
-"""Stringing a robot's nodes into segments, to be replayed as live streams (SPEC §7 MERGE 2)."""
+"""Divides a robot's nodes into segments, to be replayed as live streams (SPEC §7 MERGE 2)."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from engram.graph.model import Edge, EdgeKind, Node, NodeId
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """A chain of nodes that one session saved, in the order of time.
+    """A chain of nodes of one session, in the order of time.
 
     Attributes:
         nodes: at least one.
-        steps: the odometry edges between them, one fewer than nodes; each as it is in the map, so
-            it may run either way.
+        steps: the odometry edges between them, one fewer than nodes; each in its stored
+            direction.
     """
 
     nodes: tuple[Node, ...]
@@ -28,7 +28,7 @@ class Segment:
 
     @property
     def key(self) -> tuple[int, NodeId]:
-        """Stamp and UUID of the first node: segments of one session are replayed in this order."""
+        """Sort key of a session's segments: stamp and UUID of the first node."""
         return self.nodes[0].stamp_ns, self.nodes[0].id
 
     @property
@@ -43,11 +43,11 @@ class Segment:
 def string_segments(nodes: Sequence[Node], edges: Iterable[Edge]) -> list[Segment]:
     """Maximal chains of nodes linked by odometry edges, never across sessions.
 
-    Every node is in one segment; one without an odometry edge is a segment of its own. The result
-    does not depend on the order of nodes or edges.
+    Every node is in one segment; one without an odometry edge forms its own. The result does
+    not depend on the order of nodes or edges.
 
     Args:
-        nodes: those to be strung.
+        nodes: the nodes to divide.
         edges: any edges; only odometry edges between these nodes count.
 
     Returns:
@@ -65,7 +65,7 @@ def string_segments(nodes: Sequence[Node], edges: Iterable[Edge]) -> list[Segmen
 def _from(
     first: Node, known: dict[NodeId, Node], following: dict[NodeId, tuple[NodeId, Edge]]
 ) -> Segment:
-    """The chain that begins in a node; steps lead on in time, so that it ends."""
+    """The chain from a node; it ends, since steps lead forward in time."""
     nodes, steps = [first], []
     while (step := following.get(nodes[-1].id)) is not None:
         after, edge = step
@@ -75,10 +75,10 @@ def _from(
 
 
 def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[NodeId, tuple[NodeId, Edge]]:
-    """The odometry edges that go on: from each node the later one, and the edge between them.
+    """The next node of each node, and the edge between them.
 
-    Where edges branch, the one with the smaller time step goes on, then the smaller UUIDs: so each
-    node has one edge at most to an earlier node and one to a later.
+    If edges branch, the one with the smaller time step is taken, then the smaller UUIDs: each node
+    has at most one edge to an earlier node and one to a later node.
     """
     oriented: list[tuple[int, NodeId, NodeId, Edge]] = []
     for edge in edges:
@@ -88,7 +88,7 @@ def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[NodeId, tup
         if (b.stamp_ns, b.id) < (a.stamp_ns, a.id):
             a, b = b, a
         oriented.append((b.stamp_ns - a.stamp_ns, a.id, b.id, edge))
-    # An edge laid both ways between the same nodes: the key of the edge decides which is taken.
+    # Of two opposite edges between the same nodes, the edge's key decides.
     oriented.sort(key=lambda one: (one[0], one[1], one[2], one[3].a))
     chosen: dict[NodeId, tuple[NodeId, Edge]] = {}
     entered: set[NodeId] = set()

@@ -1,4 +1,4 @@
-"""One robot's map on its way into the fleet's: what is known so far, and what becomes of it."""
+"""The state of merging one robot's map into the fleet map."""
 
 from __future__ import annotations
 
@@ -28,30 +28,29 @@ from engram.graph.model import (
 from engram.localiser import Position
 from engram.maps import Map, RevisionWriter, StoredNode
 
-# Entries that a merge adds itself stand behind all that robots wrote (docs/format.md).
+# Sequence numbers of entries that merges add follow all those that robots wrote (docs/format.md).
 FIRST_REPLAYED = 2**32
-# How well a node omitted long ago lies to its equivalent: its match's covariance was not kept.
-# Set wide of what matches reach: 93 % within 0.25 m, median 2 cm (docs/performance.md).
+# Standard deviations of an omitted node's position, whose match covariance is not stored: wide
+# against the errors of matches. Source: lab/reports/constants-fleet.md.
 _OMITTED_SIGMA_M = 0.2
 _OMITTED_SIGMA_RAD = float(np.deg2rad(1.0))
-# Stands for all nodes that the centre had before, in whatever parts they lie.
+# Represents all nodes that the fleet map had before, whatever their component.
 _CENTRE = None
 
 
 class Merge:
-    """What the centre knows, what the robot hands in, and what this merge adds.
+    """The fleet map, the robot's map, and the additions of this merge.
 
-    What is added goes into the centre's graph and path memory, the open revision and the report
-    alike.
+    Each addition goes into the fleet map's graph and path memory, the open revision and the report.
 
     Attributes:
-        centre: the fleet's map; its graph and path memory grow.
-        graph: the centre's.
-        robot: the map handed in.
+        centre: the fleet map; its graph and path memory grow.
+        graph: the fleet map's.
+        robot: the robot's map.
         sessions: of the robot's map, in the order of their starts.
         edges: of the robot's map, by their keys.
         report: counts so far.
-        writer: the open revision; from when something is to be added.
+        writer: the open revision; set before the first addition.
     """
 
     writer: RevisionWriter
@@ -69,27 +68,27 @@ class Merge:
             for omission in centre.omissions.values()
         }
         self._entries: dict[PathId, set[_EntryKey]] = {}
-        # Nodes that were taken, by what joins them: a graph search for each would take too long.
+        # Components of the taken nodes: a graph search for each would be too slow.
         self._parts: DisjointSet = DisjointSet([_CENTRE])
 
     # -- what is known
 
     def has_omitted(self, node: NodeId) -> bool:
-        """Whether the node was handed in once and not taken."""
+        """Whether an earlier merge omitted the node."""
         return node in self._omitted and node not in self.graph
 
     def knows(self, node: NodeId) -> bool:
-        """Whether the node needs no more looking at."""
+        """Whether the node was taken or omitted before."""
         return node in self.graph or node in self._omitted
 
     def equivalent(self, node: NodeId) -> Position | None:
-        """Where the node's camera is in the centre: in itself or in its equivalent."""
+        """Position of the node's camera in the fleet map: at itself or its equivalent."""
         if node in self.graph:
             return Position.at(node)
         return self._omitted.get(node)
 
     def is_apart(self, node: NodeId) -> bool:
-        """Whether a node was taken in this merge, and nothing leads from it to what was there."""
+        """Whether a node taken in this merge is not connected to the earlier fleet map."""
         return node in self._parts and not self._parts.connected(node, _CENTRE)
 
     def edges_of(self, node: NodeId) -> list[Edge]:
@@ -99,7 +98,7 @@ class Merge:
 
     @cached_property
     def relied_on(self) -> frozenset[NodeId]:
-        """Nodes of the robot's map that a drive other than their own localised by."""
+        """Nodes of the robot's map that a drive other than their own matched."""
         graph, paths = self.robot.graph, self.robot.path_memory
         return frozenset(
             entry.node
@@ -112,7 +111,7 @@ class Merge:
     # -- what the centre lacks
 
     def has_more(self) -> bool:
-        """Whether a map without new nodes has anything else to say."""
+        """Whether a map without new nodes has other new records."""
         known, paths = self.centre.sessions, self.robot.path_memory
         return (
             any(session not in known for session in self.robot.sessions)
@@ -124,7 +123,7 @@ class Merge:
         )
 
     def lacks_edge(self, edge: Edge) -> bool:
-        """Whether two of the centre's nodes lack this edge; a bridge stands for what it has."""
+        """Whether two of the fleet map's nodes lack this edge; a bridge adds nothing to others."""
         return (
             edge.kind is not EdgeKind.BRIDGE
             and edge.a in self.graph
@@ -133,7 +132,7 @@ class Merge:
         )
 
     def lacks_omission(self, omitted: NodeId) -> Position | None:
-        """Where a node that the robot's map had omitted is in the centre; None if it is no news."""
+        """Position of a node that the robot's map had omitted; None if the fleet map knows it."""
         omission = self.robot.omissions[omitted]
         known = self.equivalent(omission.node)
         if known is None or self.knows(omitted) or omitted in self.robot.graph:
@@ -141,10 +140,10 @@ class Merge:
         return known.carried_on(omission.node_from_omitted, np.zeros((6, 6)))
 
     def new_entry(self, entry: PathEntry) -> PathEntry | None:
-        """A path entry handed in, as it joins the centre's path of the same drive.
+        """The robot's path entry as an entry of the fleet map's path of the same drive.
 
-        Paths are united by (path, sequence) (SPEC §7 MERGE 4). Entries that merges made have no
-        number of the robot's: they are the same when node and stamp are, and get the next number.
+        Paths are united by (path, sequence) (SPEC §7 MERGE 4). Entries of merges are compared by
+        node and stamp, and get the next free sequence number.
 
         Returns:
             The entry, pointing to the equivalent of its node; None if the path has it, or the node
@@ -162,10 +161,10 @@ class Merge:
         return new
 
     def new_attempts(self, sessions: Iterable[SessionId], remembered: Attempts) -> Attempts:
-        """The robot's attempts between known nodes that the centre lacks, from the equivalents.
+        """The robot's new attempts between known nodes, moved to the equivalents.
 
         Args:
-            sessions: of the centre.
+            sessions: of the fleet map.
             remembered: its attempts; `session` is a place in `sessions`.
 
         Returns:
@@ -186,26 +185,26 @@ class Merge:
     # -- what it learns
 
     def take(self, stored: StoredNode, frame: Frame) -> int:
-        """A node that the centre was lacking; returns its dense index."""
+        """Adds a node to the fleet map; returns its dense index."""
         self.writer.copy_node(stored, frame)
         self._parts.add(stored.node.id)
         return self.graph.add_node(stored.node)
 
     def omit(self, node: NodeId, position: Position, landmark_hash: bytes | None) -> None:
-        """A node that is not taken, and where it is."""
+        """Records an omitted node and its position."""
         self._omitted[node] = position
         omission = Omission(node, position.node, position.node_from_live, landmark_hash)
         self.writer.add_omission(omission)
 
     def add_edge(self, edge: Edge) -> None:
-        """An edge that the graph lacks; or a surer one, of two moved from different nodes."""
+        """Adds an edge that the graph lacks, or replaces one of larger variance."""
         known = self.graph.find_edge(edge.a, edge.b, edge.kind)
         if known is None or uncertainty_m2(edge.covariance) < uncertainty_m2(known.covariance):
             self.graph.add_edge(edge)
             self.write_edges([edge])
 
     def write_edges(self, edges: Iterable[Edge]) -> None:
-        """Edges that are in the graph already."""
+        """Writes edges that are in the graph already."""
         for edge in edges:
             self.writer.add_edge(edge)
             a, b = (end if end in self._parts else _CENTRE for end in (edge.a, edge.b))
@@ -213,7 +212,7 @@ class Merge:
             self.report.edges += 1
 
     def add_entries(self, entries: Iterable[PathEntry]) -> None:
-        """The entries of these that the centre's paths lack."""
+        """Adds the entries that the fleet map's paths lack."""
         for entry in entries:
             new = self.new_entry(entry)
             if new is not None:
@@ -236,6 +235,6 @@ _EntryKey: TypeAlias = int | tuple[NodeId, int]
 
 
 def _key(entry: PathEntry) -> _EntryKey:
-    """By what an entry of a path is known, whoever numbered it."""
+    """Identity of a path entry, independent of who numbered it."""
     is_replayed = entry.kind is PathEntryKind.REPLAYED
     return (entry.node, entry.stamp_ns) if is_replayed else entry.sequence

@@ -1,4 +1,4 @@
-"""MERGE: what a robot has seen and the centre is lacking joins the centre (SPEC §7, [G16] §V-A)."""
+"""MERGE: adds to the fleet map what it lacks of a robot's map (SPEC §7, [G16] §V-A)."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ def merge_one(
     gate: Gate | None,
     monitor: Monitor,
 ) -> MergeReport:
-    """Merges one robot's map into the centre: one revision, or none where nothing is new.
+    """Merges one robot's map into the fleet map: one revision, or none if nothing is new.
 
     Args:
-        centre: the fleet's map, open for writing.
-        robot: the map handed in.
+        centre: the fleet map, open for writing.
+        robot: the robot's map.
         settings: of localiser and mapper.
         options: policy and budget.
-        gate: is shown the result before it becomes part of the centre; None for none.
-        monitor: sees how it goes, and is asked where the merge can still be given up.
+        gate: checks the result before it is committed; None for no check.
+        monitor: receives progress; its `check` is called wherever the merge can still be undone.
 
     Raises:
-        IncompatibleError: the map does not fit the centre.
-        RefusedError: the gate refuses the result. The centre is as it was.
-        MapError: a map cannot be read or written. The centre is as it was.
+        IncompatibleError: the map does not fit the fleet map.
+        RefusedError: the gate refuses the result. The fleet map is unchanged.
+        MapError: a map cannot be read or written. The fleet map is unchanged.
     """
     merge = Merge(centre, robot)
     check_fits(merge)
@@ -72,7 +72,7 @@ def merge_one(
                 report.held_out = gate(centre, robot.location, monitor)
                 monitor.check()
             report.revision = merge.writer.commit().number
-        if options.relocaliser in RECOGNISERS:  # which know places by their words
+        if options.relocaliser in RECOGNISERS:  # these use the nodes' visual words
             _keep_words(merge, settings.frontend.descriptor)
     _say_what_hangs_together(merge, before)
     report.content_hash = centre.content_hash()
@@ -82,7 +82,7 @@ def merge_one(
 def _about(
     merge: Merge, new: Sequence[Node], settings: Settings, options: MergeOptions
 ) -> dict[str, Any]:
-    """Who merged what and how: kept with the revision, and free of where it happened."""
+    """Author, message and configuration of the revision, independent of host and paths."""
     names = ", ".join(_contributors(merge, new))
     return {
         "author": options.author or names or "nobody",
@@ -96,7 +96,7 @@ def _about(
 
 
 def _contributors(merge: Merge, new: Sequence[Node]) -> list[str]:
-    """Whose drives bring nodes or ways that the centre lacks; all robots where none does."""
+    """Robots whose drives bring new nodes or paths; all robots if none does."""
     saved, paths = {node.session for node in new}, merge.robot.path_memory
     driven = {
         path
@@ -128,7 +128,7 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
     merge.add_entries(late)
     _see_edges_again(merge)
     for edge in filter(merge.lacks_edge, merge.edges):
-        merge.add_edge(edge)  # what the robot found out about nodes that the centre had
+        merge.add_edge(edge)  # the robot's new edges between known nodes
     _join_components(merge)
     _carry_omissions(merge)
     _carry_attempts(merge, replay)
@@ -157,7 +157,7 @@ def _add_session(merge: Merge, session: Session) -> None:
 
 
 def _unite_path(merge: Merge, session: Session, replay: Replay) -> list[PathEntry]:
-    """The drive's path as far as its nodes are known; returns the entries that are not yet."""
+    """Adds the drive's path as far as its nodes are known; returns the other entries."""
     entries = merge.robot.path_memory.entries(path_id(session.id))
     merge.add_entries([one for one in entries if merge.knows(one.node)])
     merge.add_entries(replay.entries.get(session.id, []))
@@ -165,7 +165,7 @@ def _unite_path(merge: Merge, session: Session, replay: Replay) -> list[PathEntr
 
 
 def _see_edges_again(merge: Merge) -> None:
-    """A node that a revert had hidden brings back its edges to nodes that stayed."""
+    """Adds the edges of nodes that a revert had hidden and this merge shows again."""
     if not merge.writer.shows_again:
         return
     merge.writer.checkpoint()
@@ -174,7 +174,7 @@ def _see_edges_again(merge: Merge) -> None:
 
 
 def _join_components(merge: Merge) -> None:
-    """Where two parts of the centre are joined only by nodes that were not taken."""
+    """Joins components of the fleet map that only omitted nodes connect."""
     labels, index = merge.graph.components(), merge.graph.index
     edges = []
     for edge in merge.edges:
@@ -190,7 +190,7 @@ def _join_components(merge: Merge) -> None:
 
 
 def _carry_omissions(merge: Merge) -> None:
-    """What the robot's map had omitted itself, when it was merged from others."""
+    """Copies the omissions of a robot's map that is itself a merge."""
     for omitted in sorted(merge.robot.omissions):
         position = merge.lacks_omission(omitted)
         if position is not None:
@@ -199,10 +199,10 @@ def _carry_omissions(merge: Merge) -> None:
 
 
 def _carry_attempts(merge: Merge, replay: Replay) -> None:
-    """Remembered attempts go along (SPEC §7 MERGE 4), those of the replay too."""
+    """Copies remembered attempts (SPEC §7 MERGE 4), and those of the replay."""
     sessions, remembered = list(merge.centre.sessions), merge.centre.attempts
     if merge.writer.shows_again:
-        # A node that is seen again brings back the attempts that were remembered at it.
+        # A node that is shown again brings back its remembered attempts.
         merge.writer.checkpoint()
         now = merge.centre.load()
         sessions, remembered = [session.id for session in now.sessions], now.attempts
@@ -222,13 +222,13 @@ def _carry_attempts(merge: Merge, replay: Replay) -> None:
 
 
 def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
-    """Copies the words that the robot's map has by the centre's vocabulary; works out the rest.
+    """Copies the robot's words of the fleet map's vocabulary, and computes the missing ones.
 
-    Words are no part of any revision: where this is interrupted, they are worked out later.
+    Words belong to no revision: if this is interrupted, they are computed later.
     """
     vocabulary, graph = vocabulary_or_default(merge.centre, descriptor), merge.graph
     theirs = NodeWords.of_map(merge.robot, vocabulary)
-    robot = merge.robot.graph  # of what is hidden there nothing was checked
+    robot = merge.robot.graph  # nodes hidden there were not checked
     brought = {node: one for node, one in theirs.kept.items() if node in graph and node in robot}
     if brought:
         merge.centre.put_words(theirs.hash, brought)
@@ -236,11 +236,11 @@ def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
 
 
 def _say_what_hangs_together(merge: Merge, before: int) -> None:
-    """Counts the parts of the centre, and notes nodes added apart from all that it had.
+    """Counts the components of the fleet map, and notes added nodes that are not connected to it.
 
     Args:
-        merge: when it is done.
-        before: how many nodes the centre had.
+        merge: the finished merge.
+        before: number of nodes before the merge.
     """
     report, labels = merge.report, merge.graph.components()
     report.components = int(labels.max(initial=-1)) + 1
@@ -249,10 +249,10 @@ def _say_what_hangs_together(merge: Merge, before: int) -> None:
     apart = ~np.isin(labels[before:], labels[:before])
     if apart.all() and not report.known:
         report.notes.append(
-            "no node of it was found in the fleet map: another town, or another look of this one"
+            "no node of it matched the fleet map: another area, or another appearance of this one"
         )
     elif apart.any():
         report.notes.append(
-            f"{int(apart.sum())} added nodes are not connected to the existing map: their way "
-            "there was not found, or odometry had lost track on it"
+            f"{int(apart.sum())} added nodes are not connected to the existing map: no match "
+            "links them to it, or odometry failed in between"
         )
