@@ -41,6 +41,7 @@ class FrameStatus(StrEnum):
     DARK = "dark"
     COVERED = "covered"
     TOO_FEW_LANDMARKS = "too_few_landmarks"
+    FROZEN = "frozen"  # the camera repeats an old image under a new stamp
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -38,6 +38,8 @@ class Candidate:
         row: its row in the neighbourhood; None when relocalising.
         doubted: whether the prediction may be wrong: the robot is lost, and has no nodes of its
             own that confirm its position.
+        needed: fewest inliers of a believable match where the prediction is too vague to support
+            one; 0 where it is not.
     """
 
     index: int
@@ -46,6 +48,7 @@ class Candidate:
     guided: bool
     row: int | None
     doubted: bool = False
+    needed: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,9 +183,10 @@ class Attempter:
         self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match
     ) -> Outcome:
         prediction, acceptance = candidate.prediction, self._acceptance
-        if prediction is not None and accept(match, prediction, acceptance):
+        enough = match.inliers >= candidate.needed
+        if prediction is not None and enough and accept(match, prediction, acceptance):
             return Outcome(candidate, rank, match, accepted=True)
-        if prediction is not None and not candidate.doubted:
+        if prediction is not None and not candidate.doubted and not candidate.needed:
             return Outcome(candidate, rank, match, accepted=False)
         spread = partial(self._spread, live, live_id, candidate.node, match)
         return Outcome(

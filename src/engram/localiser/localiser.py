@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -53,6 +54,8 @@ from engram.ranking import (
 )
 
 _PREFETCH = 16
+# Number of fixes that show how many inliers are usual.
+_USUAL_OF = 20
 # Nodes near each weak match of a lost robot to try first: they would confirm it.
 _CONFIRMING = 6
 # For a drive without an id: equal input still gives equal results.
@@ -124,6 +127,7 @@ class Localiser:
             if budget.lanes > 1 and (threads if matcher is None else matcher.threads)
             else None
         )
+        self._fix_inliers: deque[int] = deque(maxlen=_USUAL_OF)
         self._hypotheses = Hypotheses(graph, self._nodes_near, self.config.acceptance)
         self._recent = RecentAttempts(self.config.recent)
         self._run = RunLog()
@@ -469,7 +473,20 @@ class Localiser:
         )
         # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
         doubted = self._lost and not (self.certain and self._own_session is not None)
-        return Candidate(index, self._graph.node(index).id, prediction, guided, row, doubted)
+        needed = self._needed_inliers(prediction)
+        return Candidate(
+            index, self._graph.node(index).id, prediction, guided, row, doubted, needed
+        )
+
+    def _needed_inliers(self, prediction: Prediction) -> int:
+        """Of a match that the prediction is too vague to speak for; 0 where it is not."""
+        acceptance = self.config.acceptance
+        if prediction.sigma_m <= acceptance.max_prediction_sigma_m:
+            return 0
+        if not self._fix_inliers:
+            return acceptance.min_inliers_lost
+        usual = acceptance.usual_share * float(np.median(self._fix_inliers))
+        return int(np.clip(usual, acceptance.min_inliers, acceptance.min_inliers_lost))
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes; the others are reported, and not attempted again."""
@@ -515,6 +532,7 @@ class Localiser:
         assert node_from_live is not None
         assert covariance is not None
         self.position = Position(success.candidate.node, node_from_live, covariance)
+        self._fix_inliers.append(success.match.inliers)
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0
         self._hypotheses.forget()

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator, Iterable, Iterator
+from dataclasses import replace
 from queue import Queue
 from threading import Event, Thread
 from typing import TypeAlias, TypeVar
 
-from engram.frontend import Frame, Frontend, StereoPair
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import Frame, FrameStatus, Frontend, StereoPair
 from engram.localiser import StageClock
 from engram.odometry import GapFiller, Motion, Odometry
 from engram.robot.settings import Settings
@@ -19,6 +23,9 @@ Arrived: TypeAlias = StereoPair | LoggedFrame
 
 # Decoded pairs that wait for the front-end: about 8 MB at KITTI's size.
 _READ_AHEAD = 8
+# A robot that moves more than this between two frames does not see the same image twice.
+_MOVING_M = 0.02
+_MOVING_RAD = float(np.deg2rad(0.2))
 
 
 class Front:
@@ -31,6 +38,7 @@ class Front:
         self._frontend = Frontend(settings.frontend)
         self._odometry = Odometry(settings.odometry)
         self._gaps = GapFiller()
+        self._frozen = _FrozenStream()
 
     def take(
         self,
@@ -52,11 +60,41 @@ class Front:
             return arrived.frame, motion
         clock = clock or StageClock()
         frame = self._frontend.extract(arrived)
+        if self._frozen.repeats(arrived):
+            frame = replace(frame, status=FrameStatus.FROZEN)
         clock.lap("frontend")
         if motion is None:
             motion = self._gaps.motion(self._odometry.step(frame), frame.stamp_ns)
             clock.lap("odometry")
+        self._frozen.note(motion)
         return frame, motion
+
+
+class _FrozenStream:
+    """Recognises a camera that repeats an old image while the robot moves.
+
+    No two images of a real sensor are equal, not even at rest; those of a simulator without noise
+    are, so that a robot at rest is not suspected. Every fourth pixel both ways is compared, by a
+    copy: a camera's driver may fill the same arrays again and again.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
+        self._moving = False
+
+    def repeats(self, pair: StereoPair) -> bool:
+        """Whether an image is that of the pair before, though the robot moves."""
+        newest = pair.left[::4, ::4].copy(), pair.right[::4, ::4].copy()
+        last, self._last = self._last, newest
+        if last is None or not self._moving:
+            return False
+        return any(np.array_equal(a, b) for a, b in zip(last, newest, strict=True))
+
+    def note(self, motion: Motion) -> None:
+        """What was measured; while images repeat, that from before counts on."""
+        moved = motion.prev_from_curr
+        if moved is not None and not motion.guessed_m:
+            self._moving = moved.distance_m > _MOVING_M or moved.angle_rad > _MOVING_RAD
 
 
 def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]]:

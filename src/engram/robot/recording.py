@@ -9,10 +9,10 @@ from typing import Any
 
 from engram.config import config_hash
 from engram.errors import SequenceError
-from engram.frontend import Frame, FrameStatus, Frontend
+from engram.frontend import Frame, FrameStatus
 from engram.monitor import QUIET, Monitor, deferred_interrupt
-from engram.odometry import Odometry, OdometryStatus
-from engram.robot.front import arriving
+from engram.odometry import OdometryStatus
+from engram.robot.front import Front, arriving
 from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
 from engram.sequences import (
@@ -88,7 +88,7 @@ def extract_log(
         MapError: the log cannot be written; what was recorded is intact.
     """
     report = ExtractReport(str(out))
-    frontend, odometry = Frontend(settings.frontend), Odometry(settings.odometry)
+    front = Front(settings)
     writer: FrameLogWriter | None = None
     try:
         with closing(arriving(sequence)) as pairs, deferred_interrupt() as raise_if_asked:
@@ -96,8 +96,8 @@ def extract_log(
                 raise_if_asked()
                 if isinstance(pair, LoggedFrame):
                     raise SequenceError(f"{sequence.info.name}: is a frame log already")
-                frame = frontend.extract(pair)
-                step = odometry.step(frame)
+                frame, motion = front.take(pair)
+                step = motion.odometry
                 if writer is None:
                     writer = FrameLogWriter(out, _header(sequence, frame, settings))
                 _count(report, frame.status, step.status)
