@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference.bundle_adjustment import adjust, project
+from tests.reference.bundle_adjustment import adjust, project
 from tests.scenes import CAMERA
 
 from engram import _core
@@ -192,8 +192,8 @@ def test_arguments_that_do_not_fit_are_refused(change: dict, error: type) -> Non
 def test_same_bits_on_every_instruction_set() -> None:
     code = """
 import sys
-sys.path.insert(0, sys.argv[1]); sys.path.insert(0, sys.argv[1] + "/odometry")
-from test_window_kernel import Problem
+sys.path.insert(0, sys.argv[1])
+from tests.odometry.test_window_kernel import Problem
 import hashlib
 result = Problem(frames=5, points=60, seed=9, gross=5).solve()
 print(hashlib.sha256(b"".join(part.tobytes() for part in result[:2])).hexdigest())
@@ -201,7 +201,7 @@ print(hashlib.sha256(b"".join(part.tobytes() for part in result[:2])).hexdigest(
     order = ["generic", "v3", "v4"]
     digests = {
         subprocess.run(
-            [sys.executable, "-c", code, str(Path(__file__).parents[1])],
+            [sys.executable, "-c", code, str(Path(__file__).parents[2])],
             env={**os.environ, "ENGRAM_ISA": isa},
             capture_output=True,
             text=True,

@@ -1,9 +1,9 @@
 """The baseline: similarity of sets of words."""
 
 import numpy as np
+from tests.places.worlds import small_vocabulary
 
 from engram.places import BagOfWords
-from places.worlds import small_vocabulary
 
 VOCABULARY = small_vocabulary()
 

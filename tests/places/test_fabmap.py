@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from reference.fabmap import log_likelihood
+from tests.places.worlds import look, places, small_vocabulary
+from tests.reference.fabmap import log_likelihood
 
 from engram.frontend import BRIEF
 from engram.places import DetectorModel, FabMap, FabMapConfig
-from places.worlds import look, places, small_vocabulary
 
 VOCABULARY = small_vocabulary()
 

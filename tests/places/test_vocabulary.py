@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.places.worlds import THINGS, appearances, look, small_vocabulary
 
 from engram.errors import ConfigError, IncompatibleError, InputError, MapCorruptError
 from engram.frontend import BRIEF, TEBLID
@@ -16,7 +17,6 @@ from engram.places import (
     train_vocabulary,
     vocabulary_hash,
 )
-from places.worlds import THINGS, appearances, look, small_vocabulary
 
 VOCABULARY = small_vocabulary()
 BODY = encode_vocabulary(VOCABULARY)
