@@ -45,13 +45,12 @@ def test_a_kidnapped_robot_is_found_where_it_was_put(mapped) -> None:
     assert errors_m(found[-1:], live[-1:], made.saved).max() < 0.1
 
 
-def test_somewhere_else_is_a_new_place_and_never_a_position(mapped) -> None:
+def test_somewhere_else_is_never_a_position(mapped) -> None:
     path, _ = mapped
     live = drive(ELSEWHERE, np.arange(0, 10, 1.0), start_ns=4_000_000_000_000)
     for one in localise_simulated(path, live, relocaliser="fabmap"):
         assert one.status is not LocalisationStatus.LOCALISED
         assert one.node_from_live is None
-        assert one.new_place is not None
 
 
 def test_two_drives_of_one_road_made_apart_are_joined(tmp_path: Path) -> None:
