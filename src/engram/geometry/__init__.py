@@ -1,7 +1,6 @@
-"""Rigid transforms and cameras. Knows nothing of images.
+"""Rigid transforms and cameras.
 
-Rectification stands in `engram.geometry.rectification` and is not imported here: it needs OpenCV,
-which is slow to import.
+`engram.geometry.rectification` is not imported here, since it imports OpenCV, which is slow.
 """
 
 from engram.geometry.cameras import CameraId, StereoCamera

@@ -1,4 +1,4 @@
-"""Rectified stereo cameras, identified by what they are (SPEC §2.6)."""
+"""Rectified stereo cameras, identified by a hash of their calibration (SPEC §2.6)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from engram.geometry.se3 import SE3
 
 CameraId = NewType("CameraId", str)
 
-# Longer than any robot; a baseline given in millimetres exceeds it.
+# Longest baseline, metres; a baseline given in millimetres exceeds it.
 LONGEST_BASELINE_M = 20.0
 
-# Landmarks are stored with 16 bits for a pixel.
+# Landmarks store pixels in 16 bits.
 _MAX_SIDE_PX = 65535
 
 
@@ -26,15 +26,16 @@ _MAX_SIDE_PX = 65535
 class StereoCamera:
     """A rectified pinhole stereo pair; its frame is the left camera's.
 
-    Pixel centres are at integers. A recalibration is another camera: `id` is a hash of the rest.
+    Pixel centres are at integers. A recalibration gives another camera: `id` is a hash of the other
+    fields.
 
     Attributes:
         fx, fy, cx, cy: intrinsics of both rectified images, px.
         baseline_m: distance of the right camera to the right of the left one, metres, > 0.
         width, height: image size, px.
         cam_from_rig: mounting of the left camera on the robot, if known.
-        rectification: names the raw calibration that the rectified images come from; "" for
-            images that are delivered rectified.
+        rectification: hash of the raw calibration of the images; "" for images that come
+            rectified.
         id: 32 hexadecimal digits, equal for equal cameras.
 
     Raises:
@@ -84,13 +85,13 @@ class StereoCamera:
 
     @property
     def focal_baseline(self) -> float:
-        """fx·b in px·m: depth is this divided by disparity."""
+        """fx·b in px·m: depth (m) is this divided by disparity (px)."""
         return self.fx * self.baseline_m
 
     def triangulate(
         self, pixels: NDArray[np.float32], disparity_px: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Points (N, 3) in the camera frame, metres, from left pixels (N, 2) and disparities (N,).
+        """Points (N, 3) in the camera frame, m, from left pixels (N, 2) and disparities (N,), px.
 
         Source: SPEC §2.3, ``z = fx·b/d``.
         """

@@ -1,8 +1,8 @@
 """Raw stereo calibration → rectified `StereoCamera` and the tables that rectify its images.
 
-Only tables are made here; a reader applies them (`cv2.remap`), so geometry knows no images.
+Only tables are computed here; readers apply them (`cv2.remap`).
 Source: Bouguet's rectification as in OpenCV's ``stereoRectify``: each camera turns by half of the
-rotation between them, then both together until their rows lie along the baseline.
+rotation between them, then both together until their rows are parallel to the baseline.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from engram.errors import CalibrationError
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 
-# Names the method in the hash of a rectification: a change to what `rectify` computes is another
-# camera, since landmarks made with the old tables would no longer fit the new intrinsics.
+# Names the method in the hash of a rectification. Change it whenever `rectify` computes other
+# values: landmarks from old tables do not fit the new intrinsics.
 _METHOD = "bouguet-1"
 
 # Larger images are refused: the four tables of a pair take 12 bytes a pixel.
@@ -49,13 +49,13 @@ _COEFFICIENT_COUNTS = {
 
 @dataclass(frozen=True, slots=True)
 class RawCamera:
-    """One camera as it delivers its images: distorted, not rectified.
+    """One camera with its raw images: distorted, not rectified.
 
     Attributes:
         fx, fy, cx, cy: intrinsics, px; pixel centres at integers.
         width, height: image size, px.
         distortion: model of the lens.
-        coefficients: as many as the model has, see `DistortionModel`.
+        coefficients: coefficients of the model, see `DistortionModel`.
 
     Raises:
         CalibrationError: a value is not finite, not positive, or their number does not fit.
@@ -102,11 +102,11 @@ class RawCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawStereoCalibration:
-    """Two raw cameras and how they stand to each other.
+    """Two raw cameras and their relative pose.
 
     Attributes:
         left, right: the two cameras, of equal image size.
-        right_from_left: pose of the left raw camera in the right one, metres.
+        right_from_left: pose of the left raw camera in the frame of the right one, metres.
         left_from_rig: mounting of the left raw camera on the robot, if known.
     """
 
@@ -116,7 +116,7 @@ class RawStereoCalibration:
     left_from_rig: SE3 | None = None
 
     def content_hash(self) -> str:
-        """32 hexadecimal digits, equal for equal calibrations; mounting does not count."""
+        """Hash of the calibration without the mounting, 32 hexadecimal digits."""
         content = [_METHOD]
         for camera in (self.left, self.right):
             content += [float(value).hex() for value in camera.matrix.ravel()]
@@ -128,10 +128,10 @@ class RawStereoCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RemapTable:
-    """Where each pixel of a rectified image comes from, in OpenCV's fixed-point form.
+    """Source of each pixel of a rectified image, in OpenCV's fixed-point form.
 
     Attributes:
-        pixels: (height, width, 2) int16, whole source u, v.
+        pixels: (height, width, 2) int16, integer part of the source u, v, px.
         fractions: (height, width) uint16, index into the interpolation table.
     """
 
@@ -141,11 +141,11 @@ class RemapTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """A rectified camera and what leads to it from the raw one.
+    """A rectified camera and the tables that produce its images.
 
     Attributes:
         camera: the rectified pair; its `rectification` is the hash of the raw calibration.
-        rectified_from_raw: rotation of the left camera (its centre stays).
+        rectified_from_raw: rotation of the left camera about its centre.
         left, right: the tables for the two images.
     """
 
@@ -156,11 +156,11 @@ class Rectification:
 
 
 def rectify(calibration: RawStereoCalibration) -> Rectification:
-    """Rectify a raw stereo calibration; the image size stays, and no border is left unseen.
+    """Rectifies a raw stereo calibration; keeps the image size and crops all unseen borders.
 
     Raises:
-        CalibrationError: the two sizes differ, the right camera does not stand to the right of
-            the left one, or the calibration leaves no image to rectify.
+        CalibrationError: the two sizes differ, the right camera is not to the right of the left
+            one, or no usable image remains.
     """
     left, right = calibration.left, calibration.right
     _check_pair(calibration)
@@ -197,20 +197,20 @@ def _check_pair(calibration: RawStereoCalibration) -> None:
     if not (right_in_left[0] > 0 and right_in_left[0] > abs(right_in_left[1])):
         offset = ", ".join(f"{value:.4f}" for value in right_in_left)
         raise CalibrationError(
-            f"the right camera stands at ({offset}) m of the left one: x must be positive and the "
-            "largest part; swap the two cameras or correct the extrinsics"
+            f"the right camera is at ({offset}) m in the left one's frame: x must be positive "
+            "and the largest part; swap the two cameras or correct the extrinsics"
         )
 
 
 def _check_rectified(
     rotations: list[NDArray[np.float64]], projections: list[NDArray[np.float64]]
 ) -> None:
-    """OpenCV answers a lens that bends everything out of sight with infinities or a focal of 0."""
+    """Refuses OpenCV's results for an impossible lens: infinities or a focal length of 0."""
     finite = all(np.isfinite(one).all() for one in (*rotations, *projections))
     if not (finite and all(one[0, 0] > 0 and one[1, 1] > 0 for one in projections)):
         raise CalibrationError(
-            "the stereo calibration leaves no image to rectify: focal lengths of "
-            f"{', '.join(f'{one[0, 0]:.6g}' for one in projections)} px come of it; check the "
+            "the stereo calibration leaves no usable image: it gives focal lengths of "
+            f"{', '.join(f'{one[0, 0]:.6g}' for one in projections)} px; check the "
             "distortion coefficients"
         )
 
@@ -251,7 +251,7 @@ def _stereo_rectify(
 
 
 def _float64(*arrays: ArrayLike) -> list[NDArray[np.float64]]:
-    """OpenCV's results under the type they have."""
+    """OpenCV's results with their types."""
     return [np.asarray(array, dtype=np.float64) for array in arrays]
 
 
@@ -284,8 +284,8 @@ def _rectified_camera(
     rectified_from_raw: SE3,
 ) -> StereoCamera:
     left, right = projections
-    # Far below what matters, far above what differs between processors: a camera's identity hangs
-    # on every digit, and the same drive must give the same camera everywhere.
+    # Rounded coarser than differences between processors: every digit counts for a camera's id, and
+    # the same drive must give the same camera everywhere.
     fx, fy, cx, cy = (round(float(left[at]), 6) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
     baseline_m = round(float(-right[0, 3] / left[0, 0]), 9)
     mounting = calibration.left_from_rig

@@ -18,8 +18,8 @@ from engram.errors import InputError
 
 Array = NDArray[np.float64]
 
-# Below this angle the closed forms lose digits to cancellation; the series, cut after the fourth
-# power, are exact to 1e-15 there.
+# Below this angle (rad) the closed forms lose digits to cancellation; the series up to the fourth
+# power are exact to 1e-15 there.
 _SMALL_ANGLE_RAD = 1e-2
 
 
@@ -37,15 +37,15 @@ class SE3:
 
     @staticmethod
     def identity() -> SE3:
-        """The transform that changes nothing."""
+        """The identity."""
         return SE3(np.eye(3), np.zeros(3))
 
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> SE3:
         """From a (4, 4) or (3, 4) matrix; the rotation is projected onto SO(3).
 
-        One that is a rotation to within rounding is kept to the bit, so that what was stored
-        comes back as it was.
+        A block that is a rotation to within rounding is kept bit for bit, so that stored transforms
+        are read back unchanged.
 
         Raises:
             InputError: the shape is wrong, a value is not finite, or the upper left 3×3 block is
@@ -94,7 +94,7 @@ class SE3:
         return SE3(rotation, (np.eye(3) + b * k + c * kk) @ vector[:3])
 
     def log(self) -> Array:
-        """The (6,) tangent vector [translation m, rotation rad] whose `exp` this is."""
+        """The (6,) tangent vector [translation m, rotation rad]; inverse of `exp`."""
         rotation_vector = _rotation_log(self.rotation)
         angle = float(np.linalg.norm(rotation_vector))
         a, b, _ = _rodrigues_coefficients(angle)
@@ -126,9 +126,9 @@ class SE3:
         return SE3(transposed, -(transposed @ self.translation))
 
     def renormalised(self) -> SE3:
-        """The same with a rotation that has lost no digits: for the end of long products.
+        """The transform with its rotation orthonormalised, for the end of long products.
 
-        One Newton step towards the nearest rotation squares what is left of skew.
+        One Newton step towards the nearest rotation squares the error.
         """
         rotation = self.rotation
         return SE3(1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation, self.translation)
@@ -184,7 +184,7 @@ def skew(vector: Array) -> Array:
 def propagate_covariance(a_from_b: SE3, covariance_ab: Array, covariance_bc: Array) -> Array:
     """Covariance (6, 6) of ``a_from_b @ b_from_c`` from those of its two factors.
 
-    First order, the two errors independent, left perturbation.
+    First order, independent errors, left perturbation; order [translation m, rotation rad].
     """
     adjoint = a_from_b.adjoint()
     return covariance_ab + adjoint @ covariance_bc @ adjoint.T

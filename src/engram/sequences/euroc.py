@@ -35,7 +35,7 @@ from engram.sequences.listing import (
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
-# What the tools of the field write into `distortion_model`.
+# Values of `distortion_model` that common calibration tools write.
 _DISTORTION = {
     "radial-tangential": DistortionModel.RADIAL_TANGENTIAL,
     "radtan": DistortionModel.RADIAL_TANGENTIAL,
@@ -46,9 +46,9 @@ _DISTORTION = {
     "none": DistortionModel.NONE,
 }
 
-# Stamps of the data set are ns since 1970; before 2000 they cannot be, so the clock is relative.
+# Stamps of the data set are ns since 1970; one before 2000 means a relative clock.
 _YEAR_2000_NS = 946_684_800 * 1_000_000_000
-# A calibration has a few hundred bytes; nested brackets by the million are an attack.
+# A calibration has a few hundred bytes; this bounds the parser's work on malicious files.
 _MAX_YAML_CHARACTERS = 1_000_000
 
 
@@ -62,7 +62,8 @@ def find_euroc(path: Path, options: OpenOptions) -> ImageDrive:
 
     Raises:
         SequenceError: images or stamps are missing or malformed.
-        CalibrationError: a `sensor.yaml` is missing, malformed, or the two make no stereo pair.
+        CalibrationError: a `sensor.yaml` is missing or malformed, or the two cameras are not a
+            stereo pair.
     """
     folder = _mav_folder(path)
     sides = (folder / "cam0", folder / "cam1")
@@ -83,7 +84,7 @@ def rectify_sensors(left: Path, right: Path) -> Rectification:
     """Rectification of two `sensor.yaml`.
 
     Raises:
-        CalibrationError: one is missing, malformed, or they make no stereo pair.
+        CalibrationError: one is missing or malformed, or the two cameras are not a stereo pair.
     """
     left_camera, body_from_left = _read_sensor(left)
     right_camera, body_from_right = _read_sensor(right)
@@ -161,11 +162,11 @@ def _mounting(entries: dict[str, Any]) -> SE3:
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    # OpenCV writes "%YAML:1.0", which is no YAML directive.
+    # OpenCV writes "%YAML:1.0", which is not a valid YAML directive.
     lines = read_calibration_text(path).splitlines()
     text = "\n".join(line for line in lines if not line.startswith("%"))
     if len(text) > _MAX_YAML_CHARACTERS:
-        raise CalibrationError(f"{path}: {len(text)} characters, no calibration is that long")
+        raise CalibrationError(f"{path}: {len(text)} characters, too long for a calibration")
     try:
         # The base loader makes strings, lists and dictionaries, nothing else.
         entries = yaml.load(text, Loader=yaml.BaseLoader)
@@ -191,7 +192,7 @@ def _numbers(entries: dict[str, Any], name: str, counts: set[int]) -> list[float
     try:
         numbers = [float(value) for value in values]
     except (TypeError, ValueError):
-        raise CalibrationError(f"{name} holds something that is no number") from None
+        raise CalibrationError(f"{name} has an entry that is not a number") from None
     if not all(map(math.isfinite, numbers)):
         raise CalibrationError(f"{name} has a number that is not finite")
     return numbers

@@ -1,4 +1,4 @@
-"""Plain folders: `left/`, `right/`, `calibration.toml` and, if wanted, `times.txt`.
+"""Plain folders: `left/`, `right/`, `calibration.toml` and an optional `times.txt`.
 
 `docs/sequences.md` shows the layout with an example.
 """
@@ -37,7 +37,7 @@ from engram.sequences.listing import (
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
-# No camera delivers images this close together: names that count so are frame numbers.
+# Names whose numbers are this close, ns, are frame numbers: no camera is that fast.
 _CLOSEST_NS = 100_000
 _TIMES_NEEDED = (
     "write times.txt beside left/ and right/, with one line for each pair: its time in seconds, "
@@ -47,7 +47,7 @@ _TIMES_NEEDED = (
 
 @dataclass(frozen=True, slots=True)
 class RectifiedTable:
-    """`[rectified]`: the images are rectified; fields as of `StereoCamera`."""
+    """`[rectified]`: the images are rectified; fields as in `StereoCamera`."""
 
     fx: float
     fy: float
@@ -60,7 +60,7 @@ class RectifiedTable:
 
 @dataclass(frozen=True, slots=True)
 class LensTable:
-    """`[raw.left]`, `[raw.right]`: fields as of `RawCamera`."""
+    """`[raw.left]`, `[raw.right]`: fields as in `RawCamera`."""
 
     fx: float
     fy: float
@@ -72,11 +72,12 @@ class LensTable:
 
 @dataclass(frozen=True, slots=True)
 class RawTable:
-    """`[raw]`: the images are as the cameras deliver them.
+    """`[raw]`: the images are distorted and not rectified.
 
     Attributes:
         width, height: image size, px.
-        right_from_left: 16 numbers, row-major 4×4, pose of the left camera in the right one, m.
+        right_from_left: 16 numbers, row-major 4×4: pose of the left camera in the frame of the
+            right one, metres.
         left, right: the two lenses.
     """
 
@@ -89,13 +90,13 @@ class RawTable:
 
 @dataclass(frozen=True, slots=True)
 class FolderCalibration:
-    """`calibration.toml`: one of `[rectified]` and `[raw]`, and what is known of the drive.
+    """`calibration.toml`: one of `[rectified]` and `[raw]`, and facts of the drive.
 
     Attributes:
         rectified, raw: the cameras; exactly one of the two.
-        cam_from_rig: 16 numbers, row-major 4×4, mounting of the left camera as its images are
-            stored, metres; missing if unknown.
-        clock: what the stamps mean.
+        cam_from_rig: 16 numbers, row-major 4×4: mounting of the left camera (of the stored images),
+            metres; missing if unknown.
+        clock: meaning of the stamps.
         robot: name of the robot.
         longitude_deg, zone: where the drive was.
     """
@@ -116,11 +117,11 @@ def is_folder(path: Path) -> bool:
 
 
 def find_folder(path: Path, options: OpenOptions) -> ImageDrive:
-    """A plain folder. With `times.txt` pairs go by name, without it names are stamps in ns.
+    """A plain folder. With `times.txt`, images pair by name; without it, names are stamps in ns.
 
     Raises:
         SequenceError: images or stamps are missing or malformed.
-        CalibrationError: `calibration.toml` is missing, malformed, or makes no stereo pair.
+        CalibrationError: `calibration.toml` is missing or malformed, or not of a stereo pair.
     """
     file = path / "calibration.toml"
     text = read_calibration_text(file)
@@ -188,7 +189,7 @@ def _places(path: Path, options: OpenOptions) -> Listing:
         )
     stamps_ns = read_stamps(times, seconds_as_ns)
     sides = [{file.stem: file for file in image_files(folder)} for folder in (left, right)]
-    # A name that only one side has keeps its place, so that the stamps after it stay right.
+    # A name that only one side has keeps its place, so that later stamps remain correct.
     names = sorted({*sides[0], *sides[1]})
     by_number = [
         {number: side[name] for number, name in enumerate(names) if name in side} for side in sides

@@ -1,4 +1,4 @@
-"""Drives that are stored as images: one reader of pairs for all layouts."""
+"""Drives stored as images: one reader of pairs for all layouts."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from engram.sequences.sequence import SequenceInfo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageDrive:
-    """What a layout amounts to, before a caller's choices.
+    """The content of a layout, before the caller's options.
 
     Attributes:
-        path: where the drive lies.
-        info: what its files say of it.
+        path: folder of the drive.
+        info: facts from its files.
         camera: the rectified camera.
-        places: its pairs and faults, all of them, in the order of time.
-        rectification: how its raw images become rectified; None if they are delivered so.
+        places: all its pairs and faults, in the order of time.
+        rectification: rectification of its raw images; None if they are rectified already.
     """
 
     path: Path
@@ -41,12 +41,12 @@ class ImageDrive:
 
 
 class ImageSequence:
-    """A `StereoSequence` over image files. Pairs are decoded when they are asked for.
+    """A `StereoSequence` over image files. Pairs are decoded on demand.
 
     Attributes:
         info: what is known of the drive as a whole.
         camera: its one camera, rectified.
-        frames: which frames of the drive these are.
+        frames: the used frames of the drive.
 
     Raises:
         SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.
@@ -69,12 +69,12 @@ class ImageSequence:
 
     @property
     def rectification(self) -> Rectification | None:
-        """How raw images become rectified; None for a drive that is delivered rectified."""
+        """Rectification of raw images; None for a rectified drive."""
         return self._drive.rectification
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """(N,) int64 stamps of the pairs, also of those that may turn out unreadable."""
+        """(N,) int64 stamps of the pairs, ns, including pairs that may prove unreadable."""
         return np.array([pair.stamp_ns for pair in self._pairs], dtype=np.int64)
 
     @property
@@ -95,7 +95,7 @@ class ImageSequence:
 
         Raises:
             SequenceError: an image is missing, unreadable or of the wrong size, and `skip_bad`
-                was not asked for.
+                is not set.
         """
         self._reading_faults.clear()
         for index in range(len(self._pairs)):
@@ -103,7 +103,7 @@ class ImageSequence:
                 pair = self.read(index)
             except SequenceError as error:
                 if not self._options.skip_bad:
-                    raise SequenceError(f"{error}; --skip-bad goes on without it") from error
+                    raise SequenceError(f"{error}; leave it out with --skip-bad") from error
                 self._reading_faults.append(str(error))
                 continue
             yield pair
@@ -121,7 +121,7 @@ class ImageSequence:
         return StereoPair(files.stamp_ns, left, right, self.camera)
 
     def _load(self, path: Path, table: RemapTable | None) -> NDArray[np.uint8]:
-        # Rectification keeps the size, so the camera's is that of the files too.
+        # Rectification keeps the image size.
         image = read_image(path, self.camera.width, self.camera.height, self._options.channel)
         if table is None:
             return image
@@ -131,7 +131,7 @@ class ImageSequence:
 
 
 def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
-    """What is known of a drive, completed by what the caller says.
+    """Facts of a drive, completed by the caller's options.
 
     Raises:
         ConfigError: a start time is given for a drive whose clock is UTC already.
@@ -156,7 +156,7 @@ def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
 
 
 def _shifted(places: Listing, start_ns: int) -> Listing:
-    """The same places with the first good stamp of the whole drive moved to `start_ns`."""
+    """The same places, shifted so that the first good stamp of the drive is `start_ns`."""
     first_ns = next((place.stamp_ns for place in places if isinstance(place, PairFiles)), 0)
     moved_ns = start_ns - first_ns
     return [

@@ -1,7 +1,7 @@
-"""One image file → one grey image, without trusting the file.
+"""Reads an untrusted image file as a grey image.
 
-Sizes are read from the header before anything is decoded, so that a few bytes that claim to be a
-gigapixel cost nothing.
+Sizes are read from the header before decoding, so a small file that claims a gigapixel costs
+nothing.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.options import Channel
 
-# What OpenCV's wheels decode. Files of other kinds beside the images (notes, thumbnails' caches)
-# are no concern of a reader.
+# File types that OpenCV's wheels decode. Other files beside the images are ignored.
 IMAGE_SUFFIXES = frozenset(
     f".{ending}"
     for ending in (
@@ -26,8 +25,7 @@ IMAGE_SUFFIXES = frozenset(
     )
 )
 
-# An uncompressed 16-bit colour image of 64 megapixels fits; nothing a stereo camera delivers is
-# larger.
+# An uncompressed 16-bit colour image of 64 megapixels fits: more than any stereo camera delivers.
 _MAX_FILE_BYTES = 400_000_000
 _MAX_PIXELS = 64_000_000
 
@@ -43,7 +41,7 @@ def read_image(
     16-bit images are scaled from their full range (65,535 → 255); transparency is dropped.
 
     Raises:
-        SequenceError: the file is missing, cut short, no image, of an unknown kind, or its size is
+        SequenceError: the file is missing, cut short, not an image of a known type, or its size is
             not `width` × `height`.
         ConfigError: one colour channel is asked for and the image is grey.
     """
@@ -58,10 +56,10 @@ def read_image(
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, px, decoding it only where its header is not understood.
+    """Width and height of an image file, px, decoded only if its header is not understood.
 
     Raises:
-        SequenceError: the file is missing or no image.
+        SequenceError: the file is missing or not an image.
     """
     content = _read_bytes(path)
     size = header_size(content)
@@ -94,7 +92,7 @@ def _read_bytes(path: Path) -> bytes:
         size = path.stat().st_size
         if size > _MAX_FILE_BYTES:
             raise SequenceError(
-                f"{path}: {size} bytes is no camera image (at most {_MAX_FILE_BYTES})"
+                f"{path}: {size} bytes, too large for a camera image (at most {_MAX_FILE_BYTES})"
             )
         content = path.read_bytes()
     except FileNotFoundError:
@@ -191,7 +189,7 @@ def _one_channel(path: Path, image: NDArray[np.uint8], channel: Channel) -> NDAr
     if channels == 1:
         if channel is not Channel.GREY:
             raise ConfigError(
-                f"{path}: channel {channel.value!r} was asked for, but the image is grey; "
+                f"{path}: the image is grey and has no channel {channel.value!r}; "
                 "leave the channel at 'grey' or choose the colour rig"
             )
         return np.ascontiguousarray(image.reshape(image.shape[:2]))

@@ -52,7 +52,7 @@ def find_kitti_odometry(path: Path, options: OpenOptions) -> ImageDrive:
 
     Raises:
         SequenceError: images or stamps are missing or malformed.
-        CalibrationError: the projections of the rig are missing, malformed or make no pair.
+        CalibrationError: the projections of the rig are missing, malformed or not a pair.
     """
     left, right = _CAMERAS[options.rig]
     folders = _rig_folders(path, {camera: f"image_{camera}" for camera in range(4)}, options.rig)
@@ -71,7 +71,7 @@ def find_kitti_raw(path: Path, options: OpenOptions) -> ImageDrive:
 
     Raises:
         SequenceError: images or stamps are missing or malformed.
-        CalibrationError: the projections of the rig are missing, malformed or make no pair.
+        CalibrationError: the projections of the rig are missing, malformed or not a pair.
     """
     left, right = _CAMERAS[options.rig]
     names = {camera: f"image_{camera:02d}/data" for camera in range(4)}
@@ -91,7 +91,7 @@ def find_kitti_raw(path: Path, options: OpenOptions) -> ImageDrive:
 
 
 class _Calibration:
-    """A text file of lines `NAME: number number …`; other lines pass."""
+    """A text file of lines `NAME: number number …`; other lines are ignored."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -120,13 +120,13 @@ class _Calibration:
         if not difference <= _SAME_INTRINSICS_PX:
             raise CalibrationError(
                 f"{self.path}: {left} and {right} differ by {difference:.6g} in their intrinsics: "
-                "they are no rectified pair"
+                "they are not a rectified pair"
             )
         matrix = projections[0][:, :3]
         if not (matrix[0, 0] > 0 and matrix[1, 1] > 0 and abs(matrix[2, 2] - 1) < 1e-6):
-            raise CalibrationError(f"{self.path}: {left} is no projection of a pinhole camera")
-        # P = K [I | t], t the pose of camera 0's centre in this camera.
-        # Rounded, since a camera's identity hangs on every digit and must not differ between
+            raise CalibrationError(f"{self.path}: {left} is not the projection of a pinhole camera")
+        # P = K [I | t], t the position of camera 0's centre in this camera's frame, metres.
+        # Rounded, since every digit counts for a camera's id, which must not differ between
         # processors; + 0.0 makes -0.0 positive.
         offsets_m: list[NDArray[np.float64]] = [
             np.asarray(np.linalg.solve(matrix, projection[:, 3]).round(9) + 0.0, dtype=np.float64)
@@ -165,7 +165,7 @@ def _rig_folders(path: Path, names: dict[int, str], rig: Rig) -> tuple[Path, Pat
 
 
 def _first_size(places: Listing, path: Path) -> tuple[int, int]:
-    """The size of the first image that can be read: KITTI odometry states it nowhere."""
+    """Size of the first readable image: KITTI odometry does not state it."""
     failure: SequenceError | None = None
     for place in places:
         if isinstance(place, PairFiles):
@@ -173,7 +173,7 @@ def _first_size(places: Listing, path: Path) -> tuple[int, int]:
                 return image_size(place.left)
             except SequenceError as error:
                 failure = failure or error
-    raise failure or SequenceError(f"{path}: no image number is there on both sides with a stamp")
+    raise failure or SequenceError(f"{path}: no frame number has both images and a stamp")
 
 
 def _raw_calibration_file(path: Path) -> Path:
@@ -183,13 +183,13 @@ def _raw_calibration_file(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     raise CalibrationError(
-        f"{path}: calib_cam_to_cam.txt is neither in the drive's folder nor in the one above; "
-        "KITTI delivers it as a download of its own, put it there"
+        f"{path}: calib_cam_to_cam.txt is missing in the drive's folder and in its parent; "
+        "download it from KITTI (it is a separate file) and put it there"
     )
 
 
 def _oxts_longitude_deg(path: Path) -> float | None:
-    """Longitude of the first GPS record, where the drive has any."""
+    """Longitude of the first GPS record, degrees east; None without GPS."""
     record = path / "oxts" / "data" / "0000000000.txt"
     if not record.is_file():
         return None

@@ -1,8 +1,8 @@
-"""What a layout on disk amounts to: numbered places, each a pair of files or what is wrong there.
+"""Listing of a layout on disk: numbered places, each a pair of files or a fault.
 
-Each reader turns its layout into a listing; what is bad about a place is noted there and decided
-upon later, so that `--frames` and `--skip-bad` mean the same for every layout. Stamps are read from
-decimal seconds, dates or nanoseconds, all exact, as whole nanoseconds.
+Each reader turns its layout into a listing. Faults are only noted there, so `--frames` and
+`--skip-bad` mean the same for every layout. Stamps are read from decimal seconds, dates or
+nanoseconds, without rounding, as whole nanoseconds.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from engram.sequences.images import IMAGE_SUFFIXES
 
 # Text files beside images; the longest real one (an hour of ROS images at 100 Hz) has 20 MB.
 _MAX_TEXT_BYTES = 100_000_000
-# Beyond the year 2200 a stamp no longer fits into 64 bits: nothing that was driven.
+# Stamps after the year 2200 are refused: they soon exceed 64 bits.
 _MAX_STAMP_NS = 2**63 - 1
 
 _SECONDS = re.compile(r"[+-]?\d{1,12}(\.\d{0,30})?([eE][+-]?\d{1,2})?", re.ASCII)
@@ -37,13 +37,13 @@ class PairFiles:
     right: Path
 
 
-# A place without a usable pair is the reason why, for people.
+# A place without a usable pair holds the reason, as text.
 Listing = Sequence[PairFiles | str]
 
 
 @dataclass(frozen=True, slots=True)
 class StampedFile:
-    """An image file of one camera; `fault` says why it cannot be used, if so."""
+    """An image file of one camera; `fault` says why it cannot be used, "" if it can."""
 
     stamp_ns: int
     path: Path
@@ -54,7 +54,7 @@ def read_text(path: Path) -> str:
     """A text file beside the images.
 
     Raises:
-        SequenceError: it is missing, unreadable, too large, or no UTF-8 text.
+        SequenceError: it is missing, unreadable, too large, or not UTF-8 text.
     """
     try:
         size = path.stat().st_size
@@ -64,7 +64,7 @@ def read_text(path: Path) -> str:
     except FileNotFoundError:
         raise SequenceError(f"{path}: the file is missing") from None
     except UnicodeDecodeError as error:
-        raise SequenceError(f"{path}: no text at byte {error.start}") from error
+        raise SequenceError(f"{path}: not UTF-8 text at byte {error.start}") from error
     except OSError as error:
         raise SequenceError(f"{path}: cannot be read: {error.strerror}") from error
 
@@ -73,7 +73,7 @@ def read_calibration_text(path: Path) -> str:
     """As `read_text`, for a calibration.
 
     Raises:
-        CalibrationError: it is missing, unreadable, too large, or no UTF-8 text.
+        CalibrationError: it is missing, unreadable, too large, or not UTF-8 text.
     """
     try:
         return read_text(path)
@@ -82,17 +82,17 @@ def read_calibration_text(path: Path) -> str:
 
 
 def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
-    """The stamps of a file with one stamp a line, ns. Empty lines at the end do not count.
+    """The stamps of a file with one stamp a line, ns. Empty lines at the end are ignored.
 
     Raises:
-        SequenceError: as `read_text`; a line is no stamp, or there is none at all.
+        SequenceError: as `read_text`; a line is not a stamp, or there is none.
     """
     lines = read_text(path).rstrip().splitlines()
     stamps_ns: list[int] = []
     for number, line in enumerate(lines, start=1):
         stamp_ns = parse(line.strip())
         if stamp_ns is None:
-            raise SequenceError(f"{path}: line {number} is no stamp: {line[:60]!r}")
+            raise SequenceError(f"{path}: line {number} is not a stamp: {line[:60]!r}")
         stamps_ns.append(stamp_ns)
     if not stamps_ns:
         raise SequenceError(f"{path}: holds no stamp")
@@ -100,19 +100,19 @@ def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
 
 
 def seconds_as_ns(text: str) -> int | None:
-    """Decimal seconds, such as `1.044989e-01`; None if the text is none."""
+    """Nanoseconds of decimal seconds such as `1.044989e-01`; None if the text is not a number."""
     if not _SECONDS.fullmatch(text):
         return None
     return _in_range(int((Decimal(text) * 1_000_000_000).to_integral_value()))
 
 
 def nanoseconds(text: str) -> int | None:
-    """Whole nanoseconds; None if the text is none."""
+    """Whole nanoseconds; None if the text is not a whole number."""
     return _in_range(int(text)) if _NANOSECONDS.fullmatch(text) else None
 
 
 def date_as_ns(text: str) -> int | None:
-    """A UTC date such as `2011-09-26 13:02:25.967790592` as ns since 1970; None if it is none."""
+    """A UTC date such as `2011-09-26 13:02:25.967790592` as ns since 1970; None if malformed."""
     match = _DATE.fullmatch(text)
     if not match:
         return None
@@ -130,7 +130,7 @@ def _in_range(stamp_ns: int) -> int | None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The image files of a folder by name; hidden files and files of other kinds are passed over.
+    """The image files of a folder by name; hidden files and other file types are skipped.
 
     Raises:
         SequenceError: the folder does not exist, cannot be read, or holds no image.
@@ -157,17 +157,17 @@ def numbered_files(folder: Path) -> dict[int, Path]:
     """The images of a folder whose names are frame numbers, such as `000017.png`.
 
     Raises:
-        SequenceError: as `image_files`; a name is no number; two images have the same number.
+        SequenceError: as `image_files`; a name is not a number; two images have the same number.
     """
     numbered: dict[int, Path] = {}
     for path in image_files(folder):
         if not (path.stem.isascii() and path.stem.isdecimal() and len(path.stem) <= 18):
             raise SequenceError(
-                f"{path}: the name is no frame number; rename the image or move it away"
+                f"{path}: the name is not a frame number; rename the image or move it away"
             )
         other = numbered.setdefault(int(path.stem), path)
         if other is not path:
-            raise SequenceError(f"{path}: is frame {int(path.stem)} again, beside {other.name}")
+            raise SequenceError(f"{path}: frame {int(path.stem)} exists twice, see {other.name}")
     return numbered
 
 
@@ -201,14 +201,15 @@ def pair_by_stamp(
     tolerance_ns: int,
     sources: tuple[Path, Path],
 ) -> Listing:
-    """Listing of a layout in which each side has stamps of its own.
+    """Listing of a layout in which each side has its own stamps.
 
-    A left image goes with the nearest right one within the tolerance; the pair has the left stamp.
+    Each left image is paired with the nearest right one within the tolerance; the pair has the left
+    stamp.
 
     Args:
-        left: the left images, or what is wrong with one, in the order of their files.
+        left: the left images or their faults, in the order of their files.
         right: the right images likewise.
-        tolerance_ns: largest difference within a pair.
+        tolerance_ns: largest difference of stamps within a pair, ns.
         sources: the file or folder that gave the left and the right stamps, for messages.
     """
     lefts, rights = _in_order(left, sources[0]), _in_order(right, sources[1])
@@ -253,7 +254,7 @@ def usable_pairs(
     reasons = [place for place in chosen if isinstance(place, str)]
     if reasons and not skip_bad:
         more = f" (and {len(reasons) - 1} more such faults)" if len(reasons) > 1 else ""
-        raise SequenceError(f"{reasons[0]}{more}; --skip-bad goes on without them")
+        raise SequenceError(f"{reasons[0]}{more}; leave them out with --skip-bad")
     pairs = [place for place in chosen if isinstance(place, PairFiles)]
     if not pairs:
         why = f"; first fault: {reasons[0]}" if reasons else ""
@@ -265,7 +266,7 @@ def usable_pairs(
 
 
 def _in_order(items: Iterable[StampedFile | str], source: Path) -> list[StampedFile | str]:
-    """The items, with the reason in place of those whose stamps do not rise."""
+    """The items, with a fault in place of those whose stamps do not rise."""
     listed = list(items)
     files = [item for item in listed if isinstance(item, StampedFile)]
     names = [f"image {file.path.name}" for file in files]
@@ -280,7 +281,7 @@ def _nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
 
 
 def _order_faults(stamps_ns: Sequence[int], source: Path, names: Sequence[str]) -> list[str | None]:
-    """What is wrong with each stamp: they must rise; one that does not counts for none after it."""
+    """The fault of each stamp that is not above the last good one."""
     faults: list[str | None] = []
     last_ns: int | None = None
     for stamp_ns, name in zip(stamps_ns, names, strict=True):

@@ -1,4 +1,4 @@
-"""From a path to a drive: the table of known layouts and the one function that opens any."""
+"""Opens a drive of any layout: the table of known layouts and `open_sequence`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from engram.sequences.options import (
     parse_start,
 )
 
-# Of the drives inside a folder that is given in their place.
+# Most drives listed if a parent folder is given.
 _MOST_NAMED = 10
 
 
@@ -37,8 +37,8 @@ class SequenceFormat:
     """One known layout.
 
     Attributes:
-        looks_like: what a path must hold, for people.
-        recognises: whether a path is of this layout; looks at names only.
+        looks_like: what a path must hold, as text.
+        recognises: whether a path has this layout; checks names only.
         open: opens it.
         rigs: the rigs it can have.
     """
@@ -102,32 +102,32 @@ def open_sequence(
     longitude_deg: float | None = None,
     zone: str | None = None,
 ) -> ImageSequence | FrameLog:
-    """Open a drive of any known layout. No image is decoded yet, but all are looked for.
+    """Opens a drive of any known layout. Checks that all images exist, and decodes none.
 
     Image layouts give an `ImageSequence` (a `StereoSequence`), frame logs a `FrameLog` (a
     `FrameSequence`).
 
     Args:
         path: folder or file of the drive.
-        format: key of `SEQUENCES`; None recognises the layout from what is there.
-        rig: "grey" or "colour" (or "color"), where a robot carries both (KITTI).
+        format: key of `SEQUENCES`; None recognises the layout by its files.
+        rig: "grey" or "colour" (or "color"), if the robot has both (KITTI).
         channel: "grey", or one channel of colour images: "red", "green", "blue".
         frames: which frames are used, as `FrameRange` or text START:STOP:STEP.
-        skip_bad: leave bad pairs out and count them (`skipped`), instead of failing.
-        pair_tolerance_ns: largest difference of stamps within a pair, ns, where a layout pairs by
-            stamp.
-        robot: name of the robot, instead of what the source says.
+        skip_bad: leave out bad pairs and count them (`skipped`), instead of failing.
+        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair
+            by stamp.
+        robot: name of the robot; None for that of the source.
         start: absolute time of the drive's first frame (ISO 8601, UTC unless it has an offset, or
             ns since 1970), for a drive whose clock is relative or unknown.
         longitude_deg: longitude of the drive, degrees east.
         zone: IANA time zone of the drive.
 
     Raises:
-        SequenceError: there is no such path, it is of no known layout, or its images or stamps
-            cannot be used; the message names file and fact.
+        SequenceError: the path does not exist, has no known layout, or its images or stamps
+            cannot be used; the message names file and fault.
         CalibrationError: its calibration is missing, malformed, or does not fit.
         ConfigError: an argument is out of range or does not fit the layout.
-        MapError: a frame log that is damaged, locked, or of a newer format.
+        MapError: a frame log is damaged, locked, or of a newer format.
     """
     path = Path(path)
     options = OpenOptions(
@@ -155,7 +155,7 @@ def recognise(path: Path) -> str:
     """The key in `SEQUENCES` of the layout found at a path.
 
     Raises:
-        SequenceError: there is nothing, or nothing known, or more than one layout.
+        SequenceError: there is nothing, no known layout, or more than one.
     """
     if path.suffix == ".engram":
         raise SequenceError(f"{path}: is the name of a map, not of a drive; the map is given first")
@@ -175,7 +175,7 @@ def recognise(path: Path) -> str:
 
 
 def drives_inside(path: Path) -> list[Path]:
-    """The drives up to two folders below a path, by name; looks at names only.
+    """The drives up to two folders below a path, by name; checks names only.
 
     KITTI keeps them in `sequences/NN` and `DATE/DATE_drive_NNNN_sync`.
     """
@@ -193,7 +193,7 @@ def _is_drive(path: Path) -> bool:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """What a folder holds, by name; nothing where it is a file or may not be read."""
+    """Contents of a folder by name; none if it is a file or cannot be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:

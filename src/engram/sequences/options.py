@@ -1,4 +1,4 @@
-"""What a caller may say about a drive that its files do not say."""
+"""Options for opening a drive: facts that its files do not state."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _SPELLINGS = {"color": "colour", "gray": "grey"}
 
 
 class Rig(StrEnum):
-    """Which of two stereo rigs of one robot; layouts with one rig only know `GREY`."""
+    """Which of a robot's two stereo rigs; layouts with one rig only have `GREY`."""
 
     GREY = "grey"
     COLOUR = "colour"
 
 
 class Channel(StrEnum):
-    """What is taken of a colour image: its luma, or one channel alone."""
+    """How a colour image becomes grey: its luma, or one channel."""
 
     GREY = "grey"
     RED = "red"
@@ -43,8 +43,8 @@ class Channel(StrEnum):
 class FrameRange:
     """Frames `start`, `start + step`, … below `stop`, counted from 0 in the layout's own order.
 
-    Frames that are left out as bad keep their numbers, so that a range names the same frames with
-    and without `skip_bad`.
+    Bad frames keep their numbers, so that a range names the same frames with and
+    without `skip_bad`.
 
     Attributes:
         start: first frame, >= 0.
@@ -52,7 +52,7 @@ class FrameRange:
         step: distance of successive frames, >= 1.
 
     Raises:
-        ConfigError: a part is negative, the step is 0, or stop is not behind start.
+        ConfigError: a part is negative, the step is 0, or stop is not after start.
     """
 
     start: int = 0
@@ -75,7 +75,7 @@ class FrameRange:
         A single number N means the one frame N.
 
         Raises:
-            ConfigError: the text is not such a range.
+            ConfigError: the text is not a range.
         """
         parts = [part.strip() for part in text.split(":")]
         if len(parts) > 3 or text.strip() == "":
@@ -109,17 +109,17 @@ class OpenOptions:
     """How to open a drive.
 
     Attributes:
-        rig: which rig, where the layout has two.
-        channel: what is taken of colour images.
+        rig: which rig, if the layout has two.
+        channel: how colour images become grey.
         frames: which frames are used.
-        skip_bad: leave bad pairs out and count them, instead of failing.
-        pair_tolerance_ns: largest difference of stamps within a pair, where a layout pairs by
-            stamp. Default 5 ms: software-triggered pairs stay below it, and at 100 Hz it is
-            still only half of the distance to the next frame.
-        robot: name of the robot; None for what the source says.
+        skip_bad: leave out bad pairs and count them, instead of failing.
+        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair by
+            stamp. Default 5 ms: software-triggered pairs stay below it, and it is half of the
+            frame interval at 100 Hz.
+        robot: name of the robot; None for that of the source.
         start_ns: absolute time of the drive's first frame, ns since 1970 UTC, for a drive whose
             clock is not UTC.
-        longitude_deg, zone: where the drive was; None for what the source says.
+        longitude_deg, zone: where the drive was; None for the source's value.
 
     Raises:
         ConfigError: the longitude is outside ±180°, the zone is unknown, the tolerance negative.
@@ -170,7 +170,7 @@ def parse_start(start: str | datetime | int | None) -> int | None:
             start = datetime.fromisoformat(start)
         except ValueError:
             raise ConfigError(
-                f"start {start!r} is no ISO 8601 time, such as 2011-09-26T13:02:25Z"
+                f"start {start!r} is not an ISO 8601 time such as 2011-09-26T13:02:25Z"
             ) from None
     if isinstance(start, datetime):
         aware = start if start.tzinfo else start.replace(tzinfo=UTC)

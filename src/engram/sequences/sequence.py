@@ -1,4 +1,4 @@
-"""The two protocols behind which every source of data stands, and who a drive is."""
+"""The two protocols of all data sources, and the identity of a drive."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from engram.geometry import StereoCamera
 from engram.graph.model import Clock, Session, session_id
 from engram.odometry import OdometryStep
 
-# The robot of a drive whose source and caller name none.
+# Robot name of a drive if neither source nor caller gives one.
 UNNAMED_ROBOT = "robot"
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceInfo:
-    """What is known of a drive before its first image is decoded.
+    """Facts of a drive known before its first image is decoded.
 
     Attributes:
-        name: short name for people, from the path.
+        name: short display name, from the path.
         format: key in `SEQUENCES`, such as "kitti".
-        clock: what the stamps mean.
-        robot: name of the robot, where the source names one.
+        clock: meaning of the stamps.
+        robot: name of the robot, if the source gives one.
         longitude_deg, zone: where the drive was, if known (SPEC §2.8).
     """
 
@@ -63,14 +63,14 @@ class StereoSequence(Protocol):
 
         Raises:
             SequenceError: an image is missing, unreadable or of the wrong size, and `skip_bad`
-                was not asked for.
+                is not set.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedFrame:
-    """One entry of a frame log: a frame and the odometry that led to it."""
+    """One entry of a frame log: a frame and the odometry since the frame before."""
 
     frame: Frame
     odometry: OdometryStep
@@ -95,7 +95,7 @@ class FrameSequence(Protocol):
 
 
 def first_pair_hash(pair: StereoPair) -> str:
-    """32 hexadecimal digits of a pair's pixels, part of a session's identity (SPEC §2.7)."""
+    """Hash of a pair's pixels, 32 hexadecimal digits; part of a session's identity (SPEC §2.7)."""
     digest = hashlib.sha256(f"{pair.left.shape}{pair.right.shape}".encode())
     digest.update(np.ascontiguousarray(pair.left).data)
     digest.update(np.ascontiguousarray(pair.right).data)
@@ -105,12 +105,12 @@ def first_pair_hash(pair: StereoPair) -> str:
 def session_of(
     info: SequenceInfo, camera: StereoCamera, start_ns: int, first_pair_hash: str
 ) -> Session:
-    """The session of a drive, equal whenever the same frames of it are read.
+    """The session of a drive; equal for equal frames.
 
     Args:
-        info: what is known of the drive.
+        info: facts of the drive.
         camera: its camera.
-        start_ns: stamp of the first pair that is used.
+        start_ns: stamp of the first used pair, ns.
         first_pair_hash: `first_pair_hash` of that pair; a frame log has it as a property.
     """
     robot = info.robot or UNNAMED_ROBOT

@@ -1,4 +1,4 @@
-"""Trajectories as text: KITTI poses, EuRoC truth, and TUM, which evo reads and we write."""
+"""Text formats of trajectories: reads KITTI poses, EuRoC ground truth and TUM; writes TUM."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from engram.sequences.listing import nanoseconds, read_text, seconds_as_ns
 
 T = TypeVar("T")
 
-# Frame logs have their truth beside them: NAME.framelog, NAME.truth.txt.
+# Ground truth of a frame log is beside it: NAME.framelog, NAME.truth.txt.
 TRUTH_SUFFIX = ".truth.txt"
 
 
@@ -27,7 +27,7 @@ class Trajectory:
 
     Attributes:
         stamps_ns: (N,) int64, rising.
-        world_from_cam: N poses of the camera, metres.
+        world_from_cam: N poses of the camera in the world frame, metres.
 
     Raises:
         InputError: the two have different lengths, or the stamps do not rise.
@@ -49,7 +49,7 @@ class Trajectory:
         return len(self.world_from_cam)
 
     def at(self, stamp_ns: int, tolerance_ns: int = 0) -> SE3 | None:
-        """The pose with the nearest stamp; None if none lies within the tolerance."""
+        """``world_from_cam`` at the nearest stamp; None if none is within the tolerance (ns)."""
         if not len(self):
             return None
         after = int(np.searchsorted(self.stamps_ns, stamp_ns))
@@ -66,10 +66,10 @@ def read_kitti_poses(path: str | Path, stamps_ns: Sequence[int] | NDArray[np.int
 
     Args:
         path: the file.
-        stamps_ns: (N,) stamps of the frames, ns; the file has none, one line each.
+        stamps_ns: (N,) int64 stamps of the frames, ns, one per line; the file has none.
 
     Raises:
-        SequenceError: a line is no pose, or there are more or fewer of them than stamps.
+        SequenceError: a line is not a pose, or the number of poses and stamps differs.
     """
     poses = _read(path, _matrix_pose)
     if len(poses) != len(stamps_ns):
@@ -95,8 +95,8 @@ def read_euroc_truth(path: str | Path, body_from_cam: SE3) -> Trajectory:
 
     Args:
         path: the file; its poses are of the body.
-        body_from_cam: mounting of the camera whose trajectory is wanted, such as the inverse of
-            `StereoCamera.cam_from_rig`.
+        body_from_cam: pose of the wanted camera in the body frame, metres, such as the inverse
+            of `StereoCamera.cam_from_rig`.
 
     Raises:
         SequenceError: a line is something else, or the stamps do not rise.
@@ -126,12 +126,12 @@ def read_tum(path: str | Path) -> Trajectory:
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
-    """Write TUM format, nanoseconds kept; an existing file is replaced in one step.
+    """Writes TUM format with stamps to the nanosecond; replaces an existing file atomically.
 
     Args:
         path: the file.
         trajectory: what to write.
-        comments: lines for the head of the file; evo passes over them.
+        comments: lines for the head of the file; evo skips them.
 
     Raises:
         SequenceError: the file cannot be written.
@@ -153,22 +153,22 @@ def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] 
 
 
 def truth_path(framelog: str | Path) -> Path:
-    """Where the truth of a frame log stands: NAME.truth.txt beside NAME.framelog."""
+    """Path of a frame log's ground truth: NAME.truth.txt beside NAME.framelog."""
     return Path(framelog).with_suffix(TRUTH_SUFFIX)
 
 
 def read_truth(framelog: str | Path) -> Trajectory | None:
-    """The truth beside a frame log, TUM format; None if there is none.
+    """The ground truth beside a frame log, in TUM format; None if there is none.
 
     Raises:
-        SequenceError: the file is there and malformed.
+        SequenceError: the file is malformed.
     """
     path = truth_path(framelog)
     return read_tum(path) if path.exists() else None
 
 
 def _read(path: str | Path, row: Callable[[list[str]], T], delimiter: str | None = None) -> list[T]:
-    """What each row of fields comes to; comments and empty lines are passed over."""
+    """The parsed rows; comments and empty lines are skipped."""
     found = []
     for number, line in enumerate(read_text(Path(path)).splitlines(), start=1):
         if line.strip() and not line.startswith("#"):

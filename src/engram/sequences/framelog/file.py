@@ -1,4 +1,4 @@
-"""The SQLite file of a frame log: its tables, and how its write-ahead log comes and goes."""
+"""The SQLite file of a frame log: its tables and its write-ahead log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ metadata = MetaData()
 
 _INT64 = BigInteger().with_variant(Integer(), "sqlite")
 
-# One row. `digest` is that of `header`; `complete` is 1 once the whole drive was recorded.
+# One row. `digest` is that of `header`; `complete` is 1 once the whole drive is recorded.
 log_table = Table(
     "log",
     metadata,
@@ -27,8 +27,8 @@ log_table = Table(
     sqlite_strict=True,
 )
 
-# One row a frame, numbered from 0 without gaps. The blobs carry hashes of their own; `digest` is
-# over all other columns and those hashes.
+# One row a frame, numbered from 0 without gaps. The blobs have their own hashes; `digest` covers
+# all other columns and those hashes.
 frames_table = Table(
     "frames",
     metadata,
@@ -53,31 +53,31 @@ FRAME_LOG = FileKind(
     format_version=1,
     metadata=metadata,
     strange=SequenceError,
-    cure="restore a copy or extract it anew",
+    cure="restore a copy or record it again",
     busy_s=1.0,  # a second writer gives up after this; a reader never waits for a writer
 )
 
 
 def framelog_file(path: Path) -> SqliteFile:
-    """The file of a frame log, which need not be there yet."""
+    """The file of a frame log; it may not exist yet."""
     return SqliteFile(path, FRAME_LOG)
 
 
 def begin_writing(connection: Connection) -> None:
-    """Take the file's one write lock; readers go on seeing what was committed last."""
+    """Takes the file's write lock; readers still see the last commit."""
     connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
 def log_while_writing(connection: Connection) -> None:
-    """Write-ahead log: what is committed survives the process; outside a transaction."""
+    """Switches to a write-ahead log, so that commits survive the process; outside a transaction."""
     connection.exec_driver_sql("PRAGMA journal_mode = WAL")
     connection.exec_driver_sql("PRAGMA synchronous = NORMAL")
 
 
 def fold_log_in(connection: Connection) -> None:
-    """Make the file one file again, readable from read-only media; outside a transaction.
+    """Merges the write-ahead log into the file, for read-only media; outside a transaction.
 
-    Where a reader has it open, that is left to the next writer.
+    If a reader has the file open, the next writer does it.
     """
     try:
         connection.exec_driver_sql("PRAGMA journal_mode = DELETE")

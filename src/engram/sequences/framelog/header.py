@@ -1,4 +1,4 @@
-"""What holds for a whole frame log, and its JSON."""
+"""Header of a frame log, and its JSON."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _CAMERA_SIZES = ("width", "height")
 
 @dataclass(frozen=True, slots=True)
 class FrameLogHeader:
-    """What holds for all frames of a log.
+    """Facts common to all frames of a log.
 
     Attributes:
-        info: what is known of the drive; `format` names the layout that the images had.
+        info: facts of the drive; `format` names the layout of its images.
         camera: the camera of all frames.
         descriptor: the kind of all descriptors.
         frontend: hash of the front-end's version and configuration.
@@ -72,7 +72,7 @@ class FrameLogHeader:
         """Undo `to_json`.
 
         Raises:
-            MapCorruptError: the text is no such header.
+            MapCorruptError: the text is not a valid header.
             IncompatibleError: its kind of descriptor is unknown here.
         """
         try:
@@ -104,7 +104,7 @@ class FrameLogHeader:
 
 def _camera(values: dict[str, Any]) -> StereoCamera:
     mounting = values["cam_from_rig"]
-    # Not projected onto SO(3) again: the last bits count for the camera's identity.
+    # Not projected onto SO(3) again: the last bits count for the camera's id.
     matrix = None if mounting is None else np.array(mounting, dtype=np.float64).reshape(3, 4)
     camera = StereoCamera(
         **{name: float(values[name]) for name in _CAMERA_NUMBERS},
@@ -120,5 +120,5 @@ def _camera(values: dict[str, Any]) -> StereoCamera:
 
 def _text(value: object) -> str:
     if not isinstance(value, str):
-        raise TypeError(f"{value!r} is no text")
+        raise TypeError(f"{value!r} is not a text")
     return value

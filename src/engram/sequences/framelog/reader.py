@@ -1,4 +1,4 @@
-"""Reading a frame log like any drive: in order, from the middle, or every n-th frame."""
+"""Reads a frame log as a drive: all frames, a range, or every n-th frame."""
 
 from __future__ import annotations
 
@@ -26,37 +26,37 @@ SUFFIX = ".framelog"
 
 
 def is_framelog(path: Path) -> bool:
-    """A file that is named `….framelog`.
+    """A file named `….framelog`.
 
-    Its bytes are not looked at: opening and closing a file that this process also writes through
+    Its bytes are not read: opening and closing a file that this process also writes through
     SQLite would drop SQLite's locks.
     """
     return path.suffix == SUFFIX and path.is_file()
 
 
 def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
-    """A frame log as a drive; see `FrameLog` for what else is raised.
+    """A frame log as a drive; `FrameLog` lists other errors.
 
     Raises:
-        ConfigError: a colour channel is asked for.
+        ConfigError: a colour channel is selected.
     """
     if options.channel is not Channel.GREY:
         raise ConfigError(
             f"{path}: a frame log has no images to take channel {options.channel.value!r} of; "
-            "choose the channel when it is extracted"
+            "choose the channel when recording it"
         )
     return FrameLog(path, options)
 
 
 class FrameLog:
-    """A `FrameSequence` over a frame log. Frames are decoded when they are asked for.
+    """A `FrameSequence` over a frame log. Frames are decoded on demand.
 
-    With a range of frames, the odometry of each is composed over those that are left out; if one
-    of those steps failed, the composed step is that failure. With `skip_bad`, frames whose bytes
-    are damaged are left out the same way, and counted.
+    With a range of frames, odometry is composed over the frames left out; if one of those steps
+    failed, the composed step fails too. With `skip_bad`, damaged frames are left out in the same
+    way, and counted.
 
     Raises:
-        SequenceError: no frame log, or no frame of it is chosen.
+        SequenceError: the file is not a frame log, or no frame of it is chosen.
         FormatVersionError: written by a newer Engram.
         MapCorruptError: damaged or cut short.
         ConfigError: a start time is given for a log whose clock is UTC already.
@@ -96,7 +96,7 @@ class FrameLog:
 
     @property
     def header(self) -> FrameLogHeader:
-        """What the log says of itself, as it was recorded."""
+        """The header, as recorded."""
         return self._header
 
     @property
@@ -111,7 +111,7 @@ class FrameLog:
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """(N,) int64 stamps of the chosen frames."""
+        """(N,) int64 stamps of the chosen frames, ns."""
         return self._stamps_ns
 
     @property
@@ -136,7 +136,7 @@ class FrameLog:
         return list(self._skipped_reasons)
 
     def close(self) -> None:
-        """Give the file back; the log opens it again if it is asked for more."""
+        """Closes the file; the next access opens it again."""
         self._engine.dispose()
 
     def __len__(self) -> int:
@@ -146,8 +146,8 @@ class FrameLog:
         """The chosen frames in the order of time.
 
         Raises:
-            MapCorruptError: a frame's bytes do not match their hash, and `skip_bad` was not asked
-                for.
+            MapCorruptError: a frame's bytes do not match their hash, and `skip_bad` is not
+                set.
         """
         self._skipped_reasons.clear()
         previous: int | None = None
@@ -156,7 +156,7 @@ class FrameLog:
                 logged = self._read(number, previous)
             except MapCorruptError as error:
                 if not self._skip_bad:
-                    raise MapCorruptError(f"{error}; --skip-bad goes on without it") from error
+                    raise MapCorruptError(f"{error}; leave it out with --skip-bad") from error
                 self._skipped_reasons.append(str(error))
                 continue
             if logged.odometry.status is not OdometryStatus.UNUSABLE_FRAME:
@@ -174,7 +174,7 @@ class FrameLog:
         return self._read(self._numbers[index], next(usable, None))
 
     def _read(self, number: int, previous: int | None) -> LoggedFrame:
-        """A frame with the motion since `previous`, the last usable frame that was chosen."""
+        """A frame with the motion since `previous`, the last usable chosen frame."""
         try:
             with self._file.errors(), self._engine.connect() as connection:
                 row, step = self._frame_row(connection, number)
@@ -190,7 +190,7 @@ class FrameLog:
             select(*columns).where(frames_table.c.number == number).order_by(frames_table.c.number)
         ).one_or_none()
         if row is None:
-            raise MapCorruptError(f"frame {number} is gone")
+            raise MapCorruptError(f"frame {number} is missing")
         return row, decode_step(row)
 
     def _motion(self, connection: Connection, previous: int | None, last: StepRow) -> OdometryStep:
@@ -207,7 +207,7 @@ class FrameLog:
             except MapCorruptError:
                 if not self._skip_bad:
                     raise
-                # The motion over a damaged row is not known.
+                # The motion over a damaged row is unknown.
                 return OdometryStep(OdometryStatus.NO_CONSENSUS)
         return compose(composed, last.odometry)
 
@@ -229,10 +229,10 @@ class FrameLog:
 
 
 def compose(first: OdometryStep | None, second: OdometryStep) -> OdometryStep:
-    """Two successive steps as one; a failure of either is the failure of both.
+    """Composes two successive steps; if either failed, so does the result.
 
-    An unusable frame between them is passed over: the step behind it spans it (`OdometryStep`).
-    The covariance is first order with independent errors, the inliers are those of the weaker.
+    An unusable frame between them is skipped: the step after it spans it (`OdometryStep`). The
+    covariance is first order with independent errors; the inliers are the smaller of the two.
     """
     if first is None or first.status is OdometryStatus.UNUSABLE_FRAME:
         return second
@@ -269,14 +269,14 @@ def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
 
 
 def _read_stamps(connection: Connection) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """(F,) stamps of all frames, and (F,) whether odometry could use them."""
+    """(F,) int64 stamps of all frames, ns, and (F,) bool, whether odometry could use them."""
     columns = frames_table.c
     query = select(columns.number, columns.stamp_ns, columns.odometry_status)
     rows = connection.execute(query.order_by(columns.number)).all()
     if not rows:
         raise SequenceError("the frame log holds no frame")
     if not all(isinstance(value, int) for row in rows for value in row[:2]):
-        raise MapCorruptError("the frame log has stamps that are no numbers")
+        raise MapCorruptError("the frame log has stamps that are not numbers")
     table = np.array([row[:2] for row in rows], dtype=np.int64).reshape(-1, 2)
     if (table[:, 0] != np.arange(len(table))).any():
         raise MapCorruptError("frames are missing in the frame log: their numbers have gaps")

@@ -1,4 +1,4 @@
-"""One logged frame ↔ one row, and the digest that binds its columns together."""
+"""Converts logged frames to rows and back, with a digest over the columns."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from engram.sequences.framelog.file import frames_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.sequence import LoggedFrame
 
-# All but the blobs, of which the hashes at their beginning stand in: what a skipped frame needs.
+# All columns, with the blobs replaced by their leading hashes: enough for a skipped frame.
 STEP_COLUMNS = (
     *[column for column in frames_table.columns if column.name not in {"landmarks", "thumbnail"}],
     func.substr(frames_table.c.landmarks, 1, HASH_BYTES).label("landmarks_hash"),
@@ -52,14 +52,14 @@ _COLUMN_KINDS: dict[str, type | types.UnionType] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepRow:
-    """What a row says without its blobs.
+    """A row without its blobs.
 
     Attributes:
         number: place in the log.
         stamp_ns: stamp of the frame.
         status: status of the frame.
         pair_hash: `first_pair_hash` of the frame's images.
-        odometry: motion since the frame before.
+        odometry: ``prev_from_curr`` since the frame before, with its covariance.
     """
 
     number: int

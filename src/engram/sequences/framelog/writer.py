@@ -1,4 +1,4 @@
-"""Recording a frame log, checkpoint by checkpoint; goes on where an earlier run was stopped."""
+"""Records a frame log with checkpoints; continues after an interruption."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from engram.sequences.sequence import LoggedFrame
 class FrameLogWriter:
     """The one writer of a frame log. A context manager: leaving it commits and closes.
 
-    Left without an exception, the log is marked complete. A process that is killed loses at most
-    the frames since the last checkpoint; a writer on the same path then goes on behind
+    Left without an exception, the log is marked complete. A killed process loses at most
+    the frames since the last checkpoint; a writer on the same path continues after
     `last_stamp_ns`.
 
     Args:
-        path: the file, made where there is none.
-        header: what holds for all frames.
-        checkpoint_every: frames between commits. At 50 a commit costs under 1 % of the
-            front-end's time, and 5 s of a 10 Hz drive can be lost.
+        path: the file, created if missing.
+        header: facts common to all frames.
+        checkpoint_every: frames between commits. 50: commits cost under 1 % of the
+            front-end's time, and at most 5 s of a 10 Hz drive are lost.
 
     Raises:
         IncompatibleError: the file holds another drive's log, or one made with other settings.
-        SequenceError: the file is something else, or its folder does not exist.
+        SequenceError: the file is not a frame log, or its folder does not exist.
         MapLockedError: another writer has it open.
         MapError: as `FrameLog`, and `StorageFullError`.
     """
@@ -89,7 +89,7 @@ class FrameLogWriter:
                 with this frame.
 
         Raises:
-            InputError: the frame is not behind the last one, or does not fit the header.
+            InputError: the frame is not after the last one, or does not fit the header.
             StorageFullError: no space is left.
         """
         frame, header = logged.frame, self._header
@@ -98,7 +98,7 @@ class FrameLogWriter:
                 raise InputError(f"{self._path}: a frame of another {name} than the log's")
         if self._last_stamp_ns is not None and frame.stamp_ns <= self._last_stamp_ns:
             raise InputError(
-                f"{self._path}: frame stamped {frame.stamp_ns} ns is not behind the last one "
+                f"{self._path}: frame stamped {frame.stamp_ns} ns is not after the last one "
                 f"({self._last_stamp_ns} ns)"
             )
         row = encode_row(self._recorded, logged, pair_hash)
@@ -111,7 +111,7 @@ class FrameLogWriter:
             self.checkpoint()
 
     def holds(self, stamp_ns: int, pair_hash: str) -> bool:
-        """Whether an earlier run recorded this frame already, so that it is passed over.
+        """Whether an earlier run recorded this frame, so that it is skipped.
 
         Raises:
             IncompatibleError: other images are recorded at its place: the log is that of another
@@ -137,14 +137,14 @@ class FrameLogWriter:
         """Commit: what was appended so far survives the process."""
         with self._or_abandon() as connection:
             connection.commit()
-            # Begun again at once, so that no second writer gets between two checkpoints.
+            # Begun again at once, so that no other writer comes between two checkpoints.
             begin_writing(connection)
         self._since_checkpoint = 0
 
     def close(self, *, complete: bool = False) -> None:
-        """Commit and close; `complete` says that the drive ends here. Closing twice is fine.
+        """Commits and closes; `complete` marks the end of the drive. Closing twice is allowed.
 
-        After an error of the file the writer is closed already, as of its last checkpoint.
+        After a file error the writer is closed already, as of its last checkpoint.
         """
         connection = self._connection
         if connection is None:
@@ -169,7 +169,7 @@ class FrameLogWriter:
         self.close(complete=kind is None)
 
     def _begin(self, connection: Connection) -> tuple[int, int | None]:
-        """Make or find the log; the number of its frames and the stamp of the last."""
+        """Creates or opens the log; returns the number of its frames and the stamp of the last."""
         run = connection.exec_driver_sql
         if not self._file.is_new(run):
             self._file.identify(run)
@@ -210,9 +210,9 @@ class FrameLogWriter:
 
     @contextmanager
     def _or_abandon(self) -> Iterator[Connection]:
-        """The connection; after an error of SQLite the writer is closed as of its last checkpoint.
+        """The connection; after an SQLite error the writer is closed as of its last checkpoint.
 
-        SQLite may have rolled the transaction back, and then what this writer counts is wrong.
+        SQLite may have rolled back the transaction, and then this writer's counts are wrong.
         """
         if self._connection is None:
             raise InputError(f"{self._path}: this writer is closed")
