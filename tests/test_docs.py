@@ -121,6 +121,11 @@ class Ran:
     stderr: str
 
 
+def _first_session(path: str) -> str:
+    with engram.open_map(path) as opened:
+        return str(next(iter(opened.sessions)))[:8]
+
+
 def run_words(words: str | list[str]) -> Ran:
     """Runs a command in this process: each page is many of them."""
     line = shlex.split(words) if isinstance(words, str) else words
@@ -182,7 +187,9 @@ def test_the_examples_of_a_page_run_in_their_order(
         elif block.commands:
             printed = ""
             for words in block.commands:
-                ran = run_words(words)
+                # A person copies the id from `engram info --sessions`.
+                given = [_first_session(words[2]) if one == "SESSION" else one for one in words]
+                ran = run_words(given)
                 assert ran.returncode == 0, f"{page.name}: {shlex.join(words)}\n{ran.stderr}"
                 printed += ran.stdout
                 if words[1] == "localise" and "--explain" not in words and "--json" not in words:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 
 from engram.cli import options
 from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.cli.history import AUTHOR
 from engram.errors import ConfigError, EngramError
 
 if TYPE_CHECKING:
@@ -42,7 +44,6 @@ def merge(
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw the fleet map before and after."),
     ] = None,
-    author: options.Author = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -75,7 +76,7 @@ def merge(
         merge_maps(
             centre,
             robots,
-            _merging(resolved, author),
+            _merging(resolved),
             Heard(),
             settings=resolved.of_robot(),
             dry_run=dry_run,
@@ -100,7 +101,7 @@ def _merges(reports: list[MergeReport]) -> dict[str, Any]:
     return {"merges": [report.to_dict() for report in reports]}
 
 
-def _merging(settings: AllSettings, author: str | None) -> MergeOptions:
+def _merging(settings: AllSettings) -> MergeOptions:
     from engram.fleet.merge import MergeOptions
 
     given = settings.merge
@@ -109,7 +110,7 @@ def _merging(settings: AllSettings, author: str | None) -> MergeOptions:
         lanes=given.lanes,
         rounds=given.rounds,
         relocaliser=None if given.relocaliser == "none" else given.relocaliser,
-        author=author,
+        author=os.environ.get(AUTHOR),
         sure_inliers=given.sure_inliers,
     )
 
@@ -237,7 +238,6 @@ def build(
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the groups' maps in FLEET.build.")
     ] = False,
-    author: options.Author = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -258,7 +258,7 @@ def build(
     from engram.robot import RobotOptions
 
     resolved = settings.read()
-    merging = _merging(resolved, author)
+    merging = _merging(resolved)
     how, seed = _grouping(grouping)
     asked = BuildOptions(
         workers=workers,
@@ -270,7 +270,7 @@ def build(
             lanes=merging.lanes,
             rounds=merging.rounds,
             relocaliser=merging.relocaliser,
-            author=author,
+            author=merging.author,
         ),
         merging=merging,
         scheduler=scheduler,

@@ -16,7 +16,7 @@ from engram.errors import ConfigError
 
 Revision = Annotated[str, typer.Argument(metavar="REV", help="A revision: 7, a tag, head, head~2.")]
 Message = Annotated[str, typer.Option("--message", "-m", help="Why, for the log.")]
-# Takes the place of the user's name as the author of tags, reverts and vocabularies.
+# Takes the place of the user's name, or of the robots', as the author of revisions.
 AUTHOR = "ENGRAM_AUTHOR"
 # What a revision is called; all else is the beginning of a node's UUID.
 _A_REVISION = re.compile(r"head(~\d+)?|\d{1,7}")

@@ -50,12 +50,14 @@ OPTIONS = {
         "--radius": "--set download.radius_m=METRES",
     },
 }
+_AUTHOR = {"--author": "set ENGRAM_AUTHOR in the environment"}
 GONE = {
     "map": {"--deadline": "a map made against the clock is different every time; use --rounds"},
     "localise": {
         "--every": "--pictures spreads about 20 pictures over the drive",
         "--preload": "images are decoded ahead; time stages with engram lab bench",
     },
+    **dict.fromkeys(("merge", "build", "tag", "revert", "vocabulary"), _AUTHOR),
 }
 # Other spellings of a verb, which stay.
 SPELLINGS = {"localize": "localise"}

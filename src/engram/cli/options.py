@@ -82,9 +82,6 @@ Settings: TypeAlias = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE", help="Settings in TOML: engram settings show."),
 ]
-Author: TypeAlias = Annotated[
-    str | None, typer.Option("--author", help="Author of the revision [default: the robots].")
-]
 
 
 @dataclass(frozen=True, slots=True)
