@@ -32,6 +32,7 @@ EXAMPLES = {
     DOCS / "first-map.md": "drives",
     DOCS / "fleet-tutorial.md": "drives",
     DOCS / "robot-tutorial.md": "drives",
+    DOCS / "study.md": "drives",
     DOCS / "data.md": "mapped",
     DOCS / "trouble.md": "mapped",
     DOCS / "budget.md": "mapped",

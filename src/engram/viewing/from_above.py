@@ -63,7 +63,7 @@ def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> No
             x, z = track.points_m[:, 0], track.points_m[:, 1]
             colour = track.colour or colours[_name(track)]
             axes.plot(x, z, ".", color=colour, markersize=5, label=track.label)
-        axes.set_aspect("equal")
+        axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x, m")
         axes.set_ylabel("z, m")
         axes.set_title(title)
