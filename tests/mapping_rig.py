@@ -13,7 +13,7 @@ from tests.synthetic_world import Seen
 from engram.geometry import SE3
 from engram.graph.model import Clock, NodeId, Session, session_id
 from engram.localiser import Budget, Localisation, Localiser
-from engram.mapper import Mapper, Saver
+from engram.mapper import Mapper, NodeSaver, Saver
 from engram.maps import Map, open_map
 from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in
@@ -75,7 +75,7 @@ def map_simulated(
             author=name,
             configuration={},
         )
-        saver = Saver(writer, opened.frames)
+        saver = Saver(writer, NodeSaver(writer, opened.frames))
         localiser = localiser_in(
             opened,
             first.camera,

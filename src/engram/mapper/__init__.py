@@ -4,7 +4,7 @@ from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopConfig, LoopSearch
 from engram.mapper.mapper import Mapper, MapperConfig
 from engram.mapper.memory import Memory, Walk
-from engram.mapper.saver import FrameHolder, Records, RecordWriter, Saver
+from engram.mapper.saver import FrameHolder, NodeSaver, Records, RecordWriter, Saver
 
 __all__ = [
     "FrameHolder",
@@ -13,6 +13,7 @@ __all__ = [
     "Mapper",
     "MapperConfig",
     "Memory",
+    "NodeSaver",
     "RecordWriter",
     "Records",
     "Saver",

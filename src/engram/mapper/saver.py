@@ -28,26 +28,8 @@ class FrameHolder(Protocol):
         ...
 
 
-class RecordWriter(Protocol):
-    """Where a session's records go; `engram.maps.RevisionWriter` is one."""
-
-    def add_node(self, node: Node, frame: Frame) -> None:
-        """Adds a node with its frame."""
-        ...
-
-    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Adds the visual words of a node.
-
-        Args:
-            node: the node.
-            vocabulary: hash of the vocabulary.
-            found: (W,) int32, numbers of its words.
-        """
-        ...
-
-    def add_edge(self, edge: Edge) -> None:
-        """Adds an edge, or supersedes one."""
-        ...
+class PathWriter(Protocol):
+    """Where a session's path and attempts go."""
 
     def add_path_entry(self, entry: PathEntry) -> None:
         """Adds a step of the session's path."""
@@ -59,6 +41,22 @@ class RecordWriter(Protocol):
 
     def checkpoint(self) -> None:
         """Makes everything added so far durable."""
+        ...
+
+
+class RecordWriter(PathWriter, Protocol):
+    """Where all of a session's records go; `engram.maps.RevisionWriter` is one."""
+
+    def add_node(self, node: Node, frame: Frame) -> None:
+        """Adds a node with the frame that it was."""
+        ...
+
+    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
+        """Adds the words of a node."""
+        ...
+
+    def add_edge(self, edge: Edge) -> None:
+        """Adds an edge, or supersedes one."""
         ...
 
 
@@ -81,6 +79,36 @@ class _Stop:
     """The last thing in the queue."""
 
 
+@dataclass(frozen=True, slots=True)
+class NodeSaver:
+    """What it takes to save nodes and edges too.
+
+    Attributes:
+        writer: where they go.
+        frames: keeps frames readable until they are written.
+        words: finds the words stored with saved nodes; None stores none.
+    """
+
+    writer: RecordWriter
+    frames: FrameHolder
+    words: NodeWords | None = None
+
+    def hold(self, records: Records) -> None:
+        """Keeps the frame of a node readable from now on."""
+        if records.node is not None and records.frame is not None:
+            self.frames.hold(records.node.id, records.frame)
+
+    def write(self, records: Records) -> None:
+        """Writes a node with its frame and words, and edges."""
+        if records.node is not None and records.frame is not None:
+            self.writer.add_node(records.node, records.frame)
+            if self.words is not None:
+                found = self.words.of_frame(records.frame)
+                self.writer.add_words(records.node.id, self.words.hash, found)
+        for edge in records.edges:
+            self.writer.add_edge(edge)
+
+
 @dataclass(slots=True)
 class Saver:
     """Writes records in order, and checkpoints at intervals.
@@ -89,17 +117,15 @@ class Saver:
     shorter session is better than one with holes.
 
     Attributes:
-        writer: where the records go.
-        frames: keeps frames readable until they are written.
+        writer: where path entries and attempts go.
+        nodes: where nodes and edges go; None for a memory, which has none.
         checkpoint_every: live frames between two checkpoints; a crash loses at most these.
-        words: finds the words stored with saved nodes; None stores none.
         waits: whether a full queue blocks the caller; else it raises.
     """
 
-    writer: RecordWriter
-    frames: FrameHolder
+    writer: PathWriter
+    nodes: NodeSaver | None = None
     checkpoint_every: int = 20
-    words: NodeWords | None = None
     waits: bool = True
     _queue: Queue[Records | _Stop] = field(default_factory=lambda: Queue(_QUEUE_LENGTH))
     _error: BaseException | None = None
@@ -117,8 +143,8 @@ class Saver:
         Raises:
             MapError: an earlier write failed, or too many wait to be written.
         """
-        if records.node is not None and records.frame is not None:
-            self.frames.hold(records.node.id, records.frame)
+        if self.nodes is not None:
+            self.nodes.hold(records)
         self._raise_error()
         try:
             self._queue.put(records, block=self.waits)
@@ -162,13 +188,8 @@ class Saver:
                 return
 
     def _write(self, records: Records) -> None:
-        if records.node is not None and records.frame is not None:
-            self.writer.add_node(records.node, records.frame)
-            if self.words is not None:
-                found = self.words.of_frame(records.frame)
-                self.writer.add_words(records.node.id, self.words.hash, found)
-        for edge in records.edges:
-            self.writer.add_edge(edge)
+        if self.nodes is not None:
+            self.nodes.write(records)
         for entry in records.path_entries:
             self.writer.add_path_entry(entry)
         if records.attempts:

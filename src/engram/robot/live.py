@@ -218,7 +218,6 @@ class IntoMemory:
         self.localiser = owner.localiser_in(opened, saves=False)
         self._owner = owner
         self._map_path = Path(opened.location)
-        self._frames = opened.frames
         self._spool: Spool | None = None
         self._saver: Saver | None = None
 
@@ -234,7 +233,7 @@ class IntoMemory:
             configuration,
             mapper.memory_bytes,
         )
-        self._saver = Saver(self._spool, self._frames, mapper.checkpoint_every, waits=False)
+        self._saver = Saver(self._spool, checkpoint_every=mapper.checkpoint_every, waits=False)
         return Memory(self.localiser, self._saver, path_id(session.id))
 
     def end(self, saving: Saving, *, well: bool) -> None:

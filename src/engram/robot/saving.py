@@ -12,7 +12,7 @@ from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.graph.model import Session
 from engram.localiser import ByAppearance, FrameMatcher, Localiser
-from engram.mapper import LoopConfig, LoopSearch, Mapper, Saver
+from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeSaver, Saver
 from engram.maps import Map, Revision, RevisionWriter, SessionState
 from engram.places import RECOGNISERS
 from engram.places.words import NodeWords, words_of
@@ -48,7 +48,7 @@ class SavedDrive:
         opened.derived(drives_of)[writer.session.id] = writer.session
         self._writer = writer
         every = settings.mapper.checkpoint_every
-        self._saver = Saver(writer, opened.frames, every, words, waits)
+        self._saver = Saver(writer, NodeSaver(writer, opened.frames, words), every, waits)
         self._stack = ExitStack()
         loops = self._stack.enter_context(loop_search(opened, localiser, settings))
         self.mapper = Mapper(

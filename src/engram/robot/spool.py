@@ -24,17 +24,13 @@ from typing import IO, Any
 from uuid import UUID
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from engram.errors import MapCorruptError, MapError, storage_full
-from engram.frontend import DescriptorKind, Frame
+from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.graph.model import (
     Attempt,
     Clock,
-    Edge,
-    Node,
     NodeId,
     PathEntry,
     PathEntryKind,
@@ -50,7 +46,7 @@ _VERSION = 1
 
 
 class Spool:
-    """Writes one drive's memory; a `RecordWriter` of a session without nodes.
+    """Writes one drive's memory; a `PathWriter` of a session without nodes.
 
     Args:
         map_path: the map; the file lies beside it.
@@ -96,15 +92,15 @@ class Spool:
         return self._file.tell() >= self._most_bytes
 
     def add_path_entry(self, entry: PathEntry) -> None:
-        """See `RecordWriter`."""
+        """See `PathWriter`."""
         self._entries.append(entry)
 
     def add_attempts(self, made: list[Attempt]) -> None:
-        """See `RecordWriter`."""
+        """See `PathWriter`."""
         self._attempts += made
 
     def checkpoint(self) -> None:
-        """See `RecordWriter`."""
+        """See `PathWriter`."""
         if (self._entries or self._attempts) and not self.full:
             entries, attempts = ([astuple(x) for x in y] for y in (self._entries, self._attempts))
             self._append({"entries": entries, "attempts": attempts})
@@ -113,18 +109,6 @@ class Spool:
     def close(self) -> None:
         """Closes the file; from now on it may be committed."""
         self._file.close()
-
-    def add_node(self, node: Node, frame: Frame) -> None:
-        """See `RecordWriter`; a memory has none."""
-        raise NotImplementedError(f"node {node.id}: a memory saves no nodes")
-
-    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """See `RecordWriter`; a memory has none."""
-        raise NotImplementedError(f"node {node}: a memory saves no words")
-
-    def add_edge(self, edge: Edge) -> None:
-        """See `RecordWriter`; a memory has none."""
-        raise NotImplementedError(f"edge {edge.a}–{edge.b}: a memory saves no edges")
 
     def _append(self, content: dict[str, Any]) -> None:
         body = zlib.compress(msgspec.msgpack.encode(content))
