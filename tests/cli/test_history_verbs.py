@@ -84,7 +84,7 @@ def test_revert_and_its_undoing(engram, town: Path, monkeypatch: pytest.MonkeyPa
     )
     assert done["lost_by_others"] == dry["lost_by_others"]
     text = engram("revert", town, 3).out
-    assert "taken back by 4" in text
+    assert "reverted by 4" in text
     after = engram("info", town, "--json").json
     assert after["nodes"] == before["nodes"]
     assert after["components"] == before["components"]
@@ -103,7 +103,7 @@ def test_show_of_a_node_names_robot_session_and_revision(engram, town: Path) -> 
     engram("revert", town, 1)
     text = engram("show", town, node.id).out
     assert "saved by r1" in text
-    assert "taken back by revision 3" in text
+    assert "reverted by revision 3" in text
 
 
 @pytest.mark.parametrize(

@@ -263,7 +263,7 @@ class TestCheckNamesTableUuidAndFact:
         expected = f"edges {first} → row 2 (odometry): its b (row 2 of nodes) is missing"
         assert expected in found
         assert any("path_entries" in fact and "is missing" in fact for fact in found)
-        assert "nodes: revision 1 brought 3 rows, 2 are there" in found
+        assert "nodes: revision 1 added 3 rows, but 2 are stored" in found
 
     def test_a_missing_frame(self, broken, sound):
         node = sound[1][0].nodes[1].id

@@ -1,4 +1,4 @@
-"""What may be set right about a session."""
+"""Corrections of a session's robot, zone and start."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from engram.maps.rows import START, checked_text
 def checked_amendments(
     shown: Session, changes: Mapping[Amendable, str], now_ns: int
 ) -> dict[Amendable, Amendment]:
-    """Those that change what is shown of a session.
+    """The amendments that change a session.
 
     Raises:
-        InputError: none does, or a value cannot be one.
+        InputError: none does, or a value is not valid.
         ConfigError: the zone is unknown.
     """
     found = {}
@@ -25,10 +25,10 @@ def checked_amendments(
         if what is Amendable.ZONE:
             check_zone(value)
         if not value or (what is Amendable.START and not START.fullmatch(value)):
-            raise InputError(f"{value!r} cannot be the {what} of a session")
+            raise InputError(f"{value!r} is not valid as the {what} of a session")
         amendment = Amendment(shown.id, what, value, now_ns)
         if amendment.applied(shown) != shown:
             found[what] = amendment
     if not found:
-        raise InputError(f"session {shown.id} is so already: there is nothing to amend")
+        raise InputError(f"session {shown.id} has these values already: nothing to amend")
     return found

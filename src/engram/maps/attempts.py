@@ -1,4 +1,4 @@
-"""Remembered match attempts, packed: 18 bytes each and 8 bytes for every node that occurs.
+"""Packs remembered match attempts: 18 bytes each, and 8 bytes for each node that occurs.
 
 One body is a MessagePack map: version, base of the iterations, names of the policies, keys of the
 nodes, and the packed rows.
@@ -20,7 +20,7 @@ _PACKED = np.dtype(
         ("iteration", "<u2"),  # above the base
         ("reference", "<u2"),  # index into the body's nodes
         ("node", "<u2"),
-        ("along_m", "<f2"),  # half precision: 8 mm at 8 m, and it can say infinity
+        ("along_m", "<f2"),  # half precision: 8 mm at 8 m, and infinity
         ("across_m", "<f2"),
         ("yaw_rad", "<f2"),
         ("sigma_m", "u1"),  # `_SIGMA_TABLE`
@@ -37,7 +37,7 @@ _SIGMA_TABLE = np.concatenate([[0.0], np.exp2((np.arange(254) / 12) - 10), [np.i
 _SIGMA_BORDERS = np.concatenate(
     [[2.0**-10.5], np.exp2((np.arange(253) + 0.5) / 12 - 10), [2.0 ** (253.5 / 12 - 10)]]
 )
-# A body may span that many iterations and nodes; twice as many attempts as that fill 2.4 MB.
+# Most iterations and nodes of a body; twice as many attempts fill 2.4 MB.
 _SPAN = 65536
 _ROWS = 131072
 _POLICIES = 128
@@ -59,12 +59,12 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttemptTable:
-    """Attempts of one session, nodes named by their keys: a struct of arrays (see `Attempt`).
+    """Attempts of one session as a struct of arrays, with the keys of nodes (see `Attempt`).
 
     Attributes:
-        columns: (A,) arrays by the names and types of `COLUMNS`.
+        columns: (A,) arrays with the names and types of `COLUMNS`.
         policy: (A,) int32, index into `policies`.
-        policies: names.
+        policies: names of the policies.
     """
 
     columns: dict[str, NDArray[np.generic]]
@@ -88,7 +88,7 @@ _decoder = msgspec.msgpack.Decoder(_Body)
 
 
 def concatenate(tables: list[AttemptTable]) -> AttemptTable:
-    """All rows in order, one list of policies, by their names."""
+    """All rows in order, with one sorted list of policies."""
     policies = tuple(sorted({name for table in tables for name in table.policies}))
     index = {name: at for at, name in enumerate(policies)}
     columns = {
@@ -104,7 +104,7 @@ def concatenate(tables: list[AttemptTable]) -> AttemptTable:
 
 
 def pack(table: AttemptTable) -> list[tuple[int, bytes]]:
-    """Bodies that hold the table, in order, each with its number of attempts."""
+    """The bodies of the table, in order, each with its number of attempts."""
     bodies = []
     start = 0
     while start < len(table):
@@ -184,7 +184,7 @@ def _pack_body(table: AttemptTable, rows: slice) -> bytes:
     columns = {name: values[rows] for name, values in table.columns.items()}
     nodes = np.unique(np.concatenate([columns["reference"], columns["node"]]))
     used, policy = np.unique(table.policy[rows], return_inverse=True)
-    # By their names: equal attempts are equal bodies, whatever else was loaded with them.
+    # Sorted by name, so that equal attempts give equal bodies.
     policies = sorted(table.policies[at] for at in used)
     policy = np.array([policies.index(table.policies[at]) for at in used])[policy]
     base = int(columns["iteration"].astype(np.int64).min())
@@ -192,7 +192,7 @@ def _pack_body(table: AttemptTable, rows: slice) -> bytes:
     packed["iteration"] = columns["iteration"].astype(np.int64) - base
     for name in ("reference", "node"):
         packed[name] = np.searchsorted(nodes, columns[name])
-    with np.errstate(over="ignore"):  # beyond 65,504 m is infinitely far
+    with np.errstate(over="ignore"):  # beyond 65,504 m becomes infinity
         for name in ("along_m", "across_m", "yaw_rad"):
             packed[name] = columns[name]
     for name in ("sigma_m", "sigma_yaw_rad"):

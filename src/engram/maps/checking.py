@@ -1,4 +1,4 @@
-"""Is every byte of a map what was written, and does everything point at something?"""
+"""Verifies every byte and every reference of a map."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ from engram.maps.schema import (
 from engram.maps.words import decode_words
 
 _LATER = {table for news in NEWER.values() for table in news}
-# What a column refers to, by its name.
+# The table that a column refers to.
 _REFERENCES = {
     "session": sessions,
     "camera": cameras,
@@ -77,14 +77,14 @@ _REFERENCES = {
 _ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, words)
 assert set(_ORDER) == set(metadata.sorted_tables)
 
-# Rotations come out of chains of products: what is left of skew is rounding.
+# Rounding of rotations that come from chains of products.
 _ROTATION_TOLERANCE = 1e-6
 _NOBODY = NodeId(UUID(int=0))
 _NO_SESSION = SessionId(UUID(int=0))
 
 
 def check(database: Database) -> CheckReport:
-    """Verify everything: the file's structure, every row, every blob, every reference."""
+    """Verifies the file's structure, every row, every blob and every reference."""
     checking = _Checking(database)
     for fact in database.integrity_problems():
         checking.report(None, "", fact)
@@ -96,30 +96,30 @@ def check(database: Database) -> CheckReport:
 
 @dataclass
 class _Checking:
-    """What has been seen so far."""
+    """The state of a check."""
 
     database: Database
     problems: list[Problem] = field(default_factory=list)
     rows: int = 0
     blobs: int = 0
-    # Of every sound row: its table, key and revision.
+    # The revision of each sound row, by table and key.
     revision_of: dict[Table, dict[int, int]] = field(default_factory=dict)
     revision_rows: dict[int, Row] = field(default_factory=dict)
     cameras: dict[int, StereoCamera] = field(default_factory=dict)
     kinds: dict[int, DescriptorKind] = field(default_factory=dict)
-    # Of every node: hash of its landmarks, keys of its camera and front-end.
+    # The hash of landmarks and the keys of camera and front-end of each node.
     landmark_hashes: dict[int, tuple[bytes, int, int]] = field(default_factory=dict)
     uuids: dict[tuple[Table, int], str] = field(default_factory=dict)
     brought: Counter[tuple[int, str]] = field(default_factory=Counter)
     session_ids: dict[int, SessionId] = field(default_factory=dict)
-    # Sessions that an open revision shows again: who brings them now.
+    # Sessions that an open revision shows again, with that revision.
     shown_again: dict[int, int] = field(default_factory=dict)
 
     def report(self, table: Table | None, record: str, fact: str) -> None:
         self.problems.append(Problem("file" if table is None else table.name, record, fact))
 
     def check_table(self, table: Table) -> None:
-        """Every row by itself, then what it refers to."""
+        """Checks each row by itself, then its references."""
         self.revision_of[table] = {}
         check_row = _ROW_CHECKS.get(table)
         for row in self._sound_rows(table):
@@ -152,7 +152,7 @@ class _Checking:
             self.report(table, "", str(error))
 
     def _name(self, table: Table, values: Sequence[Any]) -> str:
-        """How a row is named to people: by UUIDs wherever it can be."""
+        """Name of a row in messages, by UUID if possible."""
         row = dict(zip(table.columns.keys(), values, strict=False))
         if table in {frames, words}:
             return self.uuids.get((nodes, row["node"]), f"of node row {row['node']}")
@@ -182,7 +182,7 @@ class _Checking:
                     self.report(table, name, f"its {column} {fact}")
 
     def reference_problem(self, revision: Row, target: Table, key: int) -> str:
-        """What is wrong with a reference from a row of `revision`; "" if nothing."""
+        """The fault of a reference from a row of `revision`; "" if it is valid."""
         known = self.revision_of[target]
         name = self.uuids.get((target, key), f"row {key}")
         if key not in known:
@@ -199,7 +199,7 @@ class _Checking:
         return ""
 
     def check_whole(self) -> None:
-        """What no single row can tell."""
+        """Checks that involve several rows."""
         for key in self.revision_of[nodes].keys() - self.revision_of[frames].keys():
             self.report(nodes, self.uuids[nodes, key], "its frame is missing")
         self._check_history()
@@ -215,7 +215,7 @@ class _Checking:
                 self.report(
                     revisions,
                     name,
-                    f"stands at place {number} of the history, parent {row['parent']}",
+                    f"is number {number} of the history, with parent {row['parent']}",
                 )
             try:
                 contents = from_json(row["contents"], f"revision {name}")
@@ -224,11 +224,11 @@ class _Checking:
                 continue
             for table in VERSIONED:
                 found = self.brought[row["key"], table.name]
-                # Formats before knew nothing of the table, and brought none.
+                # Earlier formats lacked the table.
                 brought = contents.get(table.name, 0 if table in _LATER else None)
                 if brought != found:
                     self.report(
-                        table, "", f"revision {name} brought {brought} rows, {found} are there"
+                        table, "", f"revision {name} added {brought} rows, but {found} are stored"
                     )
 
     def _brought_by(self, session_key: int) -> Row | None:

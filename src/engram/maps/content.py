@@ -1,4 +1,4 @@
-"""The content hash: equal for equal maps, wherever and whenever they were made (SPEC §7.5)."""
+"""The content hash: equal for equal maps, independent of place and time (SPEC §7.5)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from engram.maps.view import View
 
 _encode = msgspec.msgpack.Encoder().encode
 
-# What a column refers to, by its name: keys differ between equal maps, so identities stand in.
+# The table that a column refers to: keys differ between equal maps, so UUIDs replace them.
 _REFERENCES = {
     "revision": "revisions",
     "session": "sessions",
@@ -40,20 +40,20 @@ _REFERENCES = {
     "b": "nodes",
     "path": "paths",
 }
-# Landmarks stand in their nodes' hashes; thumbnails are for people and differ between decoders.
+# Landmarks count by their hashes. Thumbnails are left out, since decoders differ.
 _HASHED = tuple(table for table in VERSIONED if table is not frames)
 _LEFT_OUT = {"key", "checksum"}
-# A map that could do without them is the same in every format.
+# Tables left out if empty, so that a map has the same hash in every format.
 _IF_ANY = {str(table.name) for news in NEWER.values() for table in news}
 
 Identities = dict[str, dict[int, Any]]
 
 
 def content_hash(connection: Connection, at: int) -> str:
-    """32 hexadecimal digits over all rows of the committed revisions up to `at`.
+    """Hash of all rows of the committed revisions up to `at`, 32 hexadecimal digits.
 
-    Rows go in in canonical order, with UUIDs and revision numbers for keys, without when and
-    where they were written, and whatever order they were written in.
+    Rows are hashed in canonical order, with UUIDs and revision numbers in place of keys, without
+    the time and host of writing.
 
     Raises:
         MapCorruptError: a row is damaged or points at nothing.
@@ -69,10 +69,10 @@ def content_hash(connection: Connection, at: int) -> str:
 
 
 def record_hashes(connection: Connection, at: int) -> dict[str, str]:
-    """16 hexadecimal digits for each table that has rows, by its name.
+    """Hash of each table that has rows, by its name, 16 hexadecimal digits.
 
-    They cover what `content_hash` covers but for the history: maps of equal records whose
-    revisions tell other authors, messages, versions or configurations are equal here.
+    Covers the same as `content_hash` except for authors, messages, versions and configurations of
+    revisions.
 
     Raises:
         MapCorruptError: a row is damaged or points at nothing.
@@ -116,7 +116,7 @@ def _history(connection: Connection, view: View) -> bytes:
 
 
 def _identities(connection: Connection, view: View) -> Identities:
-    """What names a row in every equal map, by table and key."""
+    """Identity of each row, equal in equal maps, by table and key."""
     numbers = select(revisions.c.key, revisions.c.number).where(
         revisions.c.key.in_(view.revision_keys())
     )
@@ -159,7 +159,7 @@ def _canonical_row(row: Row, identities: Identities) -> bytes:
 
 
 def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, bytes]:
-    """Free of how they were packed."""
+    """Attempts, independent of their packing."""
     packed: dict[tuple[int, int], list[Row]] = {}
     for row in rows:
         packed.setdefault((row["revision"], row["session"]), []).append(row)
@@ -209,4 +209,4 @@ def _identity(identities: Identities, table: str, key: int) -> Any:
     try:
         return identities[table][key]
     except KeyError:
-        raise MapCorruptError(f"table {table}: row {key}, which others name, is missing") from None
+        raise MapCorruptError(f"table {table}: row {key}, which others use, is missing") from None

@@ -1,4 +1,4 @@
-"""What a map asks of a database, and how one of an older format is brought to the newest."""
+"""The interface of a map to its database, and the upgrade of older formats."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from engram.maps.schema import FORMAT_VERSION, map_format, missing_in, rebuilt_f
 
 @contextmanager
 def damage_named(name: str) -> Iterator[None]:
-    """Says of which map it is what finds its rows damaged: rows do not know, and maps are many.
+    """Adds the map's name to errors about damaged rows.
 
     Args:
         name: path or address of the map.
 
     Raises:
-        MapCorruptError: as it was raised within, with the name before it, once.
+        MapCorruptError: as raised within, with the name before it, once.
     """
     try:
         yield
@@ -36,15 +36,15 @@ def damage_named(name: str) -> Iterator[None]:
 
 
 class Lock(Protocol):
-    """The right to be the only writer."""
+    """The lock of the only writer."""
 
     @property
     def holder(self) -> Holder:
-        """Who has it."""
+        """The process that holds the lock."""
         ...
 
     def release(self) -> None:
-        """Let others write."""
+        """Releases the lock."""
         ...
 
 
@@ -52,7 +52,7 @@ class Database(Protocol):
     """Connections, transactions, errors and the few statements that differ between databases.
 
     All errors that a connection raises inside `reading` and `writing` come out as `MapError`s,
-    and a `MapCorruptError` that is raised there bears the map's name.
+    and a `MapCorruptError` that is raised there names the map.
     """
 
     @property
@@ -62,7 +62,7 @@ class Database(Protocol):
 
     @property
     def format_version(self) -> int:
-        """Format of the map as it lies there; becoming its writer raises it to the newest."""
+        """Stored format of the map; locking it for writing upgrades it to the newest."""
         ...
 
     def reading(self) -> AbstractContextManager[Connection]:
@@ -70,56 +70,56 @@ class Database(Protocol):
         ...
 
     def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
-        """The first row of a select, by the shortest way, from any thread; None if there is none.
+        """The first row of a select, from any thread; None if there is none.
 
-        For the one select that runs thousands of times a second.
+        A fast path, for the one select that runs thousands of times a second.
         """
         ...
 
     def writing(self) -> AbstractContextManager[Connection]:
-        """One durable transaction: all of it, or nothing if the block raises."""
+        """One durable transaction; rolled back if the block raises."""
         ...
 
     def lock_for_writing(self) -> Lock:
-        """Become the only writer. A map of an older format is raised to the newest.
+        """Locks the map for writing, and upgrades it to the newest format.
 
         Raises:
-            MapLockedError: somebody else is.
+            MapLockedError: another process holds the lock.
         """
         ...
 
     def writer(self) -> Holder | None:
-        """Who writes now."""
+        """The current writer; None without one."""
         ...
 
     def replace(self, table: Table, key: tuple[str, ...]) -> Executable:
-        """An insert that takes the place of a row with the same values in the columns `key`.
+        """An insert that replaces a row with the same values in the columns `key`.
 
-        The row takes on all other values, its primary key too.
+        The row takes all other values, including its primary key.
         """
         ...
 
     def integrity_problems(self) -> list[str]:
-        """What the database itself finds wrong with its file."""
+        """Faults that the database itself finds in its file."""
         ...
 
     def size_bytes(self) -> int:
-        """Bytes on disk."""
+        """Size on disk, bytes."""
         ...
 
     def close(self) -> None:
-        """Give back all connections."""
+        """Closes all connections."""
         ...
 
 
 class Place(Protocol):
-    """Where a map lies, or is to lie, that is not a file."""
+    """The place of a map, existing or new, that is not a file."""
 
     def create(self) -> None:
-        """Make an empty map.
+        """Creates an empty map.
 
         Raises:
-            InputError: there is one already.
+            InputError: the map exists.
         """
         ...
 
@@ -127,13 +127,13 @@ class Place(Protocol):
         """The database of the map.
 
         Raises:
-            NotAMapError: there is none.
+            NotAMapError: the map does not exist.
         """
         ...
 
 
 def replaced(proposed: ReadOnlyColumnCollection[str, Any], key: tuple[str, ...]) -> dict[str, Any]:
-    """What an upsert sets: all columns of the row that is in the way, but those of the key."""
+    """The columns that an upsert sets: all but those of the key."""
     return {column.name: column for column in proposed if column.name not in key}
 
 
@@ -142,13 +142,13 @@ def raise_tables(
     version: int,
     free_names: Callable[[Connection, str], None] | None = None,
 ) -> None:
-    """Make the tables that are new, copy those whose constraints changed, note the format.
+    """Creates new tables, copies those whose constraints changed, and writes the format.
 
     Args:
-        connection: in a transaction, which makes it all or nothing.
-        version: the format that the map has.
-        free_names: called with a table that was renamed out of the way: frees those names of its
-            constraints that its successor needs; None where constraints have no names.
+        connection: in a transaction, which makes the upgrade atomic.
+        version: the format of the map so far.
+        free_names: called with a renamed old table, to free the names of its constraints for
+            its successor; None if constraints have no names.
     """
     for table in missing_in(version):
         connection.execute(CreateTable(table))

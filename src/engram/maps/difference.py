@@ -1,4 +1,4 @@
-"""What differs between two revisions of a map: nodes, sessions, metres, conditions, by region.
+"""Differences between two revisions of a map: nodes, sessions, metres, conditions, by region.
 
 A map has no global frame: its regions are components, and stretches of their oldest sessions.
 """
@@ -22,9 +22,9 @@ from engram.graph.model import Edge, EdgeKind, Node, Session, SessionId
 from engram.maps.records import MapContents
 
 STRETCH_M = 50.0
-# Shorter ones are finer than nodes lie, and their numbers would overflow.
+# Shortest stretch, metres: shorter ones are below the spacing of nodes, and overflow int32.
 _LEAST_STRETCH_M = 1.0
-# A node in the very place of another is still one step away.
+# Least length of an edge, metres, so that nodes at one place are still a step apart.
 _LEAST_STEP_M = 1e-3
 
 
@@ -34,16 +34,16 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regions:
-    """Which region each node of a graph is in.
+    """The region of each node of a graph.
 
-    A stretch is so many metres of the oldest session of a component; a node belongs to the
-    stretch of that session's node that is nearest to it along the edges.
+    A stretch is `stretch_m` metres of a component's oldest session. A node belongs to the stretch
+    of that session's nearest node along the edges.
 
     Attributes:
         component: (N,) int32, numbered from 0 by first node.
         stretch: (N,) int32, `from_m` in units of the stretch's length.
-        oldest: for each component its oldest session.
-        stretch_m: length of a stretch.
+        oldest: the oldest session of each component.
+        stretch_m: length of a stretch, metres.
     """
 
     component: NDArray[np.int32]
@@ -55,7 +55,7 @@ class Regions:
 def regions_of(
     graph: ExperienceGraph, sessions: dict[SessionId, Session], stretch_m: float = STRETCH_M
 ) -> Regions:
-    """Divide a map into components and stretches.
+    """Divides a map into components and stretches.
 
     Args:
         graph: the map's.
@@ -94,11 +94,11 @@ def edge_lengths(graph: ExperienceGraph) -> csr_matrix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapDifference:
-    """Two revisions of one map, beside each other.
+    """The comparison of two revisions of one map.
 
     Attributes:
         before, after: numbers of the revisions.
-        old, new: what they hold.
+        old, new: their records.
         graph: all nodes of both, joined by the edges of both.
         regions: of that graph.
     """
@@ -131,7 +131,7 @@ class MapDifference:
             "path_entries": _counts(*entries),
             "attempts": {"before": len(old.attempts), "after": len(new.attempts)},
             "components": {"before": _components(old), "after": _components(new)},
-            # A map knows no weather: only what the clocks of its sessions say.
+            # A map holds no weather, only the clocks of its sessions.
             "hours": {"before": hours_of_nodes(old), "after": hours_of_nodes(new)},
             "regions": self._regions(added, removed),
         }
@@ -168,7 +168,7 @@ class MapDifference:
         return int(self.regions.component[at]), int(self.regions.stretch[at])
 
     def text(self) -> str:
-        """For people."""
+        """The comparison as text."""
         told = self.to_dict()
         lines = [
             f"revision {self.before} → {self.after}",
@@ -190,14 +190,14 @@ class MapDifference:
 def difference(
     before: int, old: MapContents, after: int, new: MapContents, stretch_m: float = STRETCH_M
 ) -> MapDifference:
-    """Compare what two revisions hold."""
+    """Compares two revisions."""
     graph = _joined(old, new)
     sessions = {one.id: one for one in (*old.sessions, *new.sessions)}
     return MapDifference(before, after, old, new, graph, regions_of(graph, sessions, stretch_m))
 
 
 def hours_of_nodes(contents: MapContents) -> dict[str, int]:
-    """How many nodes were saved in each hour of day; "unknown" where no clock tells."""
+    """Number of nodes by hour of day; "unknown" without a UTC clock and a place."""
     sessions = {one.id: one for one in contents.sessions}
     hours = Counter(_hour(sessions[node.session], node.stamp_ns) for node in contents.nodes)
     return dict(sorted(hours.items()))
@@ -219,7 +219,7 @@ def _counts(old: dict[Any, Any], new: dict[Any, Any]) -> dict[str, int]:
 
 
 def _edge_counts(old: dict[Any, Edge], new: dict[Any, Edge]) -> dict[str, dict[str, int]]:
-    """By kind, and how many were measured anew."""
+    """Edges by kind, and the number measured again."""
     found = {}
     for kind in EdgeKind:
         was = {key: edge for key, edge in old.items() if edge.kind is kind}
@@ -239,7 +239,7 @@ def _same(one: Edge, other: Edge) -> bool:
 def _sessions_of_one_side(
     here: MapContents, there: MapContents, changed: Iterable[Node]
 ) -> list[dict[str, Any]]:
-    """The sessions that only one side has."""
+    """The sessions of only one side."""
     nodes = Counter(node.session for node in changed)
     known = {session.id for session in there.sessions}
     return [
@@ -290,7 +290,7 @@ def _edges_text(kinds: dict[str, dict[str, int]]) -> str:
     return (
         "; ".join(
             f"{kind} {_plus_minus(counts)}"
-            + (f", {counts['changed']} measured anew" if counts["changed"] else "")
+            + (f", {counts['changed']} measured again" if counts["changed"] else "")
             for kind, counts in kinds.items()
         )
         or "none"
@@ -308,7 +308,7 @@ def _hours_text(hours: dict[str, dict[str, int]]) -> str:
         f"{hours['after'].get(name, 0)}"
         for name in sorted({*hours["before"], *hours["after"]})
     ]
-    return (", ".join(told) or "no nodes") + " (weather is not known to a map)"
+    return (", ".join(told) or "no nodes") + " (maps hold no weather)"
 
 
 def _region_text(one: dict[str, Any]) -> str:

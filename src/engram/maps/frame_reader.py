@@ -1,4 +1,4 @@
-"""Frames of a map's nodes, read when they are asked for."""
+"""Reads frames of a map's nodes on demand."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _STORED_BATCH = 64
 
 
 class FrameReader:
-    """A `LandmarkSource` over a map: bounded cache, read-ahead on a thread of its own, thread-safe.
+    """A thread-safe `LandmarkSource` over a map, with a bounded cache and a read-ahead thread.
 
     Args:
-        database: where the map is.
-        view: which nodes are seen.
-        cache_bytes: how much the decoded frames may take; the least recently used go first.
+        database: the map's database.
+        view: the visible nodes.
+        cache_bytes: largest size of the decoded frames; the least recently used are dropped.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class FrameReader:
         self.set_view(view)
 
     def frame(self, node: NodeId) -> Frame:
-        """The frame that was saved as `node`, without its thumbnail.
+        """The frame of `node`, without its thumbnail.
 
         Raises:
             InputError: the map has no such node, or not yet in this revision.
@@ -76,7 +76,7 @@ class FrameReader:
         return frame
 
     def thumbnail(self, node: NodeId) -> NDArray[np.uint8] | None:
-        """The (h, w) uint8 grey picture of a node; None if none was saved.
+        """The thumbnail of a node, (h, w) uint8 grey; None if none was saved.
 
         Raises:
             InputError: the map has no such node.
@@ -95,9 +95,9 @@ class FrameReader:
         return None if row["thumbnail"] is None else decode_thumbnail(row["thumbnail"])
 
     def stored(self, wanted: Iterable[Node]) -> Iterator[StoredNode]:
-        """Nodes with their landmarks as bytes, in the order given, a few at a time in memory.
+        """Nodes with their encoded landmarks, in the order given, read in small batches.
 
-        The bytes are held against their hash and not decoded.
+        The bytes are checked against their hash and not decoded.
 
         Raises:
             InputError: the map has no such node, or not yet in this revision.
@@ -138,7 +138,7 @@ class FrameReader:
         )
 
     def prefetch(self, nodes: list[NodeId]) -> None:
-        """Read these ahead; a newer call takes the place of what an older one still had to do."""
+        """Reads these nodes ahead; a newer call replaces pending work of an older one."""
         with self._wanted_changed:
             self._wanted = deque(
                 node for node in nodes if node not in self._cache and node not in self._held
@@ -151,12 +151,12 @@ class FrameReader:
             self._wanted_changed.notify()
 
     def hold(self, node: NodeId, frame: Frame) -> None:
-        """Keep the frame of a node that is not yet in the database."""
+        """Holds the frame of a node that is not yet in the database."""
         with self._lock:
             self._held[node] = frame
 
     def release(self, stored: list[NodeId]) -> None:
-        """These are in the database now: keep them no longer than any other."""
+        """Treats these frames as ordinary cache entries, since they are now in the database."""
         for node in stored:
             with self._lock:
                 frame = self._held.pop(node, None)
@@ -164,19 +164,19 @@ class FrameReader:
                 self._remember(node, frame)
 
     def show(self, rows: Sequence[Row]) -> None:
-        """These rows of `hidden` were written: nodes among them can be read again."""
+        """Makes nodes of these written `hidden` rows readable again."""
         shown = {row["target"] for row in rows if row["record"] == nodes.name}
         self._hidden = self._hidden - shown
 
     def forget(self) -> None:
-        """Drop all that is held or cached."""
+        """Drops all held and cached frames."""
         with self._lock:
             self._held.clear()
             self._cache.clear()
             self._cached_bytes = 0
 
     def set_view(self, view: View) -> None:
-        """See the map as of another revision."""
+        """Changes the visible revision."""
         with self._database.reading() as connection:
             self._revisions = frozenset(connection.execute(view.revision_keys()).scalars())
             found = connection.execute(view.hidden_keys(nodes))
@@ -185,7 +185,7 @@ class FrameReader:
             self._frontends: dict[int, tuple[DescriptorKind, str]] = load_frontends(connection)
 
     def close(self) -> None:
-        """End the read-ahead thread."""
+        """Ends the read-ahead thread."""
         with self._wanted_changed:
             self._closed = True
             self._wanted.clear()
@@ -260,7 +260,7 @@ class FrameReader:
             try:
                 self.frame(node)
             except (MapError, InputError):
-                continue  # only a hint: who really asks for this node gets the same error
+                continue  # only a hint: a real read of this node raises the same error
 
 
 _NODE_WITH_LANDMARKS = (

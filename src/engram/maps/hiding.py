@@ -1,7 +1,7 @@
-"""Rows that are hidden, and shown again: how history is undone without being rewritten.
+"""Hides rows and shows them again: a revert does not rewrite history.
 
-A revert writes one `hidden` row for each row that its revision brought. What is handed in again
-later is shown again by a newer `hidden` row; of the rows for one target the newest counts.
+A revert writes one `hidden` row for each row that its revision added. Records that are added again
+later are shown by a newer `hidden` row; of the rows for one target the newest counts.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from engram.maps.view import View
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reverted:
-    """What a revert did, or would do.
+    """The result of a revert, or of a dry run.
 
     Attributes:
-        number: the revision that was taken back.
-        revision: the new one that does it; None where nothing was written.
-        before, after: the map without and with it.
-        lost_by_others: how many rows of other revisions, by table, are no longer seen: they refer
-            to nodes that are hidden now, or the revision had shown them again.
-        regained_by_others: how many, by table, are seen again.
+        number: the reverted revision.
+        revision: the new revision; None if nothing was written.
+        before, after: the map before and after the revert.
+        lost_by_others: number of rows of other revisions, by table, that are hidden with it: they
+            refer to hidden nodes, or the revision had shown them again.
+        regained_by_others: number of their rows, by table, that are shown again.
     """
 
     number: int
@@ -57,7 +57,7 @@ class Reverted:
 
 
 def hidden_row(keys: KeyBook, revision_key: int, table: Table, target: int, *, hide: bool) -> Row:
-    """A row of `hidden` that hides a row of another table, or shows it again."""
+    """A row of `hidden`, which hides a row of another table or shows it again."""
     row = {
         "key": keys.next(hidden),
         "revision": revision_key,
@@ -69,7 +69,7 @@ def hidden_row(keys: KeyBook, revision_key: int, table: Table, target: int, *, h
 
 
 def hidden_rows(connection: Connection, view: View, table: Table) -> dict[Any, Row]:
-    """The rows that a revert has hidden, by what names them: UUID, or path and sequence."""
+    """The rows that a revert has hidden, by UUID or by path and sequence."""
     query = (
         select(table)
         .where(table.c.key.in_(view.hidden_keys(table)))
@@ -83,20 +83,20 @@ def hidden_rows(connection: Connection, view: View, table: Table) -> dict[Any, R
 
 
 def check_same_node(row: Row, node: Node, landmark_hash: bytes) -> None:
-    """A hidden node may come back only as what it was.
+    """Refuses to show a hidden node again with other content.
 
     Raises:
         InputError: it has other landmarks or another stamp.
     """
     if (row["landmark_hash"], row["stamp_ns"]) != (landmark_hash, node.stamp_ns):
         raise InputError(
-            f"node {node.id} was in the map before, with other landmarks; a node never changes: "
-            "hand it in with the front-end settings of then, or map the drive into another map"
+            f"node {node.id} was in the map before with other landmarks; a node never changes: "
+            "use the same front-end settings as then, or map the drive into another map"
         )
 
 
 def check_same_session(row: Row, session: Session, camera: int, frontend: int) -> None:
-    """A hidden session may come back only as what it was.
+    """Refuses to show a hidden session again with other content.
 
     Raises:
         InputError: its robot, camera, front-end, clock or place on Earth differ.
@@ -106,7 +106,7 @@ def check_same_session(row: Row, session: Session, camera: int, frontend: int) -
         if now[name] != row[name]:
             raise InputError(
                 f"session {session.id} was in the map before with {name} {row[name]}, now "
-                f"{now[name]}; a session never changes: give what was given then, or map the "
+                f"{now[name]}; a session never changes: use the same values as then, or map the "
                 "drive into another map"
             )
 
@@ -114,25 +114,25 @@ def check_same_session(row: Row, session: Session, camera: int, frontend: int) -
 def hide_revision(
     connection: Connection, keys: KeyBook, view: View, number: int, revision_key: int
 ) -> None:
-    """Write the rows that take a revision back.
+    """Writes the rows that revert a revision.
 
-    What it brought is hidden, and what it hid or showed is shown or hidden again. Sessions and
-    paths on which later revisions built stay, so that what those brought keeps its owner.
+    Rows that it added are hidden; rows that it hid or showed are shown or hidden again. Sessions
+    and paths that later revisions use stay visible.
 
     Args:
         connection: inside a transaction.
         keys: the writer's.
         view: the newest revision, and the open one.
-        number: of the revision to take back.
-        revision_key: of the open revision that takes it back.
+        number: number of the revision to revert.
+        revision_key: key of the open revision that reverts it.
 
     Raises:
-        RevisionError: nothing of it is left to take back.
+        RevisionError: nothing of it is visible.
     """
     query = select(revisions.c.key).where(revisions.c.number == number)
     target = connection.execute(query).scalar_one()
     written = _invert_hidden(connection, keys, view, target, revision_key)
-    # Owners last: they stay while anything that is still seen belongs to them.
+    # Owners last: they stay visible while any visible row belongs to them.
     owned = [table for table in VERSIONED if table not in {hidden, frames, paths, sessions}]
     for table in (*owned, paths, sessions):
         brought = (
@@ -146,13 +146,11 @@ def hide_revision(
             connection.execute(insert(hidden), rows)
         written += len(rows)
     if not written:
-        raise RevisionError(
-            f"revision {number} has nothing left to take back: it brought nothing that is seen"
-        )
+        raise RevisionError(f"revision {number} has nothing to revert: none of its rows is visible")
 
 
 def _used(connection: Connection, view: View, table: Table) -> set[int]:
-    """Keys of sessions or paths to which rows that are still seen belong."""
+    """Keys of sessions or paths that own visible rows."""
     owned = {sessions: (nodes, paths, attempts), paths: (path_entries,)}.get(table, ())
     column = {sessions: "session", paths: "path"}.get(table, "")
     return {
@@ -167,7 +165,7 @@ def _used(connection: Connection, view: View, table: Table) -> set[int]:
 def _invert_hidden(
     connection: Connection, keys: KeyBook, view: View, target: int, revision_key: int
 ) -> int:
-    """Undo those hidings and showings of a revision that are still the newest."""
+    """Undoes the hidings and showings of a revision that are still the newest."""
     query = select(hidden).where(hidden.c.revision == target).order_by(hidden.c.key)
     made = list(verified(hidden, connection.execute(query)))
     if not made:
@@ -190,10 +188,10 @@ def _invert_hidden(
 
 
 def compare(connection: Connection, number: int, before: View, after: View) -> Reverted:
-    """The map without and with a revert that is not committed yet."""
+    """The map before and after an uncommitted revert."""
     lost, regained = {}, {}
     for table in (edges, path_entries, omissions):
-        # By row, not by count: what goes and what comes back must not cancel.
+        # By row, not by count: losses and gains must not cancel.
         old, new = (_of_others(connection, view, table, number) for view in (before, after))
         lost[str(table.name)] = len(old - new)
         regained[str(table.name)] = len(new - old)
@@ -202,6 +200,6 @@ def compare(connection: Connection, number: int, before: View, after: View) -> R
 
 
 def _of_others(connection: Connection, view: View, table: Table, number: int) -> set[int]:
-    """Keys of the rows that are seen and that the revision did not bring."""
+    """Keys of the visible rows that the revision did not add."""
     rows = view.select(table).where(func.coalesce(revisions.c.number, 0) != number)
     return set(connection.execute(rows.with_only_columns(table.c.key).order_by(None)).scalars())

@@ -1,4 +1,4 @@
-"""The history of a map as users of version control know it: log, show, tag, revert, blame."""
+"""The history of a map, as in version control: log, show, tag, revert, blame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from engram.maps.map import open_map
 from engram.maps.records import MapContents, Revision
 from engram.maps.tags import Tag
 
-# What a revision brought, in the order in which `log` tells it.
+# Contents of a revision, in the order in which `log` prints them.
 _TOLD = {
     "sessions": "sessions",
     "nodes": "nodes",
@@ -43,7 +43,7 @@ def map_log(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
 
 
 def log_text(revision: Mapping[str, Any], *, oneline: bool = False) -> str:
-    """One revision of `map_log` for people."""
+    """One revision of `map_log` as text."""
     tags = f" (tag: {', '.join(revision['tags'])})" if revision["tags"] else ""
     message = revision["message"]
     if oneline:
@@ -59,7 +59,7 @@ def log_text(revision: Mapping[str, Any], *, oneline: bool = False) -> str:
 
 
 def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDifference]:
-    """One revision, and what it changed in the map.
+    """One revision and its changes to the map.
 
     Raises:
         MapError: the map cannot be read, or has no such revision.
@@ -83,12 +83,12 @@ def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDiff
 def diff_revisions(
     path: Path, before: int | str, after: int | str, *, stretch_m: float = STRETCH_M
 ) -> MapDifference:
-    """Compare two revisions of a map.
+    """Compares two revisions of a map.
 
     Args:
         path: NAME.engram.
         before, after: numbers or names of the revisions.
-        stretch_m: length of the stretches by which changes are listed.
+        stretch_m: length of the stretches by which changes are listed, metres.
 
     Raises:
         MapError: the map cannot be read, or has no such revision.
@@ -107,13 +107,13 @@ def tag_revision(
     message: str = "",
     move: bool = False,
 ) -> Tag:
-    """Give a revision a name; see `Map.tag` for the errors."""
+    """Tags a revision; `Map.tag` lists the errors."""
     with open_map(path) as store:
         return store.tag(name, named, author=author, message=message, move=move)
 
 
 def delete_tag(path: Path, name: str, *, author: str) -> Tag:
-    """Take a name away; see `Map.untag` for the errors."""
+    """Removes a tag; `Map.untag` lists the errors."""
     with open_map(path) as store:
         return store.untag(name, author=author)
 
@@ -141,11 +141,11 @@ def tag_dict(tag: Tag) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RevertReport:
-    """What taking a revision back did, or would do.
+    """The result of reverting a revision, or of a dry run.
 
     Attributes:
         reverted: the map before and after.
-        difference: between the two.
+        difference: the comparison of the two.
     """
 
     reverted: Reverted
@@ -163,37 +163,37 @@ class RevertReport:
         }
 
     def text(self) -> str:
-        """For people."""
+        """The result as text."""
         told = self.difference.to_dict()
         revision = self.reverted.revision
-        done = "would be taken back" if revision is None else f"taken back by {revision.number}"
+        done = "would be reverted" if revision is None else f"reverted by {revision.number}"
         lines = [
             f"revision {self.reverted.number} {done}",
             f"nodes      {told['nodes']['before']} → {told['nodes']['after']}",
             f"components {told['components']['before']} → {told['components']['after']}",
         ]
         if lost := _rows_text(self.reverted.lost_by_others):
-            lines.append(f"other revisions had built on it: {lost} of theirs disappear with it")
+            lines.append(f"other revisions depend on it: {lost} of theirs are hidden with it")
         if regained := _rows_text(self.reverted.regained_by_others):
-            lines.append(f"of other revisions, {regained} are seen again")
+            lines.append(f"of other revisions, {regained} are shown again")
         if told["components"]["after"] > told["components"]["before"]:
-            lines.append("the map falls into more pieces: robots cannot be carried between them")
+            lines.append("the map has more components: positions cannot be carried between them")
         lines.append(f"to undo: engram revert MAP {revision.number}" if revision else "dry run")
         return "\n".join(lines)
 
 
 def _rows_text(counts: Mapping[str, int]) -> str:
-    """How many rows of which tables, those without any left out."""
+    """Number of rows by table, without tables that have none."""
     return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
 
 
 def revert_revision(
     path: Path, named: int | str, *, author: str, message: str = "", dry_run: bool = False
 ) -> RevertReport:
-    """Take a revision back by a new one, and say what went with it.
+    """Reverts a revision by a new one, and reports the changes.
 
     Raises:
-        RevisionError: there is no such revision, or nothing of it is left.
+        RevisionError: there is no such revision, or nothing of it is visible.
         MapError: the map cannot be written.
     """
     with open_map(path) as store:
@@ -204,10 +204,10 @@ def revert_revision(
 
 
 def blame_node(path: Path, prefix: str, at: int | str | None = None) -> dict[str, Any]:
-    """Who brought a node into a map, when, and what became of it.
+    """The origin and history of a node.
 
     Raises:
-        InputError: no node, or several, begin so.
+        InputError: no node or several match.
         MapError: the map cannot be read, or has no such revision.
     """
     with open_map(path, at=at) as store:
@@ -242,20 +242,20 @@ def blame_node(path: Path, prefix: str, at: int | str | None = None) -> dict[str
 
 
 def blame_text(found: Mapping[str, Any]) -> str:
-    """`blame_node` for people."""
+    """`blame_node` as text."""
     hour = "hour of day unknown" if found["hour"] is None else f"hour of day {found['hour']:.2f}"
     edges = ", ".join(f"{count} {kind}" for kind, count in found["edges"].items()) or "none"
     lines = [
         f"node {found['node']}",
         f"  saved by {found['robot']} in session {found['session']}, {found['driven_m']:.1f} m in",
         f"  at {found['when']}, {hour}",
-        f"  brought by revision {found['revision']} of {found['author']}, {found['committed']}"
+        f"  added by revision {found['revision']} of {found['author']}, {found['committed']}"
         + (f": {found['message']}" if found["message"] else ""),
         f"  edges: {edges}; on {found['paths']} paths; matched in {found['matches']} of "
         f"{found['attempts']} attempts",
     ]
     for said in found["told"]:
-        done = "taken back" if said["hidden"] else "shown again"
+        done = "reverted" if said["hidden"] else "shown again"
         lines.append(f"  {done} by revision {said['revision']}")
     return "\n".join(lines)
 
@@ -266,7 +266,7 @@ def when(stamp_ns: int) -> str:
 
 
 def stamp_text(session: Session | None, stamp_ns: int) -> str:
-    """A stamp of a session for people; None for a session that is not seen."""
+    """A stamp of a session as text; None for an invisible session."""
     if session is not None and session.clock is Clock.UTC:
         return when(stamp_ns + session.shift_ns)
     return f"{stamp_ns / 1e9:.3f} s of a clock that is not UTC"

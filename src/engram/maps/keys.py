@@ -1,4 +1,4 @@
-"""Keys of rows: 64-bit integers, given out by the one writer in order of writing."""
+"""Keys of rows: 64-bit integers, assigned by the only writer in the order of writing."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from engram.maps.view import View
 class KeyBook:
     """The next free key of each table, and the keys of nodes by their UUIDs.
 
-    For the holder of the writer lock only: nobody else gives out keys meanwhile.
+    Only for the holder of the writer lock, so that no other process assigns keys.
     """
 
     def __init__(self, database: Database, view: View) -> None:
         self._database = database
         self._view = view
-        self._nodes: dict[bytes, int] | None = None  # read when first asked for
+        self._nodes: dict[bytes, int] | None = None  # read on first use
         with database.reading() as connection:
             self._next = {
                 table: (connection.execute(select(func.max(table.c.key))).scalar() or 0) + 1
@@ -27,25 +27,25 @@ class KeyBook:
             }
 
     def next(self, table: Table) -> int:
-        """A key that no row of the table has."""
+        """An unused key of the table."""
         key = self._next[table]
         self._next[table] = key + 1
         return key
 
     def set_view(self, view: View) -> None:
-        """Find nodes as of another revision."""
+        """Changes the visible revision."""
         self._view = view
 
     def find_node(self, node: NodeId) -> int | None:
-        """Key of a node that is seen or was announced by `learn_node`; None if there is none."""
+        """Key of a node that is visible or was announced by `learn_node`; None if there is none."""
         return self._known_nodes().get(node.bytes)
 
     def learn_node(self, node: NodeId, key: int) -> None:
-        """A node that is on its way into the map."""
+        """Announces a node that will be written."""
         self._known_nodes()[node.bytes] = key
 
     def forget_nodes(self) -> None:
-        """Nodes on their way did not arrive."""
+        """Forgets announced nodes."""
         self._nodes = None
 
     def _known_nodes(self) -> dict[bytes, int]:

@@ -1,4 +1,4 @@
-"""Map files as a whole: opened, copied, written anew, verified."""
+"""Operations on whole map files: open, copy, rewrite, verify."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ def open_database(location: Path | str | Place) -> Database:
 
 
 def copy_map(source: Path, target: Path) -> None:
-    """Copies a map file as it is now, also while somebody writes to it.
+    """Copies the current state of a map file, even while another process writes to it.
 
     Raises:
         InputError: the target exists already, or its folder does not.
-        MapError: the source cannot be read, or the target not written.
+        MapError: the source cannot be read, or the target cannot be written.
     """
     with closing(SqliteDatabase(source)) as database:
         database.copy_to(target)
 
 
 def compact_map(source: Path, target: Path) -> None:
-    """Writes a map file anew, its rows in order and without gaps.
+    """Rewrites a map file with its rows in order and without gaps.
 
-    The same rows written in the same order give the same bytes, with one version of SQLite.
+    The same rows in the same order give the same bytes, with one version of SQLite.
 
     Raises:
         InputError: the target exists already, or its folder does not.
-        MapError: the source cannot be read, or the target not written.
+        MapError: the source cannot be read, or the target cannot be written.
     """
     with closing(SqliteDatabase(source)) as database:
         database.compact_to(target)
 
 
 def publish_map(draft: Path, target: Path) -> None:
-    """Gives a map file that nobody has open its name, in the same file system: last of all.
+    """Renames a map file that no process has open, within one file system.
 
     Raises:
         InputError: the target exists already, or its folder does not.
@@ -54,10 +54,10 @@ def publish_map(draft: Path, target: Path) -> None:
 
 
 def check_file(location: Path | str | Place) -> CheckReport:
-    """Verify a map file to the last byte, also one that is too damaged to open.
+    """Verifies every byte of a map file, even of one too damaged to open.
 
     Raises:
-        NotAMapError: nothing is there, or something else.
+        NotAMapError: the file does not exist or is not a map.
         FormatVersionError: a newer Engram wrote it.
     """
     try:

@@ -1,4 +1,4 @@
-"""What can be read of a map, as of one revision."""
+"""The reading half of a map, as of one revision."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-# What is read anew once something was written.
+# Cached properties to clear after a write.
 _SMALL = (
     "amendments",
     "cameras",
@@ -75,7 +75,7 @@ _SMALL = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Contents:
-    """What a map is read for once: the graph and the paths grow with what is written."""
+    """The records of a map that are read once; the graph and the paths grow with writes."""
 
     graph: ExperienceGraph
     path_memory: PathMemory
@@ -102,9 +102,9 @@ class _Contents:
 
 
 class MapReader:
-    """A map as of one revision; the part of `Map` that only reads.
+    """A map as of one revision; the reading part of `Map`.
 
-    What is read stays in memory. The graph and the paths are read once, and grow with what this
+    Records stay in memory once read. The graph and the paths are read once, and grow with what this
     process writes.
 
     Attributes:
@@ -122,7 +122,7 @@ class MapReader:
         self._derived: dict[tuple[object, ...], Any] = {}
 
     def close(self) -> None:
-        """Give back files and threads."""
+        """Closes files and threads."""
         self.frames.close()
         self._database.close()
 
@@ -134,22 +134,22 @@ class MapReader:
 
     @property
     def location(self) -> str:
-        """Where the map lies, for messages."""
+        """Path or address of the map, for messages."""
         return self._database.name
 
     @property
     def is_pinned(self) -> bool:
-        """Whether it was opened as of a certain revision."""
+        """Whether it was opened at a given revision."""
         return self._pinned
 
     @property
     def revision(self) -> int:
-        """Number of the newest revision that is seen; 0 for an empty map."""
+        """Number of the newest visible revision; 0 for an empty map."""
         return self._view.at
 
     @property
     def format_version(self) -> int:
-        """Of the format in which the map is stored."""
+        """Version of the map's stored format."""
         return self._database.format_version
 
     @property
@@ -164,9 +164,9 @@ class MapReader:
 
     @property
     def attempts(self) -> Attempts:
-        """The attempts that it remembered when the graph was read.
+        """The remembered attempts as of the reading of the graph.
 
-        Sessions are places in `sessions`, nodes are indices of `graph`.
+        Their sessions are positions in `sessions`, their nodes dense indices of `graph`.
         """
         return self._read_contents().attempts
 
@@ -177,30 +177,30 @@ class MapReader:
 
     @property
     def last_iterations(self) -> Mapping[SessionId, int]:
-        """Number of the newest of `attempts` of each session that has any."""
+        """Newest iteration in `attempts` by session, for sessions that have any."""
         return self._read_contents().last_iterations
 
     @cached_property
     def sessions(self) -> dict[SessionId, Session]:
-        """The drives that the map knows, by id, in the order of their coming."""
+        """The map's sessions by id, in the order in which they were added."""
         return {one.id: one for one in self._read(reading.load_sessions)}
 
     def named_session(self, prefix: str) -> Session:
-        """The one session whose UUID begins so.
+        """The one session whose UUID begins with `prefix`.
 
         Raises:
-            InputError: no session, or several, begin so.
+            InputError: no session or several match.
         """
         known, wanted = self.sessions.values(), prefix.strip().lower()
         found = [one for one in known if wanted and str(one.id).startswith(wanted)]
         if len(found) != 1:
             listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or known)
-            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose of: {listed}")
+            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose from: {listed}")
         return found[0]
 
     @cached_property
     def amendments(self) -> tuple[Amendment, ...]:
-        """What was set right about its sessions, in the order in which it counts."""
+        """Amendments of its sessions, in the order in which they apply."""
         return self._read(reading.load_amendments)
 
     @cached_property
@@ -211,7 +211,7 @@ class MapReader:
 
     @cached_property
     def vocabulary(self) -> bytes | None:
-        """The newest vocabulary of the map as it was put in; None if there is none.
+        """The newest vocabulary of the map, encoded; None if there is none.
 
         Raises:
             MapCorruptError: it does not match its hash.
@@ -230,7 +230,7 @@ class MapReader:
 
     @cached_property
     def omissions(self) -> dict[NodeId, Omission]:
-        """The nodes that merges did not take, by their ids; equivalents that are hidden left out.
+        """Nodes that merges omitted, by id, without those whose equivalents are hidden.
 
         Raises:
             MapCorruptError: a row does not match its checksum.
@@ -239,26 +239,26 @@ class MapReader:
 
     @cached_property
     def landmark_hashes(self) -> dict[NodeId, bytes]:
-        """The 16 bytes that stand for each node's landmarks.
+        """Hash (16 bytes) of each node's landmarks.
 
-        Also of nodes that were not taken, as far as it was kept.
+        Includes omitted nodes whose hash was stored.
         """
         return self._read(reading.landmark_hashes)
 
     @cached_property
     def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
-        """Bytes of each node's landmarks and of its thumbnail."""
+        """Size in bytes of each node's landmarks and of its thumbnail."""
         return self._read(reading.blob_sizes)
 
     @cached_property
     def partial_paths(self) -> frozenset[PathId]:
-        """Paths of which some entries stayed elsewhere."""
+        """Paths some of whose entries are not in this map."""
         return self._read(reading.partial_paths)
 
     def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-        """The words (n,) of nodes by the vocabulary of this hash, rising, as far as they are kept.
+        """The stored words (n,) of nodes by the vocabulary of this hash, rising.
 
-        What is damaged is left out: it can be worked out again from the landmarks.
+        Damaged rows are left out: words can be computed again from the landmarks.
         """
         with self._database.reading() as connection:
             return load_words(connection, vocabulary)
@@ -266,7 +266,7 @@ class MapReader:
     def derived(
         self, make: Callable[Concatenate[Self, _P], _T], *args: _P.args, **kwargs: _P.kwargs
     ) -> _T:
-        """What others make of this map: made once for each set of arguments, then shared.
+        """A value derived from this map: made once for each set of arguments, then shared.
 
         Args:
             make: called with the map and the arguments, which are hashable.
@@ -279,7 +279,7 @@ class MapReader:
         return found
 
     def load(self) -> MapContents:
-        """All records as they are now, also what this process has checkpointed of an open session.
+        """All current records, including what this process has checkpointed of an open session.
 
         Raises:
             MapCorruptError: a row does not match its checksum or points at nothing.
@@ -287,11 +287,11 @@ class MapReader:
         return self._read(reading.load)
 
     def node_count(self) -> int:
-        """How many nodes the map has."""
+        """Number of nodes of the map."""
         return self._read(reading.node_count)
 
     def info(self) -> MapInfo:
-        """The map in numbers."""
+        """Counts and sizes of the map."""
         with self._database.reading() as connection:
             return reading.info(
                 connection,
@@ -301,20 +301,20 @@ class MapReader:
             )
 
     def statistics(self) -> dict[str, dict[str, Any]]:
-        """The newest of every statistic of the map, by name."""
+        """The newest value of each statistic of the map, by name."""
         return self._read(reading.load_statistics)
 
     def log(self) -> list[Revision]:
-        """The committed revisions that are seen, oldest first."""
+        """The visible committed revisions, oldest first."""
         return self._read(reading.log)
 
     def tags(self) -> dict[str, Tag]:
-        """The names that were given to revisions, also to those not seen from here."""
+        """The tags of all revisions, including later ones than this view."""
         with self._database.reading() as connection:
             return load_tags(connection)
 
     def resolve(self, named: int | str | None) -> int:
-        """Number of a revision of the whole map, however it is named.
+        """Number of a revision, given by number, tag or `head`.
 
         Raises:
             RevisionError: there is none.
@@ -341,13 +341,13 @@ class MapReader:
         return difference(numbers[0], old, numbers[1], new, stretch_m)
 
     def origin(self, prefix: str) -> Origin:
-        """Where a node comes from, also one that a revert has hidden.
+        """The origin of a node, even of one that a revert has hidden.
 
         Args:
             prefix: its UUID, or enough of its beginning.
 
         Raises:
-            InputError: no node, or several, begin so.
+            InputError: no node or several match.
         """
         with self._database.reading() as connection:
             return origin_of(connection, self._view, prefix)
@@ -358,12 +358,12 @@ class MapReader:
             return content_hash(connection, self._view.at)
 
     def record_hashes(self) -> dict[str, str]:
-        """16 hexadecimal digits of each table's rows, free of what revisions tell of themselves."""
+        """Hash of each table's rows without revision metadata, 16 hexadecimal digits."""
         with self._database.reading() as connection:
             return record_hashes(connection, self._view.at)
 
     def session_state(self, session: SessionId) -> SessionState:
-        """What the map knows of a session: ask before handing one in."""
+        """The state of a session in the map."""
         with self._database.reading() as connection:
             found = session_and_revision(connection, session, self._view.at)
         if found is None or found[1]["status"] == "abandoned":
@@ -375,7 +375,7 @@ class MapReader:
         return SessionState.OPEN if self._is_alive(revision) else SessionState.INTERRUPTED
 
     def interrupted(self) -> list[InterruptedSession]:
-        """Sessions whose writer is gone before it committed, oldest first."""
+        """Sessions whose writer ended before it committed, oldest first."""
         query = select(revisions).where(revisions.c.status == "open").order_by(revisions.c.key)
         with self._database.reading() as connection:
             opened = list(verified(revisions, connection.execute(query)))
@@ -385,11 +385,11 @@ class MapReader:
             ]
 
     def check(self) -> CheckReport:
-        """Verify the whole file to the last byte; `check_map` also takes one that does not open."""
+        """Verifies every byte of the file; `check_map` also handles one that does not open."""
         return check(self._database)
 
     def forget(self) -> None:
-        """Read anew, when next asked for, what has been read of this map."""
+        """Clears the cache, so that records are read again."""
         with self._contents_lock:
             self._contents = None
             self._derived.clear()
@@ -397,7 +397,7 @@ class MapReader:
                 self.__dict__.pop(name, None)
 
     def _look_from(self, view: View) -> None:
-        """See the map as of another revision; the graph and the paths stay as they have grown."""
+        """Changes the visible revision; the graph and the paths stay as they are."""
         self._view = view
         for name in _SMALL if self._contents else (*_SMALL, "sessions"):
             self.__dict__.pop(name, None)
@@ -412,7 +412,7 @@ class MapReader:
             if self._contents is None:
                 found = self.load()
                 self._contents = _Contents.of(found)
-                # Attempts name sessions by their places: those of the same moment.
+                # Attempts refer to sessions by position: both must be read together.
                 self.__dict__["sessions"] = {one.id: one for one in found.sessions}
             return self._contents
 

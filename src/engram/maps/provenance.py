@@ -1,4 +1,4 @@
-"""Where the records of a map come from: which revision brought a node, and who took it back."""
+"""The origin of a map's nodes: the revision that added one, and those that reverted it."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Origin:
         robot: of that drive.
         stamp_ns: of its frame.
         driven_m: odometry distance from the session's start.
-        brought: number of the revision that brought it.
-        told: (number, hidden) for each later revision that took it back or showed it again.
+        brought: number of the revision that added it.
+        told: (number, hidden) for each later revision that hid it or showed it again.
     """
 
     node: NodeId
@@ -41,24 +41,24 @@ class Origin:
 
     @property
     def visible(self) -> bool:
-        """Whether it is part of the map at the revision that was asked."""
+        """Whether the node is visible at the chosen revision."""
         return not (self.told and self.told[-1][1])
 
 
 def origin_of(connection: Connection, view: View, prefix: str) -> Origin:
-    """The one node whose UUID begins so, hidden ones too.
+    """The one node whose UUID begins with `prefix`, hidden ones included.
 
     Args:
         connection: of the map.
-        view: up to which revision.
+        view: the view of a revision.
         prefix: hexadecimal digits, with or without hyphens.
 
     Raises:
-        InputError: no node, or several, begin so, or the prefix is none.
+        InputError: no node or several match, or the prefix is not valid.
     """
     digits = prefix.strip().lower().replace("-", "")
     if not digits or not _HEX.issuperset(digits) or len(digits) > 32:
-        raise InputError(f"{prefix!r} is no UUID, nor the beginning of one")
+        raise InputError(f"{prefix!r} is not a UUID or the beginning of one")
     brought = nodes.c.revision.in_(view.revision_keys())
     begins = _between(digits)
     query = select(nodes).where(brought, nodes.c.uuid >= begins[0], nodes.c.uuid <= begins[1])
@@ -74,7 +74,7 @@ def origin_of(connection: Connection, view: View, prefix: str) -> Origin:
 
 
 def _between(digits: str) -> tuple[bytes, bytes]:
-    """The least and the greatest UUID that begin so."""
+    """The smallest and the largest UUID that begin with `prefix`."""
     return bytes.fromhex(digits.ljust(32, "0")), bytes.fromhex(digits.ljust(32, "f"))
 
 

@@ -1,4 +1,4 @@
-"""Rows → records: the graph, the paths and the attempts of a map as of one revision."""
+"""Reads records from rows: the graph, paths and attempts of a map as of one revision."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ from engram.maps.view import View
 
 
 def load(connection: Connection, view: View) -> MapContents:
-    """Everything but the landmarks.
+    """All records except landmarks.
 
     Raises:
         MapCorruptError: a row does not match its checksum or points at nothing.
@@ -91,7 +91,7 @@ def load_sessions(connection: Connection, view: View) -> tuple[Session, ...]:
 
 
 def load_amendments(connection: Connection, view: View) -> tuple[Amendment, ...]:
-    """What was set right about the sessions that are seen; of what contradicts, the last counts."""
+    """Amendments of the visible sessions; the last of contradicting ones counts."""
     known = _sessions(connection, view, load_cameras(connection))
     return tuple(one for _, one in _amendments(connection, view, known))
 
@@ -99,7 +99,7 @@ def load_amendments(connection: Connection, view: View) -> tuple[Amendment, ...]
 def _sessions(
     connection: Connection, view: View, known_cameras: dict[int, StereoCamera]
 ) -> dict[int, Session]:
-    """By key, with what was set right about them."""
+    """Sessions by key, with their amendments applied."""
     recorded = {
         row["key"]: session_from_row(row, _camera_id(known_cameras, row, "session"))
         for row in view.rows(connection, sessions)
@@ -143,12 +143,12 @@ def descriptor_of(connection: Connection, view: View) -> DescriptorKind | None:
     if key is None:
         return None
     if key not in known:
-        raise MapCorruptError(f"table frontends: row {key}, which a session names, is missing")
+        raise MapCorruptError(f"table frontends: row {key}, of a session, is missing")
     return known[key][0]
 
 
 def log(connection: Connection, view: View) -> list[Revision]:
-    """The committed revisions that are seen, oldest first."""
+    """The visible committed revisions, oldest first."""
     query = (
         select(revisions)
         .where(revisions.c.status == "committed", revisions.c.number <= view.at)
@@ -175,7 +175,7 @@ def revision_from_row(row: Row) -> Revision:
 
 
 def info(connection: Connection, view: View, *, format_version: int, size_bytes: int) -> MapInfo:
-    """The map in numbers, without reading it whole."""
+    """Counts and sizes of the map, without reading all records."""
     by_kind = dict.fromkeys(EdgeKind, 0)
     mapped_m = 0.0
     for row in _newest_edges(connection, view):
@@ -207,12 +207,12 @@ def info(connection: Connection, view: View, *, format_version: int, size_bytes:
 
 
 def node_count(connection: Connection, view: View) -> int:
-    """How many nodes are seen."""
+    """Number of visible nodes."""
     return _count(connection, view.select(nodes))
 
 
 def load_statistics(connection: Connection, view: View) -> dict[str, dict[str, Any]]:
-    """The newest of every statistic by name."""
+    """The newest value of each statistic by name."""
     rows = view.rows(connection, statistics)
     return {row["name"]: from_json(row["body"], f"statistic {row['name']}") for row in rows}
 
@@ -229,7 +229,7 @@ def load_vocabulary(connection: Connection, view: View) -> bytes | None:
 
 
 def load_omissions(connection: Connection, view: View) -> dict[NodeId, Omission]:
-    """Nodes that were not taken, each with its newest equivalent that is seen."""
+    """Omitted nodes, each with its newest visible equivalent."""
     query = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
     node_ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
     landmarks = {
@@ -260,7 +260,7 @@ def frontends_of_sessions(
 
 
 def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
-    """The hash of each node's landmarks; of omitted ones, too, as far as it was kept."""
+    """Hash of each node's landmarks, including omitted nodes whose hash was stored."""
     found: dict[NodeId, bytes] = {}
     for table in (omitted_landmarks, nodes):
         query = view.select(table).with_only_columns(table.c.uuid, table.c.landmark_hash)
@@ -269,7 +269,7 @@ def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
 
 
 def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:
-    """Bytes of each node's landmarks and of its thumbnail."""
+    """Size in bytes of each node's landmarks and of its thumbnail."""
     seen = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
     ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(seen)}
     query = select(
@@ -283,7 +283,7 @@ def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, in
 
 
 def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:
-    """Paths of which some entries stayed elsewhere."""
+    """Paths some of whose entries are not in this map."""
     return frozenset(
         PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}"))
         for row in view.rows(connection, paths)
@@ -315,7 +315,7 @@ def _camera_id(known: dict[int, StereoCamera], row: Row, what: str) -> CameraId:
 
 
 def _newest_edges(connection: Connection, view: View) -> list[Row]:
-    """Of each (a, b, kind) the newest, in order of writing."""
+    """The newest edge of each (a, b, kind), in order of writing."""
     newest: dict[tuple[int, int, str], Row] = {}
     for row in view.rows(connection, edges):
         key = (row["a"], row["b"], row["kind"])
@@ -325,7 +325,7 @@ def _newest_edges(connection: Connection, view: View) -> list[Row]:
 
 
 def _edges(connection: Connection, view: View, node_ids: dict[int, NodeId]) -> tuple[Edge, ...]:
-    """Edges between nodes that are seen: those of hidden nodes are hidden with them."""
+    """Edges between visible nodes: those of hidden nodes are hidden with them."""
     seen = [
         row
         for row in _newest_edges(connection, view)
@@ -354,7 +354,7 @@ def _path_entries(
 
 
 def _entry_places(view: View) -> Select[Any]:
-    """Path and sequence of the entries that are seen, once each: newer ones supersede older."""
+    """Path and sequence of the visible entries, once each: newer rows supersede older ones."""
     seen = view.select(path_entries).order_by(None)
     return seen.with_only_columns(path_entries.c.path, path_entries.c.sequence).distinct()
 
@@ -362,7 +362,7 @@ def _entry_places(view: View) -> Select[Any]:
 def _attempts(
     connection: Connection, view: View, session_keys: list[int], node_keys: list[int]
 ) -> Attempts:
-    """All attempts between nodes that are seen, with keys turned into dense indices."""
+    """All attempts between visible nodes, with keys converted to dense indices."""
     by_session = attempt_tables(connection, view)
     order = [key for key in session_keys if key in by_session]
     table = concatenate([by_session[key] for key in order])

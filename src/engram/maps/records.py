@@ -1,4 +1,4 @@
-"""What the store hands out beside the records of `engram.graph`."""
+"""Records of a map beside those of `engram.graph`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from engram.graph.model import Edge, Node, PathEntry, Session, SessionId
 
 
 class RevisionStatus(StrEnum):
-    """Where a revision is in its life."""
+    """The state of a revision."""
 
     OPEN = "open"
     COMMITTED = "committed"
@@ -26,7 +26,7 @@ class RevisionStatus(StrEnum):
 
 
 class SessionState(StrEnum):
-    """What a map knows of a session."""
+    """The state of a session in a map."""
 
     ABSENT = "absent"
     OPEN = "open"
@@ -39,15 +39,15 @@ class Revision:
     """One committed step of a map's history.
 
     Attributes:
-        number: what `--at` takes; 1 is the first.
+        number: as in `--at`; 1 is the first.
         parent: number of the revision before; None for the first.
-        author: who, or which robot.
-        message: why; "" if nothing was said.
+        author: the person or robot.
+        message: reason; "" without one.
         tool_version: version of Engram that wrote it.
-        configuration: the resolved settings that made it.
-        opened_ns, committed_ns: when, UTC, ns.
-        host: where.
-        contents: how many rows of each table it brought, and `mapped_m`, the metres of its
+        configuration: the resolved settings.
+        opened_ns, committed_ns: times, UTC, ns.
+        host: name of the writing computer.
+        contents: number of rows that it added to each table, and `mapped_m`, the metres of its
             odometry edges.
     """
 
@@ -65,12 +65,12 @@ class Revision:
 
 @dataclass(frozen=True, slots=True)
 class InterruptedSession:
-    """A session whose writer is gone before it committed: resume it or seal it.
+    """A session whose writer ended before it committed: resume it or seal it.
 
     Attributes:
-        session: which drive.
-        author, host, pid, opened_ns: who was writing, where and since when (UTC, ns).
-        nodes: how many were checkpointed.
+        session: the drive.
+        author, host, pid, opened_ns: the writer, its computer and its start (UTC, ns).
+        nodes: number of checkpointed nodes.
         last_stamp_ns: stamp of the newest of them; None without nodes.
     """
 
@@ -85,13 +85,13 @@ class InterruptedSession:
 
 @dataclass(frozen=True, slots=True)
 class StoredSession:
-    """What an open session has stored already: where a resumed mapper goes on.
+    """The stored part of an open session, from which a resumed mapper continues.
 
     Attributes:
         nodes: its nodes in order of saving.
         last_entry: the newest entry of its path; None if it has none.
         next_sequence: sequence number of its next path entry.
-        next_iteration: one past the newest iteration among its attempts.
+        next_iteration: one past the newest iteration of its attempts.
     """
 
     nodes: tuple[Node, ...] = ()
@@ -110,15 +110,15 @@ class StoredSession:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredNode:
-    """A node with its landmarks as they lie in the map: to be copied, not to be looked at.
+    """A node with its encoded landmarks, for copying.
 
     Attributes:
         node: the record.
         descriptor: kind of its descriptors.
         frontend: hash of the front-end that made its frame.
-        status: of its frame.
-        landmark_hash: the 16 bytes that stand for its landmarks.
-        landmarks: the blob.
+        status: status of its frame.
+        landmark_hash: hash (16 bytes) of its landmarks.
+        landmarks: the encoded landmarks.
         thumbnail: JPEG; None if none was saved.
     """
 
@@ -133,14 +133,14 @@ class StoredNode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapContents:
-    """Everything of a map but its landmarks, in order of writing.
+    """All records of a map except landmarks, in order of writing.
 
     Attributes:
-        cameras: by id, those of the sessions and nodes.
+        cameras: cameras of the sessions and nodes, by id.
         sessions, nodes: each once.
         edges: for each (a, b, kind) the newest only.
         path_entries: ordered by path, then sequence.
-        attempts: all remembered ones between nodes that are visible.
+        attempts: all remembered attempts between visible nodes.
     """
 
     cameras: Mapping[CameraId, StereoCamera]
@@ -151,10 +151,10 @@ class MapContents:
     attempts: Attempts
 
     def basin_counts(self, experiences: NDArray[np.int32]) -> BasinCounts:
-        """From which match basins are learnt: all remembered attempts.
+        """Counts of all remembered attempts, from which match basins are learnt.
 
         Args:
-            experiences: (N,) of each of `nodes`, numbered from 0.
+            experiences: (N,) experience of each of `nodes`, numbered from 0.
         """
         made = self.attempts
         return count_attempts(
@@ -167,9 +167,9 @@ class MapContents:
         )
 
     def last_iterations(self) -> dict[SessionId, int]:
-        """Number of the newest remembered iteration of each session that has any."""
+        """Newest remembered iteration by session, for sessions that have any."""
         made = self.attempts
-        newest = np.flatnonzero(np.diff(made.session, append=-1))  # they stand session by session
+        newest = np.flatnonzero(np.diff(made.session, append=-1))  # attempts are sorted by session
         return {
             self.sessions[place].id: iteration
             for place, iteration in zip(
@@ -180,16 +180,16 @@ class MapContents:
 
 @dataclass(frozen=True, slots=True)
 class MapInfo:
-    """A map in numbers.
+    """Counts and sizes of a map.
 
     Attributes:
-        format_version: of the file.
+        format_version: version of the file's format.
         revision: number of the newest visible revision; 0 for an empty map.
-        descriptor: kind of all its descriptors; None before the first session.
-        cameras, sessions, nodes, edges, path_entries, attempts: how many are visible.
+        descriptor: kind of all descriptors; None before the first session.
+        cameras, sessions, nodes, edges, path_entries, attempts: number of visible ones.
         edges_of_kind: edges by kind.
-        mapped_m: metres of its odometry edges.
-        size_bytes: of the file with its write-ahead log, or of the tables.
+        mapped_m: length of its odometry edges, metres.
+        size_bytes: size of the file with its write-ahead log, or of the tables.
     """
 
     format_version: int
@@ -208,12 +208,12 @@ class MapInfo:
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that `check` found.
+    """One problem that `check` found.
 
     Attributes:
-        table: where; "file" for the file as a whole.
-        record: UUID, number or key of the row; "" for the table as a whole.
-        fact: what is wrong.
+        table: name of the table; "file" for the whole file.
+        record: UUID, number or key of the row; "" for the whole table.
+        fact: the fault.
     """
 
     table: str
@@ -230,14 +230,14 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
-    """What `check` found.
+    """The result of `check`.
 
     Attributes:
         problems: empty for a sound map.
-        rows, blobs: how many were verified.
-        interrupted: sessions that wait to be resumed or sealed; no problem.
-        abandoned_rows: rows of abandoned revisions that are still in the file, until
-            `Map.clean`; no problem.
+        rows, blobs: number verified.
+        interrupted: sessions to be resumed or sealed; not a problem.
+        abandoned_rows: rows of abandoned revisions still in the file, until `Map.clean`; not
+            a problem.
     """
 
     problems: tuple[Problem, ...]
@@ -248,5 +248,5 @@ class CheckReport:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether the map has no problems."""
         return not self.problems

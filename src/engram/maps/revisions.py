@@ -1,4 +1,4 @@
-"""The lives of revisions — committed, abandoned, collected — and of the sessions in open ones."""
+"""States of revisions (committed, abandoned, collected) and of the sessions in open ones."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def commit_revision(
     contents: dict[str, float] | None = None,
     committed_ns: int | None = None,
 ) -> Revision:
-    """Flip a revision to committed and give it its number.
+    """Commits a revision and gives it its number.
 
     Args:
-        connection: of the transaction that this shall be part of.
-        revision_key: its row.
-        was: the status that it was written under.
-        contents: of `revision_contents`, where they were counted before; None counts here.
+        connection: in a transaction, of which this becomes a part.
+        revision_key: key of its row.
+        was: its status so far.
+        contents: `revision_contents` if known; None to count them here.
         committed_ns: when, UTC; None for now.
 
     Raises:
@@ -77,7 +77,7 @@ def commit_revision(
 def change_revision(
     connection: Connection, key: int, *, was: RevisionStatus = RevisionStatus.OPEN, **changes: Any
 ) -> None:
-    """Change the row of a revision that is not committed.
+    """Changes the row of an uncommitted revision.
 
     Raises:
         RevisionError: it has another status than `was`.
@@ -91,7 +91,7 @@ def change_revision(
 
 
 def revision_contents(connection: Connection, revision_key: int) -> dict[str, float]:
-    """How many rows of each table a revision brought, and metres of odometry edges."""
+    """Number of rows that a revision added to each table, and metres of odometry edges."""
     contents: dict[str, float] = {}
     for table in VERSIONED:
         rows = select(func.count()).select_from(table).where(table.c.revision == revision_key)
@@ -111,9 +111,9 @@ def revision_contents(connection: Connection, revision_key: int) -> dict[str, fl
 
 
 def collect_abandoned(connection: Connection) -> int:
-    """Remove the rows of abandoned revisions, which stay on record; returns how many."""
+    """Removes the rows of abandoned revisions, but not their records; returns the number."""
     lost = select(nodes.c.key).where(nodes.c.revision.in_(_ABANDONED))
-    connection.execute(delete(words).where(words.c.node.in_(lost)))  # keys may be given out again
+    connection.execute(delete(words).where(words.c.node.in_(lost)))  # keys may be reused
     return sum(
         connection.execute(delete(table).where(table.c.revision.in_(_ABANDONED))).rowcount
         for table in reversed(VERSIONED)
@@ -123,10 +123,10 @@ def collect_abandoned(connection: Connection) -> int:
 def session_and_revision(
     connection: Connection, session: SessionId, at: int
 ) -> tuple[Row, Row] | None:
-    """Rows of a session and of the revision that brought it, or showed it again, last.
+    """Rows of a session and of the revision that last added it or showed it again.
 
-    None if the map never had it, or if the last word on it, up to revision `at`, is that it is
-    hidden. The revision may have any status.
+    None if the map never had it, or if it is hidden as of revision `at`. The revision may have any
+    status.
     """
     query = select(sessions).where(sessions.c.uuid == session.bytes).order_by(sessions.c.key)
     row = next(verified(sessions, connection.execute(query)), None)
@@ -161,7 +161,7 @@ def _last_word(connection: Connection, session_key: int, at: int) -> Row | None:
 
 
 def sessions_of(connection: Connection, revision_key: int) -> list[Row]:
-    """The sessions that a revision brought or showed again, oldest key first."""
+    """The sessions that a revision added or showed again, oldest key first."""
     shown = select(hidden.c.target).where(
         hidden.c.record == sessions.name,
         hidden.c.hidden == 0,
@@ -176,7 +176,7 @@ def sessions_of(connection: Connection, revision_key: int) -> list[Row]:
 
 
 def open_sessions(connection: Connection) -> frozenset[bytes]:
-    """UUIDs of the sessions that nobody has committed or abandoned."""
+    """UUIDs of the sessions that are neither committed nor abandoned."""
     query = select(revisions.c.key).where(revisions.c.status == str(RevisionStatus.OPEN))
     keys = connection.execute(query.order_by(revisions.c.key)).scalars().all()
     return frozenset(row["uuid"] for key in keys for row in sessions_of(connection, key))
@@ -185,7 +185,7 @@ def open_sessions(connection: Connection) -> frozenset[bytes]:
 def interrupted_sessions(
     connection: Connection, revision: Row, at: int
 ) -> list[InterruptedSession]:
-    """The sessions of one open revision: one, or none for a revision of another kind."""
+    """The session of an open revision; none for a revision of another kind."""
     cameras = reading.load_cameras(connection)
     found = []
     for row in sessions_of(connection, revision["key"]):
@@ -206,7 +206,7 @@ def interrupted_sessions(
 
 
 def stored_session(connection: Connection, view: View, session: Row) -> StoredSession:
-    """What an open session has checkpointed, as its own view sees it."""
+    """The checkpointed part of an open session, in its own view."""
     cameras = reading.load_cameras(connection)
     session_id = session_from_row(session, cameras[session["camera"]].id).id
     query = view.select(nodes).where(nodes.c.session == session["key"])

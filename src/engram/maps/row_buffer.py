@@ -1,4 +1,4 @@
-"""Rows of one revision that wait in memory to be written together."""
+"""Buffers rows of one revision in memory, to write them together."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from engram.maps.schema import (
 )
 from engram.maps.words import words_row, write_words
 
-# Beside its blobs: a row as Python objects.
+# Bytes of a row as Python objects, without its blobs.
 _ROW_BYTES = 600
 _ATTEMPT_BYTES = 64
-# In the order in which rows refer to each other, so that a reader between two batches of an
-# abandoned revision never meets a reference to what is not there.
+# In the order of references, so that every batch of an abandoned revision refers only to rows
+# that are written.
 _TABLES = (
     cameras,
     frontends,
@@ -54,16 +54,16 @@ _TABLES = (
 
 
 class RowBuffer:
-    """What waits of a revision.
+    """Unwritten rows of a revision.
 
     Args:
-        database: where it will be written.
-        keys: from which its rows get their keys.
+        database: the database to write to.
+        keys: gives the keys of the rows.
         revision_key: of the revision.
 
     Attributes:
         rows: by table, in order of writing, but for edges, words and attempts.
-        size_bytes: about what it all takes in memory.
+        size_bytes: approximate size of the buffer in memory.
     """
 
     def __init__(self, database: Database, keys: KeyBook, revision_key: int) -> None:
@@ -73,7 +73,7 @@ class RowBuffer:
         self.clear()
 
     def clear(self) -> None:
-        """Forget what waits."""
+        """Discards all rows."""
         self.rows: dict[Table, list[Row]] = {table: [] for table in _TABLES}
         self._edges: dict[tuple[int, int, str], Row] = {}
         self._words: dict[int, Row] = {}
@@ -81,41 +81,41 @@ class RowBuffer:
         self.size_bytes = 0
 
     def new(self, table: Table, size_bytes: int = 0, **values: Any) -> int:
-        """Add a row of the revision; returns its key.
+        """Adds a row of the revision; returns its key.
 
         Args:
-            table: which table.
-            size_bytes: of its blobs.
-            values: its columns but key, revision and checksum.
+            table: its table.
+            size_bytes: size of its blobs.
+            values: its columns except key, revision and checksum.
         """
         key = self._keys.next(table)
         self.put(table, {"key": key, "revision": self._revision_key, **values}, size_bytes)
         return key
 
     def put(self, table: Table, row: Row, size_bytes: int = 0) -> None:
-        """Add a row that lacks nothing but its checksum."""
+        """Adds a row that lacks only its checksum."""
         self.rows[table].append(sealed(table, row))
         self.size_bytes += _ROW_BYTES + size_bytes
 
     def put_edge(self, edge: Edge, a: int, b: int) -> None:
-        """Add an edge between nodes of these keys, in place of one of the same kind that waits."""
+        """Adds an edge between nodes of these keys, replacing a buffered one of the same kind."""
         row = edge_row(edge, self._keys.next(edges), self._revision_key, a, b)
         self._edges.pop((a, b, row["kind"]), None)
         self._edges[a, b, row["kind"]] = sealed(edges, row)
         self.size_bytes += _ROW_BYTES
 
     def put_words(self, node: int, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Add the words of the node of this key, in place of any that wait."""
+        """Adds the words of the node of this key, replacing buffered ones."""
         self._words[node] = words_row(node, vocabulary, found)
         self.size_bytes += _ROW_BYTES
 
     def put_attempts(self, session: int, made: AttemptTable) -> None:
-        """Add attempts of the session of this key."""
+        """Adds attempts of the session of this key."""
         self._attempts[session].append(made)
         self.size_bytes += _ATTEMPT_BYTES * len(made)
 
     def write(self, connection: Connection) -> None:
-        """Write all that waits, and keep it: the transaction may fail yet."""
+        """Writes all rows without discarding them, since the transaction may still fail."""
         for table, rows in self.rows.items():
             if rows:
                 connection.execute(insert(table), rows)
@@ -127,7 +127,7 @@ class RowBuffer:
             self._write_attempts(connection, session, tables)
 
     def repack_attempts(self, connection: Connection) -> None:
-        """Pack those of all checkpoints together: the file does not tell when they were made."""
+        """Packs attempts of all checkpoints together, so that the file does not depend on them."""
         written = attempts.c.revision == self._revision_key
         found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
         tables: dict[int, list[AttemptTable]] = defaultdict(list)

@@ -1,4 +1,4 @@
-"""Records ↔ rows: how each value is written, and the checksum of every row."""
+"""Converts records to rows and back, with a checksum for each row."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _encode = msgspec.msgpack.Encoder().encode
 def checksum(values: Sequence[Any]) -> int:
     """CRC-32 of a row's columns (all but the checksum) as a MessagePack array.
 
-    It guards against damage, not against malice; landmark blobs carry a cryptographic hash.
+    It detects damage, not manipulation; landmark blobs have a cryptographic hash.
     """
     return zlib.crc32(_encode(values))
 
@@ -61,11 +61,11 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
     """Rows of one table as dicts, each checked against its checksum.
 
     Args:
-        table: all of whose columns the rows begin with, in order; what follows is dropped.
+        table: the rows begin with all its columns, in order; further columns are dropped.
         rows: from a select.
 
     Raises:
-        MapCorruptError: when met; names the table and the row.
+        MapCorruptError: a checksum does not match; names table and row.
     """
     names, kinds = _shape(table)
     count = len(names)
@@ -81,7 +81,7 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
 
 @cache
 def _shape(table: Table) -> tuple[list[str], set[tuple[type, ...]]]:
-    """Names of a table's columns, and all that the types of a row's values may be."""
+    """Names of a table's columns, and the allowed types of their values."""
     kinds = product(
         *(
             (column.type.python_type, *([type(None)] if column.nullable else []))
@@ -92,7 +92,7 @@ def _shape(table: Table) -> tuple[list[str], set[tuple[type, ...]]]:
 
 
 def describe(table: Table, values: Sequence[Any]) -> str:
-    """How a row is named to people: its UUID where it has one, else its key."""
+    """Name of a row in messages: its UUID if it has one, else its key."""
     named = dict(zip((column.name for column in table.columns), values, strict=False))
     if isinstance(named.get("uuid"), bytes) and len(named["uuid"]) == 16:
         return str(UUID(bytes=named["uuid"]))
@@ -105,12 +105,12 @@ def to_json(values: Mapping[str, Any]) -> str:
     """Canonical JSON text: equal values give equal text.
 
     Raises:
-        InputError: a value is no plain data, or not finite.
+        InputError: a value is not plain data, or not finite.
     """
     try:
         return json.dumps(dict(values), sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise InputError(f"cannot be kept as JSON: {error}") from error
+        raise InputError(f"cannot be stored as JSON: {error}") from error
 
 
 def from_json(text: str, what: str) -> dict[str, Any]:
@@ -118,14 +118,14 @@ def from_json(text: str, what: str) -> dict[str, Any]:
     try:
         values = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise MapCorruptError(f"{what} is no JSON: {error}") from error
+        raise MapCorruptError(f"{what} is not valid JSON: {error}") from error
     if not isinstance(values, dict):
-        raise MapCorruptError(f"{what} is no JSON object")
+        raise MapCorruptError(f"{what} is not a JSON object")
     return values
 
 
 def checked_text(value: str, what: str) -> str:
-    """A text that every database takes.
+    """Checks a text for all supported databases.
 
     Raises:
         InputError: it is not valid Unicode, or holds a zero character.
@@ -140,10 +140,10 @@ def checked_text(value: str, what: str) -> str:
 
 
 def checked_int(value: int, what: str) -> int:
-    """An integer of 64 bits.
+    """Checks an integer of 64 bits.
 
     Raises:
-        InputError: it has more.
+        InputError: it needs more bits.
     """
     if not -(2**63) <= value < 2**63:
         raise InputError(f"{what} is {value}, must fit into 64 bits")
@@ -158,7 +158,7 @@ def transform_bytes(target_from_source: SE3) -> bytes:
 
 
 def transform_from_bytes(data: bytes, what: str) -> SE3:
-    """Undoes `transform_bytes`, bit for bit."""
+    """Inverse of `transform_bytes`, bit for bit."""
     (values,) = _arrays([data], 12, lambda _: what)
     return SE3(values[:9].reshape(3, 3), values[9:])
 
@@ -191,7 +191,7 @@ def camera_row(camera: StereoCamera, key: int) -> Row:
 
 
 def camera_from_row(row: Row) -> StereoCamera:
-    """The camera; its id, a hash of the rest, must come out the same."""
+    """The camera; its id must match the hash of the other columns."""
     what = f"camera {row['id']}"
     mounting = row["cam_from_rig"]
     try:
@@ -210,7 +210,7 @@ def camera_from_row(row: Row) -> StereoCamera:
 
 
 def session_row(session: Session, key: int, revision: int, camera: int, frontend: int) -> Row:
-    """Columns of `sessions`: as it was recorded, whatever was set right since."""
+    """Columns of `sessions`: as recorded, without amendments."""
     session = session.as_recorded
     return {
         "key": key,
@@ -243,7 +243,7 @@ def amendment_from_row(row: Row, session: SessionId) -> Amendment:
     """The amendment of this session."""
     what = _member(Amendable, row["what"], "amendments")
     if what is Amendable.START and not START.fullmatch(row["value"]):
-        raise MapCorruptError(f"amendment of session {session}: {row['value']!r} is no start")
+        raise MapCorruptError(f"amendment of session {session}: {row['value']!r} is not a time")
     return Amendment(session, what, row["value"], row["amended_ns"])
 
 
@@ -277,7 +277,7 @@ def edge_from_row(row: Row, a: NodeId, b: NodeId) -> Edge:
 
 
 def edges_from_rows(rows: Sequence[Row], ends: Sequence[tuple[NodeId, NodeId]]) -> tuple[Edge, ...]:
-    """The edges, each with its ends (a, b); many at a time, for a map has tens of thousands."""
+    """The edges, each with its ends (a, b); in bulk, since a map has tens of thousands."""
 
     def named(at: int) -> str:
         return f"edge {ends[at][0]} {ends[at][1]} {rows[at]['kind']}"
@@ -320,7 +320,7 @@ def _member(kind: type[_Kind], value: str, table: str) -> _Kind:
 
 @cache
 def _members(kind: type[_Kind]) -> dict[str, _Kind]:
-    """By their text: asking the class is ten times slower."""
+    """Members by their text: ten times faster than calling the enum."""
     return {str(one): one for one in kind}
 
 
@@ -329,7 +329,7 @@ def _floats(values: NDArray[np.float64]) -> bytes:
 
 
 def _arrays(parts: Sequence[bytes], count: int, named: Callable[[int], str]) -> NDArray[np.float64]:
-    """(N, count) numbers of N rows; `named` says which row one of them is."""
+    """(N, count) float64 of N rows; `named` gives the name of a row for messages."""
     for at, data in enumerate(parts):
         if len(data) != 8 * count:
             raise MapCorruptError(

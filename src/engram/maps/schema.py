@@ -1,9 +1,9 @@
 """The tables of a map. Prose: docs/format.md.
 
-Every row carries the key of the revision that brought it (cameras and front-ends, which are named
-by what they are, do not) and a checksum over its other columns. References between rows are not
-declared as foreign keys: collecting abandoned rows would have to search all referring tables;
-`engram check` verifies them instead. Keys are 64-bit integers, given out in order of writing.
+Every row has the key of the revision that added it (except cameras and front-ends, whose ids are
+hashes) and a checksum over its other columns. References are not declared as foreign keys, since
+collecting abandoned rows would then search all referring tables; `engram check` verifies them. Keys
+are 64-bit integers in the order of writing.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ map_format = _table("map_format", _key(), _int("version"), _text("tool_version")
 revisions = _table(
     "revisions",
     _key(),
-    _int("number", nullable=True),  # given at commit: what users call the revision
+    _int("number", nullable=True),  # given at commit: the number that users see
     _text("status"),
     _int("parent", nullable=True),
     _text("author"),
@@ -74,7 +74,7 @@ revisions = _table(
     _int("committed_ns", nullable=True),
     _text("host"),
     _int("pid"),
-    _text("writer"),  # the token with which its writer holds the lock
+    _text("writer"),  # token of its writer's lock
     UniqueConstraint("number"),
 )
 
@@ -132,7 +132,7 @@ nodes = _table(
     UniqueConstraint("uuid"),
 )
 
-# Apart from the nodes, so that reading the graph does not walk through the blobs.
+# A separate table, so that reading the graph does not read the blobs.
 frames = _table(
     "frames",
     Column("node", _INT64, primary_key=True, autoincrement=False),
@@ -185,8 +185,7 @@ omissions = _table(
     UniqueConstraint("uuid", "revision"),  # format 1: uuid
 )
 
-# What stands for the landmarks of nodes that were not taken: one that comes again under the same
-# UUID must be the same.
+# Hashes of the landmarks of omitted nodes: a node with the same UUID must have the same landmarks.
 omitted_landmarks = _table(
     "omitted_landmarks",
     _key(),
@@ -232,20 +231,20 @@ hidden = _table(
     _int("hidden"),  # 1 hides it, 0 shows it again
 )
 
-# Names that people give to revisions. They are no part of what a revision holds: a tag that is set,
-# moved or taken away leaves history and content hash as they were. Of a name the newest row counts.
+# Names of revisions. They belong to no revision: setting, moving or removing a tag changes neither
+# history nor content hash. Of the rows of one name the newest counts.
 tags = _table(
     "tags",
     _key(),
     _text("name"),
-    _int("number", nullable=True),  # of the revision; NULL takes the name away
+    _int("number", nullable=True),  # of the revision; NULL removes the name
     _text("author"),
     _text("message"),
     _int("tagged_ns"),
 )
 
-# The words of nodes by a vocabulary (`engram.places`): worked out from their landmarks, and kept so
-# that nobody has to read those. What stands here follows from other rows: it is of no revision.
+# Words of nodes by a vocabulary (`engram.places`), computed from their landmarks. They follow from
+# other rows and belong to no revision.
 words = _table(
     "words",
     Column("node", _INT64, primary_key=True, autoincrement=False),
@@ -265,7 +264,7 @@ amendments = _table(
     _int("amended_ns"),
 )
 
-# In the order in which rows may refer to earlier tables.
+# Rows refer to earlier tables only.
 VERSIONED: tuple[Table, ...] = (
     sessions,
     nodes,
@@ -283,10 +282,10 @@ VERSIONED: tuple[Table, ...] = (
 )
 KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)
 
-# Tables by the format that brought them; all others are of format 1. A map of an older format reads
-# as one in which they are empty.
+# Tables by the format that introduced them; all others are of format 1. In a map of an older format
+# they read as empty.
 NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words), 3: (omitted_landmarks,), 4: (amendments,)}
-# Tables whose columns stand since format 1, but whose constraints a later format loosened.
+# Tables with the columns of format 1 whose constraints a later format loosened.
 LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
 
 

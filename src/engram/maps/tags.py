@@ -1,4 +1,4 @@
-"""How people name revisions: by number, by tag, as `head`, or so many steps before one."""
+"""Names of revisions: a number, a tag, `head`, or a number of steps before one."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from engram.maps.schema import tags
 from engram.maps.view import head
 
 HEAD = "head"
-# A letter first, so that no tag looks like a number or an option; no `~`, which counts steps back.
+# A letter first, so that no tag looks like a number or an option; no `~`, which means steps back.
 _TAG = re.compile(r"[A-Za-z][A-Za-z0-9._/+-]{0,99}")
 _STEPS = re.compile(r"(?P<base>.*?)(?:~(?P<steps>\d{1,9})?)?", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """A name that somebody gave to a revision.
+    """A name of a revision.
 
     Attributes:
         name: as given.
         number: of the revision.
-        author: who gave it.
-        message: why; "" if nothing was said.
+        author: the person or robot that set it.
+        message: reason; "" without one.
         tagged_ns: when, UTC, ns.
     """
 
@@ -40,7 +40,7 @@ class Tag:
 
 
 def load_tags(connection: Connection) -> dict[str, Tag]:
-    """All tags that stand, by name, in the order of their names."""
+    """All current tags by name, sorted by name."""
     newest: dict[str, Tag | None] = {}
     for row in verified(tags, connection.execute(select(tags).order_by(tags.c.key))):
         newest[row["name"]] = (
@@ -52,7 +52,7 @@ def load_tags(connection: Connection) -> dict[str, Tag]:
 
 
 def resolve(connection: Connection, named: int | str | None, where: str) -> int:
-    """Number of the revision that somebody named.
+    """Number of a revision from its name.
 
     Args:
         connection: of the map.
@@ -75,7 +75,7 @@ def resolve(connection: Connection, named: int | str | None, where: str) -> int:
 
 def _number(connection: Connection, named: str, newest: int, where: str) -> int:
     found = _STEPS.fullmatch(named)
-    assert found is not None  # the expression fits every text
+    assert found is not None  # the expression matches every text
     base = found["base"]
     back = int(found["steps"] or 1) if "~" in named else 0
     if re.fullmatch(r"-?\d{1,18}", base, re.ASCII):
@@ -144,7 +144,7 @@ def _check_tag(name: str) -> None:
 def _write_tag(
     connection: Connection, keys: KeyBook, name: str, number: int | None, author: str, message: str
 ) -> None:
-    """A name for a revision, or with None the name taken away."""
+    """Writes a tag; None as the number removes it."""
     row = {
         "key": keys.next(tags),
         "name": name,

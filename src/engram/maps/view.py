@@ -1,4 +1,4 @@
-"""Which rows can be seen: those of committed revisions up to one, and not hidden."""
+"""Visible rows: those of committed revisions up to one, and not hidden."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_
 from engram.maps.rows import Row, verified
 from engram.maps.schema import hidden, nodes, revisions
 
-# Rows of the writer's own open revision are newer than all that is committed.
+# Rows of the writer's own open revision are newer than all committed ones.
 _NEWEST = 2**62
-# What refers to a hidden node is hidden with it.
+# Rows that refer to a hidden node are hidden with it.
 _NODE_COLUMNS = {"a", "b", "node"}
 
 
@@ -22,29 +22,28 @@ class View:
     """A map as of one revision.
 
     Attributes:
-        at: number of the newest revision that is seen; 0 sees nothing.
-        own: key of the open revision that is being written and sees itself; None for readers.
+        at: number of the newest visible revision; 0 for an empty map.
+        own: key of the writer's open revision, which it sees itself; None for readers.
     """
 
     at: int
     own: int | None = None
 
     def revision_keys(self) -> Select[tuple[int]]:
-        """Keys of the revisions that are seen."""
+        """Keys of the visible revisions."""
         committed = and_(revisions.c.status == "committed", revisions.c.number <= self.at)
         seen = committed if self.own is None else or_(committed, revisions.c.key == self.own)
         return select(revisions.c.key).where(seen)
 
     def select(self, table: Table) -> Select[tuple[object, ...]]:
-        """All columns of the rows that are seen.
+        """All columns of the visible rows.
 
-        Ordered by their revision's place in history, then by key: of rows that supersede each
-        other the newest is last.
+        Ordered by revision, then by key: of rows that supersede each other the newest is last.
         """
         return _rows_seen(self, table)
 
     def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
-        """The rows that are seen, verified, in the order of `select`."""
+        """The visible rows, verified, in the order of `select`."""
         return verified(table, connection.execute(self.select(table)))
 
     def hidden_keys(self, table: Table) -> Select[tuple[int]]:
@@ -66,7 +65,7 @@ class View:
         return select(latest.c.target).where(latest.c.age == 1, latest.c.hidden == 1)
 
 
-# A map's statements are asked for again and again while it is read: views are values.
+# Cached, since reading a map needs the same statements again; views are values.
 @lru_cache(maxsize=256)
 def _rows_seen(view: View, table: Table) -> Select[tuple[object, ...]]:
     query = (
@@ -82,7 +81,7 @@ def _rows_seen(view: View, table: Table) -> Select[tuple[object, ...]]:
 
 
 def place_in_history() -> ColumnElement[int]:
-    """By what revisions are ordered: their numbers, and an open one after all."""
+    """Order of revisions: by number, with an open one last."""
     return func.coalesce(revisions.c.number, _NEWEST)
 
 

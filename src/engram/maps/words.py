@@ -1,7 +1,7 @@
-"""The words of nodes, kept so that a large map can be searched without reading its landmarks.
+"""Stored words of nodes, so that a large map can be searched without reading its landmarks.
 
-They follow from a node's landmarks and a vocabulary, and are named by both: no part of history, of
-the content hash or of any revision. A row that is missing or damaged costs time, nothing else.
+Words follow from a node's landmarks and a vocabulary. They belong to no revision and not to the
+content hash. A missing or damaged row only costs the time to compute it again.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _DTYPE = np.dtype("<u2")
 
 
 def encode_words(found: NDArray[Any]) -> bytes:
-    """Words (n,), rising, as they are stored: two bytes each.
+    """Encodes words (n,), rising, in two bytes each.
 
     Raises:
-        InputError: they do not rise, or there can be no such words.
+        InputError: they do not rise, or are out of range.
     """
     wide = np.asarray(found, np.int64)
     if len(wide) and (wide[0] < 0 or wide[-1] > np.iinfo(_DTYPE).max or (np.diff(wide) <= 0).any()):
@@ -39,10 +39,10 @@ def decode_words(body: bytes) -> NDArray[np.int32]:
     """Undoes `encode_words`.
 
     Raises:
-        MapCorruptError: these are no words.
+        MapCorruptError: the bytes are not valid words.
     """
     if len(body) % _DTYPE.itemsize:
-        raise MapCorruptError(f"{len(body)} bytes are no words of two bytes each")
+        raise MapCorruptError(f"{len(body)} bytes are not words of two bytes each")
     found = np.frombuffer(body, _DTYPE).astype(np.int32)
     if (np.diff(found) <= 0).any():
         raise MapCorruptError("the words of a node do not rise")
@@ -56,13 +56,13 @@ def words_row(node_key: int, vocabulary: bytes, found: NDArray[Any]) -> Row:
 
 
 def write_words(connection: Connection, database: Database, rows: list[Row]) -> None:
-    """Keeps words in place of any that the same nodes had by another vocabulary."""
+    """Stores words, replacing those of the same nodes by another vocabulary."""
     if rows:
         connection.execute(database.replace(words, ("node",)), rows)
 
 
 def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-    """All that are kept by the vocabulary of this hash; damaged ones are left out."""
+    """All stored words by the vocabulary of this hash, without damaged rows."""
     query = (
         select(*words.columns, nodes.c.uuid)
         .select_from(words.join(nodes, nodes.c.key == words.c.node))
@@ -75,5 +75,5 @@ def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDA
             kept = next(verified(words, [row]))
             found[NodeId(UUID(bytes=row[-1]))] = decode_words(kept["body"])
         except (MapCorruptError, ValueError):
-            continue  # they will be worked out again; `engram check` names the row
+            continue  # computed again later; `engram check` names the row
     return found
