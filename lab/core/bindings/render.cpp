@@ -250,7 +250,7 @@ StoredMesh stored(const MeshArrays &in) {
   return mesh;
 }
 
-struct Camera {
+struct RenderCamera {
   float fx, fy, cx, cy;
   int32_t width, height;
   float baseline_m;
@@ -279,15 +279,15 @@ public:
     put(0, stored(in));
   }
   void set_lamps(const Input<float, 2> &lamps);
-  auto render(const Camera &camera, const Input<double, 2> &rotation,
+  auto render(const RenderCamera &camera, const Input<double, 2> &rotation,
               const Input<double, 1> &centre, const Light &light, int threads);
-  auto depth(const Camera &camera, const Input<double, 2> &rotation,
+  auto depth(const RenderCamera &camera, const Input<double, 2> &rotation,
              const Input<double, 1> &centre);
   size_t bytes() const;
 
 private:
   void put(int32_t slot, StoredMesh mesh);
-  View view_of(const Camera &camera, const double *rotation, const double *centre, int eye,
+  View view_of(const RenderCamera &camera, const double *rotation, const double *centre, int eye,
                int samples) const;
   void point_at_meshes();
   std::vector<int32_t> order_from(const double *centre, double reach, int first_mesh,
@@ -439,7 +439,7 @@ void Scene::set_lamps(const Input<float, 2> &lamps) {
   }
 }
 
-View Scene::view_of(const Camera &camera, const double *rotation, const double *centre, int eye,
+View Scene::view_of(const RenderCamera &camera, const double *rotation, const double *centre, int eye,
                     int samples) const {
   View view = {};
   std::copy_n(rotation, 9, view.rotation);
@@ -617,7 +617,7 @@ void Scene::build_lamp(StoredLamp &lamp) {
                                           {0, 0, -1, 1, 0, 0, 0, -1, 0},
                                           {1, 0, 0, 0, 0, 1, 0, -1, 0},
                                           {-1, 0, 0, 0, 0, -1, 0, -1, 0}};
-  const Camera square = {0.5f * kLampFace,
+  const RenderCamera square = {0.5f * kLampFace,
                          0.5f * kLampFace,
                          0.5f * kLampFace - 0.5f,
                          0.5f * kLampFace - 0.5f,
@@ -683,7 +683,7 @@ LampGrid Scene::lamp_grid(const std::vector<Lamp> &lamps, const double *centre) 
   return grid;
 }
 
-auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
+auto Scene::render(const RenderCamera &camera, const Input<double, 2> &rotation,
                    const Input<double, 1> &centre, const Light &light, int threads) {
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
   constexpr int kSamples = 2;
@@ -730,7 +730,7 @@ auto Scene::render(const Camera &camera, const Input<double, 2> &rotation,
                         to_numpy(std::move(inverse_depth), shape));
 }
 
-auto Scene::depth(const Camera &camera, const Input<double, 2> &rotation,
+auto Scene::depth(const RenderCamera &camera, const Input<double, 2> &rotation,
                   const Input<double, 1> &centre) {
   const size_t pixels = static_cast<size_t>(camera.width) * camera.height;
   std::vector<int32_t> ids(pixels);
@@ -766,7 +766,7 @@ size_t Scene::bytes() const {
   return total;
 }
 
-void check_pose(const Camera &camera, const Input<double, 2> &rotation,
+void check_pose(const RenderCamera &camera, const Input<double, 2> &rotation,
                 const Input<double, 1> &centre) {
   if (rotation.shape(0) != 3 || rotation.shape(1) != 3 || centre.shape(0) != 3)
     throw nb::value_error("pose: rotation must have shape (3, 3) and position (3,)");
@@ -837,11 +837,11 @@ NB_MODULE(_town, module) {
       .def_static("of", &make_light, "sun"_a, "vehicle"_a, "sun_power"_a, "sky_power"_a, "cloud"_a,
                   "cloud_x"_a, "cloud_y"_a, "fog_per_m"_a, "haze"_a, "wet"_a, "snow"_a,
                   "headlights"_a, "windows"_a);
-  nb::class_<Camera>(module, "RenderCamera")
+  nb::class_<RenderCamera>(module, "RenderCamera")
       .def(
           "__init__",
-          [](Camera *self, float fx, float fy, float cx, float cy, int32_t width, int32_t height,
-             float baseline_m) { new (self) Camera{fx, fy, cx, cy, width, height, baseline_m}; },
+          [](RenderCamera *self, float fx, float fy, float cx, float cy, int32_t width, int32_t height,
+             float baseline_m) { new (self) RenderCamera{fx, fy, cx, cy, width, height, baseline_m}; },
           "fx"_a, "fy"_a, "cx"_a, "cy"_a, "width"_a, "height"_a, "baseline_m"_a);
   nb::class_<Scene>(module, "Scene")
       .def(nb::init<const nb::ndarray<const uint8_t, nb::shape<256, 256>, nb::c_contig> &>(),
@@ -868,7 +868,7 @@ NB_MODULE(_town, module) {
       .def("set_lamps", &Scene::set_lamps, "lamps"_a)
       .def(
           "render",
-          [](Scene &scene, const Camera &camera, Input<double, 2> rotation,
+          [](Scene &scene, const RenderCamera &camera, Input<double, 2> rotation,
              Input<double, 1> position, const Light &light, int threads) {
             check_pose(camera, rotation, position);
             if (threads < 1 || threads > kThreadsMost)
@@ -878,7 +878,7 @@ NB_MODULE(_town, module) {
           "camera"_a, "rotation"_a, "position"_a, "light"_a, "threads"_a = 1)
       .def(
           "depth",
-          [](Scene &scene, const Camera &camera, Input<double, 2> rotation,
+          [](Scene &scene, const RenderCamera &camera, Input<double, 2> rotation,
              Input<double, 1> position) {
             check_pose(camera, rotation, position);
             return scene.depth(camera, rotation, position);
