@@ -204,7 +204,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
     [
         (("localise", "absent.engram", "STREET"), "absent.engram"),
         (("localise", "TOWN", "nowhere"), "nowhere"),
-        (("localise", "TOWN", "STREET", "--ranking", "best"), "there are: "),
+        (("localise", "TOWN", "STREET", "--ranking", "best"), "known: "),
         (("localise", "TOWN", "STREET", "--relocaliser", "gps"), "known: "),
         (("localise", "TOWN", "STREET", "--at", 7), "not 7"),
         (("localise", "TOWN", "STREET", "--frames", "1:x"), "1:x"),

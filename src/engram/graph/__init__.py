@@ -1,1 +1,1 @@
-"""Nodes, edges, paths: the experience graph in memory. Knows nothing of files."""
+"""Nodes, edges, paths: the experience graph in memory, independent of files."""

@@ -1,4 +1,4 @@
-"""Remembered attempts (SPEC §3.5): one struct of columns for all that handles them."""
+"""Remembered attempts (SPEC §3.5) as one struct of arrays."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class Attempts:
     """Remembered attempts as a struct of arrays, in order of session and iteration.
 
     Attributes:
-        session: (A,) int32, a place in a list of sessions.
-        iteration: (A,) int64.
-        reference, node: (A,) int32, places in a list of nodes: of a map, its graph's indices.
+        session: (A,) int32, index into a list of sessions.
+        iteration: (A,) int64, iteration of the session's localiser.
+        reference, node: (A,) int32, indices into a list of nodes; for a map, dense graph indices.
         along_m, across_m, yaw_rad, sigma_m, sigma_yaw_rad: (A,) float32, as in `Attempt`.
-        accepted: (A,) bool.
-        inliers: (A,) int32.
-        rank: (A,) int32, 255 stands for all above.
+        accepted: (A,) bool, whether the match was accepted.
+        inliers: (A,) int32, inliers of the match.
+        rank: (A,) int32, place in the ranked order, at most 255.
         policy: (A,) int32, index into `policies`.
         policies: names of the ranking policies.
     """
@@ -48,7 +48,7 @@ class Attempts:
 
     @staticmethod
     def of(made: Sequence[Attempt]) -> tuple[Attempts, list[NodeId]]:
-        """One session's records as columns, and the nodes that they are places in."""
+        """One session's records as columns, and the list of nodes that they index."""
         ids = list(dict.fromkeys(node for one in made for node in (one.reference, one.node)))
         place = {node: at for at, node in enumerate(ids)}
         policies = tuple(dict.fromkeys(one.policy for one in made))
@@ -72,14 +72,14 @@ class Attempts:
 
     @staticmethod
     def none() -> Attempts:
-        """Nothing remembered."""
+        """No attempts."""
         return Attempts.of([])[0]
 
     def __len__(self) -> int:
         return len(self.node)
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Attempts:
-        """Some of the attempts: a mask, or their places in the order wanted."""
+        """A selection of the attempts: (A,) bool mask, or (K,) row numbers in the wanted order."""
         columns = {
             field.name: getattr(self, field.name)[rows]
             for field in fields(self)
@@ -88,17 +88,17 @@ class Attempts:
         return Attempts(**columns, policies=self.policies)
 
     def moved_to(self, equivalent_from_node: Sequence[SE3 | None]) -> Attempts:
-        """The attempts as if they had been made on the equivalents of the attempted nodes.
+        """The attempts as if made on the equivalents of the attempted nodes.
 
-        An equivalent shows the place as the node does: what is known of one is known of the other.
-        The predicted offset is that from the equivalent; heights are ignored.
+        An equivalent shows the place as the node does, so that evidence for one holds for the
+        other. The predicted offset becomes that from the equivalent; heights are ignored.
 
         Args:
-            equivalent_from_node: of each node its camera in its equivalent's camera frame; None for
-                one that has no equivalent.
+            equivalent_from_node: for each node its camera in its equivalent's camera frame; None
+                without an equivalent.
 
         Returns:
-            The attempts between nodes that have equivalents, their places unchanged.
+            The attempts between nodes that have equivalents, with unchanged indices.
         """
         known = np.array([one is not None for one in equivalent_from_node], np.bool_)
         made = self.rows(known[self.reference] & known[self.node])
@@ -118,37 +118,40 @@ class Attempts:
         )
 
     def lacking(self, remembered: Attempts) -> NDArray[np.intp]:
-        """Places of the attempts that are not among the remembered ones.
+        """Rows of the attempts that are missing from the remembered ones.
 
-        Two attempts are one when they agree in all that `moved_to` leaves alone: session,
-        iteration, rank, the uncertainty of the prediction, outcome and policy. Iteration and rank
-        alone would not do: ranks above 255 are stored as 255, and two centres that replay one drive
-        number their iterations alike. Of equal attempts as many are lacking as there are more of.
+        Two attempts are equal if they agree in all that `moved_to` keeps: session, iteration,
+        rank, uncertainty of the prediction, outcome and policy. Iteration and rank alone do not
+        suffice: ranks above 255 are stored as 255, and two fleet maps that replay one drive use
+        the same iteration numbers. Equal attempts are compared by their number.
 
         Args:
-            remembered: those that are known; sessions are places in the same list.
+            remembered: the known attempts; `session` indexes the same list.
+
+        Returns:
+            (K,) intp, row numbers.
         """
         known = remembered._by_session()
         found = [np.empty(0, np.intp)]
-        # One session at a time: a centre remembers millions.
+        # One session at a time: a fleet map remembers millions.
         for session, rows in self._by_session().items():
             ours = remembered.rows(known.get(session, np.empty(0, np.intp)))
             found.append(rows[_lacking_in_session(self.rows(rows), ours)])
         return np.sort(np.concatenate(found))
 
     def _by_session(self) -> dict[int, NDArray[np.intp]]:
-        """The places of each session's attempts, in their order."""
+        """Rows of each session's attempts, in order."""
         order = np.argsort(self.session, kind="stable")
         ends = np.flatnonzero(np.diff(self.session[order])) + 1
         return {int(self.session[rows[0]]): rows for rows in np.split(order, ends) if len(rows)}
 
     def _identities(self, policies: Sequence[str]) -> NDArray[np.int64]:
-        """(A, 7) what names each attempt of a session, whatever node it is told from."""
+        """(A, 7) int64, identity of each attempt within its session, independent of its nodes."""
         policy = np.array([policies.index(name) for name in self.policies], np.int64)
         columns: list[NDArray[Any]] = [
             self.iteration,
             self.rank,
-            self.sigma_m.view(np.int32),  # to the bit
+            self.sigma_m.view(np.int32),  # bit for bit
             self.sigma_yaw_rad.view(np.int32),
             self.accepted,
             self.inliers,
@@ -165,7 +168,7 @@ def _lacking_in_session(made: Attempts, remembered: Attempts) -> NDArray[np.intp
     known, new = named[: len(remembered)], named[len(remembered) :]
     order = np.argsort(new, kind="stable")
     ranked = new[order]
-    # How many equals came before each: they take what is remembered one by one.
+    # Number of equal attempts before each: the n-th is known if n + 1 equal ones are remembered.
     before = np.arange(len(ranked)) - np.searchsorted(ranked, ranked)
     counts = np.bincount(known, minlength=int(named.max()) + 1)
     return order[before >= counts[ranked]]

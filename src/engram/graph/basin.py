@@ -19,19 +19,17 @@ BIN_COUNT = 48  # up to 24 m
 BASIN_LEVEL = 0.6
 DEFAULT_RADIUS_M = 8.0
 
-# The prior weighs as much as this many attempts in each bin: a bin with a few dozen real
-# attempts speaks for itself.
+# Weight of the prior, in attempts per bin: a few dozen real attempts outweigh it.
 _PRIOR_ATTEMPTS = 10.0
-# Success at no offset, of compatible appearance: 94 % within 1 m in the feasibility study.
+# Success rate at zero offset, compatible appearance (`lab/reports/constants.md`).
 _SUCCESS_AT_ZERO = 0.97
-# Steepness of the prior, as a share of the basin: the study's 0.94, 0.7, 0.4, 0.15, 0 at 0.5, 1.5,
-# 2.5, 3.5 and 5 m for a basin of 2 m.
+# Steepness of the prior, as a share of the basin (`lab/reports/constants.md`).
 _SOFTNESS = 0.28
-# Attempts count for one direction if they are closer than this in the other (half a metre aside
-# was seen to cost nothing), and if their prediction was better than this.
+# Attempts count for one direction if their offset in the other, and the uncertainty of their
+# prediction, are below this: half a metre aside costs nothing.
 _ASIDE_M = 1.0
 _GREATEST_SIGMA_M = 1.0
-# An experience is compatible if it was matched within the last 5 m: ten iterations of 0.5 m.
+# An experience is compatible if it was matched within the last 5 m: ten iterations of 0.5 m each.
 _COMPATIBLE_ITERATIONS = 10
 
 
@@ -48,12 +46,12 @@ def prior_basin_m(focal_px: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BasinCounts:
-    """Remembered attempts by distance: what match basins are learnt from.
+    """Remembered attempts by distance, from which match basins are learnt.
 
     Attributes:
         attempts: (2, BIN_COUNT) int64; row 0 along the viewing direction, row 1 across; bin k
-            holds offsets from ``k`` to ``k + 1`` times `BIN_M`, the last one all beyond.
-        successes: (2, BIN_COUNT) int64, those accepted.
+            holds offsets from ``k`` to ``k + 1`` times `BIN_M`, the last bin all larger ones.
+        successes: (2, BIN_COUNT) int64, accepted attempts.
     """
 
     attempts: NDArray[np.int64]
@@ -68,13 +66,13 @@ class BasinCounts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchBasin:
-    """g(d): the success rate of an attempt against distance, appearance being compatible.
+    """g(d): the success rate of an attempt against distance, if the appearance is compatible.
 
     Attributes:
-        focal_px: focal length of the camera that the map is searched with.
+        focal_px: focal length of the live camera.
         counts: the attempts learnt from.
         rates: (2, BIN_COUNT) float64, success rate in the middle of each bin, along and across,
-            falling with distance (isotonic regression over counts and prior).
+            decreasing with distance (isotonic regression over counts and prior).
     """
 
     focal_px: float
@@ -101,9 +99,15 @@ class MatchBasin:
         return MatchBasin(focal_px, counts, rates)
 
     def success_rate(self, along_m: Array, across_m: Array) -> Array:
-        """The rate g at offsets along and across the viewing direction, metres, of any one shape.
+        """The rate g at offsets along and across the viewing direction.
 
-        The two directions are taken as independent: ``g_along · g_across / g(0)``.
+        The two directions count as independent: ``g_along · g_across / g(0)``.
+
+        Args:
+            along_m, across_m: float64 of one shape, metres in the node's frame.
+
+        Returns:
+            float64 of that shape, 0…1.
         """
         along = np.ascontiguousarray(along_m, dtype=np.float64)
         across = np.ascontiguousarray(across_m, dtype=np.float64)
@@ -128,7 +132,7 @@ class MatchBasin:
     ) -> float:
         """Radius of the neighbourhood search for a position with this standard deviation.
 
-        Never less than the basin, nor than `least_m`, whatever `most_m` says.
+        Never less than the basin or `least_m`, even if `most_m` is.
         """
         return max(least_m, self.basin_m + min(2 * sigma_m, max(most_m - self.basin_m, 0.0)))
 
@@ -143,22 +147,21 @@ def count_attempts(
 ) -> BasinCounts:
     """Counts of the attempts on experiences that the drive had matched within the last 5 m.
 
-    An attempt on an experience that had no match in the ten iterations before says more about
-    appearance than about distance, and is left out; so is one whose prediction was vague. A match
-    does not vouch for itself: only earlier iterations count.
+    Left out are attempts on an experience without a match in the ten iterations before, which
+    depend on appearance more than on distance, and attempts with an uncertain prediction. Only
+    earlier iterations count, so that no match confirms itself.
 
     Args:
-        drives: (A,) which drive made each attempt, numbered from 0.
-        experiences: (A,) the experience of its node, numbered from 0.
-        iterations: (A,) when.
-        offsets_m: (A,) each, where it was expected along and across the viewing direction.
-        sigma_m: (A,) how vaguely.
-        accepted: (A,) whether it was a success.
+        drives: (A,) int64, the drive of each attempt, numbered from 0.
+        experiences: (A,) int64, the experience of its node, numbered from 0.
+        iterations: (A,) int64, its iteration.
+        offsets_m: (A,) float64 each, predicted offsets along and across the viewing direction.
+        sigma_m: (A,) float64, standard deviation of the prediction.
+        accepted: (A,) bool, whether it was a success.
     """
     if len(iterations) == 0:
         return BasinCounts.empty()
-    # Drive, experience and iteration in one number: what was matched last before an attempt
-    # stands before it in order.
+    # Drive, experience and iteration in one number: sorted, the last match precedes its attempt.
     chain = drives.astype(np.int64) * (int(experiences.max()) + 1) + experiences
     span = int(iterations.max() - iterations.min()) + 1
     when = chain * span + (iterations - iterations.min())

@@ -1,13 +1,12 @@
-"""How uncertain a chain of edges is: a 6×6 covariance boiled down to what adds up along a chain.
+"""Uncertainty of a chain of edges: a 6×6 covariance reduced to moments that add up along a chain.
 
 The error of a transform is modelled as a small rotation, of variance v about any axis, about a
-*pivot*, and a small translation of variance τ along any axis. Seen at a point p it moves things by
+*pivot*, and a small translation of variance τ along any axis. At a point p it gives
 
     variance(p) = τ + v·|p − pivot|²        (m² along the worst axis)
 
-so that the errors of a chain add as moments: Στ, Σv, Σv·pivot, Σv·|pivot|². The pivot is what an
-isotropic model must not drop: a heading error made 100 m ago swings everything since, and the next
-metre's error is the same error again, not a fresh one.
+so that the errors of a chain add as moments: Στ, Σv, Σv·pivot, Σv·|pivot|². The pivot is essential:
+a heading error made 100 m ago moves everything since, and does so again on the next metre.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class PivotedError:
     Attributes:
         translation_var: τ, m².
         rotation_var: v, rad².
-        pivot_in_a: (3,) metres, the point about which the rotation error turns.
+        pivot_in_a: (3,) float64, metres, the centre of the rotation error.
     """
 
     translation_var: float
@@ -60,7 +59,7 @@ class ChainError:
     """Summed error of a chain of transforms, in one frame: the moments of its edges' errors.
 
     Attributes:
-        moments: (6,) Στ m², Σv rad², Σv·pivot (3), Σv·|pivot|².
+        moments: (6,) float64: Στ m², Σv rad², Σv·pivot (3), Σv·|pivot|².
     """
 
     moments: Array
@@ -70,7 +69,11 @@ class ChainError:
         return ChainError(self.moments + other.moments)
 
     def pivoted(self, default_pivot: Array) -> PivotedError:
-        """One transform's error equal to the chain's; `default_pivot` (3,) if no rotation errs."""
+        """The error of one transform equal to the chain's.
+
+        Args:
+            default_pivot: (3,) float64, metres; the pivot of a chain without rotation error.
+        """
         tau, v, *_, second = self.moments
         if v <= 0:
             return PivotedError(float(tau), 0.0, default_pivot)
@@ -80,13 +83,13 @@ class ChainError:
 
 
 def edge_error_rows(edges: Sequence[tuple[SE3, Array]]) -> Array:
-    """(E, 8) τ, v, pivot in a, pivot in b: the rows of edges for the search kernels.
+    """(E, 8) float64: τ, v, pivot in a, pivot in b of each edge, for the search kernels.
 
-    An edge's pivot is where its translational error is smallest; τ and v are the variances along
-    the worst axis there.
+    An edge's pivot is the point of its smallest translational error; τ and v are the variances
+    along the worst axis there.
 
     Args:
-        edges: (E) ``a_from_b`` with its (6, 6) covariance, left perturbation,
+        edges: E times ``a_from_b`` with its (6, 6) covariance, left perturbation,
             [translation, rotation].
 
     Raises:
@@ -101,13 +104,13 @@ def edge_error_rows(edges: Sequence[tuple[SE3, Array]]) -> Array:
 
 
 def _check(covariances: Sequence[Array]) -> None:
-    """All at once: a map has tens of thousands."""
+    """Checks all covariances at once: a map has tens of thousands."""
     for one in covariances:
         if one.shape != (6, 6):
-            raise InputError(f"a covariance is a finite (6, 6) matrix, not {one.shape}")
+            raise InputError(f"a covariance must be a finite (6, 6) matrix, not {one.shape}")
     stack = np.reshape(covariances, (-1, 6, 6))
     if not np.isfinite(stack).all():
-        raise InputError("a covariance is a finite (6, 6) matrix; it has numbers that are not")
+        raise InputError("a covariance must be a finite (6, 6) matrix; it has non-finite entries")
     eigenvalues = np.linalg.eigvalsh(stack)
     bad = eigenvalues[:, 0] < -1e-9 * np.maximum(eigenvalues[:, -1], 1e-12)
     if bad.any():

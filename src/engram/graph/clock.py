@@ -15,11 +15,11 @@ _HOURS_PER_DAY = 24
 
 
 class Clocked(Protocol):
-    """A session, or what is known of a sequence: anything with a clock and a place on Earth."""
+    """Anything with a clock and a location on Earth, such as a session or a sequence."""
 
     @property
     def clock(self) -> Clock:
-        """What the stamps mean."""
+        """The clock of the stamps."""
         ...
 
     @property
@@ -34,10 +34,10 @@ class Clocked(Protocol):
 
 
 def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
-    """Hour of day in [0, 24) at a stamp, or None where it cannot be known.
+    """Hour of day in [0, 24) at a stamp; None if unknown.
 
-    Mean solar time (UTC + longitude / 15) where a longitude is known, else civil time of the zone.
-    None for a clock that is not UTC, and without either.
+    Mean solar time (UTC + longitude / 15) if a longitude is known, else civil time of the zone.
+    None for a clock that is not UTC, and without longitude and zone.
 
     Source: SPEC §2.8.
     """
@@ -47,7 +47,7 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     if source.longitude_deg is not None:
         hour = stamp_ns / _NS_PER_HOUR + source.longitude_deg / 15
     elif source.zone is not None:
-        # To the second: the zones' offsets are whole seconds, the rest of the stamp is added after.
+        # Zones' offsets are whole seconds; the nanoseconds are added afterwards.
         seconds, nanos = divmod(stamp_ns, 1_000_000_000)
         offset = datetime.fromtimestamp(seconds, UTC).astimezone(ZoneInfo(source.zone)).utcoffset()
         if offset is None:
@@ -72,7 +72,7 @@ def _shift_ns(source: Clocked) -> int:
 
 
 def check_longitude(longitude_deg: float | None) -> None:
-    """Refuse what is no longitude.
+    """Refuse an invalid longitude.
 
     Raises:
         ConfigError: it is not a number in [-180, 180].
@@ -84,10 +84,10 @@ def check_longitude(longitude_deg: float | None) -> None:
 
 
 def check_zone(zone: str | None) -> None:
-    """Refuse what is no time zone of the IANA database.
+    """Refuse a name that is not a time zone of the IANA database.
 
     Raises:
-        ConfigError: the zone is unknown here.
+        ConfigError: the zone is unknown on this machine.
     """
     if zone is None:
         return

@@ -21,15 +21,15 @@ from engram.graph.neighbourhood import Neighbourhood, Search
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainTree:
-    """Least uncertain chains from one root to all that it reaches, a struct of arrays.
+    """Least uncertain chains from one root to all connected nodes, a struct of arrays.
 
     Attributes:
         root: the root's dense index.
-        row_of: dense index of a node to its row here.
+        row_of: dense index of a node → its row.
         nodes: (N,) int32, dense indices, least uncertain first; the root is row 0.
-        parents: (N,) int32, row of the node before; -1 for the root.
-        half_edges: (N,) int32, edge·2, plus 1 if it was used from b to a; -1 for the root.
-        root_from_node: (N, 12) float64, rotation row by row, then translation.
+        parents: (N,) int32, row of the previous node; -1 for the root.
+        half_edges: (N,) int32, edge·2, plus 1 if used from b to a; -1 for the root.
+        root_from_node: (N, 12) float64, rotation in row-major order, then translation in metres.
         moments: (N, 6) float64, `ChainError.moments` in the root's frame.
     """
 
@@ -57,9 +57,8 @@ class HalfEdges:
 
     Attributes:
         sources, targets: (H,) int32, dense indices.
-        target_in_source: (H, 3) float64, metres: where the target's camera is, seen from the
-            source.
-        of_edges: edges of the graph when these were taken.
+        target_in_source: (H, 3) float64, metres: the target's camera centre in the source's frame.
+        of_edges: number of edges in the graph when these were taken.
     """
 
     sources: NDArray[np.int32]
@@ -68,7 +67,7 @@ class HalfEdges:
     of_edges: int
 
     def rows(self, rows: NDArray[np.bool_]) -> HalfEdges:
-        """Some of them."""
+        """The half-edges selected by an (H,) bool mask."""
         return HalfEdges(
             self.sources[rows], self.targets[rows], self.target_in_source[rows], self.of_edges
         )
@@ -76,12 +75,12 @@ class HalfEdges:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Links:
-    """The lightest edge between every two nodes that any joins, a struct of arrays.
+    """The lightest edge between each pair of joined nodes, a struct of arrays.
 
     Attributes:
-        low, high: (L,) dense indices of its ends.
-        weight: (L,) float64.
-        edge: (L,) its place among the edges.
+        low, high: (L,) int64, dense indices of its ends, low < high.
+        weight: (L,) float64, its weight.
+        edge: (L,) int64, its index in `ExperienceGraph.edges`.
     """
 
     low: NDArray[np.int64]
@@ -91,11 +90,11 @@ class Links:
 
     @staticmethod
     def lightest(ends: NDArray[np.integer], weight: NDArray[np.float64]) -> Links:
-        """Of parallel edges the lightest, the earlier one of equals.
+        """The lightest of each set of parallel edges; of equal ones the earlier.
 
         Args:
-            ends: (E, 2) dense indices of each edge's ends.
-            weight: (E,) of each edge.
+            ends: (E, 2) int, dense indices of each edge's ends.
+            weight: (E,) float64, weight of each edge.
         """
         low, high = ends.min(axis=1), ends.max(axis=1)
         order = np.lexsort((weight, high, low))
@@ -108,7 +107,7 @@ class Links:
         )
 
     def matrix(self, count: int, rows: NDArray[np.bool_] | slice = slice(None)) -> csr_matrix:
-        """(count, count) sparse weights, each link once; of `rows` alone where they are given."""
+        """(count, count) sparse weights, each link once; only of `rows`, an (L,) bool mask."""
         ends = (self.low[rows], self.high[rows])
         return csr_matrix((self.weight[rows], ends), shape=(count, count))
 
@@ -116,12 +115,12 @@ class Links:
 class ExperienceGraph:
     """All nodes and edges of a map; metric over short distances, topological over long ones.
 
-    Nodes have dense indices 0, 1, 2, … in the order of adding. Edges are kept in a forward star
-    over growing arrays and serve in both directions; of edges with the same (a, b, kind) the one
-    added last counts.
+    Nodes have dense indices 0, 1, 2, … in the order of adding. Edges form a forward star over
+    growing arrays, and are usable in both directions; of edges with the same (a, b, kind) the last
+    one added counts.
 
-    Threads: one thread adds, and only that thread may search meanwhile (the localiser and the
-    mapper share it). Other threads may hold on to `Node` and `Edge` records: they never change.
+    Threads: only the thread that adds may search (localiser and mapper share it). Other threads
+    may keep `Node` and `Edge` records, which never change.
     """
 
     def __init__(self) -> None:
@@ -152,7 +151,7 @@ class ExperienceGraph:
     # -- building
 
     def add_node(self, node: Node) -> int:
-        """Add a node and return its dense index; one that is there already keeps its index."""
+        """Add a node and return its dense index; a known node keeps its index."""
         known = self._index.get(node.id)
         if known is not None:
             return known
@@ -176,12 +175,12 @@ class ExperienceGraph:
 
         Raises:
             InputError: an end is not in the graph, both ends are the same node, or the covariance
-                is none.
+                is invalid.
         """
         self.add_edges([edge])
 
     def add_edges(self, edges: Sequence[Edge]) -> None:
-        """Add many edges, in this order; see `add_edge`. Where one is refused none is added."""
+        """Add many edges, in this order; see `add_edge`. If one is refused, none is added."""
         ends = [(self.index(edge.a), self.index(edge.b)) for edge in edges]
         for (a, b), edge in zip(ends, edges, strict=True):
             if a == b:
@@ -234,7 +233,7 @@ class ExperienceGraph:
         """Dense index of a node.
 
         Raises:
-            InputError: the graph does not have it.
+            InputError: the graph does not contain it.
         """
         try:
             return self._index[node]
@@ -247,26 +246,26 @@ class ExperienceGraph:
 
     @property
     def nodes(self) -> Sequence[Node]:
-        """All nodes, by dense index. Do not change it."""
+        """All nodes, by dense index. Read-only."""
         return self._nodes
 
     @property
     def edges(self) -> Sequence[Edge]:
-        """All edges that count (superseded ones are gone), oldest key first. Do not change it."""
+        """All edges without superseded ones, oldest key first. Read-only."""
         return self._edges
 
     @property
     def sessions(self) -> NDArray[np.int32]:
-        """(N,) int32: for each node the number of its session (`session_number`). A view."""
+        """(N,) int32: session number of each node (`session_number`). A view."""
         return self._node_sessions.rows
 
     def session_number(self, session: SessionId) -> int | None:
-        """Number of a session in this graph; None if no node is of it."""
+        """Number of a session in this graph; None if it saved no node."""
         return self._session_index.get(session)
 
     @property
     def session_count(self) -> int:
-        """How many sessions saved nodes; their numbers are below it."""
+        """Number of sessions that saved nodes; session numbers are below it."""
         return len(self._sessions)
 
     def session(self, number: int) -> SessionId:
@@ -275,15 +274,15 @@ class ExperienceGraph:
 
     @property
     def driven_m(self) -> NDArray[np.float64]:
-        """(N,) float64: for each node the odometry distance from its session's start. A view."""
+        """(N,) float64: odometry distance of each node from its session's start, metres. A view."""
         return self._driven_m.rows
 
     def sessions_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
-        """(Y,) int32: the session numbers of some nodes, (Y,) dense indices."""
+        """(Y,) int32: the session numbers of nodes, given by (Y,) int32 dense indices."""
         return self._node_sessions.rows.take(nodes)
 
     def uuid_words_of(self, nodes: NDArray[np.int32]) -> NDArray[np.uint64]:
-        """(Y, 2) uint64: UUIDs of some nodes, (Y,) dense indices; high word first, for ordering."""
+        """(Y, 2) uint64: UUIDs of nodes, given by (Y,) int32 dense indices; high word first."""
         return self._uuid_words.rows.take(nodes, 0)
 
     @property
@@ -310,11 +309,11 @@ class ExperienceGraph:
 
     @property
     def edge_ends(self) -> NDArray[np.int32]:
-        """(E, 2) int32: dense indices of the ends b and a of each of `edges`. A view."""
+        """(E, 2) int32: dense indices of the ends b and a of each edge in `edges`. A view."""
         return self._target.rows.reshape(-1, 2)
 
     def lightest(self, weight: Callable[[Edge], float]) -> Links:
-        """Of parallel edges the lightest, the earlier one of equals."""
+        """The lightest of each set of parallel edges; of equal ones the earlier."""
         weights = np.array([weight(edge) for edge in self._edges], np.float64)
         return Links.lightest(self.edge_ends, weights)
 
@@ -323,7 +322,7 @@ class ExperienceGraph:
         return [edge for edge, _ in self.numbered_edges_of(node)]
 
     def numbered_edges_of(self, node: int) -> list[tuple[Edge, int]]:
-        """The edges at a node, newest key first, each with its place in `edges`."""
+        """The edges at a node, newest key first, each with its index in `edges`."""
         edges = []
         half = int(self._first_half.rows[node])
         while half != -1:
@@ -334,7 +333,7 @@ class ExperienceGraph:
     # -- searching
 
     def half_edges(self, reach_m: float) -> HalfEdges:
-        """All edges both ways, between nodes no further apart than `reach_m`."""
+        """All edges both ways, between nodes at most `reach_m` apart."""
         poses = self._a_from_b.rows
         b_in_a = poses[:, 9:]
         a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
@@ -349,7 +348,7 @@ class ExperienceGraph:
         )
 
     def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
-        """The nodes that an edge no longer than `reach_m` joins to a node."""
+        """(K,) int32: nodes joined to a node by an edge of at most `reach_m`."""
         found: set[int] = set()
         half = int(self._first_half.rows[node])
         while half >= 0:
@@ -367,22 +366,21 @@ class ExperienceGraph:
     ) -> Neighbourhood:
         """The candidates Y near the live camera (SPEC §3.1).
 
-        The search goes out from the reference over the edges, least uncertain chain first, through
-        every node within `margin_m` beyond the radius (or beyond the reference, if that is
-        farther). SPEC says breadth-first: that takes the chain with the fewest edges, which is
-        the least uncertain one where edges are equally good and wherever there is only one chain.
-        Where a few loose proximity edges compete with many tight odometry edges it is not, and its
-        predictions would be as bad as the loosest edge.
+        The search follows edges from the reference, least uncertain chain first, through every node
+        within `margin_m` beyond the radius (or beyond the reference, if that is farther).
+        Breadth-first search, as in SPEC, takes the chain with the fewest edges; if a few uncertain
+        proximity edges compete with many certain odometry edges, its predictions are as bad as the
+        worst edge.
 
-        Sharp chains end at the reach, vague ones lead back into it: through a gap of odometry a
-        node may seem to be near of which the road around knows that it is not. For such nodes a
-        better chain is looked for that may go `detour_m` further out.
+        Certain chains end at the reach; an uncertain one, through a gap of odometry, may wrongly
+        lead back into it. For nodes reached by an uncertain chain the search looks for a better
+        one that may go `detour_m` farther out.
 
         Args:
             reference: dense index of the node that the position refers to.
-            reference_from_live: the live camera in that node.
-            covariance: (6, 6) of it, left perturbation, [translation, rotation].
-            search: what is near.
+            reference_from_live: pose of the live camera in that node.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation, rotation].
+            search: radius and gates.
         """
         columns = _core.graph_candidates(
             self._arrays(),
@@ -412,8 +410,8 @@ class ExperienceGraph:
 
         Args:
             root: dense index.
-            goals: dense indices of the nodes to stop at; none to go on to the end.
-            usable: (E,) uint8, 0 for edges (by their place in `edges`) to leave out.
+            goals: dense indices of the nodes to reach; empty for all nodes.
+            usable: (E,) uint8, 0 for edges to leave out, in the order of `edges`; None for all.
         """
         columns = _core.graph_chains(self._arrays(), root, np.array(goals, dtype=np.int32), usable)
         row_of = {int(node): row for row, node in enumerate(columns[0])}
@@ -445,5 +443,5 @@ class ExperienceGraph:
 
 
 def _pose_row(transform: SE3) -> NDArray[np.float64]:
-    """(12,) rotation row by row, then translation."""
+    """(12,) float64: rotation in row-major order, then translation."""
     return np.concatenate([transform.rotation.ravel(), transform.translation])

@@ -13,8 +13,8 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 class Column(Generic[Scalar]):
     """Rows of one shape and dtype that can be appended to.
 
-    `rows` is a view without a copy. A view taken before an append keeps its length; it may go on
-    showing the old rows after the storage has moved.
+    `rows` is a view. A view taken before an append keeps its length, and may keep showing the old
+    rows after the storage has moved.
     """
 
     __slots__ = ("_count", "_storage")

@@ -1,4 +1,4 @@
-"""A map laid out on a sheet, for pictures: true near by, and only so far as its chains are."""
+"""Planar layout of a map for pictures: accurate locally, with drift along chains."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _APART_M = 20.0
 
 
 def lay_out(graph: ExperienceGraph) -> NDArray[np.float64]:
-    """(N, 2) float64, metres: each node's place seen from above, x to the right and z forward.
+    """(N, 2) float64, metres: position of each node from above, x right and z forward.
 
-    Each component is placed along the least uncertain chains from its first node; components
-    stand beside each other, since nothing says where they are to each other.
+    Each component is placed along the least uncertain chains from its first node. Components stand
+    side by side, as their relative pose is unknown.
     """
     components = graph.components()
     placed = np.zeros((len(graph), 2))

@@ -18,12 +18,12 @@ SessionId = NewType("SessionId", UUID)
 NodeId = NewType("NodeId", UUID)
 PathId = NewType("PathId", UUID)
 
-# The namespace below which all of Engram's name-based UUIDs lie.
+# Namespace of all name-based UUIDs of Engram.
 ENGRAM_NAMESPACE = UUID("6f1d1f0e-27e5-5c0e-9d6b-3c8a5c1e7a10")
 
 
 class Clock(StrEnum):
-    """What a session's stamps mean (SPEC §2.8)."""
+    """Clock of a session's stamps (SPEC §2.8)."""
 
     UTC = "utc"
     RELATIVE = "relative"
@@ -35,15 +35,15 @@ class Session:
     """One drive of one robot.
 
     Attributes:
-        id: equal whenever the same drive is read (`session_id`).
+        id: the same for each reading of the drive (`session_id`).
         robot: name of the robot.
         camera: its camera.
         start_ns: stamp of the first pair, ns.
-        clock: what the stamps mean.
-        longitude_deg: where the drive was, for mean solar time; None if unknown.
-        zone: IANA time zone, where no longitude is known; None if unknown.
-        shift_ns: what stamps lack to be UTC: other than 0 where the start was amended.
-        recorded: the session as it was mapped, where something of it was amended; else None.
+        clock: clock of the stamps.
+        longitude_deg: longitude of the drive, degrees east, for mean solar time; None if unknown.
+        zone: IANA time zone, used without a longitude; None if unknown.
+        shift_ns: offset from stamps to UTC, ns; not 0 if the start was amended.
+        recorded: the session as it was mapped, if it was amended; else None.
     """
 
     id: SessionId
@@ -58,17 +58,17 @@ class Session:
 
     @property
     def begin_ns(self) -> int:
-        """When it began, ns, by its clock and with what was set right about it."""
+        """Start of the session by its clock, with amendments, ns."""
         return self.start_ns + self.shift_ns
 
     @property
     def as_recorded(self) -> Session:
-        """What the robot handed in, without amendments."""
+        """The session as recorded, without amendments."""
         return self.recorded or self
 
 
 class Amendable(StrEnum):
-    """What people may set right about a session afterwards."""
+    """Fields of a session that may be corrected later."""
 
     ROBOT = "robot"  # the name that is shown
     ZONE = "zone"  # IANA time zone; it counts before a longitude
@@ -77,13 +77,13 @@ class Amendable(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Amendment:
-    """Something that was set right about a session; its record stays as it was.
+    """A correction to a session, whose record stays unchanged.
 
     Attributes:
-        session: which.
-        what: of it.
-        value: the new one, as text; a start in ns.
-        amended_ns: when that was said, UTC: tells it from the same said another time.
+        session: the session.
+        what: the corrected field.
+        value: its new value, as text; a start in ns.
+        amended_ns: time of the correction, UTC; distinguishes equal corrections.
     """
 
     session: SessionId
@@ -92,10 +92,10 @@ class Amendment:
     amended_ns: int
 
     def applied(self, session: Session) -> Session:
-        """The session as this amendment has it.
+        """The session with this amendment.
 
         Raises:
-            ValueError: a start is no number.
+            ValueError: a start is not a number.
         """
         recorded = session.as_recorded
         if self.what is Amendable.ROBOT:
@@ -108,10 +108,10 @@ class Amendment:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """A frame that was saved in a map. Never changed once written.
+    """A frame saved in a map. Never changes once written.
 
     Attributes:
-        id: equal whenever the same frame of the same drive is saved (`node_id`).
+        id: the same whenever this frame of this drive is saved (`node_id`).
         session: the drive that saved it.
         stamp_ns: stamp of its frame, ns.
         camera: camera of its frame.
@@ -126,7 +126,7 @@ class Node:
 
 
 class EdgeKind(StrEnum):
-    """How an edge came about (SPEC §1, §3.1)."""
+    """Origin of an edge (SPEC §1, §3.1)."""
 
     ODOMETRY = "odometry"
     MATCH = "match"
@@ -141,8 +141,8 @@ class Edge:
 
     Attributes:
         a, b: its ends. The key of an edge is (a, b, kind); a newer one supersedes an older one.
-        kind: how it came about.
-        a_from_b: node b's camera in node a's camera frame.
+        kind: its origin.
+        a_from_b: pose of node b's camera in node a's camera frame.
         covariance: (6, 6) float64 of `a_from_b`, left perturbation, [translation, rotation].
     """
 
@@ -155,14 +155,13 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Omission:
-    """A node that a merge did not take, since the map shows the same place alike (SPEC §7).
+    """A node that a merge left out, as the map already shows its place alike (SPEC §7).
 
     Attributes:
-        omitted: the node that was handed in.
+        omitted: the node that was left out.
         node: its equivalent in the map.
-        node_from_omitted: the omitted node's camera in the equivalent's camera frame.
-        landmark_hash: the 16 bytes that stand for its landmarks; None where they were not kept,
-            as by maps of format 2.
+        node_from_omitted: pose of the omitted node's camera in the equivalent's camera frame.
+        landmark_hash: 16-byte hash of its landmarks; None if not stored, as in maps of format 2.
     """
 
     omitted: NodeId
@@ -196,10 +195,10 @@ class Attempt:
 
     Attributes:
         iteration: the localiser's iteration in this session.
-        reference: node in which the robot was localised when predicting.
-        node: node that was attempted.
+        reference: node of the position that gave the prediction.
+        node: the attempted node.
         along_m, across_m: predicted offset of the live camera from the node, along and across
-            the node's viewing direction.
+            the node's viewing direction, metres.
         yaw_rad: predicted heading of the live camera relative to the node.
         sigma_m, sigma_yaw_rad: standard deviations of the prediction.
         accepted: whether the match was accepted.
@@ -234,7 +233,7 @@ class LandmarkSource(Protocol):
         ...
 
     def prefetch(self, nodes: list[NodeId]) -> None:
-        """Hint that these are likely to be asked for next. Returns at once."""
+        """Announces the nodes likely to be read next. Returns at once."""
         ...
 
 
@@ -244,7 +243,7 @@ def session_id(robot: str, camera: CameraId, start_ns: int, first_pair_hash: str
     return SessionId(uuid5(ENGRAM_NAMESPACE, name))
 
 
-@lru_cache(maxsize=1024)  # localisers in step ask for the same frame one after another
+@lru_cache(maxsize=1024)  # localisers of one drive ask for the same frame in turn
 def node_id(session: SessionId, stamp_ns: int) -> NodeId:
     """The same frame of the same drive gets the same UUID (SPEC §2.7)."""
     return NodeId(uuid5(session, f"node:{stamp_ns}"))

@@ -1,4 +1,4 @@
-"""The nodes near the robot, as seen from it."""
+"""The nodes near the robot, with its predicted pose in each."""
 
 from __future__ import annotations
 
@@ -16,52 +16,52 @@ from engram.graph.model import SessionId
 
 @dataclass(frozen=True, slots=True)
 class SearchConfig:
-    """How far a search for what is near goes out (SPEC §3.1).
+    """Extent of the neighbourhood search (SPEC §3.1).
 
-    A node just outside may truly lie inside: hence the slack, which extends the search, too.
+    A node predicted just outside may lie inside: the slack extends radius, gate and search.
 
     Raises:
-        ConfigError: one is out of its bounds.
+        ConfigError: a value is out of its bounds.
     """
 
     margin_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="how far beyond the radius chains may lead and come back, m: a block's "
-            "corner or a turning loop fits in",
+            description="distance beyond the radius that chains may lead and come back, m: room "
+            "for the corner of a block or a turning loop",
         ),
     ] = 12.0
     slack_sigmas: Annotated[
         float,
         Meta(
             ge=0,
-            description="by how many standard deviations of a prediction radius and gate are "
-            "extended; 2 keep 95 % of the nodes that are truly near",
+            description="standard deviations of a prediction by which radius and gate are "
+            "extended; 2 keep 95 % of the nodes within them",
         ),
     ] = 2.0
     slack_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="by how much at most, m: beyond it the map does not know where a node is, "
-            "and looking for it there costs too much",
+            description="upper limit of that extension, m: beyond it a node's position is unknown, "
+            "and searching for it costs too much",
         ),
     ] = 30.0
     vague_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="standard deviation of a chain past which a better one is looked for, m: "
-            "those through a gap of odometry. 0.5 and 2 give nearly the same nodes",
+            description="standard deviation of a chain above which the search looks for a better "
+            "one, m: that of a gap of odometry. 0.5 and 2 give nearly the same nodes",
         ),
     ] = 1.0
     detour_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="how much further out the better chain may lead, m: a block of houses. "
-            "From 30 on nodes change by an eighth at most, and the search gets slower",
+            description="additional distance that the better chain may lead out, m: a block of "
+            "houses. Above 30 few nodes change, and the search gets slower",
         ),
     ] = 60.0
 
@@ -74,16 +74,16 @@ DEFAULT_SEARCH = SearchConfig()
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """What of an experience graph is near (SPEC §3.1).
+    """Which nodes of an experience graph count as near (SPEC §3.1).
 
     Attributes:
-        radius_m: a node is near if its predicted distance is at most this,
-        view_gate_rad: and its heading differs by at most this (yaw alone, SPEC §2.6).
+        radius_m: largest predicted distance of a node.
+        view_gate_rad: largest difference of heading (yaw alone, SPEC §2.6).
         own_session: the live session; its nodes saved within the last `own_exclusion_m` before
-            `own_driven_m` are not near (but are gone through).
-        own_driven_m: metres driven by the live session.
-        own_exclusion_m: see above.
-        config: how far the search goes out.
+            `own_driven_m` do not count, but chains may lead through them.
+        own_driven_m: distance driven by the live session, metres.
+        own_exclusion_m: see `own_session`.
+        config: extent of the search.
     """
 
     radius_m: float
@@ -98,7 +98,7 @@ class Search:
 class Neighbourhood:
     """Candidate nodes Y of one live frame (SPEC §3.1): a struct of arrays, one row per candidate.
 
-    Rows stand in the order in which the search found them: least uncertain first.
+    Rows are in the order of the search: least uncertain first.
 
     Attributes:
         nodes: (Y,) int32, dense indices into the `ExperienceGraph`.
@@ -109,8 +109,8 @@ class Neighbourhood:
         yaw_rad: (Y,) float64, heading of the live camera relative to the node, in (-π, π].
         sigma_m, sigma_yaw_rad: (Y,) float64, standard deviations of the prediction along the
             worst axis.
-        pivot_in_node: (Y, 3) float64, the point about which the prediction's rotation error
-            turns (`chain_error`).
+        pivot_in_node: (Y, 3) float64, metres, centre of the prediction's rotation error
+            (`chain_error`).
     """
 
     nodes: NDArray[np.int32]
@@ -128,17 +128,17 @@ class Neighbourhood:
 
     @property
     def rms_distance_m(self) -> NDArray[np.float64]:
-        """(Y,) root mean square of the distance, metres: it may be longer than predicted."""
+        """(Y,) float64: root mean square of the distance under its uncertainty, metres."""
         return np.asarray(np.hypot(self.distance_m, self.sigma_m))
 
     def rows(self, rows: NDArray[np.intp]) -> Neighbourhood:
-        """Some of the candidates, in the order of `rows`."""
+        """The candidates at (K,) row numbers, in this order."""
         return Neighbourhood(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def covariance(self, row: int) -> NDArray[np.float64]:
         """(6, 6) covariance of `node_from_live[row]`, left perturbation, [translation, rotation].
 
-        At the live camera it gives a translational variance of `sigma_m` squared.
+        Its translational variance at the live camera is `sigma_m` squared.
         """
         lever = self.node_from_live[row, :3, 3] - self.pivot_in_node[row]
         rotation_var = float(self.sigma_yaw_rad[row]) ** 2

@@ -22,13 +22,13 @@ MATCHES_ONLY = frozenset({PathEntryKind.MATCHED, PathEntryKind.REPLAYED})
 class PathMemory:
     """All paths of a map, each an ordered sequence of entries, and which nodes share paths.
 
-    For each node a bitset over paths is kept up to date as entries arrive, so that "how many paths
-    hold both" is a popcount. The same thread rule as for `ExperienceGraph`.
+    Each node has a bitset over paths, updated with each entry, so that the number of paths that
+    hold two nodes is a popcount. The thread rule of `ExperienceGraph` applies.
 
     Args:
-        graph: the graph whose dense indices are used.
-        kinds: which kinds of entry put a node on a path, for counting. Entries of other kinds are
-            kept, and do not count.
+        graph: the graph that gives the dense indices.
+        kinds: kinds of entry that count a node as on a path. Entries of other kinds are stored
+            only.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class PathMemory:
         self._number: dict[PathId, int] = {}
         self._bits = np.zeros((16, 1), dtype=np.uint64)
         self._observed = _core.ObservedPaths()
-        # The bits as the core takes them, of so many paths; until they grow.
+        # Number of paths and the core's view of the bits; valid until they grow.
         self._view: tuple[int, _core.PathBits] | None = None
 
     def __len__(self) -> int:
@@ -49,16 +49,16 @@ class PathMemory:
 
     @property
     def paths(self) -> Sequence[PathId]:
-        """All paths, in the order of their first entries. Do not change it."""
+        """All paths, in the order of their first entries. Read-only."""
         return self._paths
 
     def entries(self, path: PathId) -> Sequence[PathEntry]:
-        """A path's entries by sequence number; none if the path is unknown. Do not change it."""
+        """A path's entries by sequence number; none if the path is unknown. Read-only."""
         number = self._number.get(path)
         return () if number is None else self._entries[number]
 
     def add(self, entry: PathEntry) -> None:
-        """Add an entry; one with the same (path, sequence) is there already and stays.
+        """Add an entry; an existing one with the same (path, sequence) stays instead.
 
         Raises:
             InputError: its node is not in the graph.
@@ -77,7 +77,7 @@ class PathMemory:
         """(P, N) bool: whether each path holds each node; unknown paths hold none.
 
         Args:
-            paths: (P,) any paths.
+            paths: P paths.
             nodes: (N,) int32, dense node indices.
         """
         self._make_room()
@@ -108,10 +108,10 @@ class PathMemory:
         alpha: float = 1.0,
         gamma: float = 1.0,
     ) -> _core.PathEvidence:
-        """What candidates are judged by: W, z and k of [L15 §V].
+        """The evidence that scores candidates: W, z and k of [L15 §V].
 
         Args:
-            observed: (W,) int32, dense indices of the nodes attempted lately, each once.
+            observed: (W,) int32, dense indices of the recently attempted nodes, each once.
             outcomes: (W,) bool, z: whether the latest attempt on each succeeded.
             reference: node k in which the robot is localised; None makes the prior uniform.
             excluded: a path that does not count, such as the live session's own.
@@ -132,9 +132,10 @@ class PathMemory:
     ) -> NDArray[np.float64]:
         """(Y,) float64: log p(y = i | Z, θ, π) of each candidate, up to a common constant.
 
-        Source: SPEC §4, [L15 §V, eqs. (1)–(7)]. Observing none or one node leaves the prior alone.
-        What is worked out for the observed nodes is kept for the next call, which should ask for
-        much the same ones.
+        Without two observed nodes only the prior counts. Results for the observed nodes are cached
+        for the next call.
+
+        Source: SPEC §4, [L15 §V, eqs. (1)–(7)].
 
         Args:
             candidates: (Y,) int32, dense node indices.
@@ -149,16 +150,15 @@ class PathMemory:
         basin: MatchBasin,
         level: float,
     ) -> NDArray[np.int64]:
-        """(Y,) int64: rows by `scores` where g >= `level`, then the others, by distance.
+        """(Y,) int64: rows with g >= `level` by `scores`, then the others by distance.
 
-        Ties break by distance, then by UUID. One call to the core, where ranking by the parts
-        takes a handful.
+        Ties break by distance, then by UUID.
 
         Args:
             neighbourhood: the candidates Y.
             evidence: made by this path memory.
             basin: gives g.
-            level: of g.
+            level: threshold of g.
         """
         candidates = _core.PathCandidates(
             neighbourhood.nodes,
@@ -181,7 +181,7 @@ class PathMemory:
         return -1 if path is None else self._number.get(path, -1)
 
     def _make_room(self) -> None:
-        """Rows for all nodes of the graph, words for all paths; both double when they run out."""
+        """Make room for all nodes (rows) and paths (words); each doubles when full."""
         rows, words = self._bits.shape
         if len(self._graph) <= rows and len(self._paths) <= 64 * words:
             return

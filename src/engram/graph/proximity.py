@@ -1,10 +1,9 @@
-"""Proximity edges: what joins experiences that run side by side without matching (SPEC §3.1).
+"""Proximity edges join experiences that run side by side without matching (SPEC §3.1).
 
-Two experiences that cannot be matched with each other may run in parallel for hundreds of metres. A
-robot that is localised in one of them must see the nodes of the other. So while a robot saves nodes
-on odometry alone beside known ones, each is joined to them where the dead reckoning puts it, as
-uncertain as that is; and when the far end of the chain is tied by a match, the closure is
-distributed along the chain.
+Two experiences that do not match each other may run in parallel for hundreds of metres. A robot
+localised in one of them needs the nodes of the other as candidates. So when a robot saves nodes on
+odometry alone beside known ones, each is joined to them by dead reckoning, with its uncertainty.
+Once a match ties the far end of the chain, the closure is distributed along it.
 """
 
 from __future__ import annotations
@@ -34,48 +33,47 @@ class ProximityConfig:
     """Settings of `lay_proximity_edges` and `tighten_chain`.
 
     Raises:
-        ConfigError: one is out of its bounds.
+        ConfigError: a value is out of its bounds.
     """
 
     reach_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="nodes within this predicted distance are beside, plus two standard "
-            "deviations, m: the search radius, so that what a localiser should see is joined",
+            description="largest predicted distance of nodes to join, plus two standard "
+            "deviations, m: the search radius, so that all candidates of a localiser are joined",
         ),
     ] = 8.0
     spacing_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="a chain is joined to the same experience no more often than this, m; the "
-            "margin of the neighbourhood search leaps it",
+            description="least distance between joints of a chain to the same experience, m; "
+            "below the margin of the neighbourhood search",
         ),
     ] = 4.0
     greatest_sigma_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="dead reckoning vaguer than this, m, joins nothing: the chain's far end "
-            "will tell where it was",
+            description="largest standard deviation of dead reckoning that joins nodes, m: beyond "
+            "it the tie at the chain's far end decides",
         ),
     ] = 15.0
     pass_gap_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="nodes of one experience further apart than this along the drive, m, are "
-            "different passes, each joined for itself; own nodes nearer behind are no neighbours. "
-            "Source: SPEC §3.1",
+            description="distance along the drive from which nodes of one experience are separate "
+            "passes, each joined for itself, m; nearer own nodes are not joined. Source: SPEC §3.1",
         ),
     ] = 30.0
     consistent_chi2: Annotated[
         float,
         Meta(
             gt=0,
-            description="two estimates of a transform further apart contradict each other: 99.9 % "
-            "of χ² with six degrees of freedom",
+            description="squared distance from which two estimates of a transform contradict each "
+            "other: 99.9 % of χ² with six degrees of freedom",
         ),
     ] = 22.5
 
@@ -91,12 +89,12 @@ def lay_proximity_edges(
 ) -> list[Edge]:
     """Join a node to the nearest node of each experience beside it.
 
-    Call it once the node and the edge that chains it to the one before (or ties it) are in the
-    graph. The prediction and its uncertainty are the graph's own: they grow along the chain.
+    Call it after the node, and the edge that chains it to the previous one or ties it, are in the
+    graph. The graph gives the prediction and its uncertainty, which grows along the chain.
 
     Returns:
-        The edges, each from the known node to the given one. They are in the graph already, and
-        are to be stored.
+        The edges, each from the known node to the given one. They are already in the graph; the
+        caller stores them.
     """
     near = _beside(graph, node, config)
     linked = _linked_lately(graph, node, config.spacing_m)
@@ -122,22 +120,21 @@ def lay_proximity_edges(
 def tighten_chain(
     graph: ExperienceGraph, chain: Sequence[int], config: ProximityConfig = DEFAULT_CONFIG
 ) -> list[Edge]:
-    """Make use of the tie at the far end of a chain: sharpen its proximity edges, lay the missing.
+    """Sharpen a chain's proximity edges by the tie at its far end, and lay the missing ones.
 
-    Each proximity edge that the chain laid was predicted from its near end. The far end predicts
-    the same transform along other edges, so the two errors are independent, and fusing them by
-    covariance distributes the closure along the chain: little where one end is near. Then the chain
-    is walked from its far end, and what was out of reach of the dead reckoning is joined: all of
-    it, where the robot was lost from the start.
+    Each proximity edge of the chain was predicted from its near end. The far end predicts the same
+    transform along other edges, so the two errors are independent, and fusing them by covariance
+    distributes the closure along the chain. Then, from the far end on, nodes that were too
+    uncertain for dead reckoning are joined; if the robot was lost from the start, all of them.
 
     Args:
-        graph: with the tie in it.
+        graph: contains the tie.
         chain: dense indices of the nodes saved since the robot was last localised, in order; the
             last one is tied by a `TIE` or `MATCH` edge.
         config: settings.
 
     Returns:
-        The new and the superseding edges. They are in the graph already, and are to be stored.
+        The new and the superseding edges. They are already in the graph; the caller stores them.
     """
     edges = list(_sharpened(graph, chain, config.consistent_chi2))
     graph.add_edges(edges)
@@ -147,7 +144,7 @@ def tighten_chain(
 
 
 def _beside(graph: ExperienceGraph, node: int, config: ProximityConfig) -> Neighbourhood:
-    """What is beside a node, whichever way it looks: one that looks back is a way on as well."""
+    """Nodes beside a node, of any heading: chains lead through them too."""
     record = graph.node(node)
     near = graph.neighbourhood(
         node,
@@ -161,7 +158,7 @@ def _beside(graph: ExperienceGraph, node: int, config: ProximityConfig) -> Neigh
 def _passes(
     graph: ExperienceGraph, near: Neighbourhood, gap_m: float
 ) -> Iterator[NDArray[np.intp]]:
-    """Rows of each experience, parted where it came by more than once."""
+    """Rows of each experience, split by pass."""
     driven = graph.driven_m[near.nodes]
     experiences = graph.experiences[near.nodes]
     order = np.lexsort((driven, experiences))
@@ -172,9 +169,9 @@ def _passes(
 
 
 def _linked_lately(graph: ExperienceGraph, node: int, spacing_m: float) -> set[int]:
-    """Nodes near the far ends of links that the chain has within the spacing before and after.
+    """Nodes near the far ends of the chain's links within the spacing before and after.
 
-    A link to one node of a pass counts for the pass's nodes around it.
+    A link to one node of a pass counts for the nodes around it.
     """
     linked: set[int] = set()
     for member in _along_chain(graph, node, spacing_m):
@@ -187,7 +184,7 @@ def _linked_lately(graph: ExperienceGraph, node: int, spacing_m: float) -> set[i
 
 
 def _along_chain(graph: ExperienceGraph, node: int, within_m: float) -> list[int]:
-    """The nodes of a node's experience within a distance driven, itself included."""
+    """The nodes of a node's experience within a driven distance, including itself."""
     driven = graph.driven_m
     members, frontier = {node}, [node]
     while frontier:
@@ -206,7 +203,7 @@ def _along_chain(graph: ExperienceGraph, node: int, within_m: float) -> list[int
 def _sharpened(
     graph: ExperienceGraph, chain: Sequence[int], consistent_chi2: float
 ) -> Iterator[Edge]:
-    """Each proximity edge that the chain laid, as both of its ends together predict it."""
+    """Each proximity edge of the chain, fused from the predictions of both ends."""
     laid = [
         (edge, graph.index(edge.a), node)
         for node in chain
@@ -215,7 +212,7 @@ def _sharpened(
     ]
     if not laid:
         return
-    # What was saved before the first of them is on the known side, if the chain met itself.
+    # If the chain met itself, nodes before the first of them are on the known side.
     first = min(chain.index(node) for _, _, node in laid)
     newer = set(chain[first:])
     known = [a for _, a, _ in laid]
@@ -232,7 +229,7 @@ def _sharpened(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _EndView:
-    """What one end of a chain predicts: through its tie into the map, and along the chain."""
+    """Predictions of one end of a chain: through its tie into the map, and along the chain."""
 
     outward: ChainTree
     inward: ChainTree
@@ -241,7 +238,7 @@ class _EndView:
         return a in self.outward.row_of and b in self.inward.row_of
 
     def predict(self, a: int, b: int) -> tuple[SE3, Array]:
-        """``a_from_b`` by way of the chain's end, and its covariance."""
+        """``a_from_b`` through the chain's end, and its (6, 6) covariance."""
         a_from_end = self.outward.pose(a).inverse()
         end_from_b = self.inward.pose(b)
         error = (self.outward.error(a) + self.inward.error(b)).pivoted(end_from_b.translation)
@@ -251,7 +248,7 @@ class _EndView:
 def _view_from_end(
     graph: ExperienceGraph, end: int, chain: set[int], known: Sequence[int]
 ) -> _EndView:
-    """The view to the known nodes, no further: the cost follows the chain, not the map."""
+    """The view to the known nodes only: the cost depends on the chain, not on the map."""
     members = np.array(sorted(chain), dtype=np.int32)
     in_chain = np.zeros(len(graph), dtype=bool)
     in_chain[members] = True
@@ -276,10 +273,10 @@ def _view_from_end(
 def _fused_at_junction(
     edge: Edge, ends: tuple[int, int], near: _EndView, far: _EndView, consistent_chi2: float
 ) -> Edge:
-    """Fuse where the two ends' chains to node a come together, and go on to a from there.
+    """Fuse where the two ends' chains to node a meet, and continue to a from there.
 
-    From there on they share their edges, and so their errors: fused at a, the two would pass for
-    independent and the result for surer than it is.
+    Beyond that point they share edges and errors: fused at a, they would wrongly count as
+    independent, and the result as too certain.
     """
     a, b = ends
     junction = _junction(near.outward, far.outward, a)
@@ -308,7 +305,7 @@ def _fused_at_junction(
 
 
 def _junction(one: ChainTree, other: ChainTree, node: int) -> int:
-    """Where the chains of two trees to a node come together; the node itself at the latest."""
+    """Where the chains of two trees to a node meet; the node itself at the latest."""
     row, other_row = one.row_of[node], other.row_of[node]
     while one.parents[row] >= 0 and other.parents[other_row] >= 0:
         if one.half_edges[row] != other.half_edges[other_row]:
@@ -323,10 +320,10 @@ def _fused(
     covariance: Array,
     consistent_chi2: float = DEFAULT_CONFIG.consistent_chi2,
 ) -> Edge:
-    """The edge moved towards another estimate of it, as far as that is the surer one.
+    """The edge fused with another estimate, weighted by certainty.
 
-    Estimates that contradict each other are not averaged: somewhere a chain is worse than it
-    thinks, and what lies between two wrong places is a third. The surer one stands.
+    Contradicting estimates are not averaged, as the average of a right and a wrong pose is wrong:
+    the more certain one is kept.
     """
     difference = (a_from_b @ edge.a_from_b.inverse()).log()
     both = edge.covariance + covariance

@@ -1,4 +1,4 @@
-"""How high the sun stands, of what a map knows: the day, the hour of day, and a latitude."""
+"""Height of the sun from the day, the hour of day and a latitude."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _SOLSTICE_DAYS = 10.0
 def sun_height_deg(day: ArrayLike, hour: ArrayLike, latitude_deg: float) -> NDArray[np.float64]:
     """Height of the sun over the horizon, degrees; negative at night.
 
-    Within 2°: as good as mean solar time is, which leaves out the equation of time.
+    Accurate to 2°, as mean solar time leaves out the equation of time.
 
     Args:
-        day: days since the first of January 0:00, of any year.
+        day: days since 1 January 0:00 of any year.
         hour: hour of day, mean solar time (SPEC §2.8).
         latitude_deg: north is positive.
 
@@ -33,5 +33,5 @@ def sun_height_deg(day: ArrayLike, hour: ArrayLike, latitude_deg: float) -> NDAr
 
 
 def day_of_year(stamp_ns: int) -> float:
-    """Days since the first of January 0:00 UTC, within a day, over all years alike."""
+    """Days since 1 January 0:00 UTC, accurate to a day, for a year of mean length."""
     return stamp_ns / 86_400e9 % _YEAR_DAYS

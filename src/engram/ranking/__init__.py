@@ -1,7 +1,7 @@
-"""Ranking policies Γ: in which order to attempt the candidates (SPEC §4).
+"""Ranking policies Γ: the order in which to attempt the candidates (SPEC §4).
 
-Every policy is one file and stands in `POLICIES`; other installed packages bring theirs by the
-entry points `ENTRY_POINTS`, each a callable without arguments that makes the policy.
+Each policy is one file and an entry of `POLICIES`. Other packages add policies by entry points of
+the group `ENTRY_POINTS`, each a callable without arguments that makes the policy.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ ENTRY_POINTS = "engram.policies"
 
 @cache
 def _brought() -> dict[str, EntryPoint]:
-    """Policies of other installed packages; imported when they are asked for."""
+    """Policies of other installed packages, not yet imported."""
     return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
 
 
 def policy_names() -> list[str]:
-    """All policies that `policy_named` knows: Engram's own, then those that packages bring."""
+    """All policies that `policy_named` knows: Engram's own, then those of other packages."""
     return [*POLICIES, *(name for name in _brought() if name not in POLICIES)]
 
 
@@ -46,21 +46,21 @@ def policy_named(name: str) -> RankingPolicy:
     """A new policy of that name.
 
     Raises:
-        ConfigError: there is none; the message lists those that there are.
+        ConfigError: the name is unknown; the message lists the known ones.
     """
     if name in POLICIES:
         return POLICIES[name]()
     if name in _brought():
         policy: RankingPolicy = _brought()[name].load()()
         return policy
-    raise ConfigError(f"no ranking policy '{name}'; there are: {', '.join(sorted(policy_names()))}")
+    raise ConfigError(f"no ranking policy '{name}'; known: {', '.join(sorted(policy_names()))}")
 
 
 def check_for_robot(name: str) -> None:
     """Refuses a policy that looks ahead: a robot would attempt every candidate to rank them.
 
     Raises:
-        ConfigError: there is no such policy, or only an evaluation may use it.
+        ConfigError: the policy is unknown, or only for evaluations.
     """
     if looks_ahead(policy_named(name)):
         raise ConfigError(

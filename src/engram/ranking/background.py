@@ -1,4 +1,4 @@
-"""What is known of a map beyond its graph and its paths: made once, serves all frames."""
+"""Data about a map beyond its graph and paths, made once for all frames."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from engram.ranking.lessons import Lessons
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """What some policies want to know of a map. All of it may be missing.
+    """Data about a map that some policies use. Any of it may be missing.
 
     Attributes:
-        sessions: the drives by id, with the times when they began.
-        lessons: what past drives matched and failed to match.
+        sessions: the drives by id, with their start times.
+        lessons: how likely each node matches, by past drives.
         words: the visual words of nodes and frames; None without a vocabulary.
     """
 

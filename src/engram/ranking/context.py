@@ -1,4 +1,4 @@
-"""What a ranking policy gets to see, and what it is."""
+"""The ranking policy protocol and its input."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from engram.ranking.run import RunAttempts
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Foreseen:
-    """What attempting each candidate would come to.
+    """The outcome of attempting each candidate.
 
     Attributes:
-        accepted: (Y,) bool, whether it would be a success.
-        inliers: (Y,) int64, inliers of the match, 0 if there were none.
+        accepted: (Y,) bool, whether it is a success.
+        inliers: (Y,) int64, inliers of the match, 0 without one.
     """
 
     accepted: NDArray[np.bool_]
@@ -35,27 +35,27 @@ class Foreseen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RankingContext:
-    """One live frame's situation.
+    """The input of a policy for one live frame.
 
     Attributes:
         neighbourhood: the candidates Y.
-        graph: the graph that they are in.
+        graph: their graph.
         path_memory: all paths of the map.
         basin: the live camera's match basin.
         observations: W and z, the recent attempts.
-        reference: dense index of the node k in which the robot is localised, or was last; None
+        reference: dense index of the node k in which the robot is or was last localised; None
             if it never was.
-        own_path: the live session's path, which counts neither in Z nor in N; None if it has none.
+        own_path: the live session's path, excluded from Z and N; None if it has none.
         stamp_ns: the live frame's stamp, ns.
-        seed: of policies that draw at random.
-        foresee: makes every attempt to see how it ends; only the oracle, the bound of all
-            policies, asks (SPEC §4). None where it cannot be known.
-        run: this run's attempts, with where they were made and how likely they were.
-        hour: hour of day of the live frame in [0, 24); None where it is not known.
-        day: its date, days since 1970; None where its clock is not UTC.
-        background: what is known of the map's sessions and nodes.
-        live_words: gives the distinct words (n,) int32 of the live frame, rising; None where
-            there is no vocabulary. Costs time only when called.
+        seed: seed for policies that draw at random.
+        foresee: makes every attempt; only for the oracle, the upper bound of all policies (SPEC
+            §4). None if unavailable.
+        run: this run's attempts, with their distances and success rates.
+        hour: hour of day of the live frame in [0, 24); None if unknown.
+        day: its date, days since 1970; None if its clock is not UTC.
+        background: data about the map's sessions and nodes.
+        live_words: computes the distinct words of the live frame, (n,) int32, increasing; None
+            without a vocabulary.
     """
 
     neighbourhood: Neighbourhood
@@ -76,11 +76,11 @@ class RankingContext:
 
     @property
     def sessions(self) -> NDArray[np.int32]:
-        """(Y,) int32: for each candidate the number of the session that saved it."""
+        """(Y,) int32: number of the session that saved each candidate."""
         return self.graph.sessions_of(self.neighbourhood.nodes)
 
     def success_rates(self) -> NDArray[np.float64]:
-        """(Y,) float64: g(d) of each candidate, appearance being compatible (SPEC §3.1)."""
+        """(Y,) float64: g(d) of each candidate, for compatible appearance (SPEC §3.1)."""
         near = self.neighbourhood
         return self.basin.success_rate(near.along_m, near.across_m)
 
@@ -97,26 +97,26 @@ class RankingPolicy(Protocol):
         """(Y,) int64: the rows of the neighbourhood, most promising first; each row once.
 
         Raises:
-            ConfigError: the policy needs to know what the context cannot tell.
+            ConfigError: the policy needs data that the context does not have.
         """
         ...
 
 
 def uses_words(policy: RankingPolicy) -> bool:
-    """Whether a policy looks at visual words: a localiser then has them read before it sets off.
+    """Whether a policy uses visual words, which are then read before the drive.
 
-    It says so by an attribute of this name that is true.
+    A policy states it by a true attribute of this name.
     """
     return bool(getattr(policy, "uses_words", False))
 
 
 def looks_ahead(policy: RankingPolicy) -> bool:
-    """Whether a policy asks `RankingContext.foresee`, as its attribute of this name says."""
+    """Whether a policy calls `RankingContext.foresee`, by its attribute of this name."""
     return bool(getattr(policy, "looks_ahead", False))
 
 
 def order_by(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
-    """Rows by the keys, (Y,) each, smallest first; ties by distance, then by UUID (SPEC §4)."""
+    """(Y,) int64: rows by the keys, (Y,) each, smallest first; ties by distance, then UUID."""
     neighbourhood = context.neighbourhood
     values = (np.ascontiguousarray(key, dtype=np.float64) for key in keys)
     uuid_words = context.graph.uuid_words_of(neighbourhood.nodes)

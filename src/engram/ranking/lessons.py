@@ -1,4 +1,4 @@
-"""What past drives learnt at each node: how often it matched, and how often in vain."""
+"""Evidence of past drives for each node: how often it matched, and how often it failed."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import PathId, path_id
 from engram.graph.paths import PathMemory
 
-# A node of the same experience tells as much less as it is farther along the drive: e-fold per
-# 3 m, nothing beyond 4 m. The chains are sampled every metre, and a drive attempts some of them.
+# Evidence of another node of the experience decays e-fold per 3 m along the drive and ends at 4 m:
+# nodes are a metre apart, and a drive attempts only some of them.
 _POOL_M, _POOL_REACH_M = 3.0, 4.0
 _POOL_NODES = 8
-# The drive that saved a node would have matched it with certainty.
+# Successes counted for the drive that saved a node, which would surely have matched it.
 _SAVING_COUNTS = 2.0
-# How likely anybody matches a node of which nothing is known, and how many attempts that is worth.
+# Match probability of a node without evidence, and the weight of it in attempts.
 UNKNOWN_BASE = 0.4
 _BASE_ATTEMPTS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lessons:
-    """How likely each node is matched where offsets do not prevent it.
+    """Probability that each node matches if its offset does not prevent it.
 
     Attributes:
-        base: (N,) float64, by all past drives; nodes saved since the map was opened are missing.
+        base: (N,) float64, by all past drives; without nodes saved since the map was opened.
     """
 
     base: NDArray[np.float64]
@@ -41,11 +41,11 @@ class Lessons:
 
     @staticmethod
     def none() -> Lessons:
-        """Of an empty map."""
+        """Lessons of an empty map."""
         return Lessons(np.zeros(0))
 
     def of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(Y,) the base of some nodes; 0.4 where it is missing."""
+        """(Y,) float64: the base of nodes, (Y,) dense indices; 0.4 if missing."""
         return self._and_unknown[np.minimum(nodes, len(self.base))]
 
     @staticmethod
@@ -56,18 +56,18 @@ class Lessons:
         attempts: Attempts,
         rates: NDArray[np.float64],
     ) -> Lessons:
-        """What the drives of a map teach.
+        """Learns from the drives of a map.
 
-        A success counts one, a failure as much as a match was likely; a drive of which no attempt
-        is remembered is taken to have matched the nodes on its path. Evidence is shared along an
-        experience: what happened a metre before happens here.
+        A success counts 1, a failure as much as its success rate g. A drive without remembered
+        attempts counts as having matched the nodes on its path. Evidence is shared along an
+        experience, as nodes a metre apart match alike.
 
         Args:
             graph: the nodes.
             path_memory: the paths.
-            viewers: (V,) the drives.
-            attempts: what they attempted; sessions are places in `viewers`.
-            rates: (A,) g at the predicted offset of each.
+            viewers: V drives, by their paths.
+            attempts: their attempts; `session` indexes `viewers`.
+            rates: (A,) float64, g at the predicted offset of each attempt.
         """
         sharing = _sharing(graph)
         good, bad = (
@@ -83,7 +83,7 @@ def _counts(
     attempts: Attempts,
     rates: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N,) successes and weighted failures of each node."""
+    """(N,) float64 each: successes and weighted failures of each node."""
     count = len(graph)
     good, bad = np.zeros((2, count))
     np.add.at(good, attempts.node, attempts.accepted)
@@ -99,7 +99,7 @@ def _counts(
 
 
 def _sharing(graph: ExperienceGraph) -> csr_matrix:
-    """(N, N) how much each node's evidence counts at another of its experience."""
+    """(N, N) weight of each node's evidence at the other nodes of its experience."""
     count = len(graph)
     driven_m, experiences = graph.driven_m, graph.experiences
     in_line = np.lexsort((np.arange(count), driven_m, experiences))

@@ -1,4 +1,4 @@
-"""How alike a live frame and nodes look, by their visual words."""
+"""Visual similarity of a live frame and nodes, by their words."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from engram.ranking.context import RankingContext
 def likenesses(
     words: NodeWords, live: NDArray[np.int32], nodes: Sequence[NodeId]
 ) -> NDArray[np.float64]:
-    """(Y,) cosine, 0…1, of the idf-weighted set of words of a frame with that of each node.
+    """(Y,) float64: cosine, 0…1, of the idf-weighted word sets of a frame and each node.
 
     Args:
-        words: knows the nodes' words.
+        words: gives the nodes' words.
         live: (n,) int32, the distinct words of the frame.
-        nodes: Y nodes; damaged ones show nothing.
+        nodes: Y nodes; damaged ones count as without words.
     """
     weights = words.idf**2
     seen = np.zeros(len(weights))
@@ -38,9 +38,9 @@ def likenesses(
 
 
 def standard_likenesses(context: RankingContext) -> NDArray[np.float64]:
-    """(Y,) by how many standard deviations each candidate looks more like the frame than average.
+    """(Y,) float64: similarity of each candidate to the frame, in standard deviations over all.
 
-    Zeros where there is no vocabulary, and where all look equally like the live frame.
+    Zeros without a vocabulary, and if all are equally similar.
     """
     words, nodes = context.background.words, context.neighbourhood.nodes
     if words is None or context.live_words is None or len(nodes) == 0:

@@ -9,8 +9,8 @@ from engram import _core
 from engram.ranking.context import RankingContext, order_by
 from engram.ranking.reasons import Reasons
 
-# Posteriors that are equal on paper tie, though their logarithms were added up from other numbers;
-# as in the core's `path_order`.
+# Mathematically equal posteriors tie, though their logarithms are sums of different numbers; as in
+# the core's `path_order`.
 _TIE_SCALE = 2.0**30
 _MEANING = {
     "score": "log posterior of [L15 §V], up to a common constant",
@@ -57,10 +57,9 @@ class PathPolicy:
         return Reasons(terms, meaning, rule="highest score first, of equals the nearest")
 
     def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(N,) log posterior of nodes up to a common constant.
+        """(N,) float64: log posterior of nodes up to a common constant.
 
-        Nodes that share as many paths with as many of W have the same to the last bit; others
-        whose posterior is the same on paper may differ in that, and tie when they are ranked.
+        Mathematically equal posteriors may differ by rounding; they tie in the ranking.
         """
         evidence = evidence_of(context, self._alpha, self._gamma)
         return context.path_memory.scores(nodes, evidence)

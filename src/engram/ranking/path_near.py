@@ -14,12 +14,11 @@ from engram.ranking.reasons import Reasons
 
 
 class PathNearPolicy:
-    """By the formula of [L15 §V] among the candidates that are near enough to match; then the rest.
+    """By the formula of [L15 §V] within the match basin; then the rest by distance.
 
-    The formula knows no distance: over the whole search radius it would put a node of the right
-    experience 8 m away before one of the same experience at 1 m. Here it ranks what
-    lies within the match basin, where g(d) >= 0.6: another reading of the paper's "local metric
-    neighbourhood".
+    The formula ignores distance: over the whole search radius it may prefer a node 8 m away to one
+    of the same experience at 1 m. So it ranks only within the match basin, where g(d) >= 0.6: one
+    reading of the paper's "local metric neighbourhood".
     """
 
     name = "path-near"

@@ -1,4 +1,4 @@
-"""Why a policy orders candidates as it does, for people."""
+"""The reasons for a policy's order, for people."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from engram.ranking.context import RankingContext, RankingPolicy
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reasons:
-    """What a policy's order is made of.
+    """The parts of a policy's order.
 
     Attributes:
         terms: name → (Y,) float64, by row of the neighbourhood.
-        meaning: name → what the term says, in plain words.
-        chances: (Y,) float64 of success; None where the policy reckons none.
-        by_turn: (Y,) bool, whether a candidate has its place not for its merits, but because its
-            turn has come; None where the policy has no turns.
-        rule: how the terms make the order, in plain words.
+        meaning: name → description of the term.
+        chances: (Y,) float64, probability of success; None if the policy estimates none.
+        by_turn: (Y,) bool, whether a candidate's place is by rotation, not by its score; None if
+            the policy has no rotation.
+        rule: description of how the terms give the order.
     """
 
     terms: dict[str, NDArray[np.float64]] = field(default_factory=dict)
@@ -33,13 +33,13 @@ class Reasons:
 
 @runtime_checkable
 class Explains(Protocol):
-    """A policy that can say more than distance."""
+    """A policy that can explain its order."""
 
     def reasons(self, context: RankingContext) -> Reasons:
-        """What the order of this context's candidates is made of."""
+        """The parts of the order of this context's candidates."""
         ...
 
 
 def reasons_of(policy: RankingPolicy, context: RankingContext) -> Reasons:
-    """A policy's reasons; none where distance or chance is all there is."""
+    """A policy's reasons; empty ones if it explains nothing."""
     return policy.reasons(context) if isinstance(policy, Explains) else Reasons()

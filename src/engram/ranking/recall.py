@@ -1,4 +1,4 @@
-"""Γ(recall), Engram's own: how many inliers a match would have, by this run and past drives."""
+"""Γ(recall), Engram's own: ranks by the inliers expected from this run and past drives."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Array = NDArray[np.float64]
 class RecallConstants:
     """The constants of Γ(recall); `RECALL` ships with the package.
 
-    Margins are logarithms of inliers over those that a match needs. Source: found on `village@2`, a
-    town that nothing is judged on, by `engram_lab.fits.recall`, and rounded: what is lost depends
-    little on any of them but the distance.
+    A margin is the logarithm of inliers over those that a match needs. Source: fitted on
+    `village@2`, a town used for no evaluation, by `engram_lab.fits.recall`, and rounded; results
+    depend little on any but `distance`.
 
     Raises:
-        ConfigError: one is out of its bounds.
+        ConfigError: a value is out of its bounds.
     """
 
     distance: Annotated[
@@ -43,79 +43,73 @@ class RecallConstants:
         float,
         Meta(
             ge=0,
-            description="margin per log odds of how likely past drives matched the node",
+            description="margin per log odds of a match with the node by past drives",
         ),
     ] = 0.3
     level: Annotated[
         float,
         Meta(
-            description="margin at no distance of a node that every other past drive matched",
+            description="margin at zero distance of a node that every second past drive matched",
         ),
     ] = 0.5
     prior_weight: Annotated[
         float,
         Meta(
             gt=0,
-            description="how many attempts of this very moment all past drives together are worth",
+            description="weight of all past drives together, in attempts made now",
         ),
     ] = 0.5
     memory_m: Annotated[
         float,
         Meta(
             gt=0,
-            description="metres driven over which an attempt of this run comes to weigh e times "
-            "less",
+            description="distance driven over which the weight of an attempt falls e-fold, m",
         ),
     ] = 4.0
     regret: Annotated[
         float,
         Meta(
             ge=0,
-            description="how many attempts of this very moment a pick counts as, supposed to have "
-            "failed",
+            description="weight of the assumed failure of each earlier pick, in attempts made now",
         ),
     ] = 2.0
     tally: Annotated[
         float,
         Meta(
             ge=0,
-            description="margin per log of how often this run matched the node's drive, over that "
-            "of a drive not tried yet",
+            description="margin per log of this run's success rate with the node's drive, relative "
+            "to that of an untried drive",
         ),
     ] = 0.5
     tally_memory_m: Annotated[
         float,
         Meta(
             gt=0,
-            description="metres driven over which an attempt weighs e times less there",
+            description="distance over which the weight of an attempt in that rate falls e-fold, m",
         ),
     ] = 8.0
     untried_rate: Annotated[
         float,
-        Meta(
-            gt=0, description="success rate of a drive not tried yet. Source: SPEC §4, as Γ(bandit)"
-        ),
+        Meta(gt=0, description="success rate of an untried drive. Source: SPEC §4, as Γ(bandit)"),
     ] = 0.3
     untried_attempts: Annotated[
         float,
-        Meta(
-            gt=0, description="how many attempts that rate is worth. Source: SPEC §4, as Γ(bandit)"
-        ),
+        Meta(gt=0, description="weight of that rate, in attempts. Source: SPEC §4, as Γ(bandit)"),
     ] = 1.0
     likeness: Annotated[
         float,
         Meta(
             ge=0,
-            description="margin per standard deviation that a node looks more like the frame than "
-            "the others do. Source: trials with lost robots",
+            description="margin per standard deviation of visual similarity to the frame. "
+            "Source: trials with lost robots",
         ),
     ] = 0.4
     vague_m: Annotated[
         float,
         Meta(
             ge=0,
-            description="how vaguely even the surest candidate is known, σ in m, before likeness "
-            "counts. Source: trials with lost robots",
+            description="standard deviation of the most certain candidate from which similarity "
+            "counts, m. Source: trials with lost robots",
         ),
     ] = 0.5
     steepness: Annotated[float, Meta(gt=0, description="log odds of a success per margin")] = 1.8
@@ -132,11 +126,11 @@ class RecallConstants:
         int,
         Meta(
             ge=0,
-            description="how many of this run's newest attempts count: 20 m at four every 0.7 m",
+            description="most recent attempts of this run that count: 20 m at four every 0.7 m",
         ),
     ] = 128
-    picks: Annotated[int, Meta(ge=0, description="how many picks are made greedily")] = 8
-    shortlist: Annotated[int, Meta(ge=0, description="among how many of the best they are")] = 32
+    picks: Annotated[int, Meta(ge=0, description="number of greedy picks")] = 8
+    shortlist: Annotated[int, Meta(ge=0, description="best candidates to pick from")] = 32
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -159,13 +153,13 @@ _MEANING = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecallJudgement:
-    """What Γ(recall) thinks of the candidates of one frame.
+    """The ranking of one frame's candidates by Γ(recall).
 
     Attributes:
         order: (Y,) int64, rows best first.
-        chances: (Y,) of success when picked, all picked before supposed to have failed.
-        terms: name → (Y,), the parts of the margin at first; they add up.
-        by_turn: (Y,) bool by row, whether it stands where it does because its turn has come.
+        chances: (Y,) float64, probability of success when picked, if all earlier picks failed.
+        terms: name → (Y,) float64, the parts of the initial margin; they add up.
+        by_turn: (Y,) bool by row, whether its place is by rotation.
     """
 
     order: NDArray[np.int64]
@@ -175,16 +169,16 @@ class RecallJudgement:
 
 
 class RecallPolicy:
-    """By the inliers that a match would have, picked greedily and diversely.
+    """By the expected inliers of a match, picked greedily and diversely.
 
-    Inliers fall exponentially with distance. What is left when that is made up for tells how
-    alike the node's drive looks now: this run's attempts say so, the newest loudest, past drives
-    where it has not tried, and words where nobody knows the distance. Inliers alone would let a
-    drive that just fails be tried for ever; so its successes and failures count, too. Each pick is
-    made as if those before it had failed: what would fail with them comes later.
+    Inliers fall exponentially with distance. Corrected for that, they measure how similar the
+    node's drive looks now. The evidence is this run's attempts, weighted by recency; past drives
+    if there are none; and words if the distance is unknown. Success rates count too, as inliers
+    alone would retry a drive that narrowly fails for ever. Each pick assumes that the earlier ones
+    failed, so that nodes likely to fail with them come later.
 
     Args:
-        constants: None for those that ship with the package.
+        constants: None for those of the package.
     """
 
     name = "recall"
@@ -238,13 +232,12 @@ class RecallPolicy:
     def _in_turns(
         self, context: RankingContext, order: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Every second pick goes by turns where nobody knows how far the nodes are.
+        """Gives every second place by rotation if the predictions are too uncertain for a match.
 
-        A robot that has lost its place would try the same few nodes for ever, those where it
-        believes to be. Where they are expected more vaguely than a match bears, every second one is
-        of those that were tried least often of late, in every second frame the first: a robot that
-        has one attempt a frame must not stay with the best. Tells by row, too, whose place is by
-        turn.
+        Otherwise a lost robot would try the same few nodes for ever. These places go to the nodes
+        tried least often of late; in every second frame they come first, for a robot with one
+        attempt per frame. Returns the order, and (Y,) bool by row: whether its place is by
+        rotation.
         """
         near = context.neighbourhood
         vague = near.sigma_m[order] > prior_basin_m(context.basin.focal_px)
@@ -266,9 +259,9 @@ class RecallPolicy:
     def _costs_and_prior(
         self, context: RankingContext, canonical: NDArray[np.int64]
     ) -> tuple[Array, Array, Array]:
-        """Margins lost by distance less what looks win, by past drives, by looks; (Y,) each.
+        """(Y,) float64 each, nearest first: cost, prior by past drives, gain by similarity.
 
-        All nearest first.
+        The cost is the margin lost by distance less that gain.
         """
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
@@ -277,10 +270,9 @@ class RecallPolicy:
         return costs, c.level + c.lessons * np.log(base / (1 - base)), likeness
 
     def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
-        """Margins won by looking like the live frame, (Y,), nearest first.
+        """(Y,) float64, nearest first: margins gained by similarity to the live frame.
 
-        Which words a frame shares with others of its place is noise beside what distance and this
-        run tell, unless nobody knows the distance.
+        Shared words are noise compared with distance and this run, unless the distance is unknown.
         """
         c, sigma_m = self._constants, context.neighbourhood.sigma_m
         if len(canonical) == 0 or sigma_m.min() < c.vague_m:
@@ -288,7 +280,7 @@ class RecallPolicy:
         return np.asarray(c.likeness * standard_likenesses(context)[canonical])
 
     def _per_m(self, context: RankingContext) -> float:
-        """A longer lens sees alike from farther away."""
+        """Margin lost per metre; a longer focal length matches from farther away."""
         return self._constants.distance / prior_basin_m(context.basin.focal_px)
 
     def _pick(
@@ -316,9 +308,9 @@ class RecallPolicy:
 
 
 def _bound(constants: RecallConstants) -> _core.RecallConstants:
-    """As the core takes them, but for `per_m`, which the lens decides."""
+    """The constants for the core, without `per_m`, which depends on the focal length."""
     bound = _core.RecallConstants()
     for one in fields(constants):
-        if hasattr(bound, one.name):  # the core knows no likeness and no chances
+        if hasattr(bound, one.name):  # the core uses neither similarity nor probabilities
             setattr(bound, one.name, getattr(constants, one.name))
     return bound

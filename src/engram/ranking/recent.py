@@ -16,7 +16,7 @@ from engram.config import check_bounds
 
 
 class IterationUnit(StrEnum):
-    """What one iteration of the localiser is."""
+    """Unit of one iteration of the localiser."""
 
     DISTANCE = "distance"
     FRAME = "frame"
@@ -68,7 +68,7 @@ class Observations:
 
     @staticmethod
     def none() -> Observations:
-        """Nothing attempted yet."""
+        """No attempts yet."""
         return Observations(np.zeros(0, np.int32), np.zeros(0, np.bool_))
 
     def __len__(self) -> int:
@@ -76,26 +76,26 @@ class Observations:
 
 
 class RecentAttempts:
-    """The window over the last T iterations that the localiser feeds.
+    """The window over the last T iterations, fed by the localiser.
 
-    Before the attempts of a frame: `begin_frame`; W is `observations`. After them: `add`. The
-    frames of the running iteration see T iterations before it and what it attempted so far.
+    Call `begin_frame` before the attempts of a frame, and `add` after them; W is `observations`.
+    Frames see the T iterations before the current one, and its attempts so far.
     """
 
     def __init__(self, config: RecentConfig | None = None, first_iteration: int = 0) -> None:
         self._config = RecentConfig() if config is None else config
-        # By node, least recent first: twice the iteration of its latest attempt, plus its outcome.
+        # Node → twice the iteration of its latest attempt, plus its outcome; least recent first.
         self._latest: dict[int, int] = {}
         self._began_m: float | None = None
         self._number = first_iteration - 1
 
     @property
     def iteration(self) -> int:
-        """Number of the running iteration; one less than the first before the first frame."""
+        """Number of the current iteration; one less than the first before the first frame."""
         return self._number
 
     def begin_frame(self, driven_m: float) -> int:
-        """Tell how far the session has driven, metres; returns the frame's iteration."""
+        """Begin a frame at this distance driven, metres; returns its iteration."""
         by_distance = self._config.T_unit is IterationUnit.DISTANCE
         if (
             by_distance
@@ -126,7 +126,7 @@ class RecentAttempts:
         )
 
     def _forget(self) -> None:
-        """Drops what was last attempted before the last T iterations."""
+        """Drops nodes last attempted before the last T iterations."""
         oldest = 2 * (self._number - self._config.T)
         for node in list(takewhile(lambda node: self._latest[node] < oldest, self._latest)):
             del self._latest[node]

@@ -1,4 +1,4 @@
-"""This run's attempts with where they were made: what policies learn from while driving."""
+"""This run's attempts with their positions, from which policies learn during the drive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-# Attempts farther back say nothing about the light here, whatever the policy.
+# Attempts farther back do not reflect the light here.
 _REMEMBERED_M = 200.0
 
 
@@ -18,17 +18,17 @@ class RunAttempts:
     """Attempts of the live session over the last 200 m, oldest first.
 
     Attributes:
-        driven_m: odometry distance of the live session now.
-        at_m: (R,) float64, that distance when each was made.
-        nodes: (R,) int32, dense indices of the nodes attempted.
-        distance_m: (R,) float64, from the node to where the robot was found, or else was expected,
-            root mean square. NaN where there was no prediction (relocalisation).
-        rates: (R,) float64, g at the predicted offset: how likely a match was, had the appearance
-            been compatible. NaN likewise.
-        accepted: (R,) bool.
-        inliers: (R,) int64.
+        driven_m: odometry distance of the live session now, metres.
+        at_m: (R,) float64, that distance at each attempt.
+        nodes: (R,) int32, dense indices of the attempted nodes.
+        distance_m: (R,) float64, distance from the node to the measured position, or else root mean
+            square of the predicted one, metres. NaN without a prediction (relocalisation).
+        rates: (R,) float64, g at the predicted offset: probability of a match for compatible
+            appearance. NaN without a prediction.
+        accepted: (R,) bool, whether the match was accepted.
+        inliers: (R,) int64, inliers of the match.
         landmarks: (R,) int64, landmarks of the live frame.
-        frames: how many frames of the session anything was attempted in, from its beginning.
+        frames: number of frames with attempts since the session began.
     """
 
     driven_m: float
@@ -43,7 +43,7 @@ class RunAttempts:
 
     @staticmethod
     def none() -> RunAttempts:
-        """Nothing attempted yet."""
+        """No attempts yet."""
         nothing = np.zeros(0)
         return RunAttempts(
             0.0,
@@ -60,9 +60,9 @@ class RunAttempts:
         return len(self.nodes)
 
     def newest(self, count: int) -> RunAttempts:
-        """The last `count` of them at most that tell something.
+        """The last `count` informative ones at most.
 
-        A failure without a prediction does not: a lost robot has dozens in every frame.
+        A failure without a prediction is not informative: a lost robot has dozens per frame.
         """
         telling = np.flatnonzero(self.accepted | ~np.isnan(self.distance_m))
         if len(telling) == len(self) <= count:
@@ -99,7 +99,7 @@ class RunLog:
         inliers: Sequence[int],
         landmarks: int,
     ) -> None:
-        """Remember the attempts of one frame; see `RunAttempts` for what the arguments mean."""
+        """Add the R attempts of one frame; see `RunAttempts` for the arguments."""
         count = len(nodes)
         self._frames += count > 0
         if self._end + count > len(self._columns[0]):
@@ -111,9 +111,9 @@ class RunLog:
         self._end += count
 
     def attempts(self, driven_m: float) -> RunAttempts:
-        """What is remembered after `driven_m` metres of the session.
+        """The attempts remembered after `driven_m` metres of the session.
 
-        Views: what is behind them is written once and never changed.
+        Its arrays are views of data that never changes.
         """
         self._forget(driven_m)
         at_m, nodes, distance_m, rates, accepted, inliers, landmarks = (
