@@ -43,7 +43,7 @@ EXAMPLES = {
     DOCS / "python.md": "drives",
 }
 # What cannot run here: set-up, the demo (its own tests run it), and real drives with two rigs.
-_ELSEWHERE = ("make ", "make\n", ". .venv", "engram map colour.engram")
+_ELSEWHERE = ("make ", ". .venv", "engram map colour.engram")
 _FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.M | re.S)
 
 
@@ -188,6 +188,8 @@ def test_the_examples_of_a_page_run_in_their_order(
         elif block.commands:
             printed = ""
             for words in block.commands:
+                if words[1] == "lab":  # minutes to hours; the laboratory's tests run its verbs
+                    continue
                 # A person copies the id from `engram info --sessions`.
                 given = [_first_session(words[2]) if one == "SESSION" else one for one in words]
                 ran = run_words(given)
