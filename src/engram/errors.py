@@ -3,7 +3,7 @@
 ::
 
     EngramError
-    ├── InputError               what was given cannot be used: correct it and call again
+    ├── InputError               an input cannot be used: correct it and call again
     │   ├── SequenceError        images, stamps or layout of a drive
     │   ├── CalibrationError     a calibration that is missing, malformed or does not fit
     │   └── ConfigError          a setting: unknown key, wrong type, out of range
@@ -14,8 +14,8 @@
     │   ├── MapCorruptError      bytes do not match their hash: restore a copy
     │   ├── RevisionError        no such revision, or in a state that forbids the step
     │   └── StorageFullError     no space left: free some; nothing committed is lost
-    ├── IncompatibleError        two things that are each fine do not fit together
-    ├── RefusedError             a result did not pass the gate that was asked for
+    ├── IncompatibleError        two valid things do not fit together
+    ├── RefusedError             a result did not pass the requested gate
     ├── WorkerError              workers died, or cannot be reached: look at memory and disk
     └── MissingExtraError        an optional dependency: the message names the pip command
 
@@ -30,11 +30,11 @@ class EngramError(Exception):
 
 
 class InputError(EngramError, ValueError):
-    """What was given cannot be used."""
+    """An input cannot be used."""
 
 
 class SequenceError(InputError):
-    """Images, stamps or the layout of a drive cannot be used; names the file and the fact."""
+    """Images, stamps or the layout of a drive cannot be used; names the file and the fault."""
 
 
 class CalibrationError(InputError):
@@ -46,11 +46,11 @@ class ConfigError(InputError):
 
 
 class MapError(EngramError):
-    """A map or a frame log cannot be used as asked."""
+    """A map or a frame log cannot be used as requested."""
 
 
 class NotAMapError(MapError):
-    """The file is no Engram map."""
+    """The file is not an Engram map."""
 
 
 class FormatVersionError(MapError):
@@ -62,7 +62,7 @@ class MapLockedError(MapError):
 
 
 class MapCorruptError(MapError):
-    """Stored bytes do not match their hash, or a record points at nothing."""
+    """Stored bytes do not match their hash, or a record refers to a missing one."""
 
 
 class RevisionError(MapError):
@@ -78,7 +78,7 @@ class IncompatibleError(EngramError):
 
 
 class RefusedError(EngramError):
-    """A result is worse than what it would take the place of, and was not kept."""
+    """A result is worse than the one it would replace, and was discarded."""
 
 
 class WorkerError(EngramError):
@@ -90,10 +90,10 @@ class MissingExtraError(EngramError, ImportError):
 
 
 def storage_full(error: OSError, where: object) -> StorageFullError | None:
-    """What to raise where the file system says that no space is left; None where it says else."""
+    """The error to raise if a file system error means that no space is left; else None."""
     if error.errno not in {errno.ENOSPC, errno.EDQUOT}:
         return None
     return StorageFullError(
-        f"{where}: no space is left; free some and give the same command again: what was finished "
+        f"{where}: no space is left; free some and run the same command again: what was finished "
         "is kept"
     )

@@ -1,8 +1,8 @@
-"""SQLite files of ours, maps and frame logs: what makes one, how it is opened, what errors mean.
+"""Engram's SQLite files, maps and frame logs: identity, opening, and errors.
 
-Nobody but SQLite opens such a file, not even to look at its header: closing a handle of one's own
-drops the locks that this process holds through SQLite. The next process to close the file would
-then take itself for the last, and remove the write-ahead log under the writer.
+Only SQLite opens such a file, even to read its header: closing another handle drops the locks that
+this process holds through SQLite. The next process that closes the file would then remove the
+write-ahead log while the writer still uses it.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ Execute: TypeAlias = Callable[[str], Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FileKind:
-    """What tells one kind of file from another.
+    """A kind of file.
 
     Attributes:
-        noun: what people call it.
-        application_id: stands in the file's header, so that `file` and we know what it is.
-        format_version: the newest format that is known.
+        noun: its name in messages.
+        application_id: number in the file's header that identifies the kind.
+        format_version: the newest known format.
         metadata: its tables, in the newest format.
-        strange: the error for what is no such file, or cannot be opened.
-        cure: what to do about a damaged one.
-        busy_s: for how long another process may hold the file before that is an error.
+        strange: the error for a file that is not of this kind, or cannot be opened.
+        cure: advice for a damaged file.
+        busy_s: how long to wait for another process to release the file, seconds.
     """
 
     noun: str
@@ -72,11 +72,11 @@ class FileKind:
 
 
 class SqliteFile:
-    """One file of a kind.
+    """A file of a kind.
 
     Args:
-        path: where it is, or is to be.
-        kind: what it is.
+        path: its path; the file may not exist yet.
+        kind: its kind.
     """
 
     def __init__(self, path: Path, kind: FileKind) -> None:
@@ -84,14 +84,14 @@ class SqliteFile:
         self.kind = kind
 
     def check_regular(self, *, may_be_new: bool = False) -> None:
-        """Refuse what SQLite would wait for, or take for an empty database.
+        """Refuses files on which SQLite would block, or which it would take for an empty database.
 
         Args:
-            may_be_new: whether the file may be empty, or not there.
+            may_be_new: whether the file may be empty or missing.
 
         Raises:
-            EngramError: the kind's `strange`: no regular file, or an empty one.
-            MapError: the file cannot be looked at.
+            EngramError: the kind's `strange`: not a regular file, or an empty one.
+            MapError: the file cannot be read.
         """
         noun, strange = self.kind.noun, self.kind.strange
         try:
@@ -103,23 +103,23 @@ class SqliteFile:
         except OSError as error:
             raise MapError(f"{self.path} cannot be read: {error.strerror}") from error
         if stat.S_ISDIR(found.st_mode):
-            raise strange(f"{self.path} is a folder, no {noun}")
+            raise strange(f"{self.path} is a folder, not a {noun}")
         if not stat.S_ISREG(found.st_mode):
-            raise strange(f"{self.path} is a pipe, a socket or a device, no {noun}")
+            raise strange(f"{self.path} is a pipe, a socket or a device, not a {noun}")
         if not found.st_size and not may_be_new:
-            raise strange(f"{self.path} is an empty file, no {noun}")
+            raise strange(f"{self.path} is an empty file, not a {noun}")
 
     def identify(self, execute: Execute) -> int:
-        """Format of the file, as SQLite sees it: the log may be newer than the first page.
+        """Format of the file, read through SQLite, since the log may be newer than the first page.
 
         Raises:
             EngramError: the kind's `strange`: a file of another kind.
             FormatVersionError: written by a newer Engram.
-            MapCorruptError: there never was such a format.
+            MapCorruptError: the format does not exist.
         """
         kind = self.kind
         if self._pragma(execute, "application_id") != kind.application_id:
-            raise kind.strange(f"{self.path} is an SQLite file, but no {kind.noun}")
+            raise kind.strange(f"{self.path} is an SQLite file, but not a {kind.noun}")
         version = self._pragma(execute, "user_version")
         if version > kind.format_version:
             raise FormatVersionError(
@@ -127,25 +127,25 @@ class SqliteFile:
                 f"reads up to {kind.format_version}: upgrade it"
             )
         if version < 1:
-            raise MapCorruptError(f"{self.path}: format {version} never existed; {kind.cure}")
+            raise MapCorruptError(f"{self.path}: format {version} does not exist; {kind.cure}")
         return version
 
     def is_new(self, execute: Execute) -> bool:
-        """Whether the file holds nothing at all yet."""
+        """Whether the file is still empty."""
         (count,) = execute("SELECT count(*) FROM sqlite_schema").fetchone()
         return not count and self._pragma(execute, "application_id") == 0
 
     def mark(self, execute: Execute) -> None:
-        """Write into the header what the file is."""
+        """Writes the kind and the format into the header."""
         execute(f"PRAGMA application_id={self.kind.application_id}")
         execute(f"PRAGMA user_version={self.kind.format_version}")
 
     def check_tables(self, execute: Execute, missing: Collection[str] = ()) -> None:
-        """Only our tables with our columns: no view, trigger or computed column of a stranger.
+        """Refuses files with other tables or columns, or with views and triggers.
 
         Args:
-            execute: of an open connection; tables that are missing may stand in it for itself.
-            missing: tables that the file's format does not have.
+            execute: `execute` of an open connection; temporary tables may replace missing ones.
+            missing: tables that the file's format lacks.
 
         Raises:
             MapCorruptError: other tables, or other columns.
@@ -166,7 +166,7 @@ class SqliteFile:
                 raise MapCorruptError(f"{self.path}: table {table.name} has the columns {columns}")
 
     def connect(self, options: str) -> sqlite3.Connection:
-        """A connection; transactions are begun by hand.
+        """A connection; transactions begin explicitly.
 
         Args:
             options: of SQLite's URI: ``mode=ro``, ``mode=rw`` or ``mode=rwc``.
@@ -183,11 +183,11 @@ class SqliteFile:
             f"file:{quote(str(self.path.absolute()))}?{options}",
             uri=True,
             timeout=self.kind.busy_s,
-            check_same_thread=False,  # whoever takes a connection has it alone until giving it back
+            check_same_thread=False,  # only one thread at a time uses a connection
             isolation_level=None,
         )
         try:
-            connection.execute("PRAGMA trusted_schema=OFF")  # no function of a stranger's is called
+            connection.execute("PRAGMA trusted_schema=OFF")  # call no functions of the file
             connection.execute("PRAGMA cell_size_check=ON")
             connection.execute("PRAGMA synchronous=FULL")
             connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")
@@ -221,10 +221,10 @@ class SqliteFile:
 
     @contextmanager
     def errors(self) -> Iterator[None]:
-        """SQLite's errors as ours, each with the file's name.
+        """Converts SQLite's errors into Engram's, with the file's name.
 
         Raises:
-            EngramError: the kind's `strange`: no SQLite file, or it cannot be opened.
+            EngramError: the kind's `strange`: not an SQLite file, or it cannot be opened.
             MapCorruptError: it is damaged or cut short.
             MapLockedError: another process writes to it.
             StorageFullError: no space is left.
@@ -235,7 +235,7 @@ class SqliteFile:
         except (DBAPIError, sqlite3.Error) as error:
             cause = error.orig if isinstance(error, DBAPIError) else error
             raise self._translate(cause) from error
-        except UnicodeDecodeError as error:  # sqlite3 reads names of columns without a net
+        except UnicodeDecodeError as error:  # sqlite3 does not guard column names
             raise MapCorruptError(f"{self.path} is damaged ({error}); {self.kind.cure}") from error
 
     def _translate(self, cause: BaseException | None) -> EngramError:
@@ -251,12 +251,12 @@ class SqliteFile:
             )
         elif primary == sqlite3.SQLITE_NOTADB:
             error = self.kind.strange
-            fact = f"is no {noun}: it is no SQLite file, or its beginning is damaged"
+            fact = f"is not a {noun}: it is not an SQLite file, or its beginning is damaged"
         elif primary == sqlite3.SQLITE_CANTOPEN:
             error = self.kind.strange
             fact = (
                 f"cannot be opened ({cause}); if it lies on read-only media with a file "
-                f"{self.path.name}-wal beside it, copy both where they may be written"
+                f"{self.path.name}-wal beside it, copy both to a writable folder"
             )
         elif primary in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
             error = MapLockedError
@@ -271,10 +271,10 @@ class SqliteFile:
 
 
 class _FileDialect(SQLiteDialect_pysqlite):
-    """SQLite's dialect, equal for all files: a statement is compiled once, not for every file.
+    """One SQLite dialect for all files, so that each statement is compiled once.
 
-    SQLAlchemy keys compiled statements by the engine's dialect. A process that opens many small
-    maps would spend half of its time on compiling the same statements again.
+    SQLAlchemy caches compiled statements by dialect. With one dialect per file, a process that
+    opens many small maps would spend half of its time compiling.
     """
 
     supports_statement_cache = True

@@ -138,7 +138,7 @@ def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
         (empty, "empty file"),
         (text, "no map"),
         (folder, "folder"),
-        (other, "an SQLite file, but no map"),
+        (other, "an SQLite file, but not a map"),
     ):
         for opener in (Map.open, partial(Map.open, writes=True), check_file):
             with pytest.raises(NotAMapError, match=fact):

@@ -1,1 +1,1 @@
-"""What a centre on a server needs beyond maps in files: maps in PostgreSQL."""
+"""Maps in PostgreSQL, for a fleet map on a server."""

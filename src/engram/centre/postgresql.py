@@ -1,4 +1,4 @@
-"""A map as one schema of a PostgreSQL database: the same tables, another lock.
+"""A map as one schema of a PostgreSQL database, with the same tables and an advisory lock.
 
 The address is an SQLAlchemy URL with the map's name in its query, for example
 ``postgresql+psycopg://engram@centre/fleet?map=town``.
@@ -49,31 +49,31 @@ from engram.maps.schema import (
     missing_in,
 )
 
-# The first half of the advisory lock's key says that it is ours, the second which map.
+# The first half of the advisory lock's key identifies Engram, the second the map.
 _LOCK_CLASS = 0x4547524D
 # PostgreSQL cuts application names there.
 _NAME_BYTES = 63
 
 
 class PostgresMap:
-    """Where a map lies, or is to lie: a `Place` that maps are made at and opened from.
+    """The `Place` of a map, existing or new.
 
     Args:
         address: URL with ``map=NAME`` in its query.
 
     Raises:
-        InputError: the address cannot be understood.
+        InputError: the address is not valid.
     """
 
     def __init__(self, address: str) -> None:
         self._url, self._schema = _parse(address)
 
     def create(self) -> None:
-        """Make an empty map: all of it or nothing.
+        """Creates an empty map atomically.
 
         Raises:
             InputError: the map exists.
-            MapError: no connection.
+            MapError: the server cannot be reached.
         """
         schema = self._schema
         engine = _engine(self._url, schema)
@@ -96,7 +96,7 @@ class PostgresMap:
         Raises:
             NotAMapError: the database has no such map.
             FormatVersionError: written by a newer Engram.
-            MapError: no connection.
+            MapError: the server cannot be reached.
         """
         return PostgresDatabase(self._url, self._schema)
 
@@ -144,7 +144,7 @@ class PostgresDatabase:
             yield connection
 
     def lock_for_writing(self) -> AdvisoryLock:
-        """Become the only writer."""
+        """Locks the map for writing."""
         lock = AdvisoryLock(self._url, self._schema, self)
         try:
             self._raise_format()
@@ -154,7 +154,7 @@ class PostgresDatabase:
         return lock
 
     def _raise_format(self) -> None:
-        """Bring an older map to the newest format: all of it, in one transaction."""
+        """Upgrades an older map to the newest format in one transaction."""
         if self._read_version() < FORMAT_VERSION:
             self._engine.dispose()
             self._engine = _engine(self._url, self._schema)
@@ -166,7 +166,7 @@ class PostgresDatabase:
             self.format_version = FORMAT_VERSION
 
     def writer(self) -> Holder | None:
-        """Who writes now."""
+        """The current writer; None without one."""
         query = text(
             "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a ON a.pid = l.pid "
             "WHERE l.locktype = 'advisory' AND l.granted AND l.classid = :class "
@@ -193,11 +193,11 @@ class PostgresDatabase:
         )
 
     def integrity_problems(self) -> list[str]:
-        """PostgreSQL checks its pages itself where data checksums are on."""
+        """No faults: PostgreSQL checks its own pages if data checksums are enabled."""
         return []
 
     def size_bytes(self) -> int:
-        """Tables with their indices."""
+        """Size of all tables with their indices, bytes."""
         query = text(
             "SELECT coalesce(sum(pg_total_relation_size(c.oid)), 0) FROM pg_class c "
             "JOIN pg_namespace n ON n.oid = c.relnamespace "
@@ -212,13 +212,13 @@ class PostgresDatabase:
 
 
 class AdvisoryLock:
-    """The right to be a map's only writer; the server drops it with the connection.
+    """The lock of a map's only writer; the server releases it with the connection.
 
     Attributes:
-        holder: who has it: this process.
+        holder: this process.
 
     Raises:
-        MapLockedError: somebody else has it.
+        MapLockedError: another process holds it.
     """
 
     def __init__(self, url: URL, schema: str, database: PostgresDatabase) -> None:
@@ -241,7 +241,7 @@ class AdvisoryLock:
             )
 
     def release(self) -> None:
-        """Let others write."""
+        """Releases the lock."""
         self._connection.close()
         self._engine.dispose()
 
@@ -250,7 +250,7 @@ def _parse(address: str) -> tuple[URL, str]:
     try:
         url = make_url(address)
     except ArgumentError as error:
-        raise InputError(f"{address!r} is no database address: {error}") from error
+        raise InputError(f"{address!r} is not a database address: {error}") from error
     schema = url.query.get("map")
     if not isinstance(schema, str) or not schema.isidentifier():
         raise InputError(
@@ -275,7 +275,7 @@ def _engine(url: URL, schema: str, **options: str) -> Engine:
 
 
 def _show_missing_tables(engine: Engine, version: int) -> None:
-    """What a map of an older format lacks is seen as empty tables of each connection alone."""
+    """Adds tables that an older format lacks as empty temporary tables of each connection."""
     definitions = [
         str(CreateTable(table).compile(dialect=engine.dialect)).replace(
             "CREATE TABLE", "CREATE TEMP TABLE", 1
@@ -291,7 +291,7 @@ def _show_missing_tables(engine: Engine, version: int) -> None:
 
 
 def _free_names(connection: Connection, renamed: str) -> None:
-    """Constraints keep their names when their table is renamed; the new table needs them."""
+    """Renames the constraints of a renamed table, since the new table needs their names."""
     names = connection.execute(
         text("SELECT conname FROM pg_constraint WHERE conrelid = CAST(:table AS regclass)"),
         {"table": renamed},
@@ -310,7 +310,7 @@ def _signed(number: int) -> int:
 
 @contextmanager
 def _translated(name: str) -> Iterator[None]:
-    """PostgreSQL's errors as ours, by SQLSTATE."""
+    """Converts PostgreSQL's errors into Engram's, by SQLSTATE."""
     try:
         yield
     except DBAPIError as error:

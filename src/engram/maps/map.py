@@ -1,4 +1,4 @@
-"""A map on disk: open it, read it, add sessions to it, look at its history."""
+"""A map on disk: opening, reading, adding sessions, and history."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _T = TypeVar("_T")
 
 
 def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[Map, _P], _T]:
-    """The map is locked for writing while the method runs."""
+    """Locks the map for writing while the method runs."""
 
     @wraps(method)
     def locked(self: Map, /, *args: _P.args, **kwargs: _P.kwargs) -> _T:
@@ -74,11 +74,11 @@ def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[
 
 
 class Map(MapReader):
-    """A map on disk, seen as of one revision. A context manager; threads may share it.
+    """A map on disk as of one revision. A context manager; threads may share it.
 
-    Readers never wait for the writer, nor it for them: they see the revisions that were committed
-    when they opened the map, whatever is added meanwhile. What is read stays in memory. The graph
-    and the paths are read once, and grow with what this process writes.
+    Readers and the writer never wait for each other: readers see the revisions committed when
+    they opened the map. Records stay in memory once read. The graph and the paths are read once,
+    and grow with what this process writes.
 
     Attributes:
         frames: the frames of its nodes: a `LandmarkSource`.
@@ -103,10 +103,10 @@ class Map(MapReader):
 
     @staticmethod
     def create(location: Path | str | Place) -> Map:
-        """Make an empty map and open it for writing.
+        """Creates an empty map and opens it for writing.
 
         Raises:
-            InputError: something is there already, or the folder is not.
+            InputError: the file exists already, or its folder does not.
             MapError: it cannot be written.
         """
         if isinstance(location, Path | str):
@@ -123,19 +123,19 @@ class Map(MapReader):
         writes: bool = False,
         cache_bytes: int = DEFAULT_CACHE_BYTES,
     ) -> Map:
-        """Open an existing map.
+        """Opens an existing map.
 
         Args:
-            location: path of the map file, or a place where a map lies in another database.
+            location: path of the map file, or the place of a map in another database.
             at: number or name of the revision to see (`resolve`); None for the newest, 0 for the
                 map before the first.
-            writes: become its only writer at once, until `close`.
-            cache_bytes: how much memory decoded frames may take.
+            writes: lock it for writing until `close`.
+            cache_bytes: largest memory of decoded frames.
 
         Raises:
-            NotAMapError: nothing is there, or something else.
+            NotAMapError: the file does not exist or is not a map.
             FormatVersionError: a newer Engram wrote it.
-            MapCorruptError: it is damaged so that it cannot be read.
+            MapCorruptError: it is too damaged to read.
             MapLockedError: another process writes to it; names process and host.
             RevisionError: it has no such revision.
         """
@@ -156,23 +156,23 @@ class Map(MapReader):
     ) -> Robot:
         """A robot that localises in this map; see `Robot.step`.
 
-        A robot that maps or remembers keeps its drive as a session, and closing it commits that as
-        a revision. It sees what it saves at once; others see it once it is committed.
+        A robot that maps or remembers stores its drive as a session; closing the robot commits it
+        as a revision. The robot sees its own nodes at once, others after the commit.
 
         Args:
             camera: its rectified stereo camera.
             settings: the configuration; None for the defaults.
-            name: of the robot; needed where its drives are kept.
-            maps: whether it saves, on a thread of its own and with checkpoints, what it does not
-                localise. It is the map's only writer until it is closed. A crash leaves a session
-                that `engram check --seal` commits as far as it was saved.
-            remembers: whether the path of its drive and its match attempts are kept, which later
-                drives rank by; a robot that maps remembers anyway. They wait in a file beside the
-                map until the drive ends, and while another process writes to it.
+            name: name of the robot; required if its drives are stored.
+            maps: whether it saves frames that it does not localise, on a separate thread with
+                checkpoints. It is the map's only writer until it is closed. After a crash,
+                `engram check --seal` commits the saved part of the session.
+            remembers: whether to store its path and match attempts, by which later drives rank;
+                implied by `maps`. They are kept in a file beside the map until the drive ends and
+                no other process writes to the map.
             policy: key of `POLICIES`.
-            lanes: attempts at the same time (Np).
-            rounds: rounds of attempts for one frame (Nr).
-            relocaliser: how it is found when lost; None for not at all.
+            lanes: attempts in parallel (Np).
+            rounds: rounds of attempts per frame (Nr).
+            relocaliser: key of `RELOCALISERS`, for lost robots; None for none.
         """
         from engram.robot.settings import RobotOptions
         from engram.robot.starting import robot_in
@@ -182,20 +182,20 @@ class Map(MapReader):
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """Be the map's only writer for a while, on top of its newest revision.
+        """Locks the map for writing, on top of its newest revision.
 
-        A map that was opened with `writes` is its writer anyway.
+        A map opened with `writes` is locked already.
 
         Raises:
             MapLockedError: another process writes to it.
-            RevisionError: the map was opened as of a certain revision.
+            RevisionError: the map was opened at a given revision.
         """
         if self._lock is not None:
             yield
             return
         if self._pinned:
             raise RevisionError(
-                f"{self.location} is open as of revision {self.revision}; to write to it, open it "
+                f"{self.location} is open at revision {self.revision}; to write to it, open it "
                 "without naming a revision"
             )
         self._lock = self._database.lock_for_writing()
@@ -221,22 +221,22 @@ class Map(MapReader):
         configuration: Mapping[str, Any],
         message: str = "",
     ) -> RevisionWriter:
-        """Begin to write one drive, in a revision of its own.
+        """Begins to write one drive, in its own revision.
 
         Args:
-            session: the drive; its id tells whether the map has it already (`session_state`).
+            session: the drive; `session_state` tells whether the map has it already.
             camera: the session's camera.
             descriptor: kind of the descriptors of all its frames.
             frontend: hash of the front-end that makes them.
-            author: who, or which robot.
+            author: the person or robot.
             configuration: the resolved settings, plain JSON data.
-            message: what `log` shows.
+            message: text for `log`.
 
         Raises:
             RevisionError: the map has this session already, committed or interrupted, or another
                 session is being written.
             IncompatibleError: the map's frames have another kind of descriptor.
-            InputError: the camera is not the session's, or the configuration is no JSON data.
+            InputError: the camera is not the session's, or the configuration is not JSON data.
         """
         self._check_none_open()
         self._check_new(session)
@@ -251,11 +251,11 @@ class Map(MapReader):
         return writer
 
     def resume_session(self, session: SessionId) -> RevisionWriter:
-        """Go on with an interrupted session; `RevisionWriter.stored` says where.
+        """Continues an interrupted session; `RevisionWriter.stored` is its stored part.
 
         Raises:
             RevisionError: the map has no interrupted session of this id.
-            IncompatibleError: meanwhile another kind of descriptor came into the map.
+            IncompatibleError: the map has since got another kind of descriptor.
         """
         self._check_none_open()
         row, revision = self._interrupted_rows(session)
@@ -274,11 +274,11 @@ class Map(MapReader):
 
     @_writes
     def seal(self, session: SessionId) -> Revision:
-        """Commit what an interrupted session had checkpointed.
+        """Commits the checkpointed part of an interrupted session.
 
         Raises:
             RevisionError: the map has no interrupted session of this id.
-            IncompatibleError: meanwhile another kind of descriptor came into the map.
+            IncompatibleError: the map has since got another kind of descriptor.
         """
         return self.resume_session(session).commit()
 
@@ -290,18 +290,18 @@ class Map(MapReader):
         configuration: Mapping[str, Any],
         at_ns: int | None = None,
     ) -> RevisionWriter:
-        """Begin to write one revision that brings records of many sessions at once.
+        """Begins to write one revision with records of many sessions.
 
         Args:
-            author: who, or which robot.
-            message: what `log` shows.
+            author: the person or robot.
+            message: text for `log`.
             configuration: the resolved settings, plain JSON data.
-            at_ns: a time that stands for when it was written, UTC; the revision then names no host
-                either, so that the same records give the same bytes. None for now and here.
+            at_ns: time of the revision, UTC, ns; the revision then names no host, so that the same
+                records give the same bytes. None for the current time and host.
 
         Raises:
             RevisionError: a session or another such revision is being written.
-            InputError: the configuration is no JSON data.
+            InputError: the configuration is not JSON data.
         """
         self._check_none_open()
         row = self._revision_row(author, message, configuration)
@@ -313,23 +313,23 @@ class Map(MapReader):
     def revert(
         self, named: int | str, *, author: str, message: str = "", dry_run: bool = False
     ) -> Reverted:
-        """Take a revision back, by a new revision that hides what it brought (`hide_revision`).
+        """Reverts a revision, by a new one that hides its rows (`hide_revision`).
 
         Args:
             named: the revision.
-            author: who.
-            message: why.
-            dry_run: only say what would come of it.
+            author: the person or robot.
+            message: reason.
+            dry_run: only report the result.
 
         Raises:
-            RevisionError: there is no such revision, nothing of it is left to take back, or a
-                session is being written.
-            StorageFullError: no space; the map is as it was.
+            RevisionError: there is no such revision, nothing of it is visible, or a session is
+                being written.
+            StorageFullError: no space; the map is unchanged.
         """
         self._check_none_open()
         number = self.resolve(named)
         if number == 0:
-            raise RevisionError(f"{self._database.name}: there is no revision 0 to take back")
+            raise RevisionError(f"{self._database.name}: there is no revision 0 to revert")
         said = f"revert revision {number}" + (f": {message}" if message else "")
         opened = self._revision_row(author, said, {"revert": number})
         try:
@@ -352,7 +352,7 @@ class Map(MapReader):
 
     @_writes
     def put_words(self, vocabulary: bytes, found: Mapping[NodeId, NDArray[np.int32]]) -> None:
-        """Keep words of nodes, in one transaction: no revision, since they follow from other rows.
+        """Stores words of nodes in one transaction; no revision, since they follow from other rows.
 
         Args:
             vocabulary: hash (16 bytes) of the vocabulary.
@@ -360,7 +360,7 @@ class Map(MapReader):
 
         Raises:
             InputError: a node is not in the map, or its words do not rise.
-            StorageFullError: no space; the map is as it was.
+            StorageFullError: no space; the map is unchanged.
         """
         rows = []
         for node, shown in found.items():
@@ -375,17 +375,17 @@ class Map(MapReader):
     def put_vocabulary(
         self, body: bytes, *, author: str, message: str, configuration: Mapping[str, Any]
     ) -> Revision:
-        """Keep a vocabulary in the map, in a revision of its own; the newest counts.
+        """Stores a vocabulary in its own revision; the newest counts.
 
         Args:
             body: the vocabulary, encoded.
-            author: who, or which robot.
-            message: what `log` shows.
+            author: the person or robot.
+            message: text for `log`.
             configuration: how it was trained, plain JSON data.
 
         Raises:
             RevisionError: a session is being written.
-            StorageFullError: no space; the map is as it was.
+            StorageFullError: no space; the map is unchanged.
         """
         with self.begin_revision(
             author=author, message=message, configuration=configuration
@@ -404,20 +404,21 @@ class Map(MapReader):
         author: str,
         message: str = "",
     ) -> Revision:
-        """Set right what is shown of a session; its record, and all ids, stay as they are.
+        """Corrects facts of a session; its record and all ids stay unchanged.
 
         Args:
-            session: which.
-            changes: what is wrong, and what it is: a robot's name, an IANA zone, or the UTC of the
-                session's first pair, in ns.
-            author: who.
-            message: why.
+            session: the session.
+            changes: new values by fact: a robot's name, an IANA zone, or the UTC time of the
+                session's first pair, ns.
+            author: the person or robot.
+            message: reason.
 
         Raises:
-            InputError: the map has no such session, it is so already, or a value cannot be one.
+            InputError: the map has no such session, it has these values already, or a value is not
+                valid.
             ConfigError: the zone is unknown.
             RevisionError: a session is being written.
-            StorageFullError: no space; the map is as it was.
+            StorageFullError: no space; the map is unchanged.
         """
         if session not in self.sessions:
             raise InputError(f"{self.location} has no session {session}")
@@ -443,17 +444,17 @@ class Map(MapReader):
         message: str = "",
         move: bool = False,
     ) -> Tag:
-        """Give a revision a name. History and content hash stay as they are.
+        """Tags a revision. History and content hash do not change.
 
         Args:
             name: a letter, then letters, digits and ``. _ / + -``.
             named: the revision; None for the newest.
-            author: who.
-            message: why.
-            move: whether a name that another revision has may be taken from it.
+            author: the person or robot.
+            message: reason.
+            move: whether to move a tag that another revision has.
 
         Raises:
-            InputError: the name cannot be one.
+            InputError: the name is not valid.
             RevisionError: there is no such revision, or another one has the name.
         """
         with self._database.writing() as connection:
@@ -463,7 +464,7 @@ class Map(MapReader):
 
     @_writes
     def untag(self, name: str, *, author: str) -> Tag:
-        """Take a name away; returns what it was.
+        """Removes a tag and returns it.
 
         Raises:
             RevisionError: there is no such tag.
@@ -473,13 +474,13 @@ class Map(MapReader):
 
     @_writes
     def clean(self) -> int:
-        """Remove the rows of abandoned revisions; returns how many there were."""
+        """Removes the rows of abandoned revisions; returns their number."""
         self._check_none_open()
         with self._database.writing() as connection:
             return collect_abandoned(connection)
 
     def close(self) -> None:
-        """Give back files, threads and the right to write.
+        """Closes files and threads, and releases the lock.
 
         A session that is still open becomes interrupted.
         """
@@ -490,7 +491,7 @@ class Map(MapReader):
 
     @property
     def _holder(self) -> Holder:
-        assert self._lock is not None  # whoever asks has keys
+        assert self._lock is not None  # keys exist only with the lock
         return self._lock.holder
 
     @property
@@ -508,7 +509,7 @@ class Map(MapReader):
         return {
             "key": self._keys.next(revisions),
             "number": None,
-            "status": str(RevisionStatus.ABANDONED),  # until it has something to keep
+            "status": str(RevisionStatus.ABANDONED),  # until its first checkpoint
             "parent": None,
             "author": checked_text(author, "author"),
             "message": checked_text(message, "message"),
@@ -525,16 +526,16 @@ class Map(MapReader):
     def _begin(
         self, row: Row, *, session: Session | None = None, committed_ns: int | None = None
     ) -> RevisionWriter:
-        """A new revision, in which nothing is yet."""
+        """A new, empty revision."""
         with self._database.writing() as connection:
-            collect_abandoned(connection)  # whose UUIDs may come again
+            collect_abandoned(connection)  # since their UUIDs may be used again
             connection.execute(insert(revisions), [sealed(revisions, row)])
-        self._keys.forget_nodes()  # some may have been hidden since they were learnt
+        self._keys.forget_nodes()  # some may be hidden since then
         own = View(self._view.at, row["key"])
         return self._written(own, session=session, committed_ns=committed_ns)
 
     def _written(self, own: View, *, session: Session | None, **kind: Any) -> RevisionWriter:
-        """The writer of a revision; until it ends, this map is seen with what it has written."""
+        """The writer of a revision; until it ends, this map includes its rows."""
         if session is not None:
             self.forget()  # what is read from now on includes the session
         self._see(own)
@@ -598,19 +599,19 @@ class Map(MapReader):
 
 
 class _DryRunError(Exception):
-    """Ends a transaction of which nothing shall stay."""
+    """Ends a transaction without committing it."""
 
 
 def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
-    """Opens a map to localise in it, to add to it, or to look at it.
+    """Opens a map for localising, writing or reading.
 
     Args:
         path: NAME.engram.
         at: number or tag of a revision, to see the map as it was then; None for the newest.
-        create: make an empty map where nothing is.
+        create: create an empty map if the file does not exist.
 
     Raises:
-        MapError: the file is no map, of a newer format, or damaged.
+        MapError: the file is not a map, of a newer format, or damaged.
         RevisionError: there is no such revision.
     """
     if create and not map_path(path).exists():

@@ -1,9 +1,9 @@
 """A map as one SQLite file.
 
-Write-ahead log, so that readers and the writer never wait for each other. `synchronous=FULL`: a
-checkpoint that has returned survives a power cut, not only a kill; that costs one fsync, on the
-saving thread (20 nodes of 25 kB on ext4: 2.1 ms a checkpoint, 1.5 ms with NORMAL). No memory
-mapping: a file that is cut while it is mapped would kill the process.
+A write-ahead log lets readers and the writer work without waiting for each other. With
+`synchronous=FULL` a finished checkpoint survives a power cut; this costs one fsync on the saving
+thread (0.6 ms for 20 nodes of 25 kB on ext4). No memory mapping, since truncating a mapped file
+would kill the process.
 """
 
 from __future__ import annotations
@@ -37,28 +37,28 @@ MAP_FILE = FileKind(
     metadata=metadata,
     strange=NotAMapError,
     cure="run engram check, and restore a copy",
-    busy_s=30.0,  # writers hold the file for a checkpoint only; longer, and somebody is stuck
+    busy_s=30.0,  # seconds; writers lock the file only for a checkpoint
 )
-# SQLite then takes no locks, and does not notice what others write.
+# SQLite then takes no locks, and does not notice writes of other processes.
 _NOBODY_WRITES = "mode=ro&immutable=1"
 _BESIDE = ("-wal", "-shm", "-journal")
 
 
 class SqliteDatabase:
-    """One map file. Checks on opening that it is a map of a format that this version reads.
+    """One map file. Opening it checks that it is a map of a known format.
 
     Args:
         path: the file.
 
     Raises:
-        NotAMapError: nothing is there, or something else.
+        NotAMapError: the file does not exist or is not a map.
         FormatVersionError: written by a newer Engram.
-        MapCorruptError: a map whose tables are not as they must be.
+        MapCorruptError: its tables are not those of its format.
         MapError: it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path.resolve()  # one lock per map, whatever links lead to it
+        self.path = path.resolve()  # one lock per map, even through links
         self._file = SqliteFile(self.path, MAP_FILE)
         self._file.check_regular()
         self._options, self.format_version = self._way_of_reading()
@@ -67,17 +67,17 @@ class SqliteDatabase:
         self._reader = self._file.engine(self._options, self._prepare_reader)
         self._writer: Engine | None = None
         self._compiled: dict[Select[Any], tuple[str, tuple[str, ...]]] = {}
-        self._idle: deque[sqlite3.Connection] = deque()  # as many as there were threads at once
+        self._idle: deque[sqlite3.Connection] = deque()  # one for each concurrent thread
         missing = {table.name for table in missing_in(self.format_version)}
         with self.reading() as connection:
             self._file.check_tables(connection.exec_driver_sql, missing)
 
     @staticmethod
     def create(path: Path) -> None:
-        """Make an empty map. It appears under its name whole or not at all.
+        """Creates an empty map atomically.
 
         Raises:
-            InputError: something is there already, or the folder is not.
+            InputError: the file exists already, or its folder does not.
             MapError: it cannot be written.
         """
         with _new_map(path) as draft:
@@ -110,10 +110,9 @@ class SqliteDatabase:
 
     @contextmanager
     def _unchanged(self) -> Iterator[None]:
-        """What is read is of the file as it was opened, or it is told that it was written since.
+        """Raises an error if the file was written since it was opened without locks.
 
-        Only where SQLite was told that nobody writes: then it mixes old pages and new ones, which
-        looks like damage, or like nothing at all.
+        SQLite would then mix old and new pages, which looks like damage or goes unnoticed.
         """
         try:
             yield
@@ -125,12 +124,11 @@ class SqliteDatabase:
     def _check_unchanged(self, cause: MapError | None) -> None:
         if self._as_opened is not None and _state(self.path) != self._as_opened:
             raise MapError(
-                f"{self.name} was written since it was opened, where this user may only read: "
-                "open it again"
+                f"{self.name} was written since it was opened read-only: open it again"
             ) from cause
 
     def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:
-        """The first row of a select, without SQLAlchemy between: that takes 100 µs a time."""
+        """The first row of a select, without SQLAlchemy, which takes 100 µs per call."""
         if query not in self._compiled:
             compiled = query.compile(dialect=self._reader.dialect)
             assert isinstance(compiled, SQLCompiler)
@@ -152,16 +150,16 @@ class SqliteDatabase:
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """One transaction, durable when the block is left."""
+        """One transaction, durable at the end of the block."""
         if self._writer is None:
             self._writer = _writing_engine(self._file, "mode=rw")
         with damage_named(self.name), self._file.errors(), self._writer.begin() as connection:
             yield connection
 
     def lock_for_writing(self) -> WriterLock:
-        """Become the only writer."""
+        """Locks the map for writing."""
         if not os.access(self.path, os.W_OK):
-            raise MapError(f"{self.path} is read-only; copy it where it may be written")
+            raise MapError(f"{self.path} is read-only; copy it to a writable folder")
         lock = WriterLock(self.path)
         try:
             self._raise_format()
@@ -171,7 +169,7 @@ class SqliteDatabase:
         return lock
 
     def writer(self) -> Holder | None:
-        """Who writes now."""
+        """The current writer; None without one."""
         return current_holder(self.path)
 
     def replace(self, table: Table, key: tuple[str, ...]) -> Insert:
@@ -182,7 +180,7 @@ class SqliteDatabase:
         )
 
     def integrity_problems(self) -> list[str]:
-        """What `PRAGMA integrity_check` says."""
+        """Faults that `PRAGMA integrity_check` reports."""
         try:
             with self.reading() as connection:
                 found = connection.exec_driver_sql("PRAGMA integrity_check(100)").scalars().all()
@@ -191,10 +189,10 @@ class SqliteDatabase:
         return [str(fact) for fact in found if fact != "ok"]
 
     def copy_to(self, target: Path) -> None:
-        """Copies the map as it is now, whoever writes to it meanwhile; whole or not at all.
+        """Copies the current state of the map atomically, even while another process writes.
 
         Raises:
-            InputError: something is there already, or the folder is not.
+            InputError: the file exists already, or its folder does not.
             MapError: it cannot be written.
         """
         with self._written_anew(target) as (source, draft):
@@ -203,10 +201,10 @@ class SqliteDatabase:
             _keep_log(draft)
 
     def compact_to(self, target: Path) -> None:
-        """Writes the map anew, without what deleting and growing left; whole or not at all.
+        """Rewrites the map atomically, without free pages.
 
         Raises:
-            InputError: something is there already, or the folder is not.
+            InputError: the file exists already, or its folder does not.
             MapError: it cannot be written.
         """
         with self._written_anew(target) as (source, draft):
@@ -226,14 +224,14 @@ class SqliteDatabase:
 
     @staticmethod
     def publish(draft: Path, path: Path) -> None:
-        """Give a map file that nobody has open its name, in the same file system.
+        """Renames a map file that no process has open, within one file system.
 
         Raises:
-            InputError: something is there already, or the folder is not.
-            MapError: the name cannot be given.
+            InputError: the file exists already, or its folder does not.
+            MapError: the file cannot be renamed.
         """
         if _has_log(draft):
-            raise MapError(f"{draft} is open still: {path} would lack what its log holds")
+            raise MapError(f"{draft} is still open: {path} would lack the content of its log")
         with naming(path):
             _remove_orphans(path)
             publish(draft, path)
@@ -256,11 +254,10 @@ class SqliteDatabase:
             self._idle.pop().close()
 
     def _way_of_reading(self) -> tuple[str, int]:
-        """How the file can be opened for reading, wherever it lies; and its format.
+        """The way to open the file for reading, and its format.
 
-        A write-ahead log wants a second file beside it, which cannot be made on read-only media
-        or on a full disk. Without a log and without a writer there is nothing to coordinate, and
-        SQLite may be told so: history stays readable, and a map can be copied elsewhere.
+        A write-ahead log needs a second file, which cannot be created on read-only media or a full
+        disk. Without a log and a writer, SQLite can open the file as immutable instead.
         """
         if os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK):
             try:
@@ -276,13 +273,13 @@ class SqliteDatabase:
             return self._file.identify(connection.execute)
 
     def _prepare_reader(self, connection: sqlite3.Connection) -> None:
-        """What a map of an older format lacks is seen as empty tables of this connection alone."""
+        """Adds tables that an older format lacks as empty temporary tables of this connection."""
         for table in missing_in(self.format_version):
             connection.execute(_definition(table).replace("CREATE TABLE", "CREATE TEMP TABLE", 1))
         connection.execute("PRAGMA query_only=ON")
 
     def _raise_format(self) -> None:
-        """Bring an older map to the newest format: all of it, in one transaction."""
+        """Upgrades an older map to the newest format in one transaction."""
         if self._format_version("mode=rw") < FORMAT_VERSION:
             with self.writing() as connection:
                 raise_tables(connection, self.format_version)
@@ -297,7 +294,7 @@ def map_path(location: Path | str) -> Path:
     """The path of a map file.
 
     Raises:
-        InputError: it is the address of a database. It may hold a password: it is not repeated.
+        InputError: it is the address of a database; not shown, as it may hold a password.
     """
     if isinstance(location, str) and location.startswith("postgresql"):
         raise InputError(
@@ -321,7 +318,7 @@ def _has_log(path: Path) -> bool:
 
 
 def _state(path: Path) -> tuple[int, int, int] | None:
-    """Which file stands under a name, and when it was last written; None where none does."""
+    """Identity and time of the last write of a file; None if it does not exist."""
     try:
         found = path.stat()
     except OSError:
@@ -331,33 +328,33 @@ def _state(path: Path) -> tuple[int, int, int] | None:
 
 def _writing_engine(file: SqliteFile, options: str) -> Engine:
     engine = file.engine(options)
-    # Take the write lock at once: a transaction that upgrades later can fail half way.
+    # Takes the write lock at once: a transaction that upgrades later can fail half way.
     event.listen(engine, "begin", lambda one: one.exec_driver_sql("BEGIN IMMEDIATE"))
     return engine
 
 
 def _keep_log(file: SqliteFile) -> None:
-    """A write-ahead log from now on: the file remembers it for ever."""
+    """Switches the file to a write-ahead log permanently."""
     with closing(file.connect("mode=rw")) as connection:
         connection.execute("PRAGMA journal_mode=WAL")
 
 
 @contextmanager
 def _new_map(path: Path) -> Iterator[Path]:
-    """A draft to be filled, which then appears under its name whole or not at all."""
+    """A draft file that is renamed to its final name when complete."""
     with new_file(path) as draft:
         yield draft
         _remove_orphans(path)
 
 
 def _remove_orphans(path: Path) -> None:
-    """Logs of a map that was removed after its writer was killed.
+    """Removes logs of a map that was deleted after its writer was killed.
 
-    SQLite would take them for those of the map that comes to lie beside them. Whoever finds some
-    holds the writer's lock, so that nobody makes that map, and a log of it, meanwhile.
+    SQLite would apply them to a new map of that name. The writer's lock is held meanwhile, so that
+    no other process creates that map.
 
     Raises:
-        MapLockedError: somebody else does so now.
+        MapLockedError: another process does so now.
     """
     orphans = [path.with_name(path.name + suffix) for suffix in _BESIDE]
     if not any(one.exists() for one in orphans):

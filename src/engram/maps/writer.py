@@ -1,4 +1,4 @@
-"""One revision on its way into a map: buffered, checkpointed, then committed in one small step."""
+"""Writes one revision of a map: buffers, checkpoints, then commits in one small step."""
 
 from __future__ import annotations
 
@@ -64,35 +64,35 @@ from engram.maps.schema import (
 )
 from engram.maps.view import View
 
-# What may wait in memory of a revision that cannot be resumed.
+# Most bytes in memory of a revision that is not resumable.
 _BATCH_BYTES = 8 * 2**20
-# Covariances come from products with their own transposes: what is left of asymmetry is rounding.
+# Asymmetry of covariances by rounding, since they come from products with transposes.
 _ASYMMETRY_LIMIT = 1e-6
 
 
 class RevisionWriter:
-    """Adds records to a map, in one revision that appears whole or not at all.
+    """Adds records to a map, in one atomic revision.
 
-    Made by `begin_session`, `resume_session` and `begin_revision` of `Map`. What is
-    added waits in memory until `checkpoint` writes it; readers see it after `commit`. Sessions come
-    before their nodes, nodes before what refers to them. What a revert has hidden is shown again
-    when it is added again.
+    Made by `begin_session`, `resume_session` and `begin_revision` of `Map`. Records are buffered
+    until `checkpoint` writes them; readers see them after `commit`. Add sessions before their
+    nodes, and nodes before records that refer to them. Adding a record that a revert has hidden
+    shows it again.
 
-    A revision of one drive that is being mapped is *resumable*: killed, or left without `commit`,
-    it keeps what was checkpointed, to be resumed or sealed. Any other, a merge or a download, is
-    lost then, and its rows are collected by the next writer or by ``check --clean``; it checkpoints
-    itself before more than 8 MiB wait, so that memory does not grow with it.
+    The revision of a drive that is being mapped is *resumable*: killed, or left without `commit`,
+    it keeps its checkpoints, to be resumed or sealed. Any other (a merge or a download) is then
+    lost, and the next writer or ``check --clean`` collects its rows; it checkpoints itself before
+    the buffer exceeds 8 MiB.
 
-    One thread at a time may write. The map's `frames` can read a node, from any thread, as soon as
-    it was added.
+    One thread at a time may write. The map's `frames` can read a node from any thread as soon as
+    it is added.
 
     Args:
         database, keys, frame_reader: the map's.
-        view: the newest revision, and the revision that is written, which is born abandoned.
-        on_end: called when it is committed or abandoned.
-        session: the drive of a resumable revision; None for any other.
-        stored: what a resumed session has checkpointed; None for a new revision.
-        committed_ns: a time that stands for that of the commit, UTC; None for that time itself.
+        view: the newest revision and this one, which has the state abandoned until a checkpoint.
+        on_end: called after commit or abandonment.
+        session: the drive of a resumable revision; None for others.
+        stored: the checkpointed part of a resumed session; None for a new revision.
+        committed_ns: time of the commit to store, UTC, ns; None for the actual time.
 
     Attributes:
         resumable: whether it is of one drive.
@@ -144,7 +144,7 @@ class RevisionWriter:
             self._interrupted = open_sessions(connection)
         self._sequences: dict[int, set[int]] = {}
         self._omitted: set[bytes] = set()
-        self._amended: set[Amendment] | None = None  # read when first asked for
+        self._amended: set[Amendment] | None = None  # read on first use
         self._shows_again = False
         self._held: list[NodeId] = []
 
@@ -159,14 +159,14 @@ class RevisionWriter:
         frontend: str,
         partial: bool = False,
     ) -> bool:
-        """Add a drive with its path; one that the map has already changes nothing.
+        """Adds a drive with its path; one that the map has already changes nothing.
 
         Args:
             session: the drive.
             camera: the session's camera.
             descriptor: kind of its descriptors.
             frontend: hash of its front-end.
-            partial: whether some of its path's entries stay elsewhere.
+            partial: whether some of its path's entries are not in this map.
 
         Returns:
             Whether it was new.
@@ -174,7 +174,7 @@ class RevisionWriter:
         Raises:
             IncompatibleError: the map's frames have another kind of descriptor.
             InputError: the camera is not the session's.
-            RevisionError: the map holds what an interrupted run of the session had saved.
+            RevisionError: the map holds an interrupted run of the session.
         """
         self._check_open()
         if session.camera != camera.id:
@@ -210,7 +210,7 @@ class RevisionWriter:
         return True
 
     def add_node(self, node: Node, frame: Frame) -> None:
-        """Save a frame as a node.
+        """Saves a frame as a node.
 
         Raises:
             InputError: node and frame do not belong together, the landmarks cannot be stored
@@ -235,15 +235,15 @@ class RevisionWriter:
         self.copy_node(stored, frame)
 
     def copy_node(self, stored: StoredNode, frame: Frame | None = None) -> None:
-        """Add a node of another map, its landmarks copied byte for byte.
+        """Adds a node of another map, with its landmarks copied byte for byte.
 
         Args:
             stored: from another map's `frames.stored`.
-            frame: its frame, if it was decoded anyway: read from memory until it is written.
+            frame: its decoded frame, if at hand: read from memory until the node is written.
 
         Raises:
             InputError: its session has not been added or has another camera, the map has the node
-                already or had it with other landmarks, or a number of it cannot be.
+                already or had it with other landmarks, or one of its numbers is not valid.
             IncompatibleError: it comes from another front-end than its session.
         """
         self._check_open()
@@ -262,7 +262,7 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Keep the words of a node by the vocabulary of this hash (16 bytes).
+        """Stores the words of a node by the vocabulary of this hash (16 bytes).
 
         Args:
             node: a node of the map.
@@ -277,7 +277,7 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_edge(self, edge: Edge) -> None:
-        """Add an edge; it takes the place of an older one with the same (a, b, kind).
+        """Adds an edge, replacing an older one with the same (a, b, kind).
 
         Raises:
             InputError: an end is not in the map, both are the same, or a number is not finite.
@@ -289,7 +289,7 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_path_entry(self, entry: PathEntry) -> None:
-        """Add a step of any session's path, in any order.
+        """Adds an entry of any session's path, in any order.
 
         Raises:
             InputError: the path or the node is not in the map, or the path has an entry of this
@@ -315,9 +315,9 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_attempts(self, made: Sequence[Attempt]) -> None:
-        """Remember match attempts (SPEC §3.5) of the drive being mapped, rounded to 18 bytes each.
+        """Stores match attempts (SPEC §3.5) of the drive being mapped, rounded to 18 bytes each.
 
-        Offsets and headings keep 11 bits, standard deviations are right to 3 %, ranks end at 255.
+        Offsets and headings keep 11 bits, standard deviations are exact to 3 %, ranks end at 255.
 
         Raises:
             InputError: a node is not in the map.
@@ -326,12 +326,12 @@ class RevisionWriter:
         self.copy_attempts(self.session.id, *Attempts.of(made))
 
     def copy_attempts(self, session: SessionId, made: Attempts, node_ids: Sequence[NodeId]) -> None:
-        """Remember attempts of one session of another map, in the order of their iterations.
+        """Stores attempts of one session of another map, in the order of their iterations.
 
         Args:
-            session: whose they are.
-            made: the attempts; their column `session` is of no account.
-            node_ids: what their `reference` and `node` are indices into.
+            session: their session.
+            made: the attempts; their column `session` is ignored.
+            node_ids: the nodes to which their `reference` and `node` are indices.
 
         Raises:
             InputError: the session or a node is not in the map.
@@ -355,10 +355,10 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_omission(self, omission: Omission) -> None:
-        """Remember that a node was not taken, and for which.
+        """Stores an omitted node and its equivalent.
 
         Raises:
-            InputError: the equivalent is not in the map, or the omitted node is remembered already.
+            InputError: the equivalent is not in the map, or the omission is stored already.
         """
         self._check_open()
         node_key = self._node_key(omission.node, "omission")
@@ -375,7 +375,7 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_amendment(self, amendment: Amendment) -> bool:
-        """Set something right about a session; what the map was told before changes nothing.
+        """Adds a correction of a session; one that the map has already changes nothing.
 
         Returns:
             Whether it was new.
@@ -403,7 +403,7 @@ class RevisionWriter:
         return True
 
     def put_vocabulary(self, body: bytes) -> None:
-        """Keep a vocabulary, encoded; the newest counts."""
+        """Stores an encoded vocabulary; the newest counts."""
         self._check_open()
         self._rows.new(vocabularies, len(body), hash=content_digest(body), body=body)
         self._checkpoint_if_due()
@@ -416,16 +416,16 @@ class RevisionWriter:
 
     @property
     def shows_again(self) -> bool:
-        """Whether anything that a revert had hidden is seen again by this revision."""
+        """Whether this revision shows rows again that a revert had hidden."""
         return self._shows_again
 
     # -- how it ends
 
     def checkpoint(self) -> None:
-        """Write what waits, in one durable transaction. Readers see it after `commit`.
+        """Writes the buffer in one durable transaction. Readers see it after `commit`.
 
         Raises:
-            StorageFullError: no space; the last checkpoint is intact, and this may be tried again.
+            StorageFullError: no space; the last checkpoint is intact, and the call may be repeated.
         """
         self._check_open()
         opens = self.resumable and self._status is RevisionStatus.ABANDONED
@@ -443,7 +443,7 @@ class RevisionWriter:
         self._clear()
 
     def commit(self) -> Revision:
-        """Make all of it part of the map: a last checkpoint, then the revision's status.
+        """Commits the revision: a last checkpoint, then its status.
 
         Raises:
             StorageFullError: as `checkpoint`.
@@ -465,7 +465,7 @@ class RevisionWriter:
         return revision
 
     def abandon(self) -> None:
-        """Give the revision up: the map is as it was. Without effect once it is over."""
+        """Abandons the revision: the map is unchanged. No effect after its end."""
         if self._ended:
             return
         if self._status is RevisionStatus.OPEN:
@@ -503,7 +503,7 @@ class RevisionWriter:
         self._held.clear()
 
     def _checkpoint_if_due(self) -> None:
-        # What is resumed must not begin in the middle of a frame's records.
+        # A resumed session must not begin in the middle of a frame's records.
         if not self.resumable and self._rows.size_bytes > _BATCH_BYTES:
             self.checkpoint()
 
@@ -580,7 +580,7 @@ class RevisionWriter:
         return np.array(keys, np.int64)[inverse]
 
     def _sequences_of(self, path_key: int) -> set[int]:
-        """Sequence numbers of the entries of a path that are seen."""
+        """Sequence numbers of the visible entries of a path."""
         if path_key not in self._sequences:
             query = (
                 self._view.select(path_entries)
@@ -592,7 +592,7 @@ class RevisionWriter:
         return self._sequences[path_key]
 
     def _shown_again(self, table: Table, uuid: bytes) -> int | None:
-        """Key of a row that was hidden and is shown from this revision on; None without one."""
+        """Key of a hidden row that this revision shows again; None without one."""
         again = self._hidden[table].pop(uuid, None)
         if again is None:
             return None
@@ -604,7 +604,7 @@ class RevisionWriter:
 
 
 def _check_edge(edge: Edge) -> None:
-    """Refuse an edge that no map should hold.
+    """Refuses an invalid edge.
 
     Raises:
         InputError: it joins a node with itself, or its numbers are not finite and symmetric.
