@@ -1,4 +1,4 @@
-"""Stereo pair → frame; frame ↔ frame matching and relative pose. Knows nothing of maps."""
+"""Stereo pair → frame; frame ↔ frame matching and relative pose. Independent of maps."""
 
 from engram.frontend.features import FEATURES, FeatureKind, feature_kind
 from engram.frontend.frame import (

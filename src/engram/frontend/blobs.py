@@ -1,9 +1,9 @@
-"""Landmarks and thumbnails as bytes: what a map and a frame log keep of a frame.
+"""Landmarks and thumbnails as bytes, as maps and frame logs store them.
 
-A landmark blob is the first 16 bytes of the SHA-256 of what follows, then a safetensors file
-(an eight-byte length, a JSON header that names every array with its type and shape, the arrays):
-it describes itself and cannot execute anything. Its metadata name the format, its version and the
-pixel quantum. Layout in prose: docs/format.md.
+A landmark blob is the first 16 bytes of the SHA-256 of the rest, then a safetensors file (an
+eight-byte length, a JSON header with name, type and shape of every array, the arrays). It is
+self-describing and cannot execute code. Its metadata name the format, its version and the pixel
+quantum. Layout in prose: docs/format.md.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from engram.geometry import StereoCamera
 LANDMARK_FORMAT = 1
 HASH_BYTES = 16
 
-# One entry only: the order of several is not the same in every process, and equal landmarks must
-# give equal bytes.
+# A single entry: the order of several differs between processes, and equal landmarks must give
+# equal bytes.
 _METADATA_KEY = "engram.landmarks"
 _ROW_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
     "pixels": ("U16", (2,)),
@@ -41,13 +41,13 @@ _ROW_SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
 }
 _DTYPES: dict[str, np.dtype[Any]] = {"U16": np.dtype("<u2"), "U8": np.dtype("u1")}
 
-# Good enough to recognise a place at 160 px, a third of the bytes of PNG.
+# Enough to recognise a place at 160 px, at a third of the size of PNG.
 _JPEG_QUALITY = 80
 _THUMBNAIL_SIDE_LIMIT = 1024
 
 
 def content_digest(content: bytes) -> bytes:
-    """The 16 bytes that stand for `content`: truncated SHA-256, the fastest hash with SHA-NI."""
+    """16-byte hash of `content`: truncated SHA-256, the fastest hash with SHA-NI."""
     return hashlib.sha256(content).digest()[:HASH_BYTES]
 
 
@@ -55,12 +55,11 @@ def encode_landmarks(landmarks: Landmarks, camera: StereoCamera) -> bytes:
     """The blob of a frame's landmarks; equal landmarks give equal bytes.
 
     Args:
-        landmarks: as the front-end makes them, on the quanta of `camera`'s image.
+        landmarks: landmarks of the front-end, in the quanta of `camera`'s image.
         camera: the camera of the frame.
 
     Raises:
-        InputError: the landmarks are not exactly what their codes stand for, so that reading
-            them back would give others.
+        InputError: the landmarks are not exactly representable by their codes.
     """
     quantum_px = pixel_quantum(camera.width, camera.height)
     codes = quantise(
@@ -86,14 +85,14 @@ def decode_landmarks(blob: bytes, camera: StereoCamera, kind: DescriptorKind) ->
     """The landmarks of a blob, bit for bit those that were encoded.
 
     Args:
-        blob: what `encode_landmarks` made; may come from anywhere.
+        blob: a result of `encode_landmarks`, of any origin.
         camera: the camera of the frame.
-        kind: of its descriptors.
+        kind: kind of its descriptors.
 
     Raises:
-        IncompatibleError: the kind is unknown here.
-        MapCorruptError: the bytes do not match their hash, are no landmark blob of a known
-            version, or hold impossible values.
+        IncompatibleError: the kind is unknown.
+        MapCorruptError: the bytes do not match their hash, are not a landmark blob of a known
+            version, or hold invalid values.
     """
     body = blob[HASH_BYTES:]
     if len(blob) < HASH_BYTES or content_digest(body) != blob[:HASH_BYTES]:
@@ -101,7 +100,7 @@ def decode_landmarks(blob: bytes, camera: StereoCamera, kind: DescriptorKind) ->
     try:
         tensors = safetensors.deserialize(body)  # type: ignore[no-untyped-call]  # as it comes
     except safetensors.SafetensorError as error:
-        raise MapCorruptError(f"landmark blob is no safetensors file: {error}") from error
+        raise MapCorruptError(f"landmark blob is not a safetensors file: {error}") from error
     _check_metadata(body, pixel_quantum(camera.width, camera.height))
     arrays = _checked_arrays(tensors, feature_kind(kind).descriptor_bytes)
     if not arrays["disparity"].all():
@@ -111,17 +110,17 @@ def decode_landmarks(blob: bytes, camera: StereoCamera, kind: DescriptorKind) ->
 
 
 def blob_hash(blob: bytes) -> bytes:
-    """The 16-byte hash that a landmark blob carries (not checked here)."""
+    """The 16-byte hash stored in a landmark blob, unchecked."""
     return blob[:HASH_BYTES]
 
 
 def is_intact(blob: bytes) -> bool:
-    """Whether a landmark blob is what its hash says, without decoding it."""
+    """Whether a landmark blob matches its hash, without decoding it."""
     return content_digest(blob[HASH_BYTES:]) == blob[:HASH_BYTES]
 
 
 def encode_thumbnail(thumbnail: NDArray[np.uint8]) -> bytes:
-    """A (h, w) uint8 grey picture as JPEG: for people to look at, so small beats exact.
+    """A (h, w) uint8 grey picture as JPEG, for people to look at.
 
     Raises:
         InputError: not a (h, w) uint8 array with sides of 1 to 1024 px.
@@ -143,10 +142,10 @@ def decode_thumbnail(data: bytes) -> NDArray[np.uint8]:
     """The (h, w) uint8 grey picture of `encode_thumbnail`.
 
     Raises:
-        MapCorruptError: the bytes are no JPEG picture of at most 1024 px.
+        MapCorruptError: the bytes are not a JPEG picture of at most 1024 px.
     """
     if not data.startswith(b"\xff\xd8") or not _jpeg_is_small(data):
-        raise MapCorruptError(f"thumbnail of {len(data)} bytes is no small JPEG picture")
+        raise MapCorruptError(f"thumbnail of {len(data)} bytes is not a small JPEG picture")
     try:
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error as error:
@@ -164,8 +163,8 @@ def _check_exact(given: Landmarks, stored: Landmarks) -> None:
     for name in ("pixels", "disparity_px", "disparity_sigma_px", "points_in_cam"):
         if not np.array_equal(getattr(given, name), getattr(stored, name)):
             raise InputError(
-                f"landmarks cannot be stored without loss: their {name} differ from what their "
-                "codes stand for; make them with landmarks_from_codes"
+                f"landmarks cannot be stored without loss: their {name} differ from those of their "
+                "codes; make them with landmarks_from_codes"
             )
     count = len(given.pixels)
     for name, dtype, shape in (
@@ -181,21 +180,21 @@ def _check_exact(given: Landmarks, stored: Landmarks) -> None:
 
 
 def _check_metadata(body: bytes, quantum_px: float) -> None:
-    """The metadata stand in the header as one entry, which the reader hands out no other way."""
+    """Checks the metadata in the header's bytes, as the reader does not expose them."""
     header = body[8 : 8 + int.from_bytes(body[:8], "little")]
     expected = f'"__metadata__":{{"{_METADATA_KEY}":"{_metadata(quantum_px)}"}}'
     if expected.encode() not in header:
         raise MapCorruptError(
             f"landmark blob is not of version {LANDMARK_FORMAT} with quantum {quantum_px} px: "
-            f"its header begins {header[:96]!r}; it belongs to another camera, or a newer Engram "
-            "wrote it"
+            f"its header begins {header[:96]!r}; it belongs to another camera or was written by a "
+            "newer Engram"
         )
 
 
 def _checked_arrays(
     tensors: list[tuple[str, dict[str, Any]]], descriptor_bytes: int
 ) -> dict[str, NDArray[Any]]:
-    """Arrays by name, after their names, types and shapes have been found right."""
+    """Arrays by name, with checked names, types and shapes."""
     found = dict(tensors)
     if found.keys() != _ROW_SHAPES.keys():
         raise MapCorruptError(f"landmark blob holds {sorted(found)}, not {sorted(_ROW_SHAPES)}")
@@ -214,7 +213,7 @@ def _checked_arrays(
 
 
 def _jpeg_is_small(data: bytes) -> bool:
-    """Whether the first frame header names sides within the limit, before memory is spent on it."""
+    """Whether the first frame header gives sides within the limit, before memory is allocated."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

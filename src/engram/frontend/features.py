@@ -1,7 +1,7 @@
 """The kinds of features: how landmarks are detected and described, in one table.
 
-Everything above asks this table for the width of a descriptor and never assumes one. Another
-package adds a kind by an entry point of the group `engram.features` that names a `FeatureKind`.
+All other code takes the width of a descriptor from this table. Another package adds a kind by an
+entry point of the group `engram.features` that names a `FeatureKind`.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 ENTRY_POINTS = "engram.features"
 
-# OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 were measured best for
-# corners that have no size of their own.
+# OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 suit corners without a
+# size best.
 _TEBLID_SCALE_FACTOR = 5.0
 _TEBLID_KEYPOINT_SIZE_PX = 7.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
-    """Where a stereo pair has landmarks, before they are rounded to what is stored.
+    """Detected landmarks of a stereo pair, before quantisation.
 
     Attributes:
         pixels: (N, 2) float32, left u, v, px.
         disparity_px: (N,) float32, > 0.
         sigma_px: (N,) float32, standard deviation of the disparity.
         octaves: (N,) uint8, pyramid level of detection, 0 is full resolution.
-        candidates: points of the left image for which a disparity was sought.
-        descriptors: (N, B) uint8 where the detector describes in passing, else None.
+        candidates: number of points of the left image whose disparity was searched.
+        descriptors: (N, B) uint8 if the detector also describes, else None.
     """
 
     pixels: NDArray[np.float32]
@@ -55,7 +55,7 @@ class Detect(Protocol):
     """Finds landmarks in a stereo pair."""
 
     def __call__(self, pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
-        """At most `landmarks` keypoints of a pair whose images have been checked."""
+        """At most `landmarks` keypoints of a pair with checked images."""
         ...
 
 
@@ -70,23 +70,22 @@ class Describe(Protocol):
         Args:
             image: (h, w) uint8 grey.
             pixels: (N, 2) float32 u, v, px of the full-size image.
-            octaves: (N,) uint8, the pyramid level at which each point was found; each level is
-                half the size of the one before.
+            octaves: (N,) uint8, pyramid level of each point; each level is half the size of the
+                previous one.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureKind:
-    """One kind of feature: binary descriptors, compared by the number of bits that differ.
+    """One kind of feature: binary descriptors, compared by the number of different bits.
 
     Attributes:
-        name: what settings, maps and frame logs call it.
+        name: its name in settings, maps and frame logs.
         descriptor_bytes: width of a descriptor, a multiple of 8 up to 2048.
         detect: finds the landmarks.
-        describe: describes them, where `detect` does not do so in passing.
-        matcher: settings of matching that suit it; they take the place of those left at their
-            defaults.
+        describe: describes them, if `detect` does not.
+        matcher: suitable matcher settings; they replace those left at their defaults.
     """
 
     name: DescriptorKind
@@ -111,7 +110,7 @@ def detect_corners(pair: StereoPair, config: FrontendConfig, landmarks: int) -> 
 def detect_corners_with_brief(
     pair: StereoPair, config: FrontendConfig, landmarks: int
 ) -> Keypoints:
-    """`detect_corners`, with what `describe_brief` gives for them, in one pass."""
+    """`detect_corners` and `describe_brief` in one pass."""
     return _corners(pair, config, landmarks, with_brief=True)
 
 
@@ -141,7 +140,7 @@ def _corners(
 def describe_brief(
     image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """BRIEF-256, upright: descriptors (N, 32) uint8.
+    """BRIEF-256, upright: descriptors (N, 32) uint8. For arguments see `Describe`.
 
     Source: Calonder et al., ECCV 2010. Pattern: `src/core/kernels/brief_pattern.inc`.
     """
@@ -159,7 +158,7 @@ def describe_brief(
 def describe_teblid(
     image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """TEBLID-256, upright, by OpenCV: descriptors (N, 32) uint8.
+    """TEBLID-256, upright, by OpenCV: descriptors (N, 32) uint8. For arguments see `Describe`.
 
     Source: Suárez et al., Revisiting Binary Local Image Description for Resource Limited Devices,
     RA-L 2021.
@@ -189,10 +188,10 @@ FEATURES: dict[DescriptorKind, FeatureKind] = {
 
 
 def feature_kind(name: str) -> FeatureKind:
-    """The kind of that name, from the table or from an installed package that brings it.
+    """The kind of that name, from the table or an installed package.
 
     Raises:
-        IncompatibleError: there is no such kind here.
+        IncompatibleError: the kind is unknown.
     """
     known = FEATURES.get(DescriptorKind(name))
     if known is not None:
@@ -200,7 +199,7 @@ def feature_kind(name: str) -> FeatureKind:
     brought = _brought()
     if name not in brought:
         raise IncompatibleError(
-            f"descriptors of kind {name!r} are unknown here; known: "
+            f"descriptors of kind {name!r} are unknown; known: "
             f"{', '.join(sorted(FEATURES.keys() | brought))}; install the package that adds them"
         )
     return FEATURES.setdefault(DescriptorKind(name), brought[name].load())
@@ -208,22 +207,22 @@ def feature_kind(name: str) -> FeatureKind:
 
 @lru_cache(maxsize=1)
 def _brought() -> dict[str, Any]:
-    """What installed packages add, by name, not yet loaded."""
+    """Kinds of installed packages by name, not yet loaded."""
     return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
 
 
 def fitted_matcher(
     matcher: MatcherConfig, before: DescriptorKind, kind: DescriptorKind
 ) -> MatcherConfig:
-    """Settings of matching for another kind; what was set on purpose stays.
+    """Matcher settings for another kind; explicitly set values stay.
 
     Args:
-        matcher: settings made for features of the kind `before`.
+        matcher: settings for features of the kind `before`.
         before: that kind.
-        kind: the kind that they are to suit.
+        kind: the new kind.
 
     Raises:
-        IncompatibleError: there is no such kind here.
+        IncompatibleError: a kind is unknown.
     """
     untouched = (MatcherConfig(), feature_kind(before).matcher)
     suited = feature_kind(kind).matcher

@@ -1,4 +1,4 @@
-"""What the front-end takes and makes: `StereoPair` → `Frame`."""
+"""Input and output of the front-end: `StereoPair` → `Frame`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engram.geometry import StereoCamera
 
-# Key in `FEATURES`. Two kinds are never matched with each other.
+# Key in `FEATURES`. Different kinds never match.
 DescriptorKind = NewType("DescriptorKind", str)
 
 BRIEF = DescriptorKind("brief")
@@ -25,7 +25,7 @@ class StereoPair:
     Attributes:
         stamp_ns: capture time, ns.
         left, right: (height, width) uint8 grey images, C-contiguous.
-        camera: the camera that both images belong to.
+        camera: the camera of both images.
     """
 
     stamp_ns: int
@@ -35,7 +35,7 @@ class StereoPair:
 
 
 class FrameStatus(StrEnum):
-    """Whether a frame is of use on its own (SPEC §5: useless frames are never saved)."""
+    """Whether a frame is usable (SPEC §5: unusable frames are never saved)."""
 
     OK = "ok"
     DARK = "dark"
@@ -48,15 +48,15 @@ class FrameStatus(StrEnum):
 class Landmarks:
     """The landmarks of one frame: a struct of arrays, one row per landmark.
 
-    Pixels and disparities are multiples of the quantum in which they are stored, so that a frame
-    read back from a log or a map matches exactly as the frame that was written.
+    Pixels and disparities are multiples of the storage quantum, so that a frame read back from a
+    log or a map matches exactly like the original.
 
     Attributes:
         pixels: (N, 2) float32, left u, v, px.
         disparity_px: (N,) float32, > 0.
         disparity_sigma_px: (N,) float32, standard deviation of the disparity.
         points_in_cam: (N, 3) float32, metres, in the left camera.
-        descriptors: (N, B) uint8, as wide as their kind has them.
+        descriptors: (N, B) uint8, B by their kind.
         octaves: (N,) uint8, pyramid level of detection, 0 is full resolution.
     """
 
@@ -73,7 +73,7 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """What the front-end makes of one stereo pair, in the camera's own coordinates.
+    """Landmarks and status of one stereo pair, in the left camera's frame.
 
     Attributes:
         stamp_ns: capture time, ns.
@@ -81,9 +81,9 @@ class Frame:
         landmarks: its 3D landmarks (possibly none).
         descriptor: the kind of the landmarks' descriptors.
         frontend: hash of the front-end's version and configuration.
-        status: `FrameStatus.OK`, or why the frame is of no use on its own.
-        thumbnail: (h, w) uint8 grey, at most 160 px wide, for people to look at; None where it
-            was not loaded.
+        status: `FrameStatus.OK`, or why the frame is unusable.
+        thumbnail: (h, w) uint8 grey, at most 160 px wide, for people to look at; None if not
+            loaded.
     """
 
     stamp_ns: int

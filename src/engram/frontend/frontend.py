@@ -16,7 +16,7 @@ from engram.frontend.features import feature_kind
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
 from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
 
-# Goes up whenever the same settings give other landmarks than before.
+# Raise it when equal settings give different landmarks.
 FRONTEND_VERSION = 1
 
 _THUMBNAIL_WIDTH_PX = 160
@@ -28,27 +28,27 @@ class FrontendConfig:
     """Settings of the front-end.
 
     Attributes:
-        descriptor: kind of descriptor; a map is matched only with its own kind.
-        landmarks: at most so many in a 512×384 image; other sizes have more or fewer in proportion
-            to area^0.6 (1000 at 1242×375): a larger image shows more, but not another scene.
-        octaves: pyramid levels, each half the size of the one before, 1 to 4.
+        descriptor: kind of descriptor; a map matches only its own kind.
+        landmarks: most landmarks in a 512×384 image; other sizes scale with area^0.6 (1000 at
+            1242×375), as a larger image shows more detail of the same scene.
+        octaves: pyramid levels, each half the size of the previous one, 1 to 4.
         fast_threshold: least FAST score of a corner, grey levels. Low, so that dark and
-            low-contrast images still give corners: the grid keeps the best of each cell anyway,
-            and what is only noise fails the stereo match.
-        cell_px: side of the grid's cells in which the best corners are taken in turn.
-        max_disparity_px: bound of the search, so the nearest landmark.
-        min_disparity_px: the farthest landmark.
-        uniqueness: best matching cost along the row, as a share of the next best elsewhere.
-        max_residual: what may differ between the two matched windows, as a share of the left
-            one's variance: 0.7 is a normalised correlation of about 0.55.
-        max_sigma_px: landmarks with a less certain disparity are left out.
+            low-contrast images give corners: the grid keeps the best of each cell, and noise
+            fails the stereo match.
+        cell_px: side of the grid's cells, from which the best corners are taken in turn.
+        max_disparity_px: largest disparity, which bounds the nearest landmark.
+        min_disparity_px: smallest disparity, which bounds the farthest landmark.
+        uniqueness: largest ratio of the best matching cost along the row to the next best one.
+        max_residual: largest difference of two matched windows, as a share of the left one's
+            variance: 0.7 is a normalised correlation of about 0.55.
+        max_sigma_px: largest standard deviation of a landmark's disparity.
         sigma_floor_px, sigma_scale: σ² = floor² + (scale · σ from image noise and gradient)².
-            Between successive frames of KITTI raw drive 0001 disparities scatter by 0.05 px at
-            least. What views of slanted surfaces add, and what all disparities of a camera have in
-            common, is the matcher's to allow for (`MatcherConfig`).
-        min_landmarks: a frame with fewer is of no use on its own; a match asks for 20 inliers
-            (SPEC §3), and rarely are more than half of the landmarks inliers.
-        dark_mean: mean grey level below which a useless frame is called dark rather than covered.
+            Source: scatter of disparities between successive frames of KITTI raw drive 0001. The
+            matcher adds the effects of slanted surfaces and of the camera's common disparity
+            offset (`MatcherConfig`).
+        min_landmarks: fewest landmarks of a usable frame; a match needs 20 inliers (SPEC §3), and
+            rarely more than half of the landmarks are inliers.
+        dark_mean: mean grey level below which an unusable frame counts as dark, not covered.
         thumbnails: whether frames carry a small picture for people.
     """
 
@@ -77,7 +77,7 @@ class FrontendConfig:
 
 
 class Frontend:
-    """Makes frames of stereo pairs. Keeps nothing between frames; usable from any thread.
+    """Makes frames from stereo pairs. Stateless between frames; usable from any thread.
 
     Attributes:
         config: its settings.
@@ -90,10 +90,10 @@ class Frontend:
         self.hash = config_hash({"version": FRONTEND_VERSION, "settings": settings})
 
     def extract(self, pair: StereoPair) -> Frame:
-        """Corners with a disparity, their descriptors and points; never fails on what it sees.
+        """Corners with a disparity, their descriptors and points; image content never raises.
 
         Raises:
-            SequenceError: the images are no uint8 arrays of the camera's size, or smaller than
+            SequenceError: the images are not uint8 arrays of the camera's size, or smaller than
                 64 px.
         """
         _check_images(pair)
@@ -116,11 +116,11 @@ class Frontend:
         )
 
     def _status(self, pair: StereoPair, landmarks: int, corners: int) -> FrameStatus:
-        """Why a frame has too few landmarks to be of use, from plain facts about its images.
+        """Why a frame has too few landmarks to be usable.
 
-        Dark: there is no light. Covered: there is light, but nothing in focus, so no corners in the
-        left image or next to no contrast in the right one (a wall without texture looks the same).
-        Else there are corners, but they have no match in the right image.
+        Dark: the image is dark. Covered: there is light, but hardly any corners in the left image
+        or contrast in the right one; a wall without texture looks the same. Else the corners have
+        no match in the right image.
         """
         if landmarks >= self.config.min_landmarks:
             return FrameStatus.OK

@@ -23,7 +23,7 @@ from engram.errors import IncompatibleError, InputError
 from engram.frontend.frame import Frame
 from engram.geometry import SE3
 
-# Goes into `matcher_hash`: raise it whenever the kernels give other results for equal settings.
+# Part of `matcher_hash`: raise it when the kernels give different results for equal settings.
 _VERSION = 3
 
 
@@ -32,42 +32,41 @@ class MatcherConfig:
     """Settings of `match_frames`.
 
     Attributes:
-        max_distance: bits in which descriptors may differ, searching the whole frame. Two random
-            descriptors of 256 bits differ in 128 ± 8; the least of 500 differs in about 100.
-        max_guided_distance: the same near a predicted place, where few candidates compete.
+        max_distance: largest number of different bits of two descriptors, searching the whole
+            frame. Two random descriptors of 256 bits differ in 128 ± 8; the least of 500 differs
+            in about 100.
+        max_guided_distance: the same near a predicted pixel, where few candidates compete.
         ratio: the best distance must be less than this times the next best (Lowe 2004).
-        guided_ratio: the same near a predicted place.
+        guided_ratio: the same near a predicted pixel.
         same_corner_px: a candidate this close to the best one is the same corner in another
             octave, not a rival.
         octave_scale: size ratio of successive octaves of the front-end.
-        patch_ratio: largest ratio of the sizes in the world of two patches that are compared
-            (SPEC §2.6). BRIEF bears a change of scale of about 1.5; the rest is for slanted
-            surfaces. Doubt about depth widens it.
-        pixel_sigma_px: error of a corner's place at full resolution, one axis, as it scatters
-            between views 0.4 to 2 m apart; it grows with the square root of the octave's scale
-            (measured on EuRoC and KITTI alike: 0.65 and 0.9 px).
-        disparity_sigma_px: what sub-pixel interpolation and slanted surfaces add to a disparity's
-            own σ from view to view (measured likewise).
-        offset_sigma_px: what all disparities of a camera may have in common: rectification is good
-            to a few tenths of a pixel, and that error does not average out. It is estimated along
-            with the pose, and the covariance knows of it.
-        offset_drift_px: how far that offset may differ between two frames of one camera.
-        gate_sigmas: how many standard deviations gates and search windows span.
-        max_radius_px: bound of a search window, whatever the prediction's covariance.
-        chi2: an inlier's squared normalised reprojection error is below this: 99 % of χ² with the
+        patch_ratio: largest ratio of the metric sizes of two compared patches (SPEC §2.6). BRIEF
+            tolerates a change of scale of about 1.5; the rest allows for slanted surfaces. Depth
+            uncertainty widens it.
+        pixel_sigma_px: standard deviation of a corner's pixel at full resolution, one axis, between
+            views 0.4 to 2 m apart; it grows with the square root of the octave's scale. Source:
+            EuRoC and KITTI, 0.65 and 0.9 px.
+        disparity_sigma_px: error that sub-pixel interpolation and slanted surfaces add to a
+            disparity's own σ between views. Source: as `pixel_sigma_px`.
+        offset_sigma_px: standard deviation of the common offset of a camera's disparities:
+            rectification is good to a few tenths of a pixel, and its error does not average out.
+            The offset is estimated with the pose, and its uncertainty is part of the covariance.
+        offset_drift_px: standard deviation of that offset between two frames of one camera.
+        gate_sigmas: standard deviations that gates and search windows span.
+        max_radius_px: largest radius of a search window, whatever the prediction's covariance.
+        chi2: largest squared normalised reprojection error of an inlier: 99 % of χ² with the
             three degrees of freedom of left u, left v and disparity.
-        independent_landmarks: landmarks beyond this many share their errors (residual distortion,
-            rectification, the scene's geometry), so that the covariance of a pose does not fall
-            below what this many alone would give. Measured against motion capture on EuRoC.
-        min_consensus: fewest landmarks that make a pose at all; three agree on some pose whatever
-            they are. What is accepted as a
-            localisation is decided by the localiser, with a higher threshold.
-        max_samples: bound on the triples drawn from the matches.
-        max_hypotheses: bound on the triples that are scored.
+        independent_landmarks: landmarks beyond this number share their errors (residual
+            distortion, rectification, scene geometry), so that they do not reduce the covariance
+            further. Source: motion capture of EuRoC.
+        min_consensus: fewest landmarks of a pose; any three agree on some pose. The localiser
+            accepts a match by a higher threshold.
+        max_samples: most triples drawn from the matches.
+        max_hypotheses: most triples scored.
         confidence: stop drawing once a better pose is less likely than one minus this.
-        max_view_angle_rad: a pose whose optical axis is turned further than this is none: beyond
-            the view gate of SPEC §3.1 (60°) with a margin, where images have little in common but
-            their edges.
+        max_view_angle_rad: largest angle between the optical axes of a valid pose: the view gate of
+            SPEC §3.1 with a margin. Beyond it images overlap only at their edges.
         second_pass: search once more, guided by the pose found.
     """
 
@@ -99,12 +98,13 @@ class MatcherConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """What two frames have to do with each other.
+    """The result of matching two frames.
 
     Attributes:
-        reference_from_live: pose of the live camera in the reference camera; None where too few
+        reference_from_live: pose of the live camera in the reference camera; None if too few
             landmarks agree on one.
-        covariance: (6, 6) float64 of it, left perturbation, [translation, rotation].
+        covariance: (6, 6) float64 of `reference_from_live`, left perturbation, [translation,
+            rotation]; None without it.
         inliers: number of landmarks that agree, 0 without a pose.
         reference_rows, live_rows: (inliers,) int32, rows of the landmarks that agree.
     """
@@ -130,14 +130,14 @@ def match_frames(
     """Match the landmarks of two frames and estimate the pose between them.
 
     Args:
-        reference: the frame in which the live camera is sought; its camera may be another one.
-        live: the frame whose camera is sought.
+        reference: the reference frame; its camera may differ from the live one.
+        live: the live frame.
         config: the settings.
-        seed: of the random draws, 0 … 2⁶⁴ − 1; see `pair_seed`.
-        predicted: reference_from_live as far as known: only landmarks near their predicted places
-            are compared.
-        predicted_covariance: (6, 6) of `predicted`, left perturbation, [translation, rotation];
-            needed with it.
+        seed: seed of the random draws, 0 … 2⁶⁴ − 1; see `pair_seed`.
+        predicted: predicted reference_from_live; only landmarks near their predicted pixels are
+            then compared. None to search the whole frame.
+        predicted_covariance: (6, 6) float64 of `predicted`, left perturbation, [translation,
+            rotation]; required with it.
 
     Raises:
         IncompatibleError: the frames have different kinds of descriptors.
@@ -151,7 +151,7 @@ def match_frames(
             "use the front-end that the map was made with"
         )
     if (predicted is None) != (predicted_covariance is None):
-        raise InputError("a prediction and its covariance are given together or not at all")
+        raise InputError("give a prediction and its covariance together or not at all")
     found = _core.attempt(
         features(reference),
         features(live),
@@ -180,7 +180,7 @@ def pair_seed(a: UUID, b: UUID) -> int:
 
 
 def features(frame: Frame) -> _core.Features:
-    """The landmarks of a frame as the kernels take them; nothing is copied."""
+    """The landmarks of a frame in the form of the kernels, without a copy."""
     landmarks, camera = frame.landmarks, frame.camera
     return _core.Features(
         landmarks.pixels,

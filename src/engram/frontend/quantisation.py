@@ -1,9 +1,9 @@
 """Landmarks as small integers, and back without loss.
 
-The front-end rounds its measurements to what is stored before anything is computed from them, so a
-frame read back from a log or a map is bit for bit the frame that was in memory. A landmark's
-position takes 7 bytes: u, v and disparity as uint16 multiples of the pixel quantum, the standard
-deviation of the disparity as a logarithmic uint8.
+The front-end quantises its measurements before any further use, so a frame read back from a log or
+a map equals the original bit for bit. A landmark's position takes 7 bytes: u, v and disparity as
+uint16 multiples of the pixel quantum, the standard deviation of the disparity as a logarithmic
+uint8.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from engram.errors import InputError
 from engram.frontend.frame import Landmarks
 from engram.geometry import StereoCamera
 
-# Finer than 1/64 px gains nothing: the best disparities are good to 0.05 px.
+# The best disparities have a standard deviation of 0.05 px: finer than 1/64 px gains nothing.
 FINEST_QUANTUM_LOG2 = 6
 _LARGEST_CODE = 65535
 
-# σ code c stands for 2^(c/32 - 6) px: from 1/64 px to 3.9 px in steps of 2.2 %.
+# σ code c means 2^(c/32 - 6) px: from 1/64 px to 3.9 px in steps of 2.2 %.
 SIGMA_TABLE_PX = np.exp2(np.arange(256) / 32 - 6).astype(np.float32)
 SIGMA_TABLE_PX.setflags(write=False)
-# A value belongs to the code it is nearest to in logarithm: the borders are geometric means.
+# A value gets the code nearest in logarithm: the borders are geometric means.
 _SIGMA_BORDERS_PX = np.exp2((np.arange(255) + 0.5) / 32 - 6).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LandmarkCodes:
-    """The positions of landmarks as they are stored: a struct of arrays, one row per landmark.
+    """The stored positions of landmarks: a struct of arrays, one row per landmark.
 
     Attributes:
         pixels: (N, 2) uint16, left u, v in pixel quanta.
@@ -47,9 +47,9 @@ class LandmarkCodes:
 
 
 def pixel_quantum(width: int, height: int = 1) -> float:
-    """Step in which pixels and disparities of an image of this size are stored, px.
+    """Step of stored pixels and disparities for an image of this size, px.
 
-    The smallest power of two, no finer than 1/64, with which the longer side fits into 16 bits.
+    The smallest power of two, at least 1/64, for which the longer side fits into 16 bits.
 
     Raises:
         InputError: a side is not positive or longer than 65535 px.
@@ -71,7 +71,7 @@ def quantise(
 
     Args:
         pixels: (N, 2) float32, left u, v, px, ≥ 0.
-        disparity_px: (N,) float32, px, > 0; what rounds to zero is stored as one quantum.
+        disparity_px: (N,) float32, px, > 0; values that round to zero become one quantum.
         disparity_sigma_px: (N,) float32, px, > 0; limited to the range of `SIGMA_TABLE_PX`.
         quantum_px: `pixel_quantum` of the image.
 
@@ -97,9 +97,9 @@ def quantise(
 def dequantise(
     codes: LandmarkCodes, quantum_px: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Pixels (N, 2), disparities (N,) and their σ (N,), all float32 px: undoes `quantise` exactly.
+    """Pixels (N, 2), disparities (N,) and their σ (N,), all float32 px.
 
-    `quantise` of the result gives the same codes again.
+    `quantise` of the result gives the same codes.
     """
     step = np.float32(quantum_px)
     return codes.pixels * step, codes.disparity * step, SIGMA_TABLE_PX[codes.sigma]
@@ -111,7 +111,7 @@ def landmarks_from_codes(
     octaves: NDArray[np.uint8],
     camera: StereoCamera,
 ) -> Landmarks:
-    """The landmarks (N) that were stored: the one way in which they come into being.
+    """N landmarks from their stored codes; all landmarks are made here.
 
     Args:
         codes: positions of N landmarks, in quanta of the camera's image.

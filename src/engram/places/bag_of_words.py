@@ -1,8 +1,9 @@
-"""Bag of words: the similarity of two images' words, rare words counting more. The baseline.
+"""Bag of words, the baseline: similarity of two images' words, weighted by their rarity.
 
-Source: Sivic & Zisserman, Video Google, ICCV 2003. A word counts once however often an image shows
-it: repeated structure would drown the rest (Jégou et al., On the burstiness of visual elements,
-CVPR 2009).
+A word counts once however often an image shows it: repeated structure would dominate otherwise
+(Jégou et al., On the burstiness of visual elements, CVPR 2009).
+
+Source: Sivic & Zisserman, Video Google, ICCV 2003.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from engram.places.vocabulary import Vocabulary
 
 
 class BagOfWords:
-    """A `PlaceRecogniser` by the cosine of tf-idf vectors. Knows nothing of new places.
+    """A `PlaceRecogniser` by the cosine of tf-idf vectors. It does not detect new places.
 
     Args:
-        vocabulary: its training images tell how rare each word is.
+        vocabulary: its training images give the rarity of each word.
     """
 
     name = "bag-of-words"
@@ -42,7 +43,7 @@ class BagOfWords:
         return number
 
     def similarities(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Cosine (P,), 0…1, of an image with these words and each place."""
+        """(P,) float64: cosine, 0…1, of an image with the words (n,) int32 and each place."""
         sums = np.zeros(len(self))
         self._index.add_weights(words, self._idf[words] ** 2, sums)
         norms = self._norms[: len(self)] * self._norm(words)
@@ -63,5 +64,5 @@ class BagOfWords:
 
 
 def inverse_frequencies(statistics: WordStatistics) -> NDArray[np.float64]:
-    """Inverse document frequency (W,) of each word: how much it tells about a place."""
+    """(W,) float64: inverse document frequency of each word."""
     return np.asarray(np.log((statistics.images + 1) / (statistics.seen + 0.5)))

@@ -1,4 +1,4 @@
-"""The words of a map's nodes in a place recogniser: what a lost robot looks itself up in."""
+"""The words of a map's nodes in a place recogniser, in which a lost robot is looked up."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from engram.places.words import NodeWords, Words
 
 
 class PlaceBook:
-    """All nodes of a map, known by their words.
+    """All nodes of a map as places of a recogniser.
 
-    One thread, that of the graph, calls `learn_new_nodes`; any thread may compare.
+    Only the thread of the graph calls `learn_new_nodes`; any thread may compare.
 
     Args:
-        graph: the nodes; may grow.
-        words: their words.
+        graph: the experience graph; may grow.
+        words: the words of its nodes.
         recogniser: makes the recogniser for a vocabulary.
 
     Attributes:
-        unreadable: nodes, by dense index, whose landmarks are damaged: they stand in the book
-            without words, and are not to be proposed.
+        unreadable: nodes, by dense index, with damaged landmarks: they have no words here, and
+            must not be proposed.
     """
 
     def __init__(
@@ -43,11 +43,11 @@ class PlaceBook:
         self.learn_new_nodes()
 
     def __len__(self) -> int:
-        """Number of nodes that are known; their numbers are the graph's."""
+        """Number of known nodes; place numbers are dense indices of the graph."""
         return len(self._recogniser)
 
     def words_of(self, frame: Frame) -> Words:
-        """The distinct words (n,) int32 of a frame, rising.
+        """The distinct words of a frame, (n,) int32, increasing.
 
         Raises:
             IncompatibleError: it has another kind of descriptor.
@@ -55,10 +55,10 @@ class PlaceBook:
         return self._words.of_frame(frame)
 
     def learn_new_nodes(self) -> None:
-        """Adds the nodes that have joined the graph since."""
+        """Adds the new nodes of the graph."""
         for index in range(len(self._recogniser), len(self._graph)):
             words = self._words.of_node(self._graph.node(index).id)
-            if words is None:  # the others can be found without it
+            if words is None:  # relocalisation works without it
                 self.unreadable.add(index)
                 words = np.zeros(0, np.int32)
             with self._lock:

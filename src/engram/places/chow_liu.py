@@ -1,4 +1,4 @@
-"""The Chow-Liu tree: which word tells most about which.
+"""The Chow-Liu tree: the strongest dependences between words.
 
 Source: Chow & Liu, Approximating discrete probability distributions with dependence trees, IEEE
 Transactions on Information Theory 14(3), 1968; used for visual words by Cummins & Newman, FAB-MAP,
@@ -16,19 +16,19 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 
 from engram.monitor import QUIET, Monitor
 
-# Words whose rows of the mutual information are held at a time: 40 MB at 10,000 words.
+# Rows of the mutual information held at a time: 40 MB at 10,000 words.
 _BLOCK = 512
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WordStatistics:
-    """How often words are seen, alone and together with their parent in the tree: exact counts.
+    """Counts of words in training images, alone and together with their parent in the tree.
 
     Attributes:
         images: number of training images.
         seen: (W,) int32, images that show each word.
-        parents: (W,) int32, parent of each word in the Chow-Liu tree; -1 for a root. Words that
-            tell nothing about each other hang in trees of their own.
+        parents: (W,) int32, parent of each word in the Chow-Liu tree; -1 for a root. Independent
+            words are in separate trees.
         seen_with_parent: (W,) int32, images that show both; 0 for a root.
     """
 
@@ -44,16 +44,16 @@ class WordStatistics:
 def learn_statistics(
     images: list[NDArray[np.int32]], words: int, monitor: Monitor = QUIET
 ) -> WordStatistics:
-    """Counts words and grows the tree of the greatest total mutual information.
+    """Counts words and builds the tree of the greatest total mutual information.
 
-    The mutual information of all pairs is never held at once: of each block of rows only what the
-    maximum spanning forest keeps is carried on. That is exact, since an edge that is the weakest
-    of a cycle among some of the edges is so among all.
+    Memory holds one block of rows of the mutual information at a time; of each block only the
+    maximum spanning forest is kept. This is exact: an edge that is the weakest of a cycle among
+    some edges is the weakest among all.
 
     Args:
-        images: the distinct words (n,) of each training image.
+        images: the distinct words, (n,) int32, of each training image.
         words: size of the vocabulary, W.
-        monitor: sees the stage `relate`, one item a block of rows.
+        monitor: receives the stage `relate`, one item per block of rows.
     """
     shown = _occurrences(images, words)
     seen = np.asarray(shown.sum(axis=0), dtype=np.int32)
@@ -75,12 +75,15 @@ def learn_statistics(
 def mutual_information(
     both: NDArray[np.float64], a: NDArray[np.int32], b: NDArray[np.int32], images: int
 ) -> NDArray[np.float64]:
-    """Of two binary variables in nats, from counts; arrays broadcast against each other.
+    """Mutual information of pairs of binary variables, from counts that broadcast.
 
     Args:
-        both: images that show both words.
-        a, b: images that show the one, and the other.
-        images: their number.
+        both: float64, images that show both words.
+        a, b: int32, images that show each of the two words.
+        images: number of images.
+
+    Returns:
+        float64, nats.
     """
     p_a, p_b = a / images, b / images
     p_both = both / images
@@ -113,7 +116,7 @@ def _strongest(forest: csr_array, information: NDArray[np.float64], first: int) 
 
 
 def _rooted(forest: csr_array, seen: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Parent of each word, when each tree hangs from its most frequent word."""
+    """(W,) int32: parent of each word, if each tree's root is its most frequent word."""
     words = len(seen)
     parents = np.full(words, -1, np.int32)
     _, tree_of = connected_components(forest, directed=False)
@@ -130,7 +133,7 @@ def _rooted(forest: csr_array, seen: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def _with_parent(by_word: csr_array, parents: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Images that show a word and its parent."""
+    """(W,) int32: number of images that show a word and its parent."""
     children = np.flatnonzero(parents >= 0)
     together = np.zeros(len(parents), np.int32)
     if len(children):

@@ -1,9 +1,9 @@
-"""FAB-MAP 2.0 with an inverted index: exact likelihoods at the cost of the words that are seen.
+"""FAB-MAP 2.0 with an inverted index: exact likelihoods at the cost of the seen words only.
 
-log p(Z | L) is a sum over all words, most of which neither the image nor the place shows. What a
-place's words give when the image shows neither them nor their parents is summed up when the place
-is added; a query corrects that for the words that it shows and for their children in the tree, by
-walking through the places that show them. Nothing is left out or rounded.
+log p(Z | L) is a sum over all words, most of which neither the image nor the place shows. The sum
+for an image without words is computed once, when a place is added. A query corrects it for the
+words that it shows and for their children in the tree, by an inverted index of the places that
+show them. The result is exact.
 
 Source: Cummins & Newman, FAB-MAP, IJRR 27(6), 2008; Appearance-only SLAM at large scale with
 FAB-MAP 2.0, IJRR 30(9), 2011, §4.
@@ -28,10 +28,10 @@ class FabMapConfig:
     """Settings of FAB-MAP.
 
     Attributes:
-        detector: how well the front-end shows what is there.
-        new_place_prior: probability that an image shows none of the places, before looking. A lost
-            robot may as well be somewhere new.
-        naive_bayes: take words as independent instead of by the Chow-Liu tree.
+        detector: detection rates of the front-end.
+        new_place_prior: prior probability that an image shows none of the places: a lost robot is
+            as likely to be somewhere new.
+        naive_bayes: treat words as independent instead of using the Chow-Liu tree.
     """
 
     detector: DetectorModel = field(default_factory=DetectorModel)
@@ -46,10 +46,10 @@ class FabMapConfig:
 
 
 class FabMap:
-    """A `PlaceRecogniser` that knows probabilities, of new places too.
+    """A `PlaceRecogniser` that gives probabilities, including that of a new place.
 
     Args:
-        vocabulary: words, their company, and samples of places that are not in the map.
+        vocabulary: words, their statistics, and samples of places outside the map.
         config: settings.
     """
 
@@ -73,7 +73,7 @@ class FabMap:
 
     @property
     def bytes_per_place(self) -> float:
-        """Memory that each place takes, vocabulary not counted."""
+        """Memory per place, without the vocabulary."""
         return (self._places.bytes + self._expected.nbytes) / max(len(self), 1)
 
     def add(self, words: NDArray[np.int32]) -> int:
@@ -87,7 +87,7 @@ class FabMap:
         return number
 
     def _of_samples(self, vocabulary: Vocabulary) -> tuple[float, NDArray[np.float64]]:
-        """Mean constant, and mean weight (W,) of each word, when the samples are the queries."""
+        """Mean constant, and (W,) float64 mean weight of each word, over queries by samples."""
         weights = np.zeros(len(vocabulary))
         constant = 0.0
         for sample in vocabulary.samples:
@@ -98,15 +98,15 @@ class FabMap:
         return constant / count, weights / count
 
     def log_likelihoods(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
-        """Log p(Z | L) (P,) of an image with these words at each place."""
+        """(P,) float64: log p(Z | L) of an image with the words (n,) int32 at each place."""
         return self._places.of(self._query.weigh(words))
 
     def compare(self, words: NDArray[np.int32]) -> Comparison:
-        """See `PlaceRecogniser`: by how much each place beats what it gives to the samples.
+        """See `PlaceRecogniser`: the log-likelihood at each place less its mean over the samples.
 
-        In a map of several conditions the likelihoods themselves mislead: those of a drive in
-        dull light lie tens of nats above all others, whatever the robot sees, and take all
-        attempts. What a place gives to images of other places on average says how much that is.
+        In a map of several conditions the likelihoods alone mislead: places seen in dull light
+        exceed all others by tens of nats for any image. The mean over images of other places
+        corrects for this.
         """
         scores, elsewhere = self._judge(words)
         if len(scores) == 0:
@@ -118,7 +118,7 @@ class FabMap:
         )
 
     def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
-        """See `PlaceRecogniser`. Before looking, all places are equally likely."""
+        """See `PlaceRecogniser`. All places have the same prior."""
         scores, elsewhere = self._judge(words)
         if len(scores) == 0:
             return Recognition(np.zeros(0, np.int64), np.zeros(0), 1.0)
@@ -136,11 +136,11 @@ class FabMap:
 
     @property
     def _prior_here(self) -> float:
-        """Of each place."""
+        """Log prior of each place."""
         return float(np.log((1 - self.config.new_place_prior) / len(self)))
 
     def _judge(self, words: NDArray[np.int32]) -> tuple[NDArray[np.float64], float]:
-        """Log-likelihood (P,) at each place, and elsewhere."""
+        """(P,) float64 log-likelihood at each place, and that elsewhere."""
         weights = self._query.weigh(words)
         sampled = self._elsewhere.of(weights)
         return self._places.of(weights), _log_mean(sampled)
@@ -148,14 +148,14 @@ class FabMap:
     def _evidence(self, scores: NDArray[np.float64], elsewhere: float) -> float:
         """Log of the sum of prior times likelihood, over all places and elsewhere."""
         greatest = float(scores.max())
-        # What is e^-40 of the most likely is lost in the rounding of the sum.
+        # Terms below e^-40 of the greatest vanish in the rounding of the sum.
         near = scores[scores > greatest - 40.0]
         here = self._prior_here + greatest + float(np.log(np.exp(near - greatest).sum()))
         return float(np.logaddexp(here, self._prior_elsewhere + elsewhere))
 
 
 def _log_mean(logs: NDArray[np.float64]) -> float:
-    """Log of the mean of exp; that of nothing is −∞."""
+    """Log of the mean of exp; −∞ for an empty array."""
     if len(logs) == 0:
         return -np.inf
     greatest = float(logs.max())
@@ -164,12 +164,12 @@ def _log_mean(logs: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Weighed:
-    """A query, as far as it differs from an image without words.
+    """A query, relative to an image without words.
 
     Attributes:
         constant: log-likelihood of the image at a place without words.
         words: (n,) int32, words seen and their children.
-        weights: (n,) float64, what a place gains by showing each, over what it has gained anyway.
+        weights: (n,) float64, change of a place's log-likelihood if it shows the word.
     """
 
     constant: float
@@ -222,7 +222,7 @@ class _Likelihoods:
         return number
 
     def base(self, number: int) -> float:
-        """What a place's words give when nothing is seen."""
+        """Log-likelihood of an image without words at a place."""
         return float(self._base[number])
 
     def of(self, query: _Weighed) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What seeing a word, or not seeing it, says about a place: FAB-MAP's observation model.
+"""FAB-MAP's observation model: the likelihood of seeing or missing a word at a place.
 
 Source: Cummins & Newman, FAB-MAP, IJRR 27(6), 2008, §4.2 to §4.4 (here [C08]); Appearance-only SLAM
 at large scale with FAB-MAP 2.0, IJRR 30(9), 2011 (here [C11]).
@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 from engram.errors import ConfigError
 from engram.places.chow_liu import WordStatistics
 
-# Beliefs never reach certainty: a word of which training knows nothing must not decide.
+# Bound of beliefs away from 0 and 1: a word without training data must not decide.
 _LEAST_BELIEF = 1e-6
 _MOST_BELIEF = 1 - 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorModel:
-    """How well the front-end shows what is there.
+    """Detection rates of the front-end.
 
     Attributes:
-        hit: p(z = 1 | e = 1), a word is seen whose thing is there. Source: [C08] §5, 0.39.
-        false_alarm: p(z = 1 | e = 0), it is seen though its thing is not there. Source: [C08] §5,
-            0.
+        hit: p(z = 1 | e = 1), probability of seeing a word that exists. Source: [C08] §5.
+        false_alarm: p(z = 1 | e = 0), probability of seeing one that does not. Source: [C08] §5.
     """
 
     hit: float = 0.39
@@ -44,8 +43,8 @@ class ObservationModel:
     """log p(z_q | z_parent, place) for all words and all cases.
 
     Attributes:
-        parents: (W,) int32, -1 for a root, whose two columns of z_parent are equal.
-        log_p: (2, 4, W) float64: [whether the place was seen to show the word][2 z + z_parent].
+        parents: (W,) int32, -1 for a root, which has equal columns for both values of z_parent.
+        log_p: (2, 4, W) float64: [whether the place shows the word][2 z + z_parent].
     """
 
     parents: NDArray[np.int32]
@@ -58,9 +57,9 @@ class ObservationModel:
         """The model of a vocabulary.
 
         Args:
-            statistics: the vocabulary's.
-            detector: of the front-end.
-            naive: take words as independent of each other (naive Bayes).
+            statistics: statistics of the vocabulary.
+            detector: detection rates of the front-end.
+            naive: treat words as independent (naive Bayes).
         """
         parents = np.full_like(statistics.parents, -1) if naive else statistics.parents
         p_seen, p_given_parent = _probabilities(statistics)
@@ -86,10 +85,16 @@ class ObservationModel:
 
 
 def place_beliefs(p_seen: NDArray[np.float64], detector: DetectorModel) -> NDArray[np.float64]:
-    """p(e_q = 1 | place) (2, W): row 0 where the place did not show the word, row 1 where it did.
+    """(2, W) float64: p(e_q = 1 | place), row 0 for places not showing the word, row 1 for others.
 
-    Bayes over one look at the place. The prior is the share of places where the thing must be for
-    the word to be seen as often as it is. Source: [C08] §4.4.
+    Bayes' rule for one image of the place. The prior is the share of places with the word that
+    explains how often it is seen.
+
+    Args:
+        p_seen: (W,) float64, p(z_q = 1).
+        detector: detection rates of the front-end.
+
+    Source: [C08] §4.4.
     """
     span = detector.hit - detector.false_alarm
     prior = np.clip((p_seen - detector.false_alarm) / span, _LEAST_BELIEF, _MOST_BELIEF)
@@ -105,10 +110,10 @@ def place_beliefs(p_seen: NDArray[np.float64], detector: DetectorModel) -> NDArr
 def _probabilities(
     statistics: WordStatistics,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """p(z_q = 1) (W,), and p(z_q = 1 | z_parent) (2, W); a root's parent tells nothing.
+    """p(z_q = 1), (W,), and p(z_q = 1 | z_parent), (2, W); equal for a root.
 
-    Smoothed by half an image with and half an image without the word, and the conditional ones by
-    one image that shows it as often as all do.
+    Smoothed by half an image with and half an image without the word; the conditional ones by one
+    image with the unconditional probability.
     """
     images, seen = statistics.images, statistics.seen
     p_seen = (seen + 0.5) / (images + 1)
@@ -128,14 +133,16 @@ def _given_existence(
     z: int,
     parents: NDArray[np.int32],
 ) -> NDArray[np.float64]:
-    """p(z_q | e_q, z_parent) (W,). Source: [C08] §4.3, (1 + α/β)⁻¹.
+    """(W,) float64: p(z_q | e_q, z_parent) = (1 + α/β)⁻¹.
 
     Args:
-        p_seen: p(z_q = 1).
-        p_given_parent: p(z_q = 1 | z_parent).
-        sight: p(z = 0 | e) and p(z = 1 | e) of the existence e that is given.
+        p_seen: (W,) float64, p(z_q = 1).
+        p_given_parent: (W,) float64, p(z_q = 1 | z_parent).
+        sight: (2,) float64, p(z = 0 | e) and p(z = 1 | e) for the given existence e.
         z: whether the word is seen.
-        parents: -1 marks the roots, for which the detector alone counts.
+        parents: (W,) int32; for roots, -1, only the detector counts.
+
+    Source: [C08] §4.3.
     """
     p_z = p_seen if z else 1 - p_seen
     p_z_given_parent = p_given_parent if z else 1 - p_given_parent

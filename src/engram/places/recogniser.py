@@ -1,4 +1,4 @@
-"""What a place recogniser takes and answers."""
+"""The place recogniser protocol and its results."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recognition:
-    """Which places an image may show. A ranking to be verified, never a localisation.
+    """Places that an image may show: a ranking to be verified, not a localisation.
 
     Attributes:
         places: (K,) int64, numbers of the most likely places, best first; ties by number.
-        scores: (K,) float64 of these: posterior probabilities, or similarities of 0…1 where the
-            recogniser knows no probabilities.
-        new_place: probability that the image shows none of the places; None where the recogniser
-            cannot tell.
+        scores: (K,) float64, their posterior probabilities; similarities, 0…1, from a recogniser
+            without probabilities.
+        new_place: probability that the image shows none of the places; None if unknown.
     """
 
     places: NDArray[np.int64]
@@ -31,9 +30,9 @@ class Comparison:
     """How well an image fits each place.
 
     Attributes:
-        evidence: (P,) float64, log-likelihoods beyond what the place gives to any image, or
-            similarities of 0…1 where the recogniser knows no probabilities. What one place is
-            given does not depend on the others.
+        evidence: (P,) float64, log-likelihoods relative to those of other images at the place;
+            similarities, 0…1, from a recogniser without probabilities. Each is independent of the
+            other places.
         new_place: see `Recognition`.
     """
 
@@ -42,7 +41,7 @@ class Comparison:
 
 
 class PlaceRecogniser(Protocol):
-    """Places, each an image's set of words, and which of them another image may show."""
+    """Recognises places, each the set of words of one image, in other images."""
 
     @property
     def name(self) -> str:
@@ -54,10 +53,10 @@ class PlaceRecogniser(Protocol):
         ...
 
     def add(self, words: NDArray[np.int32]) -> int:
-        """Adds a place, which can be recognised at once.
+        """Adds a place.
 
         Args:
-            words: (n,) the distinct words that it shows, rising; possibly none.
+            words: (n,) int32, its distinct words, increasing; possibly none.
 
         Returns:
             Its number: 0, 1, 2, ….
@@ -68,7 +67,7 @@ class PlaceRecogniser(Protocol):
         """How well an image fits each place.
 
         Args:
-            words: (n,) the distinct words of the image, rising; possibly none.
+            words: (n,) int32, its distinct words, increasing; possibly none.
         """
         ...
 
@@ -76,7 +75,7 @@ class PlaceRecogniser(Protocol):
         """The up to `count` most likely places.
 
         Args:
-            words: (n,) the distinct words of the image, rising; possibly none.
-            count: how many places are wanted at most.
+            words: (n,) int32, the distinct words of the image, increasing; possibly none.
+            count: most places to return.
         """
         ...

@@ -21,17 +21,17 @@ from engram.places.vocabulary import Vocabulary
 
 @dataclass(frozen=True, slots=True)
 class TrainingConfig:
-    """How a vocabulary is trained.
+    """Settings of `train_vocabulary`.
 
     Attributes:
-        words: how many are wanted.
+        words: number of words.
         depth: levels of the tree. Three find the nearest word more often than four, and as fast.
         beam: see `Vocabulary`.
-        iterations: at most so many of each cluster; more changed nothing that could be measured.
-        descriptors: at most so many are clustered, drawn evenly from all frames.
-        samples: frames that stand for new places. Source: Cummins & Newman, IJRR 2008, §4.5: the
-            sum over unmapped places is estimated by sampling.
-        seed: of all that is drawn.
+        iterations: most iterations per cluster; more have no measurable effect.
+        descriptors: most descriptors to cluster, drawn evenly from all frames.
+        samples: frames that represent new places. Source: Cummins & Newman, IJRR 2008, §4.5:
+            sampling estimates the sum over unmapped places.
+        seed: seed of all random draws.
     """
 
     words: Annotated[int, Meta(ge=2, le=65_536)] = 10_000
@@ -54,17 +54,17 @@ def train_vocabulary(
     trained_on: str = "",
     monitor: Monitor = QUIET,
 ) -> Vocabulary:
-    """Clusters descriptors to words and learns which words come together.
+    """Clusters descriptors into words and learns which words occur together.
 
     Equal input and configuration give an equal vocabulary on every machine.
 
     Args:
-        frames: the descriptors (N, B) uint8 of each frame. Frames should show places apart from
-            each other, as if drawn at random from where robots drive: words are counted per frame.
-        kind: their kind.
+        frames: the descriptors of each frame, (N, B) uint8. The frames should show distinct
+            places, like a random sample of where robots drive, as words are counted per frame.
+        kind: kind of the descriptors.
         config: settings.
-        trained_on: kept in the vocabulary, for people.
-        monitor: sees the stages cluster, quantise and relate.
+        trained_on: description stored in the vocabulary, for people.
+        monitor: receives the stages `cluster`, `quantise` and `relate`.
 
     Raises:
         InputError: fewer descriptors than words.
@@ -74,7 +74,7 @@ def train_vocabulary(
     if total < config.words:
         raise InputError(
             f"{len(frames)} frames have {total} descriptors, too few for {config.words} words; "
-            "give more drives, or ask for fewer words"
+            "give more drives or fewer words"
         )
     rng = np.random.default_rng(config.seed)
     rows = np.concatenate(frames)

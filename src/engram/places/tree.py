@@ -22,8 +22,8 @@ class TreeArrays:
     """A tree as it is stored.
 
     Attributes:
-        centres: (M, B) uint8, one per node in breadth-first order; the root's means nothing.
-        bounds: (M + 1,) int32, the children of node n are nodes bounds[n] up to bounds[n + 1];
+        centres: (M, B) uint8, one per node in breadth-first order; the root's is unused.
+        bounds: (M + 1,) int32, the children of node n are the nodes bounds[n] to bounds[n + 1] - 1;
             a node without children is a leaf, and leaves are the words, in this order.
     """
 
@@ -37,14 +37,14 @@ class TreeArrays:
 
     @property
     def leaf_centres(self) -> NDArray[np.uint8]:
-        """(W, B) uint8, the words themselves."""
+        """(W, B) uint8, the centres of the words."""
         return self.centres[np.flatnonzero(np.diff(self.bounds) == 0)]
 
     def searchable(self) -> _core.WordTree:
-        """The tree as the core searches it.
+        """The tree in the form that the core searches.
 
         Raises:
-            InputError: the arrays are no tree.
+            InputError: the arrays do not form a tree.
         """
         try:
             return _core.WordTree(self.centres, self.bounds)
@@ -61,22 +61,22 @@ def grow_tree(
     seed: int,
     monitor: Monitor = QUIET,
 ) -> TreeArrays:
-    """Clusters descriptors level by level until there are as many leaves as words are wanted.
+    """Clusters descriptors level by level into a tree with one leaf per word.
 
-    All levels but the last have the same branching; the last one shares the words out in
-    proportion to the members of each cluster, so that words stand for about equally many
-    descriptors whatever the clusters above came to.
+    All levels but the last have the same branching factor. The last one divides the words in
+    proportion to the members of each cluster, so that all words cover about equally many
+    descriptors.
 
     Args:
         descriptors: (N, B) uint8, N > 0.
-        words: how many leaves are wanted; there are fewer where descriptors are equal or few.
+        words: number of leaves; there are fewer if descriptors are equal or few.
         depth: levels below the root.
-        iterations: at most so many of Lloyd's iterations for each cluster.
-        seed: of the first centres.
-        monitor: sees the stage `cluster`, one item a cluster.
+        iterations: most of Lloyd's iterations per cluster.
+        seed: seed of the first centres.
+        monitor: receives the stage `cluster`, one item per cluster.
     """
     branching = round(words ** (1 / depth))
-    # Clusters of the level above, each the rows of its members, in the order of its siblings.
+    # Clusters of the level above as rows of their members, in the order of the level.
     clusters = [np.arange(len(descriptors))]
     levels: list[NDArray[np.uint8]] = [np.zeros((1, descriptors.shape[1]), np.uint8)]
     children: list[NDArray[np.int64]] = []
@@ -109,8 +109,7 @@ def _split(
 ) -> tuple[NDArray[np.uint8], list[NDArray[np.int64]]]:
     """Centres (K, B) uint8 of a cluster's parts, and the rows of the members of each.
 
-    A cluster that is not to be parted goes on as its own only child, so that leaves are all of
-    one depth.
+    A cluster that is not split becomes its own only child, so that all leaves have the same depth.
     """
     centres, part = _core.k_majority(descriptors[cluster], k, iterations, seed)
     order = np.argsort(part, kind="stable")

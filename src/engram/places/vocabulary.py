@@ -1,4 +1,4 @@
-"""The vocabulary: binary words, what is known of their company, and how it is kept."""
+"""The vocabulary: binary words, their statistics, and their encoding."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ class Vocabulary:
     """Words of one kind of descriptor.
 
     Attributes:
-        descriptor: of which kind the words are.
-        tree: the words, and the tree by which they are found.
-        statistics: how often words are seen, and together with which.
-        samples: the words (n,) int32 of some training images: what new places look like.
-        beam: branches that are followed at a time when a descriptor is looked up. With two, 79 %
-            of descriptors find the very nearest of 10,000 words, with one 63 %.
-        trained_on: for people.
+        descriptor: kind of the words.
+        tree: the words, and the search tree over them.
+        statistics: how often words occur, alone and together.
+        samples: the words, (n,) int32, of some training images, which represent new places.
+        beam: branches followed at a time when searching a descriptor's word. Two find the nearest
+            word clearly more often than one (`lab/reports/constants.md`).
+        trained_on: description of the training data.
     """
 
     descriptor: DescriptorKind
@@ -68,18 +68,18 @@ class Vocabulary:
         return len(self.statistics)
 
     def quantise(self, descriptors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """The word (N,) int32 of each descriptor (N, B) uint8."""
+        """(N,) int32: the word of each descriptor, (N, B) uint8."""
         return self._search.quantise(descriptors, self.beam)
 
     def words_of(self, descriptors: NDArray[np.uint8], kind: DescriptorKind) -> NDArray[np.int32]:
-        """The distinct words that an image shows, rising.
+        """The distinct words of an image, (n,) int32, increasing.
 
         Args:
             descriptors: (N, B) uint8, possibly none.
-            kind: of which kind they are.
+            kind: kind of the descriptors.
 
         Raises:
-            IncompatibleError: the vocabulary is of another kind.
+            IncompatibleError: the vocabulary has another kind.
         """
         if kind != self.descriptor:
             raise IncompatibleError(
@@ -113,26 +113,26 @@ def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
         name: np.ascontiguousarray(array, _DTYPES[_SHAPES[name][0]])
         for name, array in arrays.items()
     }
-    # One entry only: several have no order, and equal content must give equal bytes.
+    # A single entry: several have no defined order, and equal content must give equal bytes.
     metadata = {_METADATA_KEY: json.dumps(about, sort_keys=True)}
     return bytes(safetensors.numpy.save(contiguous, metadata))
 
 
 def vocabulary_hash(body: bytes) -> bytes:
-    """The 16 bytes that stand for an encoded vocabulary: truncated SHA-256."""
+    """16-byte hash of an encoded vocabulary: truncated SHA-256."""
     return hashlib.sha256(body).digest()[:16]
 
 
 def hash_of(vocabulary: Vocabulary) -> bytes:
-    """`vocabulary_hash` of a vocabulary at hand."""
+    """`vocabulary_hash` of a decoded vocabulary."""
     return vocabulary_hash(encode_vocabulary(vocabulary))
 
 
 def decode_vocabulary(body: bytes) -> Vocabulary:
-    """Undoes `encode_vocabulary`; the bytes may come from anywhere.
+    """Inverse of `encode_vocabulary`, for bytes of any origin.
 
     Raises:
-        MapCorruptError: they are no vocabulary of a known format, or hold what none can.
+        MapCorruptError: they are not a vocabulary of a known format, or hold invalid values.
     """
     try:
         tensors = safetensors.deserialize(body)  # type: ignore[no-untyped-call]  # as it comes
@@ -140,18 +140,18 @@ def decode_vocabulary(body: bytes) -> Vocabulary:
         arrays = _checked_arrays(tensors)
         return _assembled(about, arrays)
     except (safetensors.SafetensorError, InputError, ValueError, KeyError, TypeError) as error:
-        raise MapCorruptError(f"no vocabulary that can be used: {error}") from error
+        raise MapCorruptError(f"not a usable vocabulary: {error}") from error
 
 
 @cache
 def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     """The vocabulary of a map that has none of its own.
 
-    For the kinds of this package a small one, trained on simulated drives only; for others one of
-    a single word, by which all places look alike.
+    For the kinds of this package a small one, trained on simulated drives; for others one with a
+    single word, by which all places look alike.
 
     Raises:
-        IncompatibleError: the kind is unknown here.
+        IncompatibleError: the kind is unknown.
     """
     file = resources.files("engram.places") / "data" / f"{descriptor}.safetensors"
     if file.is_file():
@@ -167,7 +167,7 @@ def _metadata(body: bytes) -> dict[str, Any]:
     header = json.loads(body[8 : 8 + length])
     about = json.loads(header["__metadata__"][_METADATA_KEY])
     if about["format"] != VOCABULARY_FORMAT:
-        raise ValueError(f"its format is {about['format']}, known is {VOCABULARY_FORMAT}")
+        raise ValueError(f"its format is {about['format']}, must be {VOCABULARY_FORMAT}")
     return dict(about)
 
 
@@ -195,9 +195,9 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
     samples = tuple(np.split(words, np.cumsum(lengths)[:-1])) if len(lengths) else ()
     for sample in samples:
         if len(sample) and sample[-1] >= len(statistics):
-            raise ValueError("a sample shows a word that there is not")
+            raise ValueError("a sample shows an unknown word")
         if (np.diff(sample) <= 0).any():
-            raise ValueError("the words of a sample do not rise")
+            raise ValueError("the words of a sample do not increase")
     kind = feature_kind(about["descriptor"])
     if arrays["centres"].shape[1] != kind.descriptor_bytes:
         raise ValueError(
@@ -219,14 +219,14 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
 
 
 def _check_statistics(statistics: WordStatistics) -> None:
-    """Counts that can be counts, and a forest without rings."""
+    """Checks that the counts are consistent and the forest has no cycle."""
     words, parents = len(statistics), statistics.parents
     if not 0 < words <= _MOST_WORDS:
         raise ValueError(f"it has {words} words, must be 1 to {_MOST_WORDS}")
     if len(parents) != words or len(statistics.seen_with_parent) != words:
         raise ValueError("its counts are not one per word")
     if (parents < -1).any() or (parents >= words).any():
-        raise ValueError("a word's parent is no word")
+        raise ValueError("a word's parent is not a word")
     children = np.flatnonzero(parents >= 0)
     together = statistics.seen_with_parent
     most = np.minimum(statistics.seen[children], statistics.seen[parents[children]])
@@ -239,7 +239,7 @@ def _check_statistics(statistics: WordStatistics) -> None:
     ):
         raise ValueError("its counts contradict each other")
     ancestors = parents.copy()
-    for _ in range(words.bit_length() + 1):  # each round doubles the way up
+    for _ in range(words.bit_length() + 1):  # each round doubles the distance to the ancestor
         ancestors = np.where(ancestors >= 0, ancestors[ancestors], -1)
     if (ancestors >= 0).any():
-        raise ValueError("its tree of words runs in a ring")
+        raise ValueError("its tree of words has a cycle")

@@ -1,4 +1,4 @@
-"""The words of a map's nodes: kept in it by whoever writes, worked out where they are missing."""
+"""The words of a map's nodes: stored in the map, or computed if missing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _BATCH = 1000
 
 
 def vocabulary_of(opened: Map) -> Vocabulary | None:
-    """The vocabulary that was trained for a map; None if there is none: for `Map.derived`.
+    """The vocabulary stored in a map; None without one. For `Map.derived`.
 
     Raises:
         MapCorruptError: it is damaged.
@@ -32,25 +32,25 @@ def vocabulary_of(opened: Map) -> Vocabulary | None:
 
 
 def vocabulary_or_default(opened: Map, descriptor: DescriptorKind) -> Vocabulary:
-    """A map's vocabulary, or the default one; `descriptor` counts while the map is empty."""
+    """A map's vocabulary, or the default one; `descriptor` is used while the map is empty."""
     own = opened.derived(vocabulary_of)
     return own or default_vocabulary(opened.descriptor or descriptor)
 
 
 def words_of(opened: Map, descriptor: DescriptorKind) -> NodeWords:
-    """The words of a map's nodes and of live frames of this kind: for `Map.derived`."""
+    """The words of a map's nodes and of live frames of this kind. For `Map.derived`."""
     return NodeWords(opened.frames, lambda: vocabulary_or_default(opened, descriptor), opened)
 
 
 class NodeWords:
-    """The distinct words, rising, that nodes and live frames show by one vocabulary.
+    """The distinct words, increasing, of nodes and live frames by one vocabulary.
 
-    Those that the map keeps are taken from there; others are worked out from landmarks, once.
+    Words stored in the map are read from it; others are computed from landmarks, once.
 
     Args:
         frames: landmarks of the nodes.
         vocabulary: gives the vocabulary; called once, at first use.
-        store: the map that keeps words; None where none are kept.
+        store: the map that stores words; None for none.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class NodeWords:
         self._give_vocabulary = vocabulary
         self._store = store
         self._worked_out: dict[NodeId, Words | None] = {}
-        # The live frame's words: several localisers in step ask for them one after another.
+        # The live frame's words: several localisers of one drive ask for them in turn.
         self._last: tuple[Frame, Words] | None = None
 
     @classmethod
@@ -73,17 +73,17 @@ class NodeWords:
 
     @cached_property
     def vocabulary(self) -> Vocabulary:
-        """Whose words they are."""
+        """The vocabulary of the words."""
         return self._give_vocabulary()
 
     @cached_property
     def hash(self) -> bytes:
-        """Of the vocabulary, by which maps name it."""
+        """Hash of the vocabulary, its key in maps."""
         return hash_of(self.vocabulary)
 
     @cached_property
     def kept(self) -> Mapping[NodeId, Words]:
-        """What the map keeps by this vocabulary, as far as it can be of it."""
+        """The valid words that the map stores for this vocabulary."""
         if self._store is None:
             return {}
         kept, most = self._store.words(self.hash), len(self.vocabulary)
@@ -91,11 +91,11 @@ class NodeWords:
 
     @cached_property
     def idf(self) -> NDArray[np.float64]:
-        """(W,) inverse document frequency of each word of the vocabulary."""
+        """(W,) float64: inverse document frequency of each word of the vocabulary."""
         return inverse_frequencies(self.vocabulary.statistics)
 
     def prepare(self) -> None:
-        """Reads the vocabulary and the kept words now, not in the midst of a drive."""
+        """Reads the vocabulary and the stored words now instead of during a drive."""
         _ = self.idf, self.kept
 
     def of_frame(self, frame: Frame) -> Words:
@@ -111,9 +111,9 @@ class NodeWords:
         return last[1]
 
     def of_node(self, node: NodeId) -> Words | None:
-        """The words (n,) int32 of a node; None where its landmarks are damaged.
+        """The words (n,) int32 of a node; None if its landmarks are damaged.
 
-        `engram check` names such a node, and whoever needs its landmarks meets the error.
+        ``engram check`` reports such a node, and reading its landmarks raises.
 
         Raises:
             IncompatibleError: as `of_frame`.
@@ -124,20 +124,20 @@ class NodeWords:
         return self._worked_out[node] if words is None else words
 
     def keep_missing(self, nodes: Sequence[NodeId], monitor: Monitor = QUIET) -> int:
-        """Works out the words of nodes for which the map keeps none, and keeps them there.
+        """Computes the missing words of nodes and stores them in the map.
 
-        A damaged node is left out. Stopped half way, what was done is kept.
+        Damaged nodes are left out. If stopped early, the progress is kept.
 
         Args:
             nodes: nodes of the map, which is open for writing.
-            monitor: sees the stage `words`, one item a node.
+            monitor: receives the stage `words`, one item per node.
 
         Returns:
-            How many nodes were worked out.
+            Number of nodes whose words were computed.
 
         Raises:
             IncompatibleError: the nodes have another kind of descriptor.
-            StorageFullError: no space; what was done is kept.
+            StorageFullError: the disk is full; the progress is kept.
         """
         assert self._store is not None
         missing = [node for node in nodes if node not in self.kept]
@@ -156,9 +156,9 @@ class NodeWords:
         return count
 
     def give(self, other: Map, nodes: Sequence[NodeId]) -> None:
-        """Keeps the words of nodes in another map, whether this one keeps them or not.
+        """Stores the words of nodes in another map, whether this one stores them or not.
 
-        So the same nodes make the same bytes.
+        So equal nodes give equal bytes.
         """
         found = {node: words for node in nodes if (words := self.of_node(node)) is not None}
         other.put_words(self.hash, found)
