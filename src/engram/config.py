@@ -1,6 +1,6 @@
 """Settings: TOML text → frozen dataclasses and back. Unknown keys are errors at any depth.
 
-A field says its bounds and what it means where it is declared:
+A field declares its bounds, meaning, unit and source:
 ``Annotated[float, Meta(ge=0, description="search radius, m. Source: [L15] §III")] = 8.0``.
 """
 
@@ -30,7 +30,7 @@ def load_toml(text: str, kind: type[T]) -> T:
     """Check TOML text against a dataclass and build it.
 
     Raises:
-        ConfigError: the text is no TOML, a key is unknown at any depth, or a value has the wrong
+        ConfigError: the text is not TOML, a key is unknown at any depth, or a value has the wrong
             type or fails the dataclass's own checks.
     """
     try:
@@ -50,7 +50,7 @@ def from_dict(values: dict[str, Any], kind: type[T]) -> T:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Plain values of a dataclass: the resolved configuration that is kept with every result."""
+    """Plain values of a dataclass: the resolved configuration stored with every result."""
     plain: dict[str, Any] = msgspec.to_builtins(_spread(config))
     return plain
 
@@ -58,7 +58,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 def _spread(value: Any) -> Any:
     """Dataclasses as dicts, at any depth.
 
-    msgspec would do it, but leaves out fields that it itself had filled in from their defaults.
+    msgspec would leave out fields that it had filled in from their defaults.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {one.name: _spread(getattr(value, one.name)) for one in dataclasses.fields(value)}
@@ -68,9 +68,9 @@ def _spread(value: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """What JSON can say of a value: dataclasses as objects, arrays as lists, ids and paths as text.
+    """A value for JSON: dataclasses as objects, arrays as lists, ids and paths as text.
 
-    Not-a-number and infinities become None, which JSON knows.
+    Not-a-number and infinities become None, as JSON lacks them.
     """
     return msgspec.json.decode(_encode(_spread(value)))
 
@@ -87,10 +87,10 @@ _encode = msgspec.json.Encoder(enc_hook=_of_other_kinds).encode
 
 
 def check_bounds(config: Any) -> None:
-    """Checks the fields of a dataclass against the bounds declared with them; for __post_init__.
+    """Checks the fields of a dataclass against their declared bounds; for ``__post_init__``.
 
     Raises:
-        ConfigError: a value is out of its bounds or not a finite number.
+        ConfigError: a value is out of its bounds or not finite.
     """
     kind: type = type(config)
     hints = _annotations(kind)
@@ -109,13 +109,13 @@ def _annotations(kind: type) -> dict[str, Any]:
 
 
 def _prose(kind: type) -> str:
-    """The section that a configuration stands in, as people read it: "mapper" of MapperConfig."""
+    """The section name of a configuration, for people: "mapper" for MapperConfig."""
     name = kind.__name__.removesuffix("Config").removesuffix("Options")
     return "".join(f" {c.lower()}" if c.isupper() else c for c in name).strip()
 
 
 def _broken(value: Any, bound: Any) -> str:
-    """What a value must be and is not; empty where it is."""
+    """The bound that a value breaks, as text; empty if it breaks none."""
     if not isinstance(bound, msgspec.Meta):
         return ""
     limits = (

@@ -1,7 +1,7 @@
-"""How good is a map: how often, and how far, a robot goes without a match (SPEC §8).
+"""Measures of a map's quality: how often and how far a robot drives without a match (SPEC §8).
 
-Everything here is a pure function of two arrays per session, one row per live frame: the
-odometry distance of the step that ends in the frame, and whether that frame was matched.
+All are pure functions of two arrays per session, one row per live frame: the odometry distance of
+the step that ends in the frame, and whether the frame was matched.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from engram.errors import InputError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """What the measures need to know of one localised session.
+    """The input of the measures from one localised session.
 
     Attributes:
-        step_m: (F,) float64, distance driven from the previous frame to this one, >= 0.
+        step_m: (F,) float64, distance driven from the previous frame to this one, metres, >= 0.
         matched: (F,) bool, or numbers 0 and 1: whether this frame was localised.
 
     Raises:
-        InputError: they are not two arrays of one length, or hold anything else.
+        InputError: the arrays differ in length or hold invalid values.
     """
 
     step_m: NDArray[np.float64]
@@ -36,7 +36,7 @@ class Drive:
         if matched.dtype != np.bool_:
             numbers = _numbers("matched", matched)
             if not np.isin(numbers, (0.0, 1.0)).all():
-                raise InputError("a drive's matched must be true or false, or 0 or 1, everywhere")
+                raise InputError("a drive's matched must hold only true and false, or 0 and 1")
             matched = numbers.astype(np.bool_)
         object.__setattr__(self, "matched", matched)
         if self.step_m.shape != self.matched.shape or self.step_m.ndim != 1:
@@ -59,10 +59,10 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
 class Gaps:
     """The distances between successive matches; start and end of a session close a gap.
 
-    A match in the very place where the session starts or ends makes no gap there.
+    A match at the position where the session starts or ends makes no gap there.
 
     Attributes:
-        length_m: (G,) float64.
+        length_m: (G,) float64, metres.
         failed: (G,) bool, whether at least one frame within the gap was not matched.
     """
 
@@ -71,7 +71,7 @@ class Gaps:
 
 
 def gaps(drives: Sequence[Drive]) -> Gaps:
-    """All gaps of some sessions. Source: SPEC §8."""
+    """All gaps of the given sessions. Source: SPEC §8."""
     lengths: list[float] = []
     failed: list[bool] = []
     for drive in drives:
@@ -81,7 +81,7 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
         ends = np.flatnonzero(drive.matched)
         marks = np.concatenate([[0.0], positions[ends], positions[-1:]])
         length_m = np.diff(marks)
-        # Between two matches `i < j` lie `j - i - 1` frames without one.
+        # There are `j - i - 1` unmatched frames between two matches `i < j`.
         without = np.diff(np.concatenate([[-1], ends, [len(positions)]])) > 1
         real = np.ones(len(length_m), dtype=bool)
         real[[0, -1]] = (length_m[[0, -1]] > 0) | without[[0, -1]]
@@ -91,9 +91,16 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
 
 
 def failure_curve(drives: Sequence[Drive], at_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """P(X >= x) at distances (X,), metres, from a uniformly random point of the route.
+    """P(X >= x) from a uniformly random point of the route, for many distances x.
 
-    Source: SPEC §8, estimator *route*. 0 for a route of no length.
+    Args:
+        drives: the localised sessions.
+        at_m: (X,) float64, the distances, metres.
+
+    Returns:
+        (X,) float64; 0 for a route of length 0.
+
+    Source: SPEC §8, estimator *route*.
     """
     above, below = np.zeros(len(at_m)), 0.0
     for drive in drives:
@@ -106,7 +113,7 @@ def failure_curve(drives: Sequence[Drive], at_m: NDArray[np.float64]) -> NDArray
 def failure_route(drives: Sequence[Drive], at_m: float) -> float:
     """P(X >= x) from a uniformly random point of the route: (1/L) Σ max(0, g − x).
 
-    Source: SPEC §8, estimator *route*. 0 for a route of no length.
+    0 for a route of length 0. Source: SPEC §8, estimator *route*.
     """
     length_m = route_m(drives)
     if length_m == 0.0:

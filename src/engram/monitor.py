@@ -1,4 +1,4 @@
-"""Progress and cancelling of long work, and files that are written whole or not at all."""
+"""Progress and cancellation of long work, and atomic writing of files."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from typing import Any
 
 
 class Monitor:
-    """Watches long work and may stop it. This one is silent and never stops anything.
+    """Monitors long work and may stop it. This base class is silent and never stops it.
 
-    Work calls `stage` for each of its parts, `advance` once per item of the part, and `check`
-    wherever it can stop with nothing half done.
+    The work calls `stage` for each of its parts, `advance` once per item of the part, and `check`
+    wherever it can stop in a consistent state.
     """
 
     def stage(self, what: str, total: int) -> AbstractContextManager[Monitor]:
-        """A part of the work: its name and how many items it has; yields who hears of them."""
+        """A part of the work with its name and number of items; yields the monitor of the part."""
         del what, total
         return nullcontext(self)
 
     def advance(self, word: str = "") -> None:
-        """One item is done; `word` says what became of it."""
+        """Reports one finished item; `word` is its status."""
 
     def hear(self, report: Any) -> None:
-        """A part of the result that is there for good, whatever becomes of the rest."""
+        """Reports a part of the result that is final, even if the rest fails."""
 
     def check(self) -> None:
-        """Raises KeyboardInterrupt where the work is to stop."""
+        """Raises KeyboardInterrupt if the work should stop."""
 
 
 QUIET = Monitor()
 
 
 class Advancing(Monitor):
-    """Calls a function for each item of the work, with the word on what became of it."""
+    """Calls a function with the status of each finished item."""
 
     def __init__(self, advance: Callable[[str], None]) -> None:
         self._advance = advance
@@ -50,14 +50,13 @@ class Advancing(Monitor):
 
 @contextmanager
 def deferred_interrupt() -> Iterator[Callable[[], None]]:
-    """Holds a first Ctrl-C back until the function that this yields is called, which raises it.
+    """Defers a first Ctrl-C until a call of the yielded function, which raises it.
 
-    Python raises KeyboardInterrupt between any two instructions of the main thread, also between
-    taking the lock of a queue and being able to give it back: the thread at the queue's other end
-    then waits for ever. A second Ctrl-C is raised at once, for what does not come back by itself.
+    Python raises KeyboardInterrupt between any two instructions of the main thread, even while it
+    holds the lock of a queue: the thread at the queue's other end then waits for ever. A second
+    Ctrl-C raises at once, in case the work hangs.
 
-    Only where Ctrl-C would raise KeyboardInterrupt: on the main thread of a program that has no
-    handler of its own. Elsewhere nothing changes.
+    Has an effect only on the main thread of a program without its own handler of Ctrl-C.
     """
     asked = False
 
@@ -86,7 +85,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def interruptible(monitor: Monitor) -> Iterator[Monitor]:
-    """The same monitor, whose `check` also raises where Ctrl-C was pressed; see above."""
+    """The same monitor, whose `check` also raises after Ctrl-C; see `deferred_interrupt`."""
     with deferred_interrupt() as raise_if_asked:
         yield _Interruptible(monitor, raise_if_asked)
 
@@ -114,9 +113,9 @@ class _Interruptible(Monitor):
 
 @contextmanager
 def write_whole(path: Path) -> Iterator[Path]:
-    """Yields where to write; the file gets its name when the block ends, whole and on the disk.
+    """Yields a temporary path; at the end of the block it is synced and renamed to `path`.
 
-    An error, or a killed process, leaves what was under the name before. The folder must be there.
+    After an error or a kill the previous file stays unchanged. The folder must exist.
     """
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -130,5 +129,5 @@ def write_whole(path: Path) -> Iterator[Path]:
 
 
 def ignore(word: str) -> None:
-    """The progress of a caller that shows none."""
+    """Progress function that shows nothing."""
     del word

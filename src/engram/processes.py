@@ -1,4 +1,4 @@
-"""Work in processes of this machine: who dies is replaced, none outlives its parent."""
+"""Work in processes on this machine: dead workers are replaced, none outlives its parent."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from engram.monitor import Monitor
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# A task that kills its worker this often will do so again.
+# Retries of a task that kills its worker.
 MAX_RETRIES = 3
-# How long Ctrl-C may wait.
+# Longest delay of Ctrl-C.
 LISTEN_S = 0.5
-# Words on the way are put together so that the pipe is not the bottleneck.
+# Words per message, so that the pipe is not the bottleneck.
 _WORDS_AT_ONCE = 10
 
 
 class WordsTogether(Monitor):
-    """In a worker: gathers the words of `advance` and sends several at a time."""
+    """A worker's monitor, which sends the words of `advance` in batches."""
 
     def __init__(self, send: Callable[[list[str]], object]) -> None:
         self._send = send
         self._words: list[str] = []
 
     def advance(self, word: str = "") -> None:
-        """One more word."""
+        """See `Monitor`."""
         self._words.append(word)
         if len(self._words) >= _WORDS_AT_ONCE:
             self._send(self.take())
 
     def take(self) -> list[str]:
-        """What was not sent yet."""
+        """Returns and clears the words not sent yet."""
         words, self._words = self._words, []
         return words
 
@@ -53,19 +53,19 @@ def run_in_processes(
     monitor: Monitor,
     done: Callable[[str, Result, int], None],
 ) -> None:
-    """Runs tasks in processes, several at a time, each in a process of its own.
+    """Runs each task in its own process, several at a time.
 
     Args:
-        work: a function of a module; what it says to its monitor reaches `monitor`. It must be
-            sound wherever its process ends, and go on from there when it is run again.
-        tasks: by name.
-        workers: processes at a time.
-        monitor: hears the words of all tasks; its `check` may end the work.
-        done: hears of each task that is done: name, result, how often its worker died.
+        work: a function of a module; its monitor forwards to `monitor`. Its process may end at any
+            time; run again, it must continue from there.
+        tasks: name → task.
+        workers: number of concurrent processes.
+        monitor: receives the words of all tasks; its `check` may end the work.
+        done: called for each finished task with its name, result and number of dead workers.
 
     Raises:
-        WorkerError: a worker died again and again over the same task.
-        EngramError: what a task raised.
+        WorkerError: the workers of one task died repeatedly.
+        EngramError: raised by a task.
     """
     waiting = list(tasks)
     retries = dict.fromkeys(tasks, 0)
@@ -109,7 +109,7 @@ def _count_death(one: _Running, retries: dict[str, int]) -> None:
 
 @contextmanager
 def _team() -> Iterator[list[_Running]]:
-    """The workers; whoever still runs at the end is ended."""
+    """The workers; ends those that still run at the end of the block."""
     running: list[_Running] = []
     try:
         yield running
@@ -121,7 +121,7 @@ def _team() -> Iterator[list[_Running]]:
 
 
 def _start(work: Callable[[Task, Monitor], Result], name: str, task: Task) -> _Running:
-    # Started afresh: a forked child would share the parent's threads half way through.
+    # Spawned: a forked child would inherit the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
     pipe, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(work, task, theirs), daemon=True)
@@ -131,7 +131,7 @@ def _start(work: Callable[[Task, Monitor], Result], name: str, task: Task) -> _R
 
 
 def _work(work: Callable[[Task, Monitor], Result], task: Task, pipe: Connection) -> None:
-    """In the worker: Ctrl-C is for the parent, which ends its workers."""
+    """Main function of a worker. It ignores Ctrl-C: the parent ends its workers."""
     import cv2
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -148,7 +148,7 @@ def _work(work: Callable[[Task, Monitor], Result], task: Task, pipe: Connection)
 
 
 def _listen(running: Sequence[_Running], monitor: Monitor) -> None:
-    """Until something happens, but no longer than Ctrl-C should take."""
+    """Waits for messages of the workers, at most `LISTEN_S`."""
     ready = wait(
         [one.pipe for one in running] + [one.process.sentinel for one in running], LISTEN_S
     )
@@ -158,7 +158,7 @@ def _listen(running: Sequence[_Running], monitor: Monitor) -> None:
 
 
 def _hear(one: _Running, monitor: Monitor) -> None:
-    """All that a worker has said."""
+    """Receives all messages of a worker."""
     try:
         while one.pipe.poll():
             said = one.pipe.recv()
@@ -167,15 +167,15 @@ def _hear(one: _Running, monitor: Monitor) -> None:
                     monitor.advance(word)
             else:
                 one.outcome = said
-    except (EOFError, OSError):  # it is over: by itself, or killed in the midst of a word
+    except (EOFError, OSError):  # the worker has ended or was killed within a message
         one.process.join()
 
 
 def end_with_parent() -> None:
-    """Ends this process as soon as its parent is gone, however that was killed.
+    """Ends this process as soon as its parent has ended, even by a kill.
 
-    A worker left behind would hold locks and write files, and meet the run that goes on. To be
-    called in the worker, whose work must be sound whenever it ends.
+    Otherwise a worker would keep locks and write files beside the next run. Call it in the worker,
+    whose work may end at any time.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

@@ -1,4 +1,4 @@
-"""Pictures."""
+"""Pictures of maps, matches and trajectories."""
 
 from engram.viewing.from_above import (
     Track,

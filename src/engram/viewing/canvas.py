@@ -1,4 +1,4 @@
-"""Matplotlib behind one door: it is an extra, and draws into files only."""
+"""Access to Matplotlib, an extra that draws into files only."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from engram.errors import MissingExtraError
 
 
 def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple[Any, list[Any]]:
-    """A figure with some axes in a row, or in rows of which the last may be shorter.
+    """A figure with `count` axes in `rows` rows, of which the last may be shorter.
 
-    Sizes are those of the figure, in inches.
+    Width and height are those of the figure, in inches.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.
@@ -38,7 +38,7 @@ def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple
 
 
 def save(figure: Any, path: Path) -> None:
-    """Writes the figure and gives its memory back."""
+    """Writes the figure and releases its memory."""
     from matplotlib import pyplot
 
     figure.savefig(path, dpi=120)

@@ -1,4 +1,4 @@
-"""Two revisions of a map from above: what stayed, what came, what went."""
+"""Two revisions of a map from above: unchanged, added and removed parts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from engram.viewing.from_above import Track, draw_from_above
 
 
 def draw_difference(difference: MapDifference, path: Path) -> None:
-    """Draws what stayed, what came and what went between two revisions.
+    """Draws the unchanged, added and removed parts between two revisions.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.

@@ -24,9 +24,9 @@ class Track:
     """One line of the picture.
 
     Attributes:
-        label: for the legend.
-        points_m: (N, 2) float64, x to the right and z forward in the picture's frame, metres.
-        colour: as Matplotlib names it; None for the next of a series.
+        label: label in the legend.
+        points_m: (N, 2) float64, x right and z forward in the picture's frame, metres.
+        colour: Matplotlib colour; None for the next of a series.
     """
 
     label: str
@@ -48,7 +48,7 @@ def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> No
     """Draws tracks from above, side by side.
 
     Args:
-        panels: title and tracks of each; a label has one colour in all of them.
+        panels: title and tracks of each; a label has the same colour in all of them.
         path: image file.
 
     Raises:
@@ -73,7 +73,7 @@ def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> No
 
 
 def _name(track: Track) -> str:
-    """What a track is of, without the count behind it."""
+    """The label of a track without its count."""
     return track.label.split(" (")[0]
 
 
@@ -81,9 +81,9 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
     """Draws the attempts that each frame took, one line per policy.
 
     Args:
-        attempts: policy → (F,) attempts of each frame.
+        attempts: policy → (F,) int64, attempts of each frame.
         path: image file.
-        title: over the picture.
+        title: title of the picture.
 
     Raises:
         InputError: the file cannot be written.
@@ -101,19 +101,19 @@ def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: 
 
 
 def check_picture(path: Path) -> None:
-    """Says before the work is done whether a picture can be drawn there.
+    """Checks before the work whether a picture can be written to a path.
 
     Raises:
-        InputError: there is no such folder, it may not be written, or the ending means no format.
+        InputError: the folder does not exist or is not writable, or the file extension is unknown.
         MissingExtraError: Matplotlib is not installed.
     """
     formats = _matplotlib().figure.Figure().canvas.get_supported_filetypes()
     ending = path.suffix.removeprefix(".").lower()
     if not path.parent.is_dir():
-        raise InputError(f"the picture {path} cannot be written: {path.parent} is no folder")
+        raise InputError(f"the picture {path} cannot be written: {path.parent} is not a folder")
     if ending and ending not in formats:
         raise InputError(
-            f"the picture {path} cannot be written: .{ending} is none of {', '.join(formats)}"
+            f"the picture {path} cannot be written: .{ending} is not one of {', '.join(formats)}"
         )
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise InputError(f"the picture {path} cannot be written: permission denied, or a folder")
@@ -144,7 +144,7 @@ def _save(figure: Figure, path: Path) -> None:
 
     try:
         figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:  # no such folder; an ending that means no format
+    except (OSError, ValueError) as error:  # no such folder; an unknown file extension
         raise InputError(f"the picture {path} cannot be written: {error}") from error
     finally:
         pyplot.close(figure)

@@ -1,4 +1,4 @@
-"""Any map from above, its nodes coloured by experience, hour of day, revision or robot."""
+"""A map from above, its nodes coloured by experience, hour of day, revision or robot."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ COLOURS: Mapping[str, Callable[[Map, Node], str]] = {
 def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None = None) -> int:
     """Draws a map from above.
 
-    Places are true to each other nearby; over long distances they drift with odometry. Components
-    that nothing joins stand side by side.
+    Relative positions are accurate locally; over long distances they drift with odometry.
+    Unconnected components stand side by side.
 
     Args:
         path: NAME.engram.

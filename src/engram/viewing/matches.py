@@ -24,9 +24,10 @@ def match_picture(
     Args:
         node_image: (h, w) uint8 grey, any size; enlarged to the live image's height.
         live_image: (H, W) uint8 grey.
-        node_pixels: (K, 2) positions in the node's image as fractions of its width and height.
-        live_pixels: (K, 2) positions in the live image, px.
-        caption: written below.
+        node_pixels: (K, 2) float32, positions in the node's image as fractions of its width and
+            height.
+        live_pixels: (K, 2) float32, positions in the live image, px.
+        caption: text below the images.
 
     Returns:
         (H', W', 3) uint8 BGR.

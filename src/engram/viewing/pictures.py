@@ -18,15 +18,15 @@ from engram.viewing import match_picture
 
 
 class PictureWriter:
-    """Writes every so many frames what was matched with what, or that nothing was.
+    """Writes a picture of the match, or of its absence, at regular intervals.
 
     Args:
-        folder: made where there is none.
+        folder: folder of the pictures; created if missing.
         every: frames from one picture to the next.
         frames: the map's frames.
 
     Raises:
-        InputError: the folder cannot be made.
+        InputError: the folder cannot be created.
     """
 
     def __init__(self, folder: Path, every: int, frames: FrameReader) -> None:
@@ -37,14 +37,14 @@ class PictureWriter:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be made: {error.strerror}") from error
+            raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
 
     def offer(self, seen: Seen, found: Localisation) -> None:
-        """Writes a picture of the frame just localised if it is its turn.
+        """Writes a picture of the frame just localised, if it is due.
 
         Args:
             seen: `Robot.last`.
-            found: what was found of it.
+            found: its localisation.
 
         Raises:
             InputError: the picture cannot be written.
@@ -64,7 +64,7 @@ class PictureWriter:
             picture = self._match(seen.frame, success, image)
         path = self._folder / f"{self._count:06d}_{status}.png"
         if not cv2.imwrite(str(path), picture):
-            raise InputError(f"{path}: the picture cannot be written; is there space?")
+            raise InputError(f"{path}: the picture cannot be written; is the disk full?")
 
     def _match(self, live: Frame, success: Outcome, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         node = self._frames.frame(success.candidate.node)

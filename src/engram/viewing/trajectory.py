@@ -1,8 +1,8 @@
-"""A localised drive as one trajectory, for programs that want one (ARCHITECTURE, TUM format).
+"""A localised drive as one trajectory in TUM format, for other programs.
 
-The map has no global frame. The trajectory's frame is the camera of the first localised node;
-other nodes are placed by the least uncertain chain of edges, and frames that were not localised by
-odometry from the frame before. It is therefore not globally consistent, and its header says so.
+The map has no global frame. The trajectory's frame is the camera of the first localised node; the
+least uncertain chain of edges places the other nodes, and odometry the frames without a match. The
+trajectory is therefore not globally consistent, as its header states.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ def chain_trajectory(
 ) -> list[tuple[int, SE3]]:
     """Poses of the live camera in the frame of the first localised node.
 
-    Frames before the first localised one, and frames after the motion was lost, are left out
-    until the next match.
+    Frames before the first localised one are left out, and so are frames from a loss of odometry
+    to the next match.
 
     Returns:
-        (stamp_ns, first_from_live) of each placed frame, in the order of time.
+        (stamp_ns, first_from_live) of each placed frame, in temporal order.
     """
     placed = _PlacedNodes(graph)
     trajectory: list[tuple[int, SE3]] = []
@@ -53,7 +53,7 @@ def chain_trajectory(
 
 
 class _PlacedNodes:
-    """Where nodes stand in the trajectory's frame."""
+    """Poses of nodes in the trajectory's frame."""
 
     def __init__(self, graph: ExperienceGraph) -> None:
         self._graph = graph
@@ -61,7 +61,7 @@ class _PlacedNodes:
         self._first_from: dict[NodeId, SE3] = {}
 
     def place(self, node: NodeId, first_from_live: SE3 | None, node_from_live: SE3) -> SE3 | None:
-        """Pose of a node: by the graph, else by where odometry says the live camera is."""
+        """Pose of a node: by the graph, else by the live camera's pose from odometry."""
         if node not in self._first_from:
             placed = self._by_the_graph(self._graph.index(node))
             if placed is None and first_from_live is not None:
