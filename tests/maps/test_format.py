@@ -173,3 +173,15 @@ def test_format_3_reads_as_it_was_written(third):
 def test_format_3_keeps_its_content_hash(third, at, expected):
     with Map.open(third, at=at) as store:
         assert store.content_hash() == expected
+
+
+def test_format_4_reads_as_it_was_written(tmp_path):
+    path = shutil.copy(DATA / "format-4.engram", tmp_path / "fourth.engram")
+    with Map.open(path) as store:
+        (shown,) = store.sessions.values()
+        assert (shown.robot, shown.zone) == ("robot-2", "Europe/London")
+        assert store.content_hash() == "ae59546e3a9c0172b79e5526ea6e6a71"
+    with Map.open(path, at=1) as store:
+        (shown,) = store.sessions.values()
+        assert (shown.robot, shown.zone) == ("robot-1", "Europe/Prague")
+    assert check_file(path).problems == ()

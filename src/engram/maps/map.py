@@ -14,17 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, insert
 
-from engram import __version__
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.files import Holder
 from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
-from engram.graph.model import (
-    Amendable,
-    NodeId,
-    Session,
-    SessionId,
-)
+from engram.graph.model import Amendable, NodeId, Session, SessionId
 from engram.maps import reading
 from engram.maps.amending import checked_amendments
 from engram.maps.database import Database, Lock, Place
@@ -33,19 +27,16 @@ from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.keys import KeyBook
 from engram.maps.map_files import open_database
 from engram.maps.map_reader import MapReader
-from engram.maps.records import (
-    Revision,
-    RevisionStatus,
-    SessionState,
-)
+from engram.maps.records import Revision, RevisionStatus, SessionState
 from engram.maps.revisions import (
     change_revision,
     collect_abandoned,
     commit_revision,
+    new_revision,
     session_and_revision,
     stored_session,
 )
-from engram.maps.rows import Row, checked_text, sealed, session_from_row, to_json
+from engram.maps.rows import Row, sealed, session_from_row
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, map_path
 from engram.maps.tags import Tag, set_tag, take_tag_away
@@ -240,7 +231,7 @@ class Map(MapReader):
         """
         self._check_none_open()
         self._check_new(session)
-        row = self._revision_row(author, message, configuration)
+        row = new_revision(self._keys, self._holder, author, message, configuration)
         writer = self._begin(row, session=session)
         try:
             writer.add_session(session, camera, descriptor=descriptor, frontend=frontend)
@@ -304,7 +295,7 @@ class Map(MapReader):
             InputError: the configuration is not JSON data.
         """
         self._check_none_open()
-        row = self._revision_row(author, message, configuration)
+        row = new_revision(self._keys, self._holder, author, message, configuration)
         if at_ns is not None:
             row |= {"opened_ns": at_ns, "host": "", "pid": 0, "writer": ""}
         return self._begin(row, committed_ns=at_ns)
@@ -331,7 +322,7 @@ class Map(MapReader):
         if number == 0:
             raise RevisionError(f"{self._database.name}: there is no revision 0 to revert")
         said = f"revert revision {number}" + (f": {message}" if message else "")
-        opened = self._revision_row(author, said, {"revert": number})
+        opened = new_revision(self._keys, self._holder, author, said, {"revert": number})
         try:
             with self._database.writing() as connection:
                 connection.execute(insert(revisions), [sealed(revisions, opened)])
@@ -504,24 +495,6 @@ class Map(MapReader):
         if self._lock is not None:
             self._lock.release()
             self._lock = None
-
-    def _revision_row(self, author: str, message: str, configuration: Mapping[str, Any]) -> Row:
-        return {
-            "key": self._keys.next(revisions),
-            "number": None,
-            "status": str(RevisionStatus.ABANDONED),  # until its first checkpoint
-            "parent": None,
-            "author": checked_text(author, "author"),
-            "message": checked_text(message, "message"),
-            "tool_version": __version__,
-            "configuration": to_json(configuration),
-            "contents": "{}",
-            "opened_ns": time.time_ns(),
-            "committed_ns": None,
-            "host": self._holder.host,
-            "pid": self._holder.pid,
-            "writer": self._holder.token,
-        }
 
     def _begin(
         self, row: Row, *, session: Session | None = None, committed_ns: int | None = None

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 from uuid import UUID
 
 from sqlalchemy import Connection, delete, func, select, update
 
+from engram import __version__
 from engram.errors import MapCorruptError, RevisionError
+from engram.files import Holder
 from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind, SessionId, path_id
 from engram.maps import reading
+from engram.maps.keys import KeyBook
 from engram.maps.records import InterruptedSession, Revision, RevisionStatus, StoredSession
 from engram.maps.rows import (
     Row,
+    checked_text,
     node_from_row,
     sealed,
     session_from_row,
@@ -36,6 +41,28 @@ from engram.maps.schema import (
 from engram.maps.view import View, head, place_in_history
 
 _ABANDONED = select(revisions.c.key).where(revisions.c.status == str(RevisionStatus.ABANDONED))
+
+
+def new_revision(
+    keys: KeyBook, writer: Holder, author: str, message: str, configuration: Mapping[str, Any]
+) -> Row:
+    """The row of a revision that begins."""
+    return {
+        "key": keys.next(revisions),
+        "number": None,
+        "status": str(RevisionStatus.ABANDONED),  # until it has something to keep
+        "parent": None,
+        "author": checked_text(author, "author"),
+        "message": checked_text(message, "message"),
+        "tool_version": __version__,
+        "configuration": to_json(configuration),
+        "contents": "{}",
+        "opened_ns": time.time_ns(),
+        "committed_ns": None,
+        "host": writer.host,
+        "pid": writer.pid,
+        "writer": writer.token,
+    }
 
 
 def commit_revision(

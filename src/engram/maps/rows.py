@@ -41,6 +41,9 @@ START = re.compile(r"-?\d{1,19}")  # ns, as text
 _UPPER = np.triu_indices(6)
 _encode = msgspec.msgpack.Encoder().encode
 
+# Covariances come from products with their own transposes: what is left of asymmetry is rounding.
+_ASYMMETRY_LIMIT = 1e-6
+
 
 def checksum(values: Sequence[Any]) -> int:
     """CRC-32 of a row's columns (all but the checksum) as a MessagePack array.
@@ -340,3 +343,20 @@ def _arrays(parts: Sequence[bytes], count: int, named: Callable[[int], str]) -> 
     if infinite.size:
         raise MapCorruptError(f"{named(int(infinite[0]))}: holds numbers that are not finite")
     return values
+
+
+def check_edge(edge: Edge) -> None:
+    """Refuse an edge that no map should hold.
+
+    Raises:
+        InputError: it joins a node with itself, or its numbers are not finite and symmetric.
+    """
+    what = f"edge {edge.a} → {edge.b} ({edge.kind})"
+    if edge.a == edge.b:
+        raise InputError(f"{what} joins a node with itself")
+    transform = np.concatenate([edge.a_from_b.rotation.ravel(), edge.a_from_b.translation])
+    if not np.isfinite(transform).all() or edge.covariance.shape != (6, 6):
+        raise InputError(f"{what}: a transform is finite, its covariance (6, 6)")
+    asymmetry = np.abs(edge.covariance - edge.covariance.T).max()
+    if not asymmetry <= _ASYMMETRY_LIMIT * max(1.0, np.abs(edge.covariance).max()):
+        raise InputError(f"{what}: its covariance is not finite and symmetric")

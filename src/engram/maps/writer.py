@@ -42,12 +42,7 @@ from engram.maps.revisions import (
     revision_contents,
 )
 from engram.maps.row_buffer import RowBuffer
-from engram.maps.rows import (
-    camera_row,
-    checked_int,
-    session_row,
-    transform_bytes,
-)
+from engram.maps.rows import camera_row, check_edge, checked_int, session_row, transform_bytes
 from engram.maps.schema import (
     amendments,
     cameras,
@@ -66,8 +61,6 @@ from engram.maps.view import View
 
 # Most bytes in memory of a revision that is not resumable.
 _BATCH_BYTES = 8 * 2**20
-# Asymmetry of covariances by rounding, since they come from products with transposes.
-_ASYMMETRY_LIMIT = 1e-6
 
 
 class RevisionWriter:
@@ -283,7 +276,7 @@ class RevisionWriter:
             InputError: an end is not in the map, both are the same, or a number is not finite.
         """
         self._check_open()
-        _check_edge(edge)
+        check_edge(edge)
         a, b = self._node_key(edge.a, "edge"), self._node_key(edge.b, "edge")
         self._rows.put_edge(edge, a, b)
         self._checkpoint_if_due()
@@ -601,20 +594,3 @@ class RevisionWriter:
             hidden, hidden_row(self._keys, self._revision_key, table, again["key"], hide=False)
         )
         return int(again["key"])
-
-
-def _check_edge(edge: Edge) -> None:
-    """Refuses an invalid edge.
-
-    Raises:
-        InputError: it joins a node with itself, or its numbers are not finite and symmetric.
-    """
-    what = f"edge {edge.a} → {edge.b} ({edge.kind})"
-    if edge.a == edge.b:
-        raise InputError(f"{what} joins a node with itself")
-    transform = np.concatenate([edge.a_from_b.rotation.ravel(), edge.a_from_b.translation])
-    if not np.isfinite(transform).all() or edge.covariance.shape != (6, 6):
-        raise InputError(f"{what}: a transform is finite, its covariance (6, 6)")
-    asymmetry = np.abs(edge.covariance - edge.covariance.T).max()
-    if not asymmetry <= _ASYMMETRY_LIMIT * max(1.0, np.abs(edge.covariance).max()):
-        raise InputError(f"{what}: its covariance is not finite and symmetric")

@@ -1,6 +1,6 @@
 """Writes `format-1.engram`: run once, when the format came to be. Never run it again.
 
-    cd tests && python -m store.data.make_format_1 FILE
+    python -m tests.maps.data.make_format_1 FILE
 
 Two committed sessions (the second supersedes an edge of the first), and one that was interrupted.
 """

@@ -1,6 +1,6 @@
 """Writes `format-2.engram`: run once, when the format came to be. Never run it again.
 
-    cd tests && python -m store.data.make_format_2 FILE
+    python -m tests.maps.data.make_format_2 FILE
 
 What format 1 could not hold: a tag, words of nodes, a drive that was taken back and came again.
 """

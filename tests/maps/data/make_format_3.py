@@ -1,6 +1,6 @@
 """Writes `format-3.engram`: run once, when the format came to be. Never run it again.
 
-    cd tests && python -m store.data.make_format_3 FILE
+    python -m tests.maps.data.make_format_3 FILE
 
 What format 2 could not hold: the hash of the landmarks of a node that was not taken.
 """
