@@ -54,13 +54,13 @@ def run(script: str, *words: object) -> list[str]:
 
 def test_only_regular_files_are_opened_and_nobody_waits(tmp_path: Path) -> None:
     told = run(OPENS, tmp_path)
-    devices = "is a pipe, a socket or a device, no"
+    devices = "is a pipe, a socket or a device, not a"
     expected = [*["NotAMapError"] * 9, *["SequenceError"] * 6]
     assert [line.split()[0] for line in told] == expected
     for at, line in enumerate(told):
         noun = "map" if at < 9 else "frame log"
         folder = "folder." in line
-        assert f"is a folder, no {noun}" if folder else f"{devices} {noun}" in line
+        assert (f"is a folder, not a {noun}" if folder else f"{devices} {noun}") in line
 
 
 def test_who_reads_the_map_that_it_writes_keeps_its_locks(tmp_path: Path) -> None:

@@ -157,15 +157,19 @@ def test_a_build_that_began_with_the_best_first_goes_on_as_such(tmp_path, logs, 
 
 
 def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
-    with pytest.raises(ConfigError, match=r"a\.framelog judges .* is in .*group-0\.engram"):
+    with pytest.raises(
+        ConfigError, match=r"a\.framelog is given to --validate.* is in .*group-0\.engram"
+    ):
         search(tmp_path, maps[:2], judge(logs["a"]))
     with pytest.raises(ConfigError, match=r"held-out\.framelog .* the same drive"):
         search(tmp_path, maps[:2], judge(logs["held-out"], reported=[logs["held-out"]]))
     centre = tmp_path / "centre.engram"
-    with pytest.raises(ConfigError, match=r"b\.framelog judges .* to be built from"):
+    with pytest.raises(ConfigError, match=r"b\.framelog is given to --validate.* of this build"):
         build(centre, logs, "ab", judge=judge(logs["b"]))
     copy_map(maps[2], centre)
-    with pytest.raises(ConfigError, match=r"c\.framelog judges .* in .*centre\.engram already"):
+    with pytest.raises(
+        ConfigError, match=r"c\.framelog is given to --validate.* in .*centre\.engram already"
+    ):
         build(centre, logs, "ab", judge=judge(logs["c"]))
     assert not centre.with_name("centre.engram.build").exists()
 
@@ -173,7 +177,9 @@ def test_a_drive_that_is_not_held_out_judges_nothing(tmp_path, maps, logs):
 def test_the_name_of_the_robot_does_not_let_a_drive_judge(tmp_path, maps, logs):
     robot, renamed = tmp_path / "robot.engram", open_drive(logs["held-out"], robot="somebody")
     map_drive(robot, renamed, Settings(), RobotOptions(relocaliser="exhaustive"))
-    with pytest.raises(ConfigError, match=r"held-out\.framelog judges .* of somebody"):
+    with pytest.raises(
+        ConfigError, match=r"held-out\.framelog is given to --validate.* of somebody"
+    ):
         search(tmp_path, [maps[0], robot], judge(logs["held-out"]))
 
 
@@ -194,7 +200,7 @@ def test_orders_are_judged_with_the_centre_that_they_are_merged_into(tmp_path, m
     assert (report.best.spent.merges, report.best.spent.copies) == (4, 4)
     assert report.content_hash == report.best.results[0].content_hash
     assert report.notes == []
-    assert "are of centres that are new" in report.text()
+    assert "apply to new fleet maps only" in report.text()
 
 
 def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(

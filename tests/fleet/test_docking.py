@@ -205,7 +205,7 @@ class TestRefused:
         self.refuses(centre, robot, NotAMapError)
 
     def test_the_centre_itself(self, centre):
-        self.refuses(centre, centre, InputError, "the centre itself")
+        self.refuses(centre, centre, InputError, "the fleet map itself")
 
     def test_landmarks_that_were_damaged_on_the_way(self, tmp_path, centre, fleet):
         robot = damaged(fleet["longer"][0], tmp_path / "damaged.engram")
@@ -283,7 +283,7 @@ class TestReported:
     def test_a_map_of_another_town_becomes_a_part_of_its_own(self, centre, fleet):
         (report,) = merged(centre, fleet["other"][0])
         assert report.omitted == 0
-        assert any("no node of it was found" in note for note in report.notes)
+        assert any("no node of it matched" in note for note in report.notes)
 
     def test_another_town_is_told_even_where_its_drives_found_each_other(
         self, tmp_path, centre, fleet
@@ -295,7 +295,7 @@ class TestReported:
         (report,) = merged(centre, town)
         assert report.omitted
         assert report.taken
-        assert any("no node of it was found" in note for note in report.notes)
+        assert any("no node of it matched" in note for note in report.notes)
 
     def test_a_drive_of_which_a_part_was_not_found(self, tmp_path, centre, fleet):
         mixed = tmp_path / "mixed.engram"
@@ -411,7 +411,7 @@ class TestGate:
             merged(centre, *maps, require_better=[tmp_path / "held-out"], monitor=Told(told))
         assert str(maps[1]) in str(raised.value)
         assert "held-out localise worse" in str(raised.value)
-        assert "as it was before this map" in str(raised.value)
+        assert "the fleet map is unchanged by it" in str(raised.value)
         # What passed stands.
         assert [report.revision for report in told] == [2]
         assert hash_of(centre) == told[0].content_hash

@@ -263,7 +263,7 @@ def test_a_budget_can_be_a_share_of_everything_sent_alike(centre, tmp_path):
     )
     assert as_bytes.nodes == half.nodes
     assert "of the" in half.text()
-    assert "that all nodes take" in half.text()
+    assert "of a full download in the same form" in half.text()
 
 
 def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(centre, tmp_path):

@@ -294,7 +294,7 @@ def test_nodes_that_a_revert_had_hidden_bring_back_what_joins_them_to_others(tmp
     with open_map(centre, None) as opened:
         assert report.components == opened.graph.components().max() + 1 == before.components
     assert report.taken
-    assert not any("found in the fleet map" in note for note in report.notes)
+    assert not any("matched the fleet map" in note for note in report.notes)
     assert not any("not connected" in note for note in report.notes)
     assert_sound(centre)
 

@@ -72,8 +72,8 @@ def test_the_latest_revision_has_the_last_word_and_can_be_reverted(path):
     ("changes", "error", "fact"),
     [
         ({"zone": "Middle/Earth"}, ConfigError, "unknown"),
-        ({"start": "noon"}, InputError, "cannot be the start"),
-        ({"robot": ""}, InputError, "cannot be the robot"),
+        ({"start": "noon"}, InputError, "not valid as the start"),
+        ({"robot": ""}, InputError, "not valid as the robot"),
         ({"robot": "robot-1"}, InputError, "nothing to amend"),
     ],
 )

@@ -145,7 +145,7 @@ class TestRevert:
 
     def test_nothing_left_to_take_back_is_refused(self, store, two):
         store.revert(2, author="me")
-        with pytest.raises(RevisionError, match="nothing left"):
+        with pytest.raises(RevisionError, match="nothing to revert"):
             store.revert(2, author="me")
         for named in (0, 9, "summer"):
             with pytest.raises(RevisionError):

@@ -281,7 +281,7 @@ def test_a_log_has_no_colours(tmp_path: Path) -> None:
 def test_frames_must_rise_and_fit(tmp_path: Path) -> None:
     with FrameLogWriter(tmp_path / "a.framelog", log_header()) as writer:
         writer.append(logged(1), pair_hash(1))
-        with pytest.raises(InputError, match="not behind"):
+        with pytest.raises(InputError, match="not after"):
             writer.append(logged(1), pair_hash(1))
     with (
         FrameLogWriter(tmp_path / "b.framelog", log_header(frontend="x")) as writer,
