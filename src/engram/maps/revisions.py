@@ -76,7 +76,7 @@ def commit_revision(
     """Commits a revision and gives it its number.
 
     Args:
-        connection: in a transaction, of which this becomes a part.
+        connection: in a transaction that includes this step.
         revision_key: key of its row.
         was: its status so far.
         contents: `revision_contents` if known; None to count them here.

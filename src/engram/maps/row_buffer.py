@@ -105,7 +105,7 @@ class RowBuffer:
         self.size_bytes += _ROW_BYTES
 
     def put_words(self, node: int, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Adds the words of the node of this key, replacing buffered ones."""
+        """Adds the words (n,) of the node of this key, replacing buffered ones."""
         self._words[node] = words_row(node, vocabulary, found)
         self.size_bytes += _ROW_BYTES
 

@@ -36,7 +36,7 @@ def encode_words(found: NDArray[Any]) -> bytes:
 
 
 def decode_words(body: bytes) -> NDArray[np.int32]:
-    """Undoes `encode_words`.
+    """Words (n,) int32, rising, from their stored bytes.
 
     Raises:
         MapCorruptError: the bytes are not valid words.
@@ -50,7 +50,7 @@ def decode_words(body: bytes) -> NDArray[np.int32]:
 
 
 def words_row(node_key: int, vocabulary: bytes, found: NDArray[Any]) -> Row:
-    """The row of one node's words by the vocabulary of this hash."""
+    """The row of one node's words (n,) by the vocabulary of this hash (16 bytes)."""
     row = {"node": node_key, "vocabulary": vocabulary, "body": encode_words(found)}
     return sealed(words, row)
 
@@ -62,7 +62,7 @@ def write_words(connection: Connection, database: Database, rows: list[Row]) -> 
 
 
 def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-    """All stored words by the vocabulary of this hash, without damaged rows."""
+    """Words (n,) of each node by the vocabulary of this hash (16 bytes), without damaged rows."""
     query = (
         select(*words.columns, nodes.c.uuid)
         .select_from(words.join(nodes, nodes.c.key == words.c.node))

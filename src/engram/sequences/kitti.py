@@ -99,7 +99,7 @@ class _Calibration:
         self._texts = {name.strip(): rest.split() for name, _, rest in lines}
 
     def numbers(self, name: str, count: int) -> NDArray[np.float64]:
-        """The (count,) finite numbers of an entry."""
+        """The (count,) float64 numbers of an entry, all finite."""
         if name not in self._texts:
             raise CalibrationError(f"{self.path}: entry {name} is missing")
         texts = self._texts[name]

@@ -58,7 +58,7 @@ class Demand:
     """Where the mission may go, weighted by the past drives that model it.
 
     Attributes:
-        places: (L,) dense indices of the nodes that stand for places.
+        places: (L,) int64, dense indices of the nodes that represent places.
         weight: (L, S) weight of being there as session s: the same at all places that the
             session passed and the mission may reach, 0 elsewhere.
     """
@@ -195,7 +195,7 @@ def _either(first: Array, second: Array) -> Array:
 
 
 def expected_missed(coverage: Coverage, sent: Mask) -> float:
-    """`Coverage.expected_missed` of a subset alone."""
+    """`Coverage.expected_missed` of a subset, (N,) bool."""
     coverage.clear()
     for node in np.flatnonzero(sent).tolist():
         coverage.add(node)

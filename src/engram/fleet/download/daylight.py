@@ -68,7 +68,7 @@ def importance(stock: Stock, options: DownloadOptions) -> Array:
 
 
 def latitude_of(stock: Stock, options: DownloadOptions) -> float | None:
-    """Latitude of the fleet: as given, else estimated from successes; None if they do not tell."""
+    """Latitude of the fleet, degrees: as given, else estimated; None if not determined."""
     if options.latitude_deg is not None:
         return options.latitude_deg
     return learnt_latitude(stock)

@@ -112,7 +112,7 @@ def mission_epochs(
     filled = np.flatnonzero(counts.counts.sum(axis=0))
     if not len(filled):
         raise InputError(
-            "no path has a node with a known hour of day: nothing tells which paths matter when; "
+            "no path has a node with a known hour of day: paths cannot be weighted by time; "
             "use --select copy, region or route"
         )
     epochs = _between(start_h, end_h, buffer_min, counts.epoch_min, filled)

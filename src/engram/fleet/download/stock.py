@@ -62,7 +62,7 @@ class Stock:
         return len(self.nodes)
 
     def everything(self) -> Mask:
-        """All nodes."""
+        """(N,) bool, all True: every node."""
         return np.ones(len(self), np.bool_)
 
     @cached_property
@@ -89,7 +89,7 @@ class Stock:
         return np.array([np.nan if hour is None else hour for hour in known], np.float64)
 
     def known_hours(self) -> Array:
-        """`hours`, at least one of which is known.
+        """`hours` (N,), at least one of which is known.
 
         Raises:
             InputError: all are unknown.
@@ -107,7 +107,7 @@ class Stock:
 
     @cached_property
     def on_path(self) -> dict[PathId, NDArray[np.int64]]:
-        """Dense indices of the nodes on each path, in its order, each once per visit."""
+        """(n,) int64 for each path: dense indices of its nodes in order, once per visit."""
         found: dict[PathId, list[int]] = {}
         for entry in self.contents.path_entries:
             found.setdefault(entry.path, []).append(self.index[entry.node])

@@ -59,5 +59,5 @@ def recomposed(edge: Edge, a: Position, b: Position) -> Edge | None:
 
 
 def uncertainty_m2(covariance: Array) -> float:
-    """Sum of the translational variances, m²: the measure by which two estimates are compared."""
+    """Sum of the translational variances of a (6, 6) covariance, m²; ranks two estimates."""
     return float(np.trace(covariance[:3, :3]))
