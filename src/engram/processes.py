@@ -102,8 +102,8 @@ def _count_death(one: _Running, retries: dict[str, int]) -> None:
     if retries[one.name] > MAX_RETRIES:
         raise WorkerError(
             f"the worker of {one.name} died {MAX_RETRIES + 1} times, last with exit code "
-            f"{one.process.exitcode}; what is done is kept: give the same command again, with "
-            "fewer workers if memory was short"
+            f"{one.process.exitcode}; progress is kept: give the same command again, with fewer "
+            "workers if memory was short"
         )
 
 

@@ -96,5 +96,5 @@ def test_a_drive_without_a_readable_pair_is_told(drive: Path, tmp_path: Path) ->
 def test_a_log_is_not_extracted_again(drive: Path, tmp_path: Path) -> None:
     log = tmp_path / "a.framelog"
     extract_log(open_sequence(drive), log, Settings())
-    with pytest.raises(SequenceError, match="frame log already"):
+    with pytest.raises(SequenceError, match="already a frame log"):
         extract_log(open_sequence(log), tmp_path / "b.framelog", Settings())

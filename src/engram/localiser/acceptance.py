@@ -1,4 +1,4 @@
-"""Whether a match is believed: the cheap second half of an attempt (SPEC §3.2)."""
+"""Acceptance of a match: the cheap second half of an attempt (SPEC §3.2)."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class AcceptanceConfig:
             robot found beyond the search radius of the node would be lost again.
         max_sigma_m: largest uncertainty of a match's position (root of the summed variances),
             metres. A match on few or distant landmarks determines the heading at best.
-        max_prediction_sigma_m: a vaguer prediction supports no match, metres: it also agrees with
-            look-alikes. Rows of lamps, trees and kerb stones give 20 to 31 inliers one period off,
-            consistently along the row, with a claimed accuracy of 3 cm.
-        usual_share: share of the usual inliers (median of the last fixes) that a match needs where
-            the prediction is that vague; at least `min_inliers`, at most `min_inliers_lost`.
+        max_prediction_sigma_m: largest standard deviation of a prediction that supports a match,
+            metres. A less certain one also agrees with look-alikes: rows of lamps, trees or kerb
+            stones match one period off, consistently along the row.
+        usual_share: share of the usual inliers (median of the last matches) that a match needs if
+            the prediction is less certain; at least `min_inliers`, at most `min_inliers_lost`.
         slack_m, slack_rad: disagreement with the prediction allowed beyond three standard
             deviations. At larger values most additional matches are wrong.
     """

@@ -38,8 +38,7 @@ class Candidate:
         row: its row in the neighbourhood; None when relocalising.
         doubted: whether the prediction may be wrong: the robot is lost, and has no nodes of its
             own that confirm its position.
-        needed: fewest inliers of a believable match where the prediction is too vague to support
-            one; 0 where it is not.
+        needed: fewest inliers of a match if the prediction is too uncertain to support it; else 0.
     """
 
     index: int

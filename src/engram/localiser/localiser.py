@@ -479,7 +479,7 @@ class Localiser:
         )
 
     def _needed_inliers(self, prediction: Prediction) -> int:
-        """Of a match that the prediction is too vague to speak for; 0 where it is not."""
+        """Fewest inliers of a match if its prediction is too uncertain to support it; else 0."""
         acceptance = self.config.acceptance
         if prediction.sigma_m <= acceptance.max_prediction_sigma_m:
             return 0

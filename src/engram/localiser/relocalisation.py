@@ -26,7 +26,7 @@ _PATIENCE = 10
 
 
 class Relocaliser(Protocol):
-    """Proposes nodes for a robot that does not know where it is."""
+    """Proposes nodes to a lost robot."""
 
     @property
     def name(self) -> str:

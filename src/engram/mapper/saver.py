@@ -48,11 +48,17 @@ class RecordWriter(PathWriter, Protocol):
     """Where all of a session's records go; `engram.maps.RevisionWriter` is one."""
 
     def add_node(self, node: Node, frame: Frame) -> None:
-        """Adds a node with the frame that it was."""
+        """Adds a node with its frame."""
         ...
 
     def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Adds the words of a node."""
+        """Adds the visual words of a node.
+
+        Args:
+            node: the node.
+            vocabulary: hash of the vocabulary.
+            found: (W,) int32, numbers of its words.
+        """
         ...
 
     def add_edge(self, edge: Edge) -> None:
@@ -81,10 +87,10 @@ class _Stop:
 
 @dataclass(frozen=True, slots=True)
 class NodeSaver:
-    """What it takes to save nodes and edges too.
+    """Saves nodes and edges.
 
     Attributes:
-        writer: where they go.
+        writer: writes them.
         frames: keeps frames readable until they are written.
         words: finds the words stored with saved nodes; None stores none.
     """

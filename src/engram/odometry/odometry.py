@@ -18,9 +18,9 @@ from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.window import Window, WindowConfig
 
 _S_PER_NS = 1e-9
-# So many steps tell what is usual.
+# Steps that determine the usual number of inliers and the usual interval.
 _USUAL_OF = 20
-# Frames are missing where one comes later than this many usual intervals after the last.
+# Frames are missing if one comes later than this many usual intervals after the last.
 _GAP_RATIO = 1.5
 
 
@@ -32,14 +32,13 @@ class OdometryConfig:
         matcher: how frames are matched.
         window: the joint optimisation.
         min_inliers: fewest landmarks that must agree on a motion.
-        unexpected_inliers: most inliers that a motion needs after a gap in time, where no
-            prediction supports it: lamps, trees and kerb stones that repeat match as well as the
-            same place does. Fewer are needed where `usual_share` of the usual number (median of
-            the last steps) is less.
-        usual_share: see above.
-        plausible_inliers: enough after a gap if the speed before it, changed by
-            `acceleration_m_s2` all through the gap, explains the motion. The best of 846 grossly
-            wrong matches between frames of two KITTI clips has 30.
+        unexpected_inliers: most inliers that a motion needs after a gap in time, without a
+            prediction: repeating lamps, trees and kerb stones match as well as the same place.
+            `usual_share` of the usual number (median of the last steps) suffices if it is less.
+        usual_share: see `unexpected_inliers`.
+        plausible_inliers: sufficient inliers after a gap if the speed before it, changed by
+            `acceleration_m_s2` throughout the gap, explains the motion; above every grossly wrong
+            match on KITTI (`lab/reports/constants.md`).
         acceleration_m_s2, angular_acceleration_rad_s2: standard deviations of the motion model,
             constant velocity. A car brakes with up to 8 m/s²; a head or a handlebar turns with
             10 rad/s² and more.
@@ -76,7 +75,7 @@ class Odometry:
     def __init__(self, config: OdometryConfig | None = None) -> None:
         self._config = config or OdometryConfig()
         self._track: _Track | None = None
-        # Inliers and intervals, s, of the last steps: what is usual for this camera and light.
+        # Inliers and intervals, s, of the last steps, for this camera and light.
         self._inliers: deque[int] = deque(maxlen=_USUAL_OF)
         self._intervals: deque[float] = deque(maxlen=_USUAL_OF)
 
@@ -107,7 +106,7 @@ class Odometry:
         return self._track.advance(frame, match, keyframe_from_curr, covariance)
 
     def _believes(self, match: Match, interval_s: float) -> bool:
-        """Whether enough landmarks agree on the motion; past a gap in time more are needed."""
+        """Whether enough landmarks agree on the motion; after a gap in time more are needed."""
         config = self._config
         if match.inliers < config.min_inliers or not self._is_gap(interval_s):
             return match.inliers >= config.min_inliers
@@ -119,7 +118,7 @@ class Odometry:
         return match.inliers >= config.plausible_inliers and self._track.explains(match, interval_s)
 
     def _is_gap(self, interval_s: float) -> bool:
-        """Whether frames are missing; a camera that is always slow has no gaps for that."""
+        """Whether frames are missing, judged by the camera's usual interval."""
         if 0 < interval_s <= self._config.max_prediction_s:
             return False
         usual_s = float(np.median(self._intervals)) if self._intervals else 0.0
@@ -143,7 +142,7 @@ class _Track:
         return self._window.offset_px
 
     def explains(self, match: Match, interval_s: float) -> bool:
-        """Whether the last speed leads to a match's pose, at most speeding up or braking."""
+        """Whether the last speed, with acceleration or braking, explains a match's pose."""
         if self._velocity is None or match.reference_from_live is None:
             return False
         prev_from_curr = self._keyframe_from_prev.inverse() @ match.reference_from_live
@@ -154,7 +153,7 @@ class _Track:
         """Match to the keyframe; if that fails, to the previous frame."""
         if frame.camera != self._window.keyframe.camera:
             raise IncompatibleError(
-                "the camera changed within a drive; begin another odometry for another camera"
+                "the camera changed within a drive; use a separate odometry for each camera"
             )
         match = self._match_to_keyframe(frame)
         if match.inliers < self._config.min_inliers and self._window.has_newest:

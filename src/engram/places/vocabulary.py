@@ -180,7 +180,7 @@ def _checked_arrays(tensors: Any) -> dict[str, NDArray[Any]]:
         flat = np.frombuffer(tensor["data"], _DTYPES[dtype])
         found[name] = flat.reshape(tensor["shape"])
     if found.keys() != _SHAPES.keys():
-        raise ValueError(f"it lacks {', '.join(sorted(_SHAPES.keys() - found.keys()))}")
+        raise ValueError(f"missing arrays: {', '.join(sorted(_SHAPES.keys() - found.keys()))}")
     return found
 
 
@@ -213,7 +213,7 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
         str(about["trained_on"]),
     )
     if vocabulary.tree.words != len(statistics):
-        raise ValueError("its tree has another number of words than its statistics")
+        raise ValueError("its tree and its statistics have different numbers of words")
     vocabulary.quantise(arrays["centres"][:1])  # refuses a beam that is out of range
     return vocabulary
 

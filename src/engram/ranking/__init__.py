@@ -64,8 +64,8 @@ def check_for_robot(name: str) -> None:
     """
     if looks_ahead(policy_named(name)):
         raise ConfigError(
-            f"the policy {name} knows what will match, which only an evaluation can tell; use it "
-            "in engram lab evaluate, and another policy for a drive"
+            f"the policy {name} looks ahead, which only an evaluation can do; use it in "
+            "engram lab evaluate, and another policy for a drive"
         )
 
 

@@ -20,5 +20,5 @@ class DistancePolicy:
 
     def reasons(self, context: RankingContext) -> Reasons:
         """See `Explains`."""
-        meaning = {"metres": "distance of the node from where the robot is believed to be"}
+        meaning = {"metres": "distance of the node from the estimated position"}
         return Reasons({"metres": context.neighbourhood.distance_m}, meaning, rule="nearest first")

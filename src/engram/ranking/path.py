@@ -14,9 +14,9 @@ from engram.ranking.reasons import Reasons
 _TIE_SCALE = 2.0**30
 _MEANING = {
     "score": "log posterior of [L15 §V], up to a common constant",
-    "with successes": "paths shared with the nodes matched lately, summed over those",
-    "with failures": "paths shared with the nodes that failed lately, likewise",
-    "with k": "paths shared with the node in which the robot is localised, or was last",
+    "with successes": "paths shared with the recently matched nodes, summed",
+    "with failures": "paths shared with the recently failed nodes, summed",
+    "with k": "paths shared with the node in which the robot is or was last localised",
 }
 
 
@@ -54,7 +54,7 @@ class PathPolicy:
             here = memory.co_occurrence(nodes, k, excluded=context.own_path)
             terms["with k"] = here[:, 0].astype(np.float64)
         meaning = {name: _MEANING[name] for name in terms}
-        return Reasons(terms, meaning, rule="highest score first, of equals the nearest")
+        return Reasons(terms, meaning, rule="highest score first; ties by distance")
 
     def scores(self, context: RankingContext, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
         """(N,) float64: log posterior of nodes up to a common constant.

@@ -30,8 +30,7 @@ class PathNearPolicy:
         """See `Explains`."""
         whole = PathPolicy(self._alpha, self._gamma).reasons(context)
         rule = (
-            f"highest score first where g is {BASIN_LEVEL:g} or more; behind them the others, "
-            "nearest first"
+            f"highest score first for g of {BASIN_LEVEL:g} or more; then the others, nearest first"
         )
         return replace(whole, rule=rule)
 

@@ -139,15 +139,14 @@ class RecallConstants:
 RECALL = RecallConstants()
 
 _MEANING = {
-    "distance": "log of inliers lost by the distance of the node, which is the longer the more "
-    "vaguely it is known; all terms add up, before any "
-    "pick, to the log of inliers expected over the 20 needed",
-    "likeness": "how much liker than the others it looks, by its words; only where the robot does "
-    "not know well where it is",
-    "past drives": "how past drives fared with the node, as far as this run has not spoken",
-    "this run": "how this run fared with the node's drive and the node, over the last metres",
-    "tally": "how often this run matched the node's drive: what keeps failing gives way, however "
-    "nearly it matches",
+    "distance": "log inliers lost to distance; position uncertainty adds distance. Before any pick "
+    "all terms add up to the log of the expected inliers over the 20 needed",
+    "likeness": "visual similarity compared with the other candidates; only if the position is "
+    "uncertain",
+    "past drives": "how past drives fared with the node; counts less the more this run has tried",
+    "this run": "how this run fared with the node and its drive in the last metres",
+    "tally": "how often this run matched the node's drive: one that keeps failing falls behind, "
+    "however narrowly it fails",
 }
 
 
@@ -225,8 +224,8 @@ class RecallPolicy:
             _MEANING,
             judged.chances,
             judged.by_turn,
-            "greatest sum first; each pick supposes that those before it failed, which takes from "
-            "the others of their drives",
+            "greatest sum first; each pick assumes that the earlier ones failed, which lowers the "
+            "others of their drives",
         )
 
     def _in_turns(

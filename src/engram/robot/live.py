@@ -61,13 +61,13 @@ class Saving:
         """For people."""
         match self.state:
             case SavingState.COMMITTED if self.revision is None:
-                return "the map remembers this drive already, or there was nothing to remember"
+                return "the map already remembers this drive, or there was nothing to remember"
             case SavingState.COMMITTED:
                 return f"kept as revision {self.revision}"
             case SavingState.SPOOLED:
                 return (
-                    f"another process writes to the map: the drive waits in {self.reason}, and "
-                    "whoever maps or remembers next commits it"
+                    f"another process writes to the map: the drive waits in {self.reason}; the "
+                    "next run that maps or remembers commits it"
                 )
             case SavingState.FAILED:
                 return f"saving failed: {self.reason}"
@@ -174,8 +174,8 @@ class IntoMap:
         opened, owner = self._opened, self._owner
         if opened.session_state(session.id) is not SessionState.ABSENT:
             raise MapError(
-                f"{opened.location} holds session {session.id} already; give what was recorded of "
-                "it to engram map, which goes on with an interrupted session"
+                f"{opened.location} already holds session {session.id}; give its recording to "
+                "engram map, which continues an interrupted session"
             )
         configuration = configuration_of(owner.settings, owner.options)
         writer = begin_or_resume(

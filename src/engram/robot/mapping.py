@@ -126,8 +126,8 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
     """
     if found is not None and found != asked:
         raise ConfigError(
-            f"{what} has {found} descriptors, not {asked} as --descriptor asks for; leave that "
-            f"out, or {mend}"
+            f"{what} has {found} descriptors, but --descriptor is {asked}; omit the option, or "
+            f"{mend}"
         )
 
 

@@ -61,7 +61,7 @@ class ExtractReport:
             f"{self.skipped} pairs skipped"
         )
         if self.interrupted:
-            line += "\ninterrupted: what was done is saved; give the same command to go on"
+            line += "\ninterrupted: progress is saved; give the same command to continue"
         return line
 
 
@@ -95,7 +95,7 @@ def extract_log(
             for pair in pairs:
                 raise_if_asked()
                 if isinstance(pair, LoggedFrame):
-                    raise SequenceError(f"{sequence.info.name}: is a frame log already")
+                    raise SequenceError(f"{sequence.info.name}: is already a frame log")
                 frame, motion = front.take(pair)
                 step = motion.odometry
                 if writer is None:

@@ -79,8 +79,8 @@ def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
 def damage_warning(damaged: Sequence[str]) -> str:
     """The warning about unreadable nodes, of which there is at least one."""
     return (
-        f"warning: {len(damaged)} damaged nodes of the map were passed over, such as "
-        f"{damaged[0]}: engram check tells more"
+        f"warning: skipped {len(damaged)} damaged nodes of the map, such as {damaged[0]}; "
+        "run engram check for details"
     )
 
 

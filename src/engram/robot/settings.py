@@ -71,7 +71,7 @@ class RobotOptions:
 
     def __post_init__(self) -> None:
         check_for_robot(self.policy)
-        Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)  # refuses what is no budget
+        Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)  # checks the values
 
     @property
     def budget(self) -> Budget:
