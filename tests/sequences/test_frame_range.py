@@ -35,5 +35,5 @@ def test_what_is_no_range_is_refused(text: str) -> None:
 
 
 def test_a_negative_part_is_explained() -> None:
-    with pytest.raises(ConfigError, match="counts from the end, which is not supported"):
+    with pytest.raises(ConfigError, match="counts from the end: not supported"):
         FrameRange.parse("-10:")

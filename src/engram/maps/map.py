@@ -510,7 +510,7 @@ class Map(MapReader):
     def _written(self, own: View, *, session: Session | None, **kind: Any) -> RevisionWriter:
         """The writer of a revision; until it ends, this map includes its rows."""
         if session is not None:
-            self.forget()  # what is read from now on includes the session
+            self.forget()  # later reads include the session
         self._see(own)
         self._writing = RevisionWriter(
             self._database,

@@ -41,7 +41,7 @@ START = re.compile(r"-?\d{1,19}")  # ns, as text
 _UPPER = np.triu_indices(6)
 _encode = msgspec.msgpack.Encoder().encode
 
-# Covariances come from products with their own transposes: what is left of asymmetry is rounding.
+# Asymmetry of covariances by rounding, since they come from products with transposes.
 _ASYMMETRY_LIMIT = 1e-6
 
 

@@ -82,7 +82,7 @@ class FrameRange:
             raise ConfigError(f"frames {text!r}: write START:STOP:STEP, such as 0:100:2")
         for part in parts:
             if part and not _PART.fullmatch(part):
-                why = "counts from the end, which is not supported" if part[0] == "-" else "is none"
+                why = "is not valid" if part[0] != "-" else "counts from the end: not supported"
                 raise ConfigError(
                     f"frames {text!r}: {part!r} {why}; each part is a whole number >= 0 or missing"
                 )

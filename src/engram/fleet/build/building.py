@@ -79,7 +79,7 @@ class BuildReport:
         merged_before_s: time of the merges of earlier runs of this build, seconds.
         best: how the order was found; None if it was given.
         notes: warnings.
-        interrupted: whether it was stopped; the same command goes on.
+        interrupted: whether it was stopped; the same command continues it.
         content_hash: of the map.
         seconds: wall time of this run.
     """

@@ -38,8 +38,8 @@ def look_at_drive(path: Path, source: str) -> Drive:
     """Reads what grouping needs of a drive.
 
     Args:
-        path: where it can be read here.
-        source: where a worker finds it.
+        path: local path of the drive.
+        source: path or URL for the workers.
 
     Raises:
         SequenceError: it cannot be read.

@@ -213,7 +213,7 @@ def greedy_order(
     Args:
         coverage: of the mission; its subset is replaced.
         size_bytes: (N,) float64, size of each node.
-        spare: (N,) all nodes in the order in which they fill up what is left.
+        spare: (N,) int64, all nodes in the order in which they fill the rest.
     """
     coverage.clear()
     waiting = [(-coverage.gain(node) / size, node) for node, size in enumerate(size_bytes)]

@@ -123,7 +123,7 @@ def download(
         out: NAME.engram, which must not be there yet.
         options: which part.
         at: revision of the fleet map; None for the newest.
-        monitor: hears of each node that is written.
+        monitor: receives progress per written node.
 
     Raises:
         ConfigError: an option is missing, out of range, or not used by the policy.

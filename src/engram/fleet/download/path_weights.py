@@ -1,7 +1,7 @@
 """Which paths matter at which time of day ([G16] §V-B.3, Algorithms 2 and 3; SPEC §7).
 
 Epochs are stretches of the day of one length, half-open: a node on a boundary belongs to the later
-one. The last epoch of the day is shorter where the length does not divide 24 hours.
+one. The last epoch of the day is shorter if the length does not divide 24 hours.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def epoch_count(epoch_min: float) -> int:
 
 
 def epoch_of(hours: Array, epoch_min: float) -> NDArray[np.int64]:
-    """(N,) the epoch of each hour of day; -1 where it is NaN, unknown.
+    """(N,) int64, the epoch of each hour of day; -1 for NaN (unknown).
 
     Source: [G16] (5), half-open (SPEC §9): t_k = {t | k·Δt ≤ t < (k + 1)·Δt}, k from 0.
     """

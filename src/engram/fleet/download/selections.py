@@ -50,7 +50,7 @@ def select_copy(stock: Stock, _: DownloadOptions) -> Selection:
 
 
 def select_tod(stock: Stock, options: DownloadOptions) -> Selection:
-    """Nodes whose time of day is within a window of the mission's start, over midnight too.
+    """Nodes whose time of day is within a window of the mission's start, across midnight if needed.
 
     Source: [G16] (4); SPEC §7.
     """
@@ -167,11 +167,11 @@ def _check_no_mission(options: DownloadOptions) -> None:
     if options.end_h is not None and options.policy not in _OPEN_START:
         raise ConfigError(f"selection {options.policy} needs --depart with --arrive")
     if options.day is not None:
-        raise ConfigError("--date gives the height of the sun at --depart; give that, too")
+        raise ConfigError("--date gives the height of the sun at --depart; give both")
 
 
 def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
-    """The forecast for a mission: what it is expected to need, and what each node adds."""
+    """The forecast for a mission: its expected needs, and the gain of each node."""
     where = None
     if options.route is not None:
         where = along_route(stock, options.route, options.radius_m)

@@ -298,7 +298,7 @@ class Replay(Keeper):
                 found.append(beyond(other, edge, node))
         return min(found, key=lambda one: uncertainty_m2(one.covariance), default=None)
 
-    # -- what becomes of a frame
+    # -- the outcome of a frame
 
     def _remember(self, node: Node, found: Localisation) -> None:
         """Records the attempts and matches of a frame."""

@@ -71,7 +71,7 @@ class Merge:
         # Components of the taken nodes: a graph search for each would be too slow.
         self._parts: DisjointSet = DisjointSet([_CENTRE])
 
-    # -- what is known
+    # -- known records
 
     def has_omitted(self, node: NodeId) -> bool:
         """Whether an earlier merge omitted the node."""
@@ -108,7 +108,7 @@ class Merge:
             and path_id(graph.node(graph.index(entry.node)).session) != path
         )
 
-    # -- what the centre lacks
+    # -- new records of the robot
 
     def has_more(self) -> bool:
         """Whether a map without new nodes has other new records."""
@@ -182,7 +182,7 @@ class Merge:
         new = made.rows(replace(made, session=named[made.session]).lacking(remembered))
         return new.moved_to([None if one is None else one.node_from_live for one in positions])
 
-    # -- what it learns
+    # -- additions to the fleet map
 
     def take(self, stored: StoredNode, frame: Frame) -> int:
         """Adds a node to the fleet map; returns its dense index."""

@@ -137,7 +137,7 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
 
 
 def _take_vocabulary(merge: Merge) -> None:
-    """A centre without a vocabulary of its own takes that of the robot."""
+    """Copies the robot's vocabulary if the fleet map has none."""
     theirs = merge.robot.vocabulary
     if theirs is not None and merge.centre.vocabulary is None:
         merge.writer.put_vocabulary(theirs)

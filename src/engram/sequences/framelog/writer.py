@@ -134,7 +134,7 @@ class FrameLogWriter:
         return True
 
     def checkpoint(self) -> None:
-        """Commit: what was appended so far survives the process."""
+        """Commits all appended frames, so that they survive the process."""
         with self._or_abandon() as connection:
             connection.commit()
             # Begun again at once, so that no other writer comes between two checkpoints.
