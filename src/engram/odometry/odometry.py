@@ -162,7 +162,7 @@ class _Track:
         return match
 
     def place(self, frame: Frame, match: Match) -> tuple[SE3, NDArray[np.float64]]:
-        """Pose of the frame in the keyframe, after joint optimisation, with covariance."""
+        """keyframe_from_curr after joint optimisation, with its (6, 6) covariance."""
         self._window.add(frame, match)
         return self._window.optimise(match)
 
@@ -173,7 +173,14 @@ class _Track:
         keyframe_from_curr: SE3,
         covariance: NDArray[np.float64],
     ) -> OdometryStep:
-        """Make the frame the previous one; returns the motion that led to it."""
+        """Make the frame the previous one; returns the motion that led to it.
+
+        Args:
+            frame: the frame.
+            match: its match to the keyframe.
+            keyframe_from_curr: its pose in the keyframe.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation, rotation].
+        """
         prev_from_keyframe = self._keyframe_from_prev.inverse()
         prev_from_curr = prev_from_keyframe @ keyframe_from_curr
         carry = prev_from_keyframe.adjoint()
