@@ -126,8 +126,7 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
     """
     if found is not None and found != asked:
         raise ConfigError(
-            f"{what} has {found} descriptors, but --descriptor is {asked}; omit the option, or "
-            f"{mend}"
+            f"{what} has {found} descriptors, not {asked}; omit --descriptor, or {mend}"
         )
 
 
