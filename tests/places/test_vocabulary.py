@@ -91,7 +91,7 @@ def test_a_ring_of_parents_is_refused() -> None:
         VOCABULARY.statistics, parents=parents, seen_with_parent=np.zeros(len(parents), np.int32)
     )
     ring = encode_vocabulary(dataclasses.replace(VOCABULARY, statistics=statistics))
-    with pytest.raises(MapCorruptError, match="ring"):
+    with pytest.raises(MapCorruptError, match="cycle"):
         decode_vocabulary(ring)
 
 
