@@ -54,7 +54,7 @@ def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: P
         (("--select", "budget", "--budget", "0%"), "budget_percent is 0.0"),
         (("--select", "budget", "--budget", "1e2%"), "budget is '1e2%'"),
         (("--select", "budget", "--budget", "10kB"), "not one node fits into 10000 bytes"),
-        (("--select", "region", "--near", "xyz"), "no UUID"),
+        (("--select", "region", "--near", "xyz"), "is not a UUID"),
         (("--select", "route", "--route", "00"), "0 sessions begin with '00'"),
         (("--route", "zzzz"), "does not use --route"),
         (("--select", "tod", "--depart", "9:30", "--budget", "10kB"), "does not use --budget"),

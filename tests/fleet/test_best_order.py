@@ -247,7 +247,7 @@ def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch)
 def test_a_map_that_is_not_the_one_that_was_judged_is_told(tmp_path, maps, logs, monkeypatch):
     centre = tmp_path / "centre.engram"
     with monkeypatch.context() as patch:
-        patch.setattr(best_order, "copy_map", lambda source, target: copied(source, target, centre))
+        patch.setattr(building, "copy_map", lambda source, target: copied(source, target, centre))
         with pytest.raises(KilledError):
             build(centre, logs, "ab", judge=judge(logs["held-out"]))
     copied_really(maps[2], centre)

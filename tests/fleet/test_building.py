@@ -106,7 +106,7 @@ def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, 
     centre = tmp_path / "centre.engram"
     report = build(centre, logs, monitor=Interrupting(25))
     assert report.interrupted
-    assert "go on" in report.text()
+    assert "run the same command to continue" in report.text()
     with pytest.raises(ConfigError, match="another, incomplete build"):
         build(centre, logs, groups=3)
     again = build(centre, logs)

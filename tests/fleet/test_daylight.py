@@ -124,5 +124,5 @@ def test_drives_without_a_known_hour_count_a_little(no_attempts):
 def test_what_is_no_date_or_latitude_is_refused():
     with pytest.raises(ConfigError, match="must be a day such as"):
         DownloadOptions(day="17.11.2026")
-    with pytest.raises(ConfigError, match="latitude is 91"):
+    with pytest.raises(ConfigError, match="latitude_deg is 91"):
         DownloadOptions(latitude_deg=91.0)

@@ -390,7 +390,7 @@ class TestMistakes:
         [
             ({"policy": "tod", "start_h": 13.0, "window_min": 30.0}, "no node was saved within 30"),
             ({"policy": "paths", "start_h": 12.0, "end_h": 13.0}, "no epoch from 12:00 to 13:00"),
-            ({"policy": "region", "near": ("zz",)}, "no UUID"),
+            ({"policy": "region", "near": ("zz",)}, "is not a UUID"),
             ({"policy": "region", "near": ("00000000",)}, "begins with"),
             ({"policy": "route", "route": "00000000"}, "0 sessions begin with"),
             ({"policy": "budget", "budget_bytes": 5000}, "not one node fits into 5000"),

@@ -110,7 +110,7 @@ def test_a_mission_without_data_is_told_where_there_is_some(start, end):
 
 
 def test_every_stretch_of_the_day_with_data_is_told():
-    words = "some from 8:00 to 11:00, 14:00 to 15:00, 23:00 to 24:00: give"
+    words = "some from 8:00 to 11:00, 14:00 to 15:00, 23:00 to 24:00: choose"
     with pytest.raises(InputError, match=words):
         mission_epochs(counts(), 11.5, 13.0)
 

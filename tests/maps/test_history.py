@@ -285,7 +285,7 @@ class TestBlame:
 
     @pytest.mark.parametrize("prefix", ["", "-", "xyz", "0" * 33])
     def test_what_is_no_uuid_is_refused(self, store, two, prefix):
-        with pytest.raises(InputError, match="no UUID"):
+        with pytest.raises(InputError, match="is not a UUID"):
             store.origin(prefix)
 
 

@@ -13,6 +13,7 @@ import pytest
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
+import engram
 from engram import _core
 from engram.errors import InputError
 from engram.localiser import Budget, Hint, Keeper, Localisation, Localiser, Position
@@ -21,7 +22,7 @@ from engram.robot import Front, Robot, RobotOptions, Settings, map_drive, open_d
 from engram.robot.localisers import localiser_in
 
 ROAD = np.arange(0.0, 20.0, 0.7)
-PACKAGE = str(Path(_core.__file__).parent)
+PACKAGE = str(Path(engram.__file__).parent)
 
 
 @pytest.fixture(scope="module")

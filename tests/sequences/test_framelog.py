@@ -293,19 +293,19 @@ def test_frames_must_rise_and_fit(tmp_path: Path) -> None:
 def test_what_is_no_frame_log_is_refused(tmp_path: Path) -> None:
     text = tmp_path / "a.framelog"
     text.write_text("hello, this is no database at all, but it is long enough to be one" * 20)
-    with pytest.raises(SequenceError, match="no frame log"):
+    with pytest.raises(SequenceError, match="not a frame log"):
         open_sequence(text)
-    with pytest.raises(SequenceError, match="no frame log"):
+    with pytest.raises(SequenceError, match="not a frame log"):
         FrameLogWriter(text, log_header())
     other = tmp_path / "b.framelog"
     with sqlite3.connect(other) as database:
         database.execute("CREATE TABLE frames (number INTEGER)")
     database.close()
-    with pytest.raises(SequenceError, match="no frame log"):
+    with pytest.raises(SequenceError, match="not a frame log"):
         open_sequence(other)
     empty = tmp_path / "c.framelog"
     empty.touch()
-    with pytest.raises(SequenceError, match="no frame log"):
+    with pytest.raises(SequenceError, match="not a frame log"):
         open_sequence(empty)
     with pytest.raises(SequenceError, match="there is no such"):
         open_sequence(tmp_path / "d.framelog", format="framelog")
