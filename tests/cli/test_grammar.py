@@ -10,6 +10,7 @@ import typer
 from engram import __version__
 from engram.cli import moved
 from engram.cli.app import app
+from engram.cli.settings import AllSettings, every_setting
 from engram.cli.verbs import GROUPS, VERBS
 
 COMMANDS = typer.main.get_command(app).commands
@@ -88,6 +89,12 @@ def test_other_spellings_work(engram, street: Path, tmp_path: Path) -> None:
     assert engram("localize", town, street).status == 0
     # The plain layout has one rig; that it is refused by its name shows that it was understood.
     assert "'colour'" in engram("localise", town, street, "--rig", "color").err
+
+
+def test_every_setting_has_a_meaning() -> None:
+    settings = list(every_setting(AllSettings()))
+    assert len(settings) > 100
+    assert [one.key for one in settings if len(one.description) < 5] == []
 
 
 def test_settings_show_what_a_file_and_set_change(engram, tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def _cold_start(found: Localisation, finder: Relocaliser) -> ColdStart:
     if not found.motion.usable:
         return ColdStart(found.stamp_ns, PlaceStatus.UNUSABLE_FRAME, None, 0, 0, None)
     # Where nothing can be tried all is new. Elsewhere the probability does not decide: under
-    # another light it cannot tell known places from new ones (docs/places.md).
+    # another light it cannot tell known places from new ones (lab/reports/places.md).
     status = PlaceStatus.UNKNOWN if found.attempts or found.damaged else PlaceStatus.NEW_PLACE
     return ColdStart(
         found.stamp_ns,

@@ -40,7 +40,7 @@ def morning(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_promise_is_held_against_a_drive(engram, centre: Path, street: Path) -> None:
-    asked = ("--policy", "tod", "--start", "9:00", "--window", 700, "--json")
+    asked = ("--select", "tod", "--depart", "9:00", "--window", 700, "--json")
     (mine, whole) = engram("lab", "try", centre, street, *asked).json
     assert (mine["name"], whole["name"]) == ("tod", "copy")
     # The very images of which the map was made, as of another time.
@@ -65,7 +65,7 @@ def test_a_drive_that_the_centre_holds_is_refused(
 def test_a_drive_for_whose_hour_there_is_nothing_is_a_row_of_its_own(
     engram, centre: Path, morning: Path, night: Path
 ) -> None:
-    asked = ("lab", "try", centre, morning, night, "--policy", "tod", "--start", "9:30")
+    asked = ("lab", "try", centre, morning, night, "--select", "tod", "--depart", "9:30")
     ran = engram(*asked, "--json")
     assert ran.status == 0
     mine, whole, left_out = ran.json

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
+import re
 import tomllib
 import typing
 from collections.abc import Iterator, Sequence
@@ -161,7 +163,7 @@ class Setting:
     Attributes:
         key: with its tables, "mapper.save_every_m".
         value: as resolved.
-        description: unit, meaning and source; empty where none is declared.
+        description: unit, meaning and source.
         bounds: such as ">= 0"; empty where none are declared.
     """
 
@@ -170,10 +172,17 @@ class Setting:
     description: str
     bounds: str
 
+    @property
+    def comment(self) -> str:
+        """Bounds and the first sentence of the description, for a line on the screen."""
+        first = self.description.split(". ")[0].rstrip(".")
+        return "  ".join(text for text in (self.bounds, first) if text)
+
 
 def every_setting(settings: Any, tables: str = "") -> Iterator[Setting]:
     """All settings of a dataclass at any depth, in the order of their declaration."""
     hints = typing.get_type_hints(type(settings), include_extras=True)
+    documented = _documented(type(settings))
     for one in dataclasses.fields(settings):
         value, key = getattr(settings, one.name), f"{tables}{one.name}"
         if dataclasses.is_dataclass(value):
@@ -181,7 +190,18 @@ def every_setting(settings: Any, tables: str = "") -> Iterator[Setting]:
             continue
         metas = [meta for meta in _annotations(hints[one.name]) if isinstance(meta, Meta)]
         words = "; ".join(m.description for m in metas if m.description)
+        words = words or documented.get(one.name, "")
         yield Setting(key, to_dict({"": value})[""], words, ", ".join(map(_bounds, metas)))
+
+
+def _documented(kind: type) -> dict[str, str]:
+    """What the docstring of a configuration says of each of its attributes."""
+    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
+    found = {}
+    for entry in re.split(r"\n {4}(?=\w)", "\n" + section.split("\n\n")[0]):
+        names, _, text = " ".join(entry.split()).partition(": ")
+        found.update(dict.fromkeys(names.split(", "), text))
+    return found
 
 
 def _annotations(kind: Any) -> list[Any]:
@@ -205,7 +225,7 @@ def settings_toml(settings: Any) -> str:
         if above != table:
             lines += ["", f"[{above}]"]
             table = above
-        words = "; ".join(text for text in (one.description, one.bounds) if text)
+        words = one.comment
         value = f"{name} = {json.dumps(one.value)}" if one.value is not None else f"# {name} ="
         lines.append(f"{value}  # {words}" if words else value)
     return "\n".join(lines[1:])

@@ -47,5 +47,5 @@ def settings(
         typer.echo(settings_toml(resolved))
         return
     for one in every_setting(resolved):
-        words = "  ".join(text for text in (one.bounds, one.description) if text)
+        words = one.comment
         typer.echo(f"{one.key} = {json.dumps(one.value)}" + (f"  # {words}" if words else ""))

@@ -1,6 +1,6 @@
 """Plain folders: `left/`, `right/`, `calibration.toml` and an optional `times.txt`.
 
-`docs/sequences.md` shows the layout with an example.
+`docs/data.md` shows the layout with an example.
 """
 
 from __future__ import annotations

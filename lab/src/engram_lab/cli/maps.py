@@ -111,13 +111,13 @@ def try_(
     ],
     *,
     policy: Annotated[
-        str, typer.Option("--policy", help="copy, tod, paths, tod+paths or budget.")
+        str, typer.Option("--select", help="copy, tod, paths, tod+paths or budget.")
     ] = "copy",
     start: Annotated[
-        str | None, typer.Option("--start", metavar="H:MM", help="When the mission begins.")
+        str | None, typer.Option("--depart", metavar="H:MM", help="When the mission begins.")
     ] = None,
     end: Annotated[
-        str | None, typer.Option("--end", metavar="H:MM", help="When the mission ends.")
+        str | None, typer.Option("--arrive", metavar="H:MM", help="When the mission ends.")
     ] = None,
     window: Annotated[
         float, typer.Option("--window", metavar="MIN", help="tod: how far from the start.")
@@ -137,8 +137,8 @@ def try_(
 
     \b
     Examples:
-      engram lab try fleet.engram monday.framelog --policy tod --start 9:30
-      engram lab try fleet.engram monday.framelog tuesday.framelog --policy budget --budget 25%
+      engram lab try fleet.engram monday.framelog --select tod --depart 9:30
+      engram lab try fleet.engram monday.framelog tuesday.framelog --select budget --budget 25%
     """
     from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
