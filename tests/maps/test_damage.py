@@ -136,7 +136,7 @@ def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
     for path, fact in (
         (tmp_path / "missing", "no such file"),
         (empty, "empty file"),
-        (text, "no map"),
+        (text, "is not a map"),
         (folder, "folder"),
         (other, "an SQLite file, but not a map"),
     ):
