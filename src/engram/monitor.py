@@ -126,8 +126,3 @@ def write_whole(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             draft.unlink(missing_ok=True)
-
-
-def ignore(word: str) -> None:
-    """Progress function that shows nothing."""
-    del word
