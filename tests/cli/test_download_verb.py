@@ -41,6 +41,22 @@ def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: P
     assert told["size_bytes"] <= 0.8 * told["why"]["everything_bytes"]
 
 
+def test_a_robot_keeps_its_map_and_takes_the_download_into_it(
+    engram, centre: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "r1.engram"
+    half = ("--select", "budget", "--budget", "60%")
+    assert "budget: " in engram("download", centre, out, *half, "--update").out  # a new file
+    before = engram("info", out, "--json").json["nodes"]
+    told = engram("download", centre, out, "--update", "--json").json
+    assert told["nodes"] == told["of_nodes"] - before > 0
+    assert engram("info", out, "--json").json["nodes"] == told["of_nodes"]
+    assert "nothing changed" in engram("download", centre, out, "--update").out
+    refused = engram("download", centre, out)
+    assert refused.status == 2
+    assert "exists already" in refused.err
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

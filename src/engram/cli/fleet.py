@@ -17,6 +17,7 @@ from engram.errors import ConfigError, EngramError
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
     from engram.fleet.build import JudgeOptions
+    from engram.fleet.download import DownloadReport, UpdateReport
     from engram.fleet.merge import MergeOptions, MergeReport
 
 
@@ -121,9 +122,19 @@ def download(
     ],
     out: Annotated[
         Path,
-        typer.Argument(metavar="OUT", help="The robot's map, a new file.", parser=options.map_file),
+        typer.Argument(
+            metavar="OUT",
+            help="The robot's map: a new file, or with --update its own.",
+            parser=options.map_file,
+        ),
     ],
     *,
+    update: Annotated[
+        bool,
+        typer.Option(
+            "--update", help="Take the download into OUT, which keeps its own nodes and history."
+        ),
+    ] = False,
     select: Annotated[
         str,
         typer.Option("--select", help="copy, tod, paths, tod+paths, region, route or budget."),
@@ -169,6 +180,7 @@ def download(
     \b
     Examples:
       engram download fleet.engram r1.engram
+      engram download fleet.engram r1.engram --update
       engram download fleet.engram r1.engram --select tod --depart 9:30
       engram download fleet.engram r1.engram --select tod+paths --depart 9:30 --arrive 11:00
       engram download fleet.engram r1.engram --select budget --budget 25% --depart 17:00
@@ -176,6 +188,8 @@ def download(
     from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
     from engram.fleet.download import download as send
+    from engram.fleet.download import update as take_in
+    from engram.monitor import interruptible
 
     budget_bytes, budget_percent = budget_from_text(budget)
     given = settings.read().download
@@ -196,7 +210,12 @@ def download(
         radius_m=given.radius_m,
         thumbnails=thumbnails,
     )
-    report = send(centre, out, asked, at=at, monitor=Bars())
+    report: DownloadReport | UpdateReport
+    if update and out.exists():
+        with interruptible(Bars()) as monitor:
+            report = take_in(centre, out, asked, at=at, monitor=monitor)
+    else:
+        report = send(centre, out, asked, at=at, monitor=Bars())
     if as_json:
         print(json.dumps(report.to_dict()))
     else:

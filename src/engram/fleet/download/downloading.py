@@ -7,7 +7,7 @@ and no host, and the file is compacted at the end.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from engram.config import plain, to_dict
 from engram.errors import InputError
 from engram.files import check_parent, draft_folder
-from engram.fleet.download.bridges import close_gaps, components
+from engram.fleet.download.bridges import components
 from engram.fleet.download.coverage import Coverage, expected_missed
 from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.part import Part
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
-from engram.fleet.download.stock import Mask, Stock
-from engram.graph.model import Edge, PathId, path_id
-from engram.maps import Map, RevisionWriter, compact_map, publish_map
+from engram.fleet.download.stock import Stock
+from engram.maps import Map, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
 # Bytes of a node beside its blobs: rows and indices of it, its edges and path entries. Only the
@@ -143,10 +143,11 @@ def download(
         selection = SELECTIONS[options.policy](stock, options)
         coverage = selection.coverage or coverage_for(stock, options)
         with draft_folder(out) as folder:
-            sent = _fitting(stock, selection, options, folder, monitor)
+            part, why = choose_part(stock, selection, options, folder, monitor)
+            _write_draft(part, options, folder, monitor)
             compact = folder / _COMPACT
             compact_map(folder / _DRAFT, compact)
-            report = _report(stock, sent, coverage, compact, out, options)
+            report = _report(part, why, coverage, compact, out, options)
             publish_map(compact, out)
     return report
 
@@ -154,27 +155,23 @@ def download(
 _DRAFT, _COMPACT = "draft.engram", "compact.engram"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sent:
-    selection: Selection
-    bridges: list[Edge]
-
-
-def _fitting(
+def choose_part(
     stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, monitor: Monitor
-) -> _Sent:
-    """Writes the draft; for a budget, with as many nodes as fit."""
+) -> tuple[Part, Mapping[str, Any]]:
+    """The part of a selection, and facts of its policy; for a budget, as much as fits.
+
+    A budget writes drafts into `folder` to measure them; the last one is the returned part.
+    """
     if selection.order is None:
-        return _write_draft(stock, selection, options, folder, monitor)
+        return _part(stock, selection, options), selection.why
     landmarks, thumbnails = stock.sizes
     blobs = landmarks + thumbnails * options.with_thumbnails
     pages = np.ceil(blobs / _PAGE_BYTES) * _PAGE_BYTES + _ROWS_BYTES
-    newest: dict[int, _Sent] = {}
+    parts: dict[int, Part] = {}
 
     def measure(count: int) -> int:
-        newest.clear()
-        part = _beginning(selection, count)
-        newest[count] = _write_draft(stock, part, options, folder, monitor)
+        parts[count] = _part(stock, _beginning(selection, count), options)
+        _write_draft(parts[count], options, folder, monitor)
         return _compacted_bytes(folder)
 
     budget_bytes, why = options.budget_bytes, dict(selection.why)
@@ -183,9 +180,12 @@ def _fitting(
         budget_bytes = int(everything_bytes * options.budget_percent / 100)
     assert budget_bytes is not None
     count = most_that_fit(measure, np.cumsum(pages[selection.order]), budget_bytes)
-    if count not in newest:
-        measure(count)
-    return _Sent(replace(newest[count].selection, why=why), newest[count].bridges)
+    return parts[count], why
+
+
+def _part(stock: Stock, selection: Selection, options: DownloadOptions) -> Part:
+    whole = options.policy == "copy"
+    return Part.of(stock, selection.sent, whole=whole, thumbnails=options.with_thumbnails)
 
 
 def most_that_fit(
@@ -252,144 +252,55 @@ def _compacted_bytes(folder: Path) -> int:
     return size_bytes
 
 
-def _write_draft(
-    stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, monitor: Monitor
-) -> _Sent:
+def _write_draft(part: Part, options: DownloadOptions, folder: Path, monitor: Monitor) -> None:
     for old in folder.iterdir():
         old.unlink()
-    bridges = close_gaps(stock.node_ids, stock.edges, selection.sent)
+    stock = part.stock
     with (
         Map.create(folder / _DRAFT) as draft,
-        monitor.stage("download", int(selection.sent.sum())) as part,
-        _begin(draft, stock, options) as writer,
+        monitor.stage("download", len(part)) as stage,
+        draft.begin_revision(
+            **revision_of(stock, options), at_ns=stock.store.log()[-1].committed_ns
+        ) as writer,
     ):
-        _write(writer, stock, selection.sent, bridges, options, part)
+        part.write(writer, stage)
         writer.commit()
         if stock.words is not None:
-            stock.words.give(draft, [stock.node_ids[at] for at in np.flatnonzero(selection.sent)])
-    return _Sent(selection, bridges)
+            stock.words.give(draft, part.node_ids)
 
 
-def _begin(draft: Map, stock: Stock, options: DownloadOptions) -> RevisionWriter:
+def revision_of(stock: Stock, options: DownloadOptions) -> dict[str, Any]:
+    """Author, message and configuration of a download's revision."""
     newest = stock.store.log()[-1]
-    return draft.begin_revision(
-        author="centre",
-        message=f"download {options.policy} of revision {newest.number}",
-        configuration={
+    return {
+        "author": "centre",
+        "message": f"download {options.policy} of revision {newest.number}",
+        "configuration": {
             "download": {
                 **to_dict(options),
                 "source": stock.content_hash,
                 "revision": newest.number,
             }
         },
-        at_ns=newest.committed_ns,
-    )
-
-
-def _write(
-    writer: RevisionWriter,
-    stock: Stock,
-    sent: Mask,
-    bridges: list[Edge],
-    options: DownloadOptions,
-    monitor: Monitor,
-) -> None:
-    """All records of the sent nodes, owners first."""
-    _write_sessions(writer, stock, sent)
-    nodes = [stock.nodes[at] for at in np.flatnonzero(sent)]
-    for stored in stock.store.frames.stored(nodes):
-        writer.copy_node(stored if options.with_thumbnails else replace(stored, thumbnail=None))
-        monitor.advance()
-    for edge in stock.edges:
-        if sent[stock.index[edge.a]] and sent[stock.index[edge.b]]:
-            writer.add_edge(edge)
-    for bridge in bridges:
-        writer.add_edge(bridge)
-    for entry in stock.entries:
-        if sent[stock.index[entry.node]]:
-            writer.add_path_entry(entry)
-    _write_attempts(writer, stock, sent)
-    if options.policy == "copy":
-        for _, omission in sorted(stock.store.omissions.items()):
-            writer.add_omission(omission)
-    vocabulary = stock.store.vocabulary
-    if vocabulary is not None:
-        writer.put_vocabulary(vocabulary)
-
-
-def _write_sessions(writer: RevisionWriter, stock: Stock, sent: Mask) -> None:
-    """Sessions that saved, passed or attempted a sent node; all for a whole map."""
-    frontends = stock.store.frontends
-    partial = _partial_paths(stock, sent)
-    wanted = _sessions_of(stock, sent)
-    for at, session in enumerate(stock.sessions):
-        if wanted[at]:
-            descriptor, frontend = frontends[session.id]
-            writer.add_session(
-                session,
-                stock.contents.cameras[session.camera],
-                descriptor=descriptor,
-                frontend=frontend,
-                partial=path_id(session.id) in partial,
-            )
-    told_of = {one.id for at, one in enumerate(stock.sessions) if wanted[at]}
-    for amendment in stock.store.amendments:
-        if amendment.session in told_of:
-            writer.add_amendment(amendment)
-
-
-def _sessions_of(stock: Stock, sent: Mask) -> Mask:
-    if sent.all():
-        return np.ones(len(stock.sessions), np.bool_)
-    wanted = np.zeros(len(stock.sessions), np.bool_)
-    wanted[stock.session_of[sent]] = True
-    made = _attempts_between(stock, sent)
-    wanted[stock.attempts.session[made]] = True
-    for at, session in enumerate(stock.sessions):
-        nodes = stock.on_path.get(path_id(session.id))
-        if nodes is not None and sent[nodes].any():
-            wanted[at] = True
-    return wanted
-
-
-def _partial_paths(stock: Stock, sent: Mask) -> set[PathId]:
-    """Paths of which some entries are left out, now or by an earlier download."""
-    left = {path for path, nodes in stock.on_path.items() if not sent[nodes].all()}
-    return left | set(stock.store.partial_paths)
-
-
-def _attempts_between(stock: Stock, sent: Mask) -> NDArray[np.intp]:
-    """Rows of attempts of which both nodes are sent."""
-    made = stock.attempts
-    return np.flatnonzero(sent[made.reference] & sent[made.node])
-
-
-def _write_attempts(writer: RevisionWriter, stock: Stock, sent: Mask) -> None:
-    kept = stock.attempts.rows(_attempts_between(stock, sent))
-    for at, session in enumerate(stock.sessions):
-        rows = np.flatnonzero(kept.session == at)
-        if len(rows):
-            writer.copy_attempts(session.id, kept.rows(rows), stock.node_ids)
+    }
 
 
 def _report(
-    stock: Stock,
-    done: _Sent,
+    part: Part,
+    why: Mapping[str, Any],
     coverage: Coverage,
     file: Path,
     out: Path,
     options: DownloadOptions,
 ) -> DownloadReport:
     """The report of a file that will be named `out`."""
-    sent = done.selection.sent
+    stock, sent = part.stock, part.sent
     with Map.open(file) as written:
         info = written.info()
         content_hash = written.content_hash()
     ends = np.array(
-        [(stock.index[edge.a], stock.index[edge.b]) for edge in (*stock.edges, *done.bridges)],
-        np.int64,
+        [(stock.index[edge.a], stock.index[edge.b]) for edge in part.edges()], np.int64
     ).reshape(-1, 2)
-    inner = ends[sent[ends].all(axis=1)]
     return DownloadReport(
         out=out,
         policy=options.policy,
@@ -399,13 +310,13 @@ def _report(
         nodes=info.nodes,
         of_nodes=len(stock),
         sessions=info.sessions,
-        partial_paths=len(_partial_paths(stock, sent)),
+        partial_paths=len(part.partial_paths()),
         edges=info.edges,
-        bridges=len(done.bridges),
-        components=len(np.unique(components(len(stock), inner)[sent])),
+        bridges=len(part.bridges),
+        components=len(np.unique(components(len(stock), ends)[sent])),
         size_bytes=file.stat().st_size,
         of_bytes=stock.store.info().size_bytes,
-        why=dict(done.selection.why),
+        why=dict(why),
         expected_missed=expected_missed(coverage, sent),
         copy_missed=expected_missed(coverage, stock.everything()),
     )

@@ -6,10 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.geometry import SE3, propagate_covariance
-from engram.graph.model import Edge, EdgeKind, NodeId
+from engram.graph.model import Edge, EdgeKind, NodeId, Omission
 from engram.localiser import Position
 
 Array = NDArray[np.float64]
+
+# Standard deviations of an omitted node's position, whose match covariance is not stored: wide
+# against the errors of matches. Source: lab/reports/constants-fleet.md.
+_OMITTED_SIGMA_M = 0.2
+_OMITTED_SIGMA_RAD = float(np.deg2rad(1.0))
+
+
+def position_of(omission: Omission) -> Position:
+    """Position of an omitted node in the map that omits it."""
+    spread = np.diag([_OMITTED_SIGMA_M**2] * 3 + [_OMITTED_SIGMA_RAD**2] * 3)
+    return Position(omission.node, omission.node_from_omitted, spread)
 
 
 def seen_from(edge: Edge, node: NodeId) -> tuple[NodeId, SE3, Array]:

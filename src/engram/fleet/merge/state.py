@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 
-from engram.fleet.merge.positions import uncertainty_m2
+from engram.fleet.merge.positions import position_of, uncertainty_m2
 from engram.fleet.merge.report import MergeReport
 from engram.frontend import Frame
 from engram.graph.attempts import Attempts
@@ -30,10 +30,6 @@ from engram.maps import Map, RevisionWriter, StoredNode
 
 # Sequence numbers of entries that merges add follow all those that robots wrote (docs/format.md).
 FIRST_REPLAYED = 2**32
-# Standard deviations of an omitted node's position, whose match covariance is not stored: wide
-# against the errors of matches. Source: lab/reports/constants-fleet.md.
-_OMITTED_SIGMA_M = 0.2
-_OMITTED_SIGMA_RAD = float(np.deg2rad(1.0))
 # Represents all nodes that the fleet map had before, whatever their component.
 _CENTRE = None
 
@@ -62,10 +58,8 @@ class Merge:
         self.sessions = sorted(robot.sessions.values(), key=lambda one: (one.start_ns, one.id))
         self.edges = sorted(robot.graph.edges, key=_edge_key)
         self.report = MergeReport.of(robot)
-        spread = np.diag([_OMITTED_SIGMA_M**2] * 3 + [_OMITTED_SIGMA_RAD**2] * 3)
         self._omitted = {
-            omission.omitted: Position(omission.node, omission.node_from_omitted, spread)
-            for omission in centre.omissions.values()
+            omission.omitted: position_of(omission) for omission in centre.omissions.values()
         }
         self._entries: dict[PathId, set[_EntryKey]] = {}
         # Components of the taken nodes: a graph search for each would be too slow.

@@ -1,0 +1,297 @@
+"""A download taken into a map that the robot keeps ([G16] Fig. 3c and Fig. 9).
+
+The robot's map gains what the download has and it lacks, as one revision: nodes by UUID, edges by
+ends and kind, path entries by path and sequence, attempts by `Attempts.lacking`. Nothing is
+replayed and nothing is removed. The robot's own nodes that the fleet map omitted stay, and are tied
+to their equivalents. Killed at any moment, the map is as before or as after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.config import plain
+from engram.errors import IncompatibleError, InputError
+from engram.files import draft_folder
+from engram.fleet.download.downloading import choose_part, revision_of
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.part import Part
+from engram.fleet.download.selections import SELECTIONS, check_options
+from engram.fleet.download.stock import Mask, Stock
+from engram.fleet.merge.positions import position_of, uncertainty_m2
+from engram.fleet.merge.state import FIRST_REPLAYED
+from engram.graph.model import Edge, EdgeKind, NodeId, PathEntry, PathEntryKind, PathId, Session
+from engram.maps import Map, MapContents, RevisionWriter
+from engram.monitor import QUIET, Monitor
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UpdateReport:
+    """What a robot's map gained.
+
+    Attributes:
+        out: the robot's map.
+        policy: key of `SELECTIONS`.
+        source_revision: of the fleet map.
+        revision: the new one of the robot's map; None if it lacked nothing.
+        content_hash: of the robot's map.
+        nodes, of_nodes: copied; those of the download.
+        own_nodes: nodes of the robot's map that the download does not have.
+        sessions, edges, path_entries, attempts: copied.
+        ties: new edges between own nodes and the nodes by which the fleet map replaced them.
+        why: facts of the policy, as plain data.
+    """
+
+    out: Path
+    policy: str
+    source_revision: int
+    revision: int | None
+    content_hash: str
+    nodes: int
+    of_nodes: int
+    own_nodes: int
+    sessions: int
+    edges: int
+    path_entries: int
+    attempts: int
+    ties: int
+    why: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``download --update --json`` prints."""
+        values: dict[str, Any] = plain(self)
+        return values
+
+    def text(self) -> str:
+        """The report as text."""
+        head = f"{self.policy} of revision {self.source_revision}: {self.of_nodes} nodes"
+        if self.revision is None:
+            return f"{head}; {self.out.name} has them all: nothing changed"
+        return (
+            f"{head}, {self.nodes} of them new in {self.out.name} (revision {self.revision}), "
+            f"which keeps {self.own_nodes} nodes of its own\n"
+            f"copied {self.sessions} sessions, {self.edges} edges, {self.path_entries} path "
+            f"entries, {self.attempts} attempts; tied {self.ties} own nodes to equivalents"
+        )
+
+
+def update(
+    centre: Path | str,
+    robot: Path,
+    options: DownloadOptions | None = None,
+    *,
+    at: int | str | None = None,
+    monitor: Monitor = QUIET,
+) -> UpdateReport:
+    """Takes a download into a robot's map, which keeps its own nodes and history.
+
+    Args:
+        centre: the fleet map, or its address; a file that `download` wrote will do.
+        robot: the robot's map, which must exist.
+        options: which part of the fleet map; None for all of it.
+        at: revision of the fleet map; None for the newest.
+        monitor: receives progress per copied node.
+
+    Raises:
+        ConfigError: an option is missing, out of range, or not used by the policy.
+        InputError: no node fits the options, or both maps are the same file.
+        IncompatibleError: the maps have different kinds of descriptors, or hold a session or a node
+            of one UUID with different content.
+        MapLockedError: another process writes to the robot's map.
+        MapError: a map cannot be read or written.
+
+    After any error, and after a kill, the robot's map is as it was.
+    """
+    options = options or DownloadOptions()
+    check_options(options)
+    if Path(centre).exists() and robot.exists() and robot.samefile(centre):
+        raise InputError(f"{robot} is the fleet map itself; name the robot's map")
+    with Map.open(centre, at=at) as store, Map.open(robot, writes=True) as own:
+        stock = Stock(store)
+        if not len(stock):
+            raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
+        selection = SELECTIONS[options.policy](stock, options)
+        with draft_folder(robot) as folder:
+            part, why = choose_part(stock, selection, options, folder, monitor)
+        taking = _Update(part, own)
+        revision = taking.write(revision_of(stock, options), monitor)
+        return taking.report(robot, options.policy, revision, dict(why))
+
+
+class _Update:
+    """A part of the fleet map and the robot's map that receives it."""
+
+    def __init__(self, part: Part, own: Map) -> None:
+        self._part, self._map = part, own
+        self._stock = part.stock
+        self._own = own.load()
+        self._own_nodes = len(self._own.nodes)
+        self._counts = dict.fromkeys(
+            ("nodes", "sessions", "edges", "path_entries", "attempts", "ties"), 0
+        )
+        _check_fits(part, own, self._own)
+
+    def report(
+        self, out: Path, policy: str, revision: int | None, why: dict[str, Any]
+    ) -> UpdateReport:
+        return UpdateReport(
+            out=out,
+            policy=policy,
+            source_revision=self._stock.store.revision,
+            revision=revision,
+            content_hash=self._map.content_hash(),
+            of_nodes=len(self._part),
+            own_nodes=self._own_nodes - (len(self._part) - self._counts["nodes"]),
+            why=why,
+            **self._counts,
+        )
+
+    def write(self, about: dict[str, Any], monitor: Monitor) -> int | None:
+        """Writes what is lacking, as one revision; returns its number, None if nothing was."""
+        with self._map.begin_revision(**about) as writer:
+            anything = self._write_owners(writer, monitor)
+            if writer.shows_again:
+                # Nodes that a revert had hidden bring their edges, entries and attempts back.
+                writer.checkpoint()
+                self._own = self._map.load()
+            anything |= self._write_the_rest(writer)
+            monitor.check()
+            revision = writer.commit().number if anything else None
+        if self._stock.words is not None and revision is not None:
+            self._stock.words.give(self._map, self._part.node_ids)
+        return revision
+
+    def _write_owners(self, writer: RevisionWriter, monitor: Monitor) -> bool:
+        """Sessions, amendments and nodes."""
+        partial = self._part.partial_paths()
+        for session in self._part.sessions:
+            self._counts["sessions"] += self._part.add_session(writer, session, partial)
+        amended = [writer.add_amendment(one) for one in self._part.amendments]
+        lacking = self._lacking_nodes()
+        with monitor.stage("update", int(lacking.sum())) as stage:
+            for stored in self._part.stored(lacking):
+                writer.copy_node(stored)
+                self._counts["nodes"] += 1
+                stage.advance()
+                stage.check()
+        return any(amended) or any(self._counts.values())
+
+    def _write_the_rest(self, writer: RevisionWriter) -> bool:
+        """Records that refer to nodes."""
+        edges = list(self._lacking_edges())
+        ties = list(self._lacking_ties({_key(edge) for edge in edges}))
+        entries = list(self._lacking_entries())
+        attempts = self._lacking_attempts()
+        known = {node.id for node in self._own.nodes} | self._map.omissions.keys()
+        omissions = [one for one in self._part.omissions() if one.omitted not in known]
+        for edge in (*edges, *ties):
+            writer.add_edge(edge)
+        for entry in entries:
+            writer.add_path_entry(entry)
+        self._part.write_attempts(writer, attempts)
+        for omission in omissions:
+            writer.add_omission(omission)
+        vocabulary = self._stock.store.vocabulary
+        learnt = vocabulary is not None and vocabulary != self._map.vocabulary
+        if vocabulary is not None and learnt:
+            writer.put_vocabulary(vocabulary)
+        self._counts |= {
+            "edges": len(edges),
+            "path_entries": len(entries),
+            "attempts": len(attempts),
+            "ties": len(ties),
+        }
+        return bool(edges or ties or entries or len(attempts) or omissions or learnt)
+
+    def _lacking_nodes(self) -> Mask:
+        known = {node.id for node in self._own.nodes}
+        return np.array([node not in known for node in self._stock.node_ids], np.bool_)
+
+    def _lacking_edges(self) -> Iterator[Edge]:
+        """Edges that the robot's map lacks, or knows less exactly."""
+        known = {_key(edge): uncertainty_m2(edge.covariance) for edge in self._own.edges}
+        for edge in self._part.edges():
+            if uncertainty_m2(edge.covariance) < known.get(_key(edge), np.inf):
+                yield edge
+
+    def _lacking_ties(self, copied: set[tuple[NodeId, NodeId, EdgeKind]]) -> Iterator[Edge]:
+        """Matches of own nodes with the nodes by which the fleet map replaced them."""
+        known = copied | {_key(edge) for edge in self._own.edges}
+        own = {node.id for node in self._own.nodes} - self._stock.index.keys()
+        here = own | set(self._part.node_ids)
+        for omitted, omission in sorted(self._stock.store.omissions.items()):
+            if omitted in own and omission.node in here:
+                at = position_of(omission)
+                tie = Edge(at.node, omitted, EdgeKind.MATCH, at.node_from_live, at.covariance)
+                if _key(tie) not in known:
+                    yield tie
+
+    def _lacking_entries(self) -> Iterator[PathEntry]:
+        """Path entries that the robot's map lacks; those of merges by node and stamp."""
+        taken: dict[PathId, set[int]] = {}
+        replayed = set()
+        for entry in self._own.path_entries:
+            taken.setdefault(entry.path, set()).add(entry.sequence)
+            if entry.kind is PathEntryKind.REPLAYED:
+                replayed.add((entry.path, entry.node, entry.stamp_ns))
+        for entry in self._part.entries():
+            sequences = taken.setdefault(entry.path, set())
+            new = entry
+            if entry.kind is PathEntryKind.REPLAYED:
+                if (entry.path, entry.node, entry.stamp_ns) in replayed:
+                    continue
+                if entry.sequence in sequences:
+                    new = replace(entry, sequence=max(FIRST_REPLAYED, max(sequences) + 1))
+            if new.sequence not in sequences:
+                sequences.add(new.sequence)
+                yield new
+
+    def _lacking_attempts(self) -> NDArray[np.intp]:
+        """Rows of the stock's attempts that the robot's map does not remember."""
+        rows = self._part.attempt_rows()
+        made, remembered = self._stock.attempts.rows(rows), self._own.attempts
+        place: dict[Any, int] = {}
+        for session in (*self._own.sessions, *self._stock.sessions):
+            place.setdefault(session.id, len(place))
+        named = np.array([place[one.id] for one in self._stock.sessions], np.int32)
+        theirs = replace(made, session=named[made.session])
+        return rows[theirs.lacking(remembered)]
+
+
+def _key(edge: Edge) -> tuple[NodeId, NodeId, EdgeKind]:
+    return edge.a, edge.b, edge.kind
+
+
+def _check_fits(part: Part, own: Map, contents: MapContents) -> None:
+    """Refuses a download that contradicts the robot's map."""
+    known = {one.id: one.as_recorded for one in contents.sessions}
+    for session in part.sessions:
+        ours = known.get(session.id)
+        if ours is not None and not _same_drive(ours, session.as_recorded):
+            raise IncompatibleError(
+                f"session {session.id} is a drive of {ours.robot} in {own.location} and another "
+                f"one, of {session.robot}, in the fleet map: one of the two maps is wrong"
+            )
+    ours_of, theirs_of = own.landmark_hashes, part.stock.store.landmark_hashes
+    for node in part.node_ids:
+        if ours_of.get(node, theirs_of[node]) != theirs_of[node]:
+            raise IncompatibleError(
+                f"node {node} has landmarks {ours_of[node].hex()} in {own.location} and "
+                f"{theirs_of[node].hex()} in the fleet map: a node never changes, so one of the "
+                "two maps is wrong"
+            )
+
+
+def _same_drive(ours: Session, theirs: Session) -> bool:
+    """Whether two records are of one drive; clock, longitude and zone may be set later."""
+    return (ours.robot, ours.camera, ours.start_ns) == (
+        theirs.robot,
+        theirs.camera,
+        theirs.start_ns,
+    )
