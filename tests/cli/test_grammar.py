@@ -25,9 +25,9 @@ def test_help_lists_the_verbs_in_their_groups(engram) -> None:
     assert len(lines) <= 45, "one screen"
 
 
-def test_the_products_verbs_take_at_most_150_arguments_and_options() -> None:
+def test_the_products_verbs_take_at_most_180_arguments_and_options() -> None:
     taken = {name: sum(one.name != "help" for one in COMMANDS[name].params) for name in VERBS}
-    assert sum(taken.values()) <= 150, taken
+    assert sum(taken.values()) <= 180, taken
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
@@ -44,13 +44,13 @@ def test_no_verb_takes_an_option_that_meant_two_things() -> None:
     assert not taken & {"--start", "--policy", "--every", "--preload"}
 
 
-def test_every_drive_verb_takes_the_nine_options_of_a_drive() -> None:
-    nine = {
+def test_every_drive_verb_takes_the_options_of_a_drive() -> None:
+    options = {
         "format", "rig", "channel", "frames", "skip_bad", "robot", "recorded_at", "longitude",
-        "zone",
+        "zone", "from_", "to", "calibration", "fov", "mask", "left", "right",
     }  # fmt: skip
     for name in ("map", "localise", "record"):
-        assert nine <= {one.name for one in COMMANDS[name].params}
+        assert options <= {one.name for one in COMMANDS[name].params}
 
 
 def test_version(engram) -> None:

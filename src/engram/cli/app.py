@@ -14,6 +14,7 @@ from engram.cli.endings import PartlyDoneError, VerbInterruptedError
 from engram.cli.moved import moved_option
 from engram.cli.verbs import Program, register
 from engram.errors import EngramError, InputError
+from engram.untrusted import printable
 
 app = typer.Typer(
     name="engram",
@@ -101,7 +102,7 @@ def _status_of(error: EngramError | VerbInterruptedError) -> int:
 
 def _complain(error: Exception, done: Mapping[str, Any] | None = None) -> None:
     _tell_machines(str(error), type(error).__name__, done)
-    print(f"engram: {error}", file=sys.stderr)
+    print(f"engram: {printable(str(error))}", file=sys.stderr)
 
 
 def _tell_machines(message: str, kind: str, done: Mapping[str, Any] | None = None) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engram.cli import options
+from engram.cli.losses import tell_losses
 from engram.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def map_(
         typer.echo(mapped_text(report.to_dict(), map_path))
     if report.interrupted:
         raise typer.Exit(130)
+    tell_losses(sequence)
 
 
 def localise(
@@ -132,6 +134,7 @@ def localise(
         outputs = Outputs(trajectory, pictures, rate, as_json, remember)
         with open_map(map_path, at) as opened:
             localise_and_print(opened, sequence, resolved, asked, outputs)
+        tell_losses(sequence)
         return
     given = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
@@ -174,6 +177,7 @@ def record(
         typer.echo(report.text())
     if report.interrupted:
         raise typer.Exit(130)
+    tell_losses(sequence)
 
 
 def _for_people(settings: Settings, no_thumbnails: bool) -> Settings:

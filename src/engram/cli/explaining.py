@@ -11,14 +11,14 @@ import typer
 if TYPE_CHECKING:
     from engram.robot import Settings
     from engram.robot.explaining import ExplainedCandidate, ExplainOptions, Explanation
-    from engram.sequences import FrameLog, ImageSequence
+    from engram.sequences import Drive
 
 _LISTED = 20
 
 
 def explain_and_print(
     map_path: Path,
-    sequence: ImageSequence | FrameLog,
+    sequence: Drive,
     settings: Settings,
     asked: ExplainOptions,
     *,

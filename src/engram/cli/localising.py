@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from engram.localiser import Localisation
     from engram.maps import Map
     from engram.robot import RobotOptions, Settings
-    from engram.sequences import FrameLog, ImageSequence
+    from engram.sequences import Drive
 
 # So many match pictures are spread over a drive: enough to leaf through.
 _PICTURES = 20
@@ -40,7 +40,7 @@ class Outputs:
 
 def localise_and_print(
     opened: Map,
-    sequence: ImageSequence | FrameLog,
+    sequence: Drive,
     settings: Settings,
     asked: RobotOptions,
     outputs: Outputs,

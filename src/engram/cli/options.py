@@ -15,7 +15,7 @@ import typer
 
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
-    from engram.sequences import FrameLog, ImageSequence
+    from engram.sequences.opening import Drive as OpenDrive
 
 
 def map_file(text: str) -> Path:
@@ -48,7 +48,8 @@ FleetMap: TypeAlias = Annotated[
     ),
 ]
 DrivePath: TypeAlias = Annotated[
-    Path, typer.Argument(metavar="DRIVE", help="A folder of stereo images, or a frame log.")
+    Path,
+    typer.Argument(metavar="DRIVE", help="A folder of stereo images, a ROS bag, or a frame log."),
 ]
 Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 At: TypeAlias = Annotated[
@@ -91,7 +92,9 @@ class Drive:
     format: Annotated[
         str | None,
         typer.Option(
-            "--format", help="kitti, kitti-raw, euroc, folder, framelog [default: detected]."
+            "--format",
+            help="kitti, kitti-raw, euroc, tum-vi, robotcar, folder, bag, framelog "
+            "[default: detected].",
         ),
     ] = None
     rig: Annotated[
@@ -126,10 +129,34 @@ class Drive:
     zone: Annotated[
         str | None, typer.Option("--zone", help="Time zone of the drive: Europe/London.")
     ] = None
+    from_: Annotated[
+        str | None,
+        typer.Option("--from", metavar="TIME", help="Begin here: seconds, or ISO 8601, UTC."),
+    ] = None
+    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="End here.")] = None
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", metavar="FILE", help="TOML, Kalibr, ROS or OpenCV."),
+    ] = None
+    fov: Annotated[
+        float | None,
+        typer.Option("--fov", metavar="DEG", help="Width of rectified images [default: largest]."),
+    ] = None
+    mask: Annotated[
+        Path | None,
+        typer.Option("--mask", metavar="PNG", help="Black where the robot sees itself."),
+    ] = None
+    left: Annotated[
+        str | None, typer.Option("--left", metavar="TOPIC", help="Of a bag's left images.")
+    ] = None
+    right: Annotated[
+        str | None, typer.Option("--right", metavar="TOPIC", help="Of a bag's right images.")
+    ] = None
 
-    def open(self, path: Path) -> ImageSequence | FrameLog:
+    def open(self, path: Path) -> OpenDrive:
         """The drive; see `engram.sequences.open_sequence` for the errors."""
         from engram.robot import open_drive
+        from engram.sequences import TimeRange
 
         return open_drive(
             path,
@@ -142,6 +169,12 @@ class Drive:
             start=self.recorded_at,
             longitude_deg=self.longitude,
             zone=self.zone,
+            times=TimeRange.parse(self.from_, self.to),
+            calibration=self.calibration,
+            field_of_view_deg=self.fov,
+            mask=self.mask,
+            left=self.left,
+            right=self.right,
         )
 
 

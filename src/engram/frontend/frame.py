@@ -26,12 +26,15 @@ class StereoPair:
         stamp_ns: capture time, ns.
         left, right: (height, width) uint8 grey images, C-contiguous.
         camera: the camera of both images.
+        mask: (height, width) bool, False where the left image shows the robot's own body; None if
+            all of it is used.
     """
 
     stamp_ns: int
     left: NDArray[np.uint8]
     right: NDArray[np.uint8]
     camera: StereoCamera
+    mask: NDArray[np.bool_] | None = None
 
 
 class FrameStatus(StrEnum):

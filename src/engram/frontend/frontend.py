@@ -14,6 +14,7 @@ from engram.config import check_bounds, config_hash
 from engram.errors import ConfigError, IncompatibleError, SequenceError
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
+from engram.frontend.masking import clear_of_body, without_body
 from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
 
 # Raise it when equal settings give different landmarks.
@@ -97,9 +98,11 @@ class Frontend:
                 64 px.
         """
         _check_images(pair)
-        config = self.config
+        pair, config = without_body(pair), self.config
         kind = feature_kind(config.descriptor)
         found = kind.detect(pair, config, _landmarks_for(pair.left, config.landmarks))
+        if pair.mask is not None:
+            found = clear_of_body(found, pair.mask)
         descriptors = found.descriptors
         if descriptors is None:
             descriptors = kind.describe(pair.left, found.pixels, found.octaves)

@@ -24,6 +24,10 @@ from engram.geometry.se3 import SE3
 # values: landmarks from old tables do not fit the new intrinsics.
 _METHOD = "bouguet-1"
 
+# Fisheye lenses see up to 190°. A pinhole image of the same size loses its centre to the borders,
+# so without a choice it ends here, horizontally.
+_WIDEST_FISHEYE_DEG = 100.0
+
 # Larger images are refused: the four tables of a pair take 12 bytes a pixel.
 _MAX_SIDE_PX = 16_384
 
@@ -115,9 +119,11 @@ class RawStereoCalibration:
     right_from_left: SE3
     left_from_rig: SE3 | None = None
 
-    def content_hash(self) -> str:
+    def content_hash(self, field_of_view_deg: float | None = None) -> str:
         """Hash of the calibration without the mounting, 32 hexadecimal digits."""
         content = [_METHOD]
+        if field_of_view_deg is not None:
+            content.append(float(field_of_view_deg).hex())
         for camera in (self.left, self.right):
             content += [float(value).hex() for value in camera.matrix.ravel()]
             content += [f"{camera.width}x{camera.height}", camera.distortion.value]
@@ -155,17 +161,32 @@ class Rectification:
     right: RemapTable
 
 
-def rectify(calibration: RawStereoCalibration) -> Rectification:
-    """Rectifies a raw stereo calibration; keeps the image size and crops all unseen borders.
+def rectify(
+    calibration: RawStereoCalibration, field_of_view_deg: float | None = None
+) -> Rectification:
+    """Rectifies a raw stereo calibration; keeps the image size.
+
+    Args:
+        calibration: the two lenses and their relative pose.
+        field_of_view_deg: horizontal field of view of the rectified images; None crops all unseen
+            borders, and for a fisheye ends at 100°.
 
     Raises:
         CalibrationError: the two sizes differ, the right camera is not to the right of the left
-            one, or no usable image remains.
+            one, no usable image remains, or the field of view is not within 10° to 170°.
     """
     left, right = calibration.left, calibration.right
     _check_pair(calibration)
+    if field_of_view_deg is not None and not 10 <= field_of_view_deg <= 170:
+        raise CalibrationError(
+            f"field of view is {field_of_view_deg:g}°, must be 10° to 170° for a pinhole image"
+        )
     try:
         rotations, projections = _stereo_rectify(calibration)
+        if field_of_view_deg is None and _is_too_wide(left, projections[0]):
+            field_of_view_deg = _WIDEST_FISHEYE_DEG
+        if field_of_view_deg is not None:
+            projections = _seeing(calibration, field_of_view_deg)
         _check_rectified(rotations, projections)
         tables = [
             _table(camera, rotation, projection)
@@ -176,7 +197,7 @@ def rectify(calibration: RawStereoCalibration) -> Rectification:
     except cv2.error as error:
         raise CalibrationError(f"the stereo calibration cannot be rectified: {error}") from error
     rectified_from_raw = SE3(rotations[0], np.zeros(3))
-    camera = _rectified_camera(calibration, projections, rectified_from_raw)
+    camera = _rectified_camera(calibration, projections, rectified_from_raw, field_of_view_deg)
     return Rectification(camera, rectified_from_raw, tables[0], tables[1])
 
 
@@ -250,6 +271,27 @@ def _stereo_rectify(
     return _float64(r0, r1), _float64(p0, p1)
 
 
+def _is_too_wide(left: RawCamera, projection: NDArray[np.float64]) -> bool:
+    """Whether the largest view of a fisheye is wider than 100°, or not a pinhole's at all."""
+    if left.distortion is not DistortionModel.EQUIDISTANT:
+        return False
+    half_rad = np.deg2rad(_WIDEST_FISHEYE_DEG / 2)
+    return not projection[0, 0] >= left.width / 2 / np.tan(half_rad)
+
+
+def _seeing(
+    calibration: RawStereoCalibration, field_of_view_deg: float
+) -> list[NDArray[np.float64]]:
+    """Projections (3, 4) of both images, centred, with this horizontal field of view."""
+    width, height = calibration.left.width, calibration.left.height
+    focal_px = width / 2 / np.tan(np.deg2rad(field_of_view_deg) / 2)
+    left = np.zeros((3, 4))
+    left[:, :3] = [[focal_px, 0, (width - 1) / 2], [0, focal_px, (height - 1) / 2], [0, 0, 1]]
+    right = left.copy()
+    right[0, 3] = -focal_px * float(np.linalg.norm(calibration.right_from_left.translation))
+    return [left, right]
+
+
 def _float64(*arrays: ArrayLike) -> list[NDArray[np.float64]]:
     """OpenCV's results with their types."""
     return [np.asarray(array, dtype=np.float64) for array in arrays]
@@ -282,6 +324,7 @@ def _rectified_camera(
     calibration: RawStereoCalibration,
     projections: list[NDArray[np.float64]],
     rectified_from_raw: SE3,
+    field_of_view_deg: float | None,
 ) -> StereoCamera:
     left, right = projections
     # Rounded coarser than differences between processors: every digit counts for a camera's id, and
@@ -298,7 +341,7 @@ def _rectified_camera(
         width=calibration.left.width,
         height=calibration.left.height,
         cam_from_rig=None if mounting is None else _rounded(rectified_from_raw @ mounting),
-        rectification=calibration.content_hash(),
+        rectification=calibration.content_hash(field_of_view_deg),
     )
 
 

@@ -16,9 +16,9 @@ from engram.robot.front import Front, arriving
 from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
 from engram.sequences import (
+    FrameLog,
     FrameLogHeader,
     FrameLogWriter,
-    ImageSequence,
     LoggedFrame,
     first_pair_hash,
 )
@@ -130,7 +130,7 @@ def _header(sequence: DriveSequence, frame: Frame, settings: Settings) -> FrameL
         frame.descriptor,
         frame.frontend,
         config_hash(settings.odometry),
-        str(sequence.frames) if isinstance(sequence, ImageSequence) else "",
+        "" if isinstance(sequence, FrameLog) else str(getattr(sequence, "frames", "")),
     )
 
 

@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 from engram.errors import SequenceError
 from engram.graph.model import Session
 from engram.sequences import (
+    Drive,
     FrameLog,
-    ImageSequence,
     StereoSequence,
     first_pair_hash,
     open_sequence,
@@ -19,11 +19,11 @@ from engram.sequences import (
 DriveSequence: TypeAlias = StereoSequence | FrameLog
 
 
-def open_drive(path: Path, **options: Any) -> ImageSequence | FrameLog:
+def open_drive(path: Path, **options: Any) -> Drive:
     """Opens a drive.
 
     Args:
-        path: a folder of stereo images, or a frame log.
+        path: a folder of stereo images, a bag, or a frame log.
         **options: options of `open_sequence`.
 
     Raises:

@@ -1,9 +1,10 @@
-"""Readers of drives: images in known layouts, and frame logs."""
+"""Readers of drives: images in known layouts, ROS bags, and frame logs."""
 
+from engram.sequences.bags import BagSequence
 from engram.sequences.framelog import FrameLog, FrameLogHeader, FrameLogWriter
 from engram.sequences.image_sequence import ImageSequence
-from engram.sequences.opening import SEQUENCES, open_sequence
-from engram.sequences.options import FrameRange
+from engram.sequences.opening import SEQUENCES, Drive, open_sequence
+from engram.sequences.options import FrameRange, TimeRange
 from engram.sequences.sequence import (
     FrameSequence,
     LoggedFrame,
@@ -15,6 +16,8 @@ from engram.sequences.sequence import (
 
 __all__ = [
     "SEQUENCES",
+    "BagSequence",
+    "Drive",
     "FrameLog",
     "FrameLogHeader",
     "FrameLogWriter",
@@ -24,6 +27,7 @@ __all__ = [
     "LoggedFrame",
     "SequenceInfo",
     "StereoSequence",
+    "TimeRange",
     "first_pair_hash",
     "open_sequence",
     "session_of",

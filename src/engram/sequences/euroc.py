@@ -1,60 +1,52 @@
-"""EuRoC MAV / ASL layout: raw pairs, rectified on reading, paired by stamp.
+"""EuRoC MAV / ASL layout, TUM-VI's included: raw pairs, rectified on reading, paired by stamp.
 
 Source: Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import yaml
-
+from engram.calibration import Cameras, read_calibration
+from engram.calibration.cameras import rectified_cameras
+from engram.calibration.entries import (
+    distortion_model,
+    entry,
+    numbers,
+    read_yaml,
+    transform,
+    whole,
+)
 from engram.errors import CalibrationError, InputError, SequenceError
 from engram.geometry import SE3
-from engram.geometry.rectification import (
-    DistortionModel,
-    RawCamera,
-    RawStereoCalibration,
-    Rectification,
-    rectify,
-)
+from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
 from engram.graph.model import Clock
+from engram.sequences.calibrating import cameras_of
 from engram.sequences.image_sequence import ImageDrive
-from engram.sequences.listing import (
-    StampedFile,
-    image_files,
-    nanoseconds,
-    pair_by_stamp,
-    read_calibration_text,
-    read_text,
-)
+from engram.sequences.listing import StampedFile, image_files, nanoseconds, pair_by_stamp
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
-
-# Values of `distortion_model` that common calibration tools write.
-_DISTORTION = {
-    "radial-tangential": DistortionModel.RADIAL_TANGENTIAL,
-    "radtan": DistortionModel.RADIAL_TANGENTIAL,
-    "plumb_bob": DistortionModel.RADIAL_TANGENTIAL,
-    "equidistant": DistortionModel.EQUIDISTANT,
-    "fisheye": DistortionModel.EQUIDISTANT,
-    "kannala_brandt": DistortionModel.EQUIDISTANT,
-    "none": DistortionModel.NONE,
-}
+from engram.untrusted import read_text
 
 # Stamps of the data set are ns since 1970; one before 2000 means a relative clock.
-_YEAR_2000_NS = 946_684_800 * 1_000_000_000
-# A calibration has a few hundred bytes; this bounds the parser's work on malicious files.
-_MAX_YAML_CHARACTERS = 1_000_000
+YEAR_2000_NS = 946_684_800 * 1_000_000_000
 
 
 def is_euroc(path: Path) -> bool:
-    """A folder with `mav0/cam0`, or `mav0` itself."""
-    return (_mav_folder(path) / "cam0").is_dir()
+    """A folder with `mav0/cam0`, or `mav0` itself; `tum-vi` keeps its calibration elsewhere."""
+    folder = _mav_folder(path)
+    return (folder / "cam0").is_dir() and not tumvi_calibration(path).is_file()
+
+
+def is_tumvi(path: Path) -> bool:
+    """The same layout with `dso/camchain.yaml` beside `mav0`."""
+    return (_mav_folder(path) / "cam0").is_dir() and tumvi_calibration(path).is_file()
+
+
+def tumvi_calibration(path: Path) -> Path:
+    """Where TUM-VI keeps its calibration."""
+    return _mav_folder(path).resolve().parent / "dso" / "camchain.yaml"
 
 
 def find_euroc(path: Path, options: OpenOptions) -> ImageDrive:
@@ -65,23 +57,43 @@ def find_euroc(path: Path, options: OpenOptions) -> ImageDrive:
         CalibrationError: a `sensor.yaml` is missing or malformed, or the two cameras are not a
             stereo pair.
     """
-    folder = _mav_folder(path)
-    sides = (folder / "cam0", folder / "cam1")
-    rectification = rectify_sensors(*(side / "sensor.yaml" for side in sides))
+    left, right = (_mav_folder(path) / name / "sensor.yaml" for name in ("cam0", "cam1"))
+    view = options.field_of_view_deg
+    return _find(path, options, "euroc", lambda: sensor_cameras(left, right, view))
+
+
+def find_tumvi(path: Path, options: OpenOptions) -> ImageDrive:
+    """A drive of TUM-VI: ASL layout, fisheye lenses, Kalibr's calibration.
+
+    Source: Schubert et al., "The TUM VI Benchmark for Evaluating Visual-Inertial Odometry", IROS
+    2018, and the data set's page: 16-bit images of 512 or 1024 px, `dso/camchain.yaml`.
+
+    Raises:
+        SequenceError: images or stamps are missing or malformed.
+        CalibrationError: `camchain.yaml` is malformed.
+    """
+    file = tumvi_calibration(path)
+    view = options.field_of_view_deg
+    return _find(path, options, "tum-vi", lambda: read_calibration(file, field_of_view_deg=view))
+
+
+def _find(
+    path: Path, options: OpenOptions, name: str, cameras: Callable[[], Cameras]
+) -> ImageDrive:
+    sides = [_mav_folder(path) / camera for camera in ("cam0", "cam1")]
+    calibrated = cameras_of(options, cameras, sides[0] / "data")
     left, right = (list(_stamped_files(side)) for side in sides)
-    places = pair_by_stamp(
-        left, right, options.pair_tolerance_ns, (sides[0] / "data.csv", sides[1] / "data.csv")
-    )
-    stamps_ns = [item.stamp_ns for item in left if isinstance(item, StampedFile)]
-    clock = Clock.UTC if stamps_ns and stamps_ns[0] >= _YEAR_2000_NS else Clock.RELATIVE
+    tables = (sides[0] / "data.csv", sides[1] / "data.csv")
+    places = pair_by_stamp(left, right, options.pair_tolerance_ns, tables)
+    first_ns = next((one.stamp_ns for one in left if isinstance(one, StampedFile)), 0)
+    clock = Clock.UTC if first_ns >= YEAR_2000_NS else Clock.RELATIVE
     resolved = path.resolve()
-    name = resolved.parent.name if resolved.name == "mav0" else resolved.name
-    info = SequenceInfo(name, "euroc", clock)
-    return ImageDrive(path, info, rectification.camera, places, rectification)
+    shown = resolved.parent.name if resolved.name == "mav0" else resolved.name
+    return ImageDrive(path, SequenceInfo(shown, name, clock), calibrated, places)
 
 
-def rectify_sensors(left: Path, right: Path) -> Rectification:
-    """Rectification of two `sensor.yaml`.
+def sensor_cameras(left: Path, right: Path, field_of_view_deg: float | None = None) -> Cameras:
+    """The stereo pair of two `sensor.yaml`.
 
     Raises:
         CalibrationError: one is missing or malformed, or the two cameras are not a stereo pair.
@@ -95,7 +107,7 @@ def rectify_sensors(left: Path, right: Path) -> Rectification:
         left_from_rig=body_from_left.inverse(),
     )
     try:
-        return rectify(calibration)
+        return rectified_cameras(calibration, field_of_view_deg)
     except CalibrationError as error:
         raise CalibrationError(f"{left} and {right}: {error}") from error
 
@@ -128,77 +140,21 @@ def _stamped_files(side: Path) -> Iterator[StampedFile | str]:
 
 def _read_sensor(path: Path) -> tuple[RawCamera, SE3]:
     """Camera and body_from_camera of a `sensor.yaml`."""
-    entries = _read_yaml(path)
+    text = read_text(path, CalibrationError)
     try:
-        width, height = (_whole(value) for value in _numbers(entries, "resolution", {2}))
-        fx, fy, cx, cy = _numbers(entries, "intrinsics", {4})
-        distortion = str(_entry(entries, "distortion_model")).strip().lower()
-        if distortion not in _DISTORTION:
-            raise CalibrationError(
-                f"distortion_model is {distortion[:40]!r}; known: {', '.join(_DISTORTION)}"
-            )
+        entries = read_yaml(text)
+        width, height = (whole(value) for value in numbers(entries, "resolution", {2}))
+        fx, fy, cx, cy = numbers(entries, "intrinsics", {4})
         camera_model = str(entries.get("camera_model", "pinhole")).strip().lower()
         if camera_model != "pinhole":
             raise CalibrationError(f"camera_model is {camera_model[:40]!r}, must be 'pinhole'")
-        model = _DISTORTION[distortion]
+        model = distortion_model(entry(entries, "distortion_model"))
         coefficients = (
             ()
             if model is DistortionModel.NONE
-            else tuple(_numbers(entries, "distortion_coefficients", {4, 5, 8}))
+            else tuple(numbers(entries, "distortion_coefficients", {4, 5, 8}))
         )
         camera = RawCamera(fx, fy, cx, cy, width, height, model, coefficients)
-        return camera, _mounting(entries)
+        return camera, transform(entries, "T_BS")
     except InputError as error:
         raise CalibrationError(f"{path}: {error}") from error
-
-
-def _mounting(entries: dict[str, Any]) -> SE3:
-    matrix = _entry(entries, "T_BS")
-    if isinstance(matrix, dict):
-        values = _numbers(matrix, "data", {16})
-    else:
-        values = _numbers(entries, "T_BS", {16})
-    return SE3.from_matrix(np.array(values).reshape(4, 4))
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    # OpenCV writes "%YAML:1.0", which is not a valid YAML directive.
-    lines = read_calibration_text(path).splitlines()
-    text = "\n".join(line for line in lines if not line.startswith("%"))
-    if len(text) > _MAX_YAML_CHARACTERS:
-        raise CalibrationError(f"{path}: {len(text)} characters, too long for a calibration")
-    try:
-        # The base loader makes strings, lists and dictionaries, nothing else.
-        entries = yaml.load(text, Loader=yaml.BaseLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        fact = str(error).splitlines()[0] if str(error) else "malformed"
-        raise CalibrationError(f"{path}: not valid YAML: {fact}") from error
-    if not isinstance(entries, dict):
-        raise CalibrationError(f"{path}: holds no calibration (a table of names and values)")
-    return entries
-
-
-def _entry(entries: dict[str, Any], name: str) -> Any:
-    if name not in entries:
-        raise CalibrationError(f"entry {name} is missing")
-    return entries[name]
-
-
-def _numbers(entries: dict[str, Any], name: str, counts: set[int]) -> list[float]:
-    values = _entry(entries, name)
-    if not isinstance(values, list) or len(values) not in counts:
-        wanted = " or ".join(map(str, sorted(counts)))
-        raise CalibrationError(f"{name} must be a list of {wanted} numbers")
-    try:
-        numbers = [float(value) for value in values]
-    except (TypeError, ValueError):
-        raise CalibrationError(f"{name} has an entry that is not a number") from None
-    if not all(map(math.isfinite, numbers)):
-        raise CalibrationError(f"{name} has a number that is not finite")
-    return numbers
-
-
-def _whole(value: float) -> int:
-    if not (0 < value < 1e6 and value == int(value)):
-        raise CalibrationError(f"resolution holds {value}, must be whole numbers of pixels > 0")
-    return int(value)

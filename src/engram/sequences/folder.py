@@ -5,23 +5,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
+from engram.calibration.toml import CalibrationFile
 from engram.config import load_toml
-from engram.errors import CalibrationError, ConfigError, InputError, SequenceError
-from engram.geometry import SE3, StereoCamera
-from engram.geometry.rectification import (
-    DistortionModel,
-    RawCamera,
-    RawStereoCalibration,
-    Rectification,
-    rectify,
-)
+from engram.errors import CalibrationError, InputError, SequenceError
 from engram.graph.clock import check_longitude, check_zone
 from engram.graph.model import Clock
+from engram.sequences.calibrating import cameras_of
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.listing import (
     Listing,
@@ -30,12 +21,12 @@ from engram.sequences.listing import (
     nanoseconds,
     pair_by_number,
     pair_by_stamp,
-    read_calibration_text,
     read_stamps,
     seconds_as_ns,
 )
-from engram.sequences.options import OpenOptions
+from engram.sequences.options import OpenOptions, parse_choice
 from engram.sequences.sequence import SequenceInfo
+from engram.untrusted import read_text
 
 # Names whose numbers are this close, ns, are frame numbers: no camera is that fast.
 _CLOSEST_NS = 100_000
@@ -43,71 +34,6 @@ _TIMES_NEEDED = (
     "write times.txt beside left/ and right/, with one line for each pair: its time in seconds, "
     "such as 0.0, 0.1, 0.2 at 10 Hz"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class RectifiedTable:
-    """`[rectified]`: the images are rectified; fields as in `StereoCamera`."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    baseline_m: float
-    width: int
-    height: int
-
-
-@dataclass(frozen=True, slots=True)
-class LensTable:
-    """`[raw.left]`, `[raw.right]`: fields as in `RawCamera`."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: DistortionModel = DistortionModel.NONE
-    coefficients: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class RawTable:
-    """`[raw]`: the images are distorted and not rectified.
-
-    Attributes:
-        width, height: image size, px.
-        right_from_left: 16 numbers, row-major 4×4: pose of the left camera in the frame of the
-            right one, metres.
-        left, right: the two lenses.
-    """
-
-    width: int
-    height: int
-    right_from_left: tuple[float, ...]
-    left: LensTable
-    right: LensTable
-
-
-@dataclass(frozen=True, slots=True)
-class FolderCalibration:
-    """`calibration.toml`: one of `[rectified]` and `[raw]`, and facts of the drive.
-
-    Attributes:
-        rectified, raw: the cameras; exactly one of the two.
-        cam_from_rig: 16 numbers, row-major 4×4: mounting of the left camera (of the stored images),
-            metres; missing if unknown.
-        clock: meaning of the stamps.
-        robot: name of the robot.
-        longitude_deg, zone: where the drive was.
-    """
-
-    rectified: RectifiedTable | None = None
-    raw: RawTable | None = None
-    cam_from_rig: tuple[float, ...] | None = None
-    clock: Clock = Clock.UNKNOWN
-    robot: str | None = None
-    longitude_deg: float | None = None
-    zone: str | None = None
 
 
 def is_folder(path: Path) -> bool:
@@ -124,61 +50,27 @@ def find_folder(path: Path, options: OpenOptions) -> ImageDrive:
         CalibrationError: `calibration.toml` is missing or malformed, or not of a stereo pair.
     """
     file = path / "calibration.toml"
-    text = read_calibration_text(file)
+    calibration = CalibrationFile()
     try:
-        calibration = load_toml(text, FolderCalibration)
+        if options.calibration is None or file.exists():
+            calibration = load_toml(read_text(file, CalibrationError), CalibrationFile)
         check_longitude(calibration.longitude_deg)
         check_zone(calibration.zone)
-        camera, rectification = _camera(calibration)
+        clock = parse_choice(Clock, calibration.clock)
+        cameras = cameras_of(
+            options, lambda: calibration.cameras(options.field_of_view_deg), path / "left"
+        )
     except InputError as error:
         raise CalibrationError(f"{file}: {error}") from error
     info = SequenceInfo(
         path.resolve().name,
         "folder",
-        calibration.clock,
+        clock,
         calibration.robot,
         calibration.longitude_deg,
         calibration.zone,
     )
-    return ImageDrive(path, info, camera, _places(path, options), rectification)
-
-
-def _camera(calibration: FolderCalibration) -> tuple[StereoCamera, Rectification | None]:
-    rectified, raw = calibration.rectified, calibration.raw
-    mounting = _transform("cam_from_rig", calibration.cam_from_rig)
-    if (rectified is None) == (raw is None):
-        raise ConfigError("give exactly one of the tables [rectified] and [raw]")
-    if rectified is not None:
-        values = {name: getattr(rectified, name) for name in RectifiedTable.__slots__}
-        return StereoCamera(**values, cam_from_rig=mounting), None
-    assert raw is not None
-    right_from_left = _transform("right_from_left", raw.right_from_left)
-    assert right_from_left is not None
-    rectification = rectify(
-        RawStereoCalibration(_lens(raw, raw.left), _lens(raw, raw.right), right_from_left, mounting)
-    )
-    return rectification.camera, rectification
-
-
-def _lens(raw: RawTable, lens: LensTable) -> RawCamera:
-    return RawCamera(
-        lens.fx,
-        lens.fy,
-        lens.cx,
-        lens.cy,
-        raw.width,
-        raw.height,
-        lens.distortion,
-        lens.coefficients,
-    )
-
-
-def _transform(name: str, values: tuple[float, ...] | None) -> SE3 | None:
-    if values is None:
-        return None
-    if len(values) != 16:
-        raise ConfigError(f"{name} has {len(values)} numbers, must be 16: a 4×4 matrix by rows")
-    return SE3.from_matrix(np.array(values).reshape(4, 4))
+    return ImageDrive(path, info, cameras, _places(path, options))
 
 
 def _places(path: Path, options: OpenOptions) -> Listing:

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.calibration import Cameras
 from engram.errors import ConfigError, SequenceError
 from engram.frontend import StereoPair
-from engram.geometry import StereoCamera
 from engram.geometry.rectification import Rectification, RemapTable
 from engram.graph.model import Clock
+from engram.sequences.calibrating import check_no_view, read_mask
 from engram.sequences.images import read_image
 from engram.sequences.listing import Listing, PairFiles, usable_pairs
-from engram.sequences.options import OpenOptions
+from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
 
@@ -28,16 +30,16 @@ class ImageDrive:
     Attributes:
         path: folder of the drive.
         info: facts from its files.
-        camera: the rectified camera.
+        cameras: the stereo pair.
         places: all its pairs and faults, in the order of time.
-        rectification: rectification of its raw images; None if they are rectified already.
+        read: decodes one image: path, width, height, channel.
     """
 
     path: Path
     info: SequenceInfo
-    camera: StereoCamera
+    cameras: Cameras
     places: Listing
-    rectification: Rectification | None = None
+    read: Callable[[Path, int, int, Channel], NDArray[np.uint8]] = read_image
 
 
 class ImageSequence:
@@ -45,6 +47,7 @@ class ImageSequence:
 
     Attributes:
         info: what is known of the drive as a whole.
+        cameras: its stereo pair, with the rectification of raw images.
         camera: its one camera, rectified.
         frames: the used frames of the drive.
 
@@ -55,7 +58,9 @@ class ImageSequence:
 
     def __init__(self, drive: ImageDrive, options: OpenOptions) -> None:
         self.info = with_options(drive.info, options)
-        self.camera = drive.camera
+        self.cameras = drive.cameras
+        self.camera = drive.cameras.camera
+        check_no_view(options, drive.cameras)
         self.frames = options.frames
         self._drive = drive
         self._options = options
@@ -63,14 +68,15 @@ class ImageSequence:
         if options.start_ns is not None:
             places = _shifted(places, options.start_ns)
         self._pairs, self._listing_faults = usable_pairs(
-            places, options.skip_bad, drive.path, options.frames.of
+            places, options.skip_bad, drive.path, partial(_chosen, options)
         )
+        self._mask = None if options.mask is None else read_mask(options.mask, drive.cameras)
         self._reading_faults: list[str] = []
 
     @property
     def rectification(self) -> Rectification | None:
         """Rectification of raw images; None for a rectified drive."""
-        return self._drive.rectification
+        return self.cameras.rectification
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -115,19 +121,24 @@ class ImageSequence:
             SequenceError: as for iterating.
         """
         files = self._pairs[index]
-        rectification = self._drive.rectification
+        rectification = self.cameras.rectification
         left = self._load(files.left, rectification.left if rectification else None)
         right = self._load(files.right, rectification.right if rectification else None)
-        return StereoPair(files.stamp_ns, left, right, self.camera)
+        return StereoPair(files.stamp_ns, left, right, self.camera, self._mask)
 
     def _load(self, path: Path, table: RemapTable | None) -> NDArray[np.uint8]:
         # Rectification keeps the image size.
-        image = read_image(path, self.camera.width, self.camera.height, self._options.channel)
+        image = self._drive.read(path, self.camera.width, self.camera.height, self._options.channel)
         if table is None:
             return image
-        return np.asarray(
-            cv2.remap(image, table.pixels, table.fractions, cv2.INTER_LINEAR), dtype=np.uint8
-        )
+        return rectified(image, table)
+
+
+def rectified(image: NDArray[np.uint8], table: RemapTable) -> NDArray[np.uint8]:
+    """The (h, w) uint8 rectified image of a raw one of the same size."""
+    return np.asarray(
+        cv2.remap(image, table.pixels, table.fractions, cv2.INTER_LINEAR), dtype=np.uint8
+    )
 
 
 def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
@@ -153,6 +164,20 @@ def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
         ),
         zone=info.zone if options.zone is None else options.zone,
     )
+
+
+def _chosen(options: OpenOptions, places: Listing) -> Listing:
+    """The places of the chosen frames and times; a fault between two pairs stays."""
+    chosen = options.frames.of(places)
+    if options.times.is_all:
+        return chosen
+    first_ns = next((place.stamp_ns for place in places if isinstance(place, PairFiles)), 0)
+    inside = [
+        row
+        for row, place in enumerate(chosen)
+        if isinstance(place, PairFiles) and options.times.holds(place.stamp_ns, first_ns)
+    ]
+    return chosen[inside[0] : inside[-1] + 1] if inside else []
 
 
 def _shifted(places: Listing, start_ns: int) -> Listing:

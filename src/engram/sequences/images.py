@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.options import Channel
+from engram.untrusted import read_bytes
 
 # File types that OpenCV's wheels decode. Other files beside the images are ignored.
 IMAGE_SUFFIXES = frozenset(
@@ -45,14 +46,41 @@ def read_image(
             not `width` × `height`.
         ConfigError: one colour channel is asked for and the image is grey.
     """
-    content = _read_bytes(path)
-    _check_size(path, header_size(content), width, height)
+    return grey(path, decoded(path, _read_bytes(path), (width, height)), channel)
+
+
+def decoded(
+    where: object, content: bytes, size: tuple[int, int] | None = None
+) -> NDArray[np.generic]:
+    """The pixels of an encoded image, as they are stored: grey, BGR or BGRA, 8 or 16 bit.
+
+    Args:
+        where: file or message, for messages.
+        content: its bytes.
+        size: required width and height, px; None for any.
+
+    Raises:
+        SequenceError: it is cut short, of an unknown type, or of another size.
+    """
+    _check_size(where, header_size(content), size)
     if content.startswith(b"\xff\xd8") and not _jpeg_is_whole(content):
         # libjpeg would fill the missing rows with grey and only warn.
-        raise SequenceError(f"{path}: the JPEG is cut short ({len(content)} bytes)")
-    image = _decoded(path, content)
-    _check_size(path, (image.shape[1], image.shape[0]), width, height)
-    return _one_channel(path, _eight_bit(path, image), channel)
+        raise SequenceError(f"{where}: the JPEG is cut short ({len(content)} bytes)")
+    image = _decoded(where, content)
+    _check_size(where, (image.shape[1], image.shape[0]), size)
+    return image
+
+
+def grey(
+    where: object, image: NDArray[np.generic], channel: Channel = Channel.GREY
+) -> NDArray[np.uint8]:
+    """The (h, w) uint8 grey of a (h, w[, 1, 3, 4]) image of 8 or 16 bit, in OpenCV's BGR order.
+
+    Raises:
+        SequenceError: its pixels are of another kind.
+        ConfigError: one colour channel is asked for and the image is grey.
+    """
+    return _one_channel(where, _eight_bit(where, image), channel)
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -66,7 +94,7 @@ def image_size(path: Path) -> tuple[int, int]:
     if size is None:
         height, width = _decoded(path, content).shape[:2]
         size = (width, height)
-    _check_not_huge(path, size)
+    check_not_huge(path, size)
     return size
 
 
@@ -88,23 +116,15 @@ def header_size(content: bytes) -> tuple[int, int] | None:
 
 
 def _read_bytes(path: Path) -> bytes:
-    try:
-        size = path.stat().st_size
-        if size > _MAX_FILE_BYTES:
-            raise SequenceError(
-                f"{path}: {size} bytes, too large for a camera image (at most {_MAX_FILE_BYTES})"
-            )
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise SequenceError(f"{path}: the image is missing") from None
-    except OSError as error:
-        raise SequenceError(f"{path}: cannot be read: {error.strerror}") from error
+    if not path.exists():
+        raise SequenceError(f"{path}: the image is missing")
+    content = read_bytes(path, _MAX_FILE_BYTES)
     if not content:
         raise SequenceError(f"{path}: the image is empty (0 bytes)")
     return content
 
 
-def _decoded(path: Path, content: bytes) -> NDArray[np.generic]:
+def _decoded(path: object, content: bytes) -> NDArray[np.generic]:
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -117,17 +137,23 @@ def _decoded(path: Path, content: bytes) -> NDArray[np.generic]:
     return image
 
 
-def _check_size(path: Path, size: tuple[int, int] | None, width: int, height: int) -> None:
+def _check_size(path: object, size: tuple[int, int] | None, wanted: tuple[int, int] | None) -> None:
     if size is None:
         return
-    _check_not_huge(path, size)
-    if size != (width, height):
+    check_not_huge(path, size)
+    if wanted is not None and size != wanted:
         raise SequenceError(
-            f"{path}: the image is {size[0]}×{size[1]} px, the calibration says {width}×{height}"
+            f"{path}: the image is {size[0]}×{size[1]} px, the calibration says "
+            f"{wanted[0]}×{wanted[1]}"
         )
 
 
-def _check_not_huge(path: Path, size: tuple[int, int]) -> None:
+def check_not_huge(path: object, size: tuple[int, int]) -> None:
+    """Refuses an image that claims more pixels than any stereo camera delivers.
+
+    Raises:
+        SequenceError: it does.
+    """
     if size[0] * size[1] > _MAX_PIXELS:
         raise SequenceError(
             f"{path}: claims {size[0]}×{size[1]} px, more than {_MAX_PIXELS:,}: not decoded"
@@ -173,7 +199,7 @@ def _pnm_size(content: bytes) -> tuple[int, int] | None:
     return int(numbers[0]), int(numbers[1])
 
 
-def _eight_bit(path: Path, image: NDArray[np.generic]) -> NDArray[np.uint8]:
+def _eight_bit(path: object, image: NDArray[np.generic]) -> NDArray[np.uint8]:
     if image.dtype == np.uint8:
         return image.view(np.uint8)
     if image.dtype == np.uint16:
@@ -182,7 +208,7 @@ def _eight_bit(path: Path, image: NDArray[np.generic]) -> NDArray[np.uint8]:
     raise SequenceError(f"{path}: pixels are {image.dtype}, need 8 or 16 bit unsigned")
 
 
-def _one_channel(path: Path, image: NDArray[np.uint8], channel: Channel) -> NDArray[np.uint8]:
+def _one_channel(path: object, image: NDArray[np.uint8], channel: Channel) -> NDArray[np.uint8]:
     channels = 1 if image.ndim == 2 else image.shape[2]
     if channels not in {1, 3, 4}:
         raise SequenceError(f"{path}: {channels} channels, need 1, 3 or 4")

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.calibration import Cameras
 from engram.errors import CalibrationError, SequenceError
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
+from engram.sequences.calibrating import cameras_of
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.images import image_size
 from engram.sequences.listing import (
@@ -21,13 +23,12 @@ from engram.sequences.listing import (
     date_as_ns,
     numbered_files,
     pair_by_number,
-    read_calibration_text,
     read_stamps,
-    read_text,
     seconds_as_ns,
 )
 from engram.sequences.options import OpenOptions, Rig
 from engram.sequences.sequence import SequenceInfo
+from engram.untrusted import read_text
 
 _CAMERAS = {Rig.GREY: (0, 1), Rig.COLOUR: (2, 3)}
 
@@ -61,9 +62,16 @@ def find_kitti_odometry(path: Path, options: OpenOptions) -> ImageDrive:
     stamps_ns = read_stamps(times, seconds_as_ns)
     left_files, right_files = numbered_files(folders[0]), numbered_files(folders[1])
     places = pair_by_number(stamps_ns, left_files, right_files, times)
-    camera = calibration.stereo_camera(f"P{left}", f"P{right}", _first_size(places, path))
+    cameras = cameras_of(
+        options,
+        lambda: Cameras(
+            calibration.stereo_camera(f"P{left}", f"P{right}", _first_size(places, path))
+        ),
+        folders[0],
+        rectified=True,
+    )
     info = SequenceInfo(path.resolve().name, "kitti", Clock.RELATIVE)
-    return ImageDrive(path, info, camera, places)
+    return ImageDrive(path, info, cameras, places)
 
 
 def find_kitti_raw(path: Path, options: OpenOptions) -> ImageDrive:
@@ -83,11 +91,17 @@ def find_kitti_raw(path: Path, options: OpenOptions) -> ImageDrive:
     places = pair_by_number(stamps_ns, left_files, right_files, stamps_file)
     width, height = calibration.numbers(f"S_rect_{left:02d}", 2)
     size = (_whole(width), _whole(height))
-    camera = calibration.stereo_camera(f"P_rect_{left:02d}", f"P_rect_{right:02d}", size)
+    names_of_pair = (f"P_rect_{left:02d}", f"P_rect_{right:02d}")
+    cameras = cameras_of(
+        options,
+        lambda: Cameras(calibration.stereo_camera(*names_of_pair, size)),
+        folders[0],
+        rectified=True,
+    )
     info = SequenceInfo(
         path.resolve().name, "kitti-raw", Clock.UTC, longitude_deg=_oxts_longitude_deg(path)
     )
-    return ImageDrive(path, info, camera, places)
+    return ImageDrive(path, info, cameras, places)
 
 
 class _Calibration:
@@ -95,7 +109,7 @@ class _Calibration:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        lines = (line.partition(":") for line in read_calibration_text(path).splitlines())
+        lines = (line.partition(":") for line in read_text(path, CalibrationError).splitlines())
         self._texts = {name.strip(): rest.split() for name, _, rest in lines}
 
     def numbers(self, name: str, count: int) -> NDArray[np.float64]:

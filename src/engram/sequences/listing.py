@@ -15,11 +15,10 @@ from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 
-from engram.errors import CalibrationError, SequenceError
+from engram.errors import SequenceError
 from engram.sequences.images import IMAGE_SUFFIXES
+from engram.untrusted import read_text
 
-# Text files beside images; the longest real one (an hour of ROS images at 100 Hz) has 20 MB.
-_MAX_TEXT_BYTES = 100_000_000
 # Stamps after the year 2200 are refused: they soon exceed 64 bits.
 _MAX_STAMP_NS = 2**63 - 1
 
@@ -48,37 +47,6 @@ class StampedFile:
     stamp_ns: int
     path: Path
     fault: str | None = None
-
-
-def read_text(path: Path) -> str:
-    """A text file beside the images.
-
-    Raises:
-        SequenceError: it is missing, unreadable, too large, or not UTF-8 text.
-    """
-    try:
-        size = path.stat().st_size
-        if size > _MAX_TEXT_BYTES:
-            raise SequenceError(f"{path}: {size} bytes, at most {_MAX_TEXT_BYTES} are read")
-        return path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise SequenceError(f"{path}: the file is missing") from None
-    except UnicodeDecodeError as error:
-        raise SequenceError(f"{path}: not UTF-8 text at byte {error.start}") from error
-    except OSError as error:
-        raise SequenceError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def read_calibration_text(path: Path) -> str:
-    """As `read_text`, for a calibration.
-
-    Raises:
-        CalibrationError: it is missing, unreadable, too large, or not UTF-8 text.
-    """
-    try:
-        return read_text(path)
-    except SequenceError as error:
-        raise CalibrationError(str(error)) from error
 
 
 def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:

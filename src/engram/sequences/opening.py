@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import MappingProxyType
+from typing import TypeAlias
 
 from engram.errors import ConfigError, SequenceError
-from engram.sequences.euroc import find_euroc, is_euroc
+from engram.sequences.bags import BagSequence, is_bag, open_bag
+from engram.sequences.euroc import find_euroc, find_tumvi, is_euroc, is_tumvi
 from engram.sequences.folder import find_folder, is_folder
 from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
 from engram.sequences.image_sequence import ImageDrive, ImageSequence
@@ -24,9 +26,12 @@ from engram.sequences.options import (
     FrameRange,
     OpenOptions,
     Rig,
+    TimeRange,
     parse_choice,
     parse_start,
 )
+
+Drive: TypeAlias = ImageSequence | BagSequence | FrameLog
 
 # Most drives listed if a parent folder is given.
 _MOST_NAMED = 10
@@ -41,12 +46,14 @@ class SequenceFormat:
         recognises: whether a path has this layout; checks names only.
         open: opens it.
         rigs: the rigs it can have.
+        has_topics: whether its images are named by topics.
     """
 
     looks_like: str
     recognises: Callable[[Path], bool]
-    open: Callable[[Path, OpenOptions], ImageSequence | FrameLog]
+    open: Callable[[Path, OpenOptions], Drive]
     rigs: tuple[Rig, ...] = (Rig.GREY,)
+    has_topics: bool = False
 
 
 def _images(
@@ -79,6 +86,17 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             is_folder,
             _images(find_folder),
         ),
+        "tum-vi": SequenceFormat(
+            "TUM-VI, mav0/cam0 and mav0/cam1 as in EuRoC, with dso/camchain.yaml beside mav0",
+            is_tumvi,
+            _images(find_tumvi),
+        ),
+        "bag": SequenceFormat(
+            "ROS bag, a file NAME.bag, NAME.mcap or NAME.db3, or a folder of them",
+            is_bag,
+            open_bag,
+            has_topics=True,
+        ),
         "framelog": SequenceFormat(
             "frame log, a file NAME.framelog that `engram record` made",
             is_framelog,
@@ -101,11 +119,17 @@ def open_sequence(
     start: str | datetime | int | None = None,
     longitude_deg: float | None = None,
     zone: str | None = None,
-) -> ImageSequence | FrameLog:
-    """Opens a drive of any known layout. Checks that all images exist, and decodes none.
+    times: TimeRange | None = None,
+    calibration: str | Path | None = None,
+    field_of_view_deg: float | None = None,
+    mask: str | Path | None = None,
+    left: str | None = None,
+    right: str | None = None,
+) -> Drive:
+    """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
 
-    Image layouts give an `ImageSequence` (a `StereoSequence`), frame logs a `FrameLog` (a
-    `FrameSequence`).
+    Image layouts give an `ImageSequence`, bags a `BagSequence` (both are a `StereoSequence`), frame
+    logs a `FrameLog` (a `FrameSequence`).
 
     Args:
         path: folder or file of the drive.
@@ -121,6 +145,12 @@ def open_sequence(
             ns since 1970), for a drive whose clock is relative or unknown.
         longitude_deg: longitude of the drive, degrees east.
         zone: IANA time zone of the drive.
+        times: which stretch of the drive is used; None for all.
+        calibration: file of the pair's calibration, see `engram.calibration`; None for the drive's
+            own.
+        field_of_view_deg: horizontal field of view of rectified images; None for the largest.
+        mask: image that is black where the robot sees itself, of the size of the drive's images.
+        left, right: topics of a bag's images; None finds them by their names.
 
     Raises:
         SequenceError: the path does not exist, has no known layout, or its images or stamps
@@ -140,6 +170,12 @@ def open_sequence(
         start_ns=parse_start(start),
         longitude_deg=longitude_deg,
         zone=zone,
+        times=times or TimeRange(),
+        calibration=None if calibration is None else Path(calibration),
+        field_of_view_deg=field_of_view_deg,
+        mask=None if mask is None else Path(mask),
+        left=left,
+        right=right,
     )
     name = recognise(path) if format is None else _known(format)
     layout = SEQUENCES[name]
@@ -148,6 +184,8 @@ def open_sequence(
             f"{path}: layout {name!r} has no rig {options.rig.value!r}, only "
             f"{', '.join(known.value for known in layout.rigs)}"
         )
+    if not layout.has_topics and (left is not None or right is not None):
+        raise ConfigError(f"{path}: --left and --right name topics of a bag; this is {name!r}")
     return layout.open(path, options)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 from msgspec import Meta
@@ -19,6 +20,7 @@ T = TypeVar("T")
 E = TypeVar("E", bound=StrEnum)
 
 _PART = re.compile(r"[0-9]{1,9}")
+_SECONDS = re.compile(r"[0-9]{1,9}(\.[0-9]{0,9})?")
 _MICROSECOND = timedelta(microseconds=1)
 _SPELLINGS = {"color": "colour", "gray": "grey"}
 
@@ -105,6 +107,71 @@ class FrameRange:
 
 
 @dataclass(frozen=True, slots=True)
+class TimeRange:
+    """A stretch of a drive in time.
+
+    Attributes:
+        start, stop: its ends, both included; seconds from the drive's first frame (float), or ns
+            since 1970 (int); None for the drive's own ends.
+
+    Raises:
+        ConfigError: the range is empty.
+    """
+
+    start: float | int | None = None
+    stop: float | int | None = None
+
+    def __post_init__(self) -> None:
+        start, stop = self.start, self.stop
+        if start is not None and stop is not None and type(start) is type(stop) and stop < start:
+            raise ConfigError(f"--from {start} is after --to {stop}: no frame lies between")
+
+    @staticmethod
+    def parse(start: str | None, stop: str | None) -> TimeRange:
+        """Read seconds such as 12.5, or ISO 8601 times such as 2026-03-01T09:30:00Z (UTC).
+
+        Raises:
+            ConfigError: a text is neither.
+        """
+        return TimeRange(_moment("--from", start), _moment("--to", stop))
+
+    @property
+    def is_all(self) -> bool:
+        """Whether it is the whole drive."""
+        return self.start is None and self.stop is None
+
+    def holds(self, stamp_ns: int, first_ns: int) -> bool:
+        """Whether a stamp of a drive that begins at `first_ns` is inside."""
+        return not (self.is_before(stamp_ns, first_ns) or self.is_after(stamp_ns, first_ns))
+
+    def is_before(self, stamp_ns: int, first_ns: int) -> bool:
+        """Whether a stamp lies before the range."""
+        return self.start is not None and stamp_ns < _as_ns(self.start, first_ns)
+
+    def is_after(self, stamp_ns: int, first_ns: int) -> bool:
+        """Whether a stamp lies after the range."""
+        return self.stop is not None and stamp_ns > _as_ns(self.stop, first_ns)
+
+
+def _as_ns(moment: float | int, first_ns: int) -> int:
+    return moment if isinstance(moment, int) else first_ns + round(moment * 1e9)
+
+
+def _moment(option: str, text: str | None) -> float | int | None:
+    if text is None:
+        return None
+    if _SECONDS.fullmatch(text.strip()):
+        return float(text)
+    try:
+        return parse_start(text)
+    except ConfigError:
+        raise ConfigError(
+            f"{option} {text!r}: write seconds from the drive's start, such as 12.5, or a time "
+            "such as 2026-03-01T09:30:00Z"
+        ) from None
+
+
+@dataclass(frozen=True, slots=True)
 class OpenOptions:
     """How to open a drive.
 
@@ -120,6 +187,11 @@ class OpenOptions:
         start_ns: absolute time of the drive's first frame, ns since 1970 UTC, for a drive whose
             clock is not UTC.
         longitude_deg, zone: where the drive was; None for the source's value.
+        times: which stretch of the drive is used.
+        calibration: file of the stereo pair's calibration; None for the drive's own.
+        field_of_view_deg: horizontal field of view of rectified images; None for the largest.
+        mask: image that is black where the robot sees itself; None for none.
+        left, right: topics of a bag's images; None finds them by their names.
 
     Raises:
         ConfigError: the longitude is outside ±180°, the zone is unknown, the tolerance negative.
@@ -134,6 +206,12 @@ class OpenOptions:
     start_ns: int | None = None
     longitude_deg: float | None = None
     zone: str | None = None
+    times: TimeRange = field(default_factory=TimeRange)
+    calibration: Path | None = None
+    field_of_view_deg: Annotated[float | None, Meta(ge=10, le=170)] = None
+    mask: Path | None = None
+    left: str | None = None
+    right: str | None = None
 
     def __post_init__(self) -> None:
         check_longitude(self.longitude_deg)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from engram.errors import InputError, SequenceError
 from engram.geometry import SE3
 from engram.monitor import write_whole
-from engram.sequences.listing import nanoseconds, read_text, seconds_as_ns
+from engram.sequences.listing import nanoseconds, seconds_as_ns
+from engram.untrusted import read_text
 
 T = TypeVar("T")
 

@@ -1,0 +1,66 @@
+"""Kalibr's `camchain.yaml`: two pinhole cameras with radtan or equidistant lenses.
+
+Source: Kalibr wiki, "Yaml formats": intrinsics [fu, fv, pu, pv]; ``T_cn_cnm1`` takes points from
+the previous camera of the chain to this one; ``T_cam_imu`` from the IMU to the camera.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from engram.calibration.entries import (
+    coefficients,
+    distortion_model,
+    entry,
+    numbers,
+    transform,
+    whole,
+)
+from engram.errors import CalibrationError
+from engram.geometry.rectification import RawCamera, RawStereoCalibration
+
+
+def is_camchain(entries: dict[str, Any]) -> bool:
+    """Whether the file holds cameras of a chain."""
+    return isinstance(entries.get("cam0"), dict)
+
+
+def parse_camchain(
+    entries: dict[str, Any],
+) -> tuple[RawStereoCalibration, tuple[str, str] | None]:
+    """The first two cameras of a chain, cam0 left, and their image topics.
+
+    Raises:
+        CalibrationError: an entry is missing, malformed, or of a kind that is not supported.
+    """
+    sides = [entry(entries, name) for name in ("cam0", "cam1")]
+    lenses = []
+    for name, side in zip(("cam0", "cam1"), sides, strict=True):
+        if not isinstance(side, dict):
+            raise CalibrationError(f"{name} is not a table")
+        try:
+            lenses.append(_lens(side))
+        except CalibrationError as error:
+            raise CalibrationError(f"{name}: {error}") from error
+    left, right = sides
+    right_from_left = transform(right, "T_cn_cnm1")
+    left_from_rig = transform(left, "T_cam_imu") if "T_cam_imu" in left else None
+    topics = (str(left.get("rostopic", "")), str(right.get("rostopic", "")))
+    calibration = RawStereoCalibration(lenses[0], lenses[1], right_from_left, left_from_rig)
+    return calibration, topics if all(topics) else None
+
+
+def _lens(side: dict[str, Any]) -> RawCamera:
+    model = str(entry(side, "camera_model")).strip().lower()
+    if model != "pinhole":
+        raise CalibrationError(
+            f"camera_model is {model[:40]!r}, only 'pinhole' is supported; calibrate again with "
+            "--models pinhole-radtan, or pinhole-equi for a wide lens"
+        )
+    fx, fy, cx, cy = numbers(side, "intrinsics", {4})
+    width, height = (whole(value) for value in numbers(side, "resolution", {2}))
+    lens = coefficients(
+        distortion_model(entry(side, "distortion_model")),
+        lambda counts: numbers(side, "distortion_coeffs", counts),
+    )
+    return RawCamera(fx, fy, cx, cy, width, height, *lens)

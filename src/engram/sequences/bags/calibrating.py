@@ -1,0 +1,185 @@
+"""The calibration that a bag carries: `CameraInfo` and `/tf_static`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from engram.calibration import Cameras
+from engram.calibration.camera_info import CameraInfo, cameras_of_infos
+from engram.calibration.entries import coefficients, distortion_model
+from engram.errors import CalibrationError, InputError
+from engram.geometry import SE3
+from engram.sequences.bags.bag import Bag
+from engram.sequences.bags.messages import Decoder, same_type
+from engram.sequences.bags.records import DamageError
+from engram.sequences.bags.topics import StereoTopics, info_topic
+
+_INFO = "sensor_msgs/msg/CameraInfo"
+_TF = "tf2_msgs/msg/TFMessage"
+STATIC = "/tf_static"
+# Frames that stand for the robot, the best first (REP 105, REP 120).
+BASES = ("base_link", "base_footprint", "base", "body", "imu_link")
+# Static transforms come once, or again and again from several publishers.
+_MOST_MESSAGES = 50
+
+
+class Transforms:
+    """The static transforms of a bag.
+
+    Attributes:
+        parents: child frame → its parent and parent_from_child, metres.
+    """
+
+    def __init__(self, parents: Mapping[str, tuple[str, SE3]]) -> None:
+        self.parents = dict(parents)
+
+    def __len__(self) -> int:
+        return len(self.parents)
+
+    def between(self, target: str, source: str) -> SE3 | None:
+        """target_from_source; None if the two frames are not connected."""
+        from_target, from_source = self._chain(target), self._chain(source)
+        for frame, root_from_target in from_target.items():
+            if frame in from_source:
+                return root_from_target.inverse() @ from_source[frame]
+        return None
+
+    def base_of(self, frame: str) -> str | None:
+        """The robot's frame above a camera's; None if there is none of a usual name."""
+        above = {name.rsplit("/", 1)[-1]: name for name in self._chain(frame)}
+        return next((above[base] for base in BASES if base in above), None)
+
+    def _chain(self, frame: str) -> dict[str, SE3]:
+        """Each frame above, with ancestor_from_frame; loops end."""
+        frame = frame.lstrip("/")
+        chain = {frame: SE3.identity()}
+        while frame in self.parents:
+            parent, parent_from_frame = self.parents[frame]
+            if parent in chain:
+                break
+            chain[parent] = parent_from_frame @ chain[frame]
+            frame = parent
+        return chain
+
+
+def read_transforms(bag: Bag, decoder: Decoder) -> Transforms:
+    """The static transforms; those that cannot be used are left out."""
+    parents: dict[str, tuple[str, SE3]] = {}
+    for message in islice(_messages(bag, decoder, STATIC, _TF), _MOST_MESSAGES):
+        for one in message.transforms:
+            q, t = one.transform.rotation, one.transform.translation
+            try:
+                parent_from_child = SE3.from_quaternion([q.w, q.x, q.y, q.z], [t.x, t.y, t.z])
+            except InputError:
+                bag.note(f"{STATIC}: {one.child_frame_id[:60]!r} has no valid rotation")
+                continue
+            parents[one.child_frame_id.lstrip("/")] = (
+                one.header.frame_id.lstrip("/"),
+                parent_from_child,
+            )
+    return Transforms(parents)
+
+
+def read_infos(
+    bag: Bag, decoder: Decoder, stereo: StereoTopics
+) -> tuple[CameraInfo, CameraInfo] | None:
+    """The first `CameraInfo` of each camera; None if the bag lacks one.
+
+    Raises:
+        CalibrationError: one is malformed.
+    """
+    infos = []
+    for image in (stereo.left, stereo.right):
+        topic = info_topic(image, bag.topics)
+        message = None if topic is None else next(_messages(bag, decoder, topic, _INFO), None)
+        if topic is None or message is None:
+            return None
+        infos.append(_info(topic, message))
+    return infos[0], infos[1]
+
+
+def read_cameras(
+    bag: Bag, decoder: Decoder, stereo: StereoTopics, field_of_view_deg: float | None
+) -> Cameras:
+    """The stereo pair as the bag describes it.
+
+    Raises:
+        CalibrationError: it does not, or what it says is not of a stereo pair.
+    """
+    infos = read_infos(bag, decoder, stereo)
+    if infos is None:
+        raise CalibrationError(
+            f"{bag.path}: has no CameraInfo for {stereo.left} and {stereo.right}; give the "
+            "calibration with --calibration FILE (Kalibr's camchain.yaml, ROS's left.yaml beside "
+            "right.yaml, OpenCV's, or calibration.toml)"
+        )
+    left, right = infos
+    transforms = read_transforms(bag, decoder)
+    base = transforms.base_of(left.frame)
+    try:
+        return cameras_of_infos(
+            left,
+            right,
+            rectified=stereo.are_rectified,
+            right_from_left=transforms.between(right.frame, left.frame),
+            left_from_rig=None if base is None else transforms.between(left.frame, base),
+            field_of_view_deg=field_of_view_deg,
+        )
+    except InputError as error:
+        names = [str(info_topic(one, bag.topics)) for one in (stereo.left, stereo.right)]
+        raise CalibrationError(f"{bag.path}: {' and '.join(names)}: {error}") from error
+
+
+def _messages(bag: Bag, decoder: Decoder, topic: str, kind: str) -> Iterator[Any]:
+    """The messages of a topic that can be decoded; ends with the last one."""
+    stated = bag.topics.get(topic)
+    if stated is None or same_type(stated.type) != kind:
+        return
+    for number, record in enumerate(bag.records({topic}), start=1):
+        try:
+            yield decoder.message(record, kind)
+        except DamageError as error:
+            bag.note(f"{topic}: message {number} {error}")
+        if number == stated.count:
+            return
+
+
+def _info(topic: str, message: Any) -> CameraInfo:
+    names = ("d", "k", "r", "p") if hasattr(message, "k") else ("D", "K", "R", "P")
+    d, k, r, p = (np.asarray(getattr(message, name), dtype=np.float64) for name in names)
+    try:
+        if not all(np.isfinite(one).all() for one in (d, k, r, p)):
+            raise CalibrationError("has a number that is not finite")
+        if max(message.binning_x, message.binning_y) > 1 or message.roi.width:
+            raise CalibrationError(
+                "states binning or a region of interest, which is not supported; give the pair's "
+                "calibration with --calibration FILE"
+            )
+        model, coefficients_ = coefficients(
+            distortion_model(message.distortion_model), lambda counts: _counted(d, counts)
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{topic}: {error}") from error
+    return CameraInfo(
+        int(message.width),
+        int(message.height),
+        model,
+        coefficients_,
+        k.reshape(3, 3),
+        r.reshape(3, 3),
+        p.reshape(3, 4),
+        str(message.header.frame_id),
+    )
+
+
+def _counted(d: Any, counts: set[int]) -> list[float]:
+    if len(d) == 0:  # drivers of rectified cameras leave it empty
+        return [0.0] * min(counts)
+    if len(d) not in counts:
+        wanted = " or ".join(map(str, sorted(counts)))
+        raise CalibrationError(f"D has {len(d)} coefficients, must be {wanted}")
+    return [float(one) for one in d]

@@ -1,0 +1,126 @@
+"""Image messages as grey images: raw in every usual encoding, or compressed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import SequenceError
+from engram.sequences.images import check_not_huge, decoded, grey
+from engram.sequences.options import Channel
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+
+Pixels = NDArray[Any]
+
+
+def _as_it_is(image: Pixels) -> Pixels:
+    return image
+
+
+def _bayer(code: int) -> Callable[[Pixels], Pixels]:
+    return lambda image: cv2.cvtColor(image, code)
+
+
+def _luma(first: int) -> Callable[[Pixels], Pixels]:
+    return lambda image: image[:, :, first]
+
+
+# Encoding → type of a value, values per pixel, and how OpenCV's grey or BGR follows.
+# Source: sensor_msgs/image_encodings.hpp.
+_ENCODINGS: Mapping[str, tuple[str, int, Callable[[Pixels], Pixels]]] = MappingProxyType(
+    {
+        **dict.fromkeys(("mono8", "8uc1"), ("u1", 1, _as_it_is)),
+        **dict.fromkeys(("mono16", "16uc1"), ("u2", 1, _as_it_is)),
+        **dict.fromkeys(("bgr8", "8uc3"), ("u1", 3, _as_it_is)),
+        **dict.fromkeys(("bgra8", "8uc4"), ("u1", 4, _as_it_is)),
+        "rgb8": ("u1", 3, lambda image: image[:, :, ::-1]),
+        "rgba8": ("u1", 4, lambda image: image[:, :, [2, 1, 0, 3]]),
+        "bgr16": ("u2", 3, _as_it_is),
+        "rgb16": ("u2", 3, lambda image: image[:, :, ::-1]),
+        **{name: ("u1", 2, _luma(1)) for name in ("yuv422", "uyvy")},
+        **{name: ("u1", 2, _luma(0)) for name in ("yuv422_yuy2", "yuyv")},
+        **{
+            f"bayer_{ours}{bits}": (f"u{bits // 8}", 1, _bayer(code))
+            for bits in (8, 16)
+            for ours, code in (
+                ("rggb", cv2.COLOR_BayerRGGB2BGR),
+                ("bggr", cv2.COLOR_BayerBGGR2BGR),
+                ("gbrg", cv2.COLOR_BayerGBRG2BGR),
+                ("grbg", cv2.COLOR_BayerGRBG2BGR),
+            )
+        },
+    }
+)
+
+
+def grey_of(
+    message: Any, where: str, size: tuple[int, int] | None = None, channel: Channel = Channel.GREY
+) -> NDArray[np.uint8]:
+    """The (h, w) uint8 grey image of a message.
+
+    Args:
+        message: `sensor_msgs/Image` or `CompressedImage`.
+        where: topic and place, for messages.
+        size: required width and height, px; None for any.
+        channel: of colour images.
+
+    Raises:
+        SequenceError: its encoding is unknown, or its bytes do not fit.
+        ConfigError: one colour channel is asked for and the image is grey.
+    """
+    if hasattr(message, "format"):
+        image = decoded(where, bytes(message.data), size)
+        encoding = str(message.format).split(";")[0].strip().lower()
+        if encoding.startswith("bayer_") and encoding in _ENCODINGS and image.ndim == 2:
+            image = _ENCODINGS[encoding][2](image)
+        return grey(where, image, channel)
+    encoding = str(message.encoding).strip().lower()
+    if encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
+        raise SequenceError(f"{where}: encoding is {encoding[:40]!r}; known are {known}")
+    kind, values, to_bgr = _ENCODINGS[encoding]
+    image = _array(message, where, np.dtype(kind), values, size)
+    return grey(where, np.ascontiguousarray(to_bgr(image)), channel)
+
+
+def size_of(message: Any, where: str) -> tuple[int, int]:
+    """Width and height of an image message, px.
+
+    Raises:
+        SequenceError: it cannot be decoded.
+    """
+    if hasattr(message, "format"):
+        height, width = decoded(where, bytes(message.data)).shape[:2]
+        return width, height
+    return int(message.width), int(message.height)
+
+
+def _array(
+    message: Any, where: str, kind: np.dtype[Any], values: int, size: tuple[int, int] | None
+) -> Pixels:
+    """The (h, w, values) array of a raw image, or (h, w) if it has one value a pixel."""
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    check_not_huge(where, (width, height))
+    if size is not None and (width, height) != size:
+        raise SequenceError(
+            f"{where}: the image is {width}×{height} px, the calibration says {size[0]}×{size[1]}"
+        )
+    row = width * values * kind.itemsize
+    data = np.asarray(message.data, dtype=np.uint8)
+    if not width * height or step < row or len(data) < step * (height - 1) + row:
+        raise SequenceError(
+            f"{where}: {len(data)} bytes in rows of {step} do not hold {width}×{height} px of "
+            f"{message.encoding!r}"
+        )
+    if len(data) < step * height:
+        data = np.pad(data, (0, step * height - len(data)))
+    rows = data[: step * height].reshape(height, step)[:, :row]
+    stored = kind.newbyteorder(">" if message.is_bigendian else "<")
+    pixels = np.ascontiguousarray(rows).view(stored).astype(kind, copy=False)
+    return pixels.reshape((height, width, values) if values > 1 else (height, width))

@@ -1,0 +1,219 @@
+"""A bag as a drive: `BagSequence`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.calibration import Cameras, read_calibration
+from engram.errors import SequenceError
+from engram.frontend import StereoPair
+from engram.geometry import StereoCamera
+from engram.graph.model import Clock
+from engram.sequences.bags.bag import Bag
+from engram.sequences.bags.calibrating import read_cameras
+from engram.sequences.bags.messages import Decoder, stamp_of
+from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
+from engram.sequences.bags.pictures import grey_of, size_of
+from engram.sequences.bags.records import DamageError
+from engram.sequences.bags.topics import StereoTopics, stereo_topics
+from engram.sequences.calibrating import check_no_view, read_mask
+from engram.sequences.euroc import YEAR_2000_NS
+from engram.sequences.image_sequence import rectified, with_options
+from engram.sequences.options import OpenOptions
+from engram.sequences.sequence import SequenceInfo
+
+# Images from which the tolerance of pairs is learnt.
+_LEARNT_FROM = 100
+_MOST_REASONS = 20
+
+
+def open_bag(path: Path, options: OpenOptions) -> BagSequence:
+    """A bag as a drive; see `BagSequence`."""
+    return BagSequence(path, options)
+
+
+class BagSequence:
+    """A `StereoSequence` over a ROS bag, read as a stream: memory does not grow with the bag.
+
+    Images that cannot be decoded, or have no partner of their instant, are left out and counted;
+    damaged parts of the file are reported in `lost`.
+
+    Attributes:
+        info: what is known of the drive as a whole.
+        cameras: its stereo pair, with the rectification of raw images.
+        camera: its one camera, rectified.
+        topics: where the images come from.
+        pairing: what became of the images, in the latest pass.
+
+    Raises:
+        SequenceError: the file cannot be read, or has no stereo pair of one instant.
+        CalibrationError: the calibration is missing, malformed, or does not fit.
+        MissingExtraError: the extra `bags` is not installed.
+        ConfigError: an option does not fit the bag.
+    """
+
+    def __init__(self, path: Path, options: OpenOptions) -> None:
+        self._options = options
+        self._bag = Bag(path)
+        self._decoder = Decoder(self._bag.is_ros1)
+        given = None if options.calibration is None else self._given(options)
+        self.topics = self._stereo_topics(given)
+        tolerance_ns, self._first_ns = self._learn()
+        self.pairing = Pairing(tolerance_ns)
+        self.cameras = given or self._calibrated(options)
+        self.camera: StereoCamera = self.cameras.camera
+        check_no_view(options, self.cameras)
+        self._mask = None if options.mask is None else read_mask(options.mask, self.cameras)
+        self._shift_ns = 0 if options.start_ns is None else options.start_ns - self._first_ns
+        clock = Clock.UTC if self._first_ns >= YEAR_2000_NS else Clock.RELATIVE
+        name = path.resolve().name.split(".")[0]
+        self.info = with_options(SequenceInfo(name, "bag", clock), options)
+        self._reasons: list[str] = []
+
+    @property
+    def frames(self) -> str:
+        """Which of the left images are used."""
+        return str(self._options.frames)
+
+    @property
+    def skipped(self) -> int:
+        """Images left out so far, in the latest pass, as damaged or of another size."""
+        return self.pairing.unusable
+
+    @property
+    def skipped_reasons(self) -> list[str]:
+        """Why; the first of them."""
+        return list(self._reasons)
+
+    @property
+    def lost(self) -> list[str]:
+        """What of the bag could not be read, in all passes; empty for a sound one."""
+        return [*self._bag.lost, *self._reasons]
+
+    def __len__(self) -> int:
+        """Number of pairs, at most: how many are of one instant is known after reading."""
+        counts = [self._bag.topics[name].count for name in (self.topics.left, self.topics.right)]
+        if None in counts:
+            counts = [sum(1 for _ in self._bag.records({self.topics.left}))]
+        return len(self._options.frames.indices(min(count or 0 for count in counts)))
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        """Decodes one pair at a time.
+
+        Raises:
+            SequenceError: no pair can be used.
+            ConfigError: one colour channel is asked for and the images are grey.
+        """
+        self.pairing = Pairing(self.pairing.tolerance_ns)
+        self._reasons.clear()
+        frames, times, used = self._options.frames, self._options.times, 0
+        sides = (self._shots(self.topics.left), self._shots(self.topics.right))
+        for left, right in pairs_of(*sides, self.pairing):
+            if frames.stop is not None and left.number >= frames.stop:
+                break
+            if times.is_after(left.stamp_ns, self._first_ns):
+                break
+            if right is None or left.number not in frames.indices(left.number + 1):
+                continue
+            if times.is_before(left.stamp_ns, self._first_ns):
+                continue
+            pair = self._decoded(left, right)
+            if pair is not None:
+                used += 1
+                yield pair
+        if not used:
+            why = f"; first fault: {self._reasons[0]}" if self._reasons else ""
+            raise SequenceError(
+                f"{self._bag.path}: no pair can be used of {self.pairing.left} left and "
+                f"{self.pairing.right} right images{why}"
+            )
+
+    def _decoded(self, left: Shot[Any], right: Shot[Any]) -> StereoPair | None:
+        """The pair; None if an image of it is damaged or does not fit."""
+        table = self.cameras.rectification
+        try:
+            image = self._image(self.topics.left, left, table and table.left)
+            other = self._image(self.topics.right, right, table and table.right)
+        except SequenceError as error:
+            self.pairing.unusable += 1
+            self.pairing.paired -= 1
+            if len(self._reasons) < _MOST_REASONS:
+                self._reasons.append(str(error))
+            return None
+        return StereoPair(left.stamp_ns + self._shift_ns, image, other, self.camera, self._mask)
+
+    def _image(self, topic: str, shot: Shot[Any], table: Any) -> NDArray[np.uint8]:
+        where = f"{topic}: image {shot.number}"
+        if isinstance(shot.content, str):
+            raise SequenceError(f"{where} {shot.content}")
+        size = (self.camera.width, self.camera.height)
+        image = grey_of(shot.content, where, size, self._options.channel)
+        return image if table is None else rectified(image, table)
+
+    def _shots(self, topic: str) -> Iterator[Shot[Any]]:
+        """The images of a topic, decoded to messages but not to pixels."""
+        kind = self._bag.topics[topic].type
+        for number, record in enumerate(self._bag.records({topic})):
+            try:
+                message = self._decoder.message(record, kind)
+            except DamageError as error:
+                yield Shot(number, record.received_ns, str(error))
+            else:
+                yield Shot(number, stamp_of(message, record), message)
+
+    def _learn(self) -> tuple[int, int]:
+        """Tolerance of pairs and first stamp of the left images, ns."""
+        stamps = [
+            [
+                shot.stamp_ns
+                for shot in islice(self._shots(topic), _LEARNT_FROM)
+                if not isinstance(shot.content, str)
+            ]
+            for topic in (self.topics.left, self.topics.right)
+        ]
+        for topic, found in zip((self.topics.left, self.topics.right), stamps, strict=True):
+            if not found:
+                first = next(self._shots(topic), None)
+                why = "no image can be read" if first is None else f"image 0 {first.content}"
+                raise SequenceError(f"{self._bag.path}: {topic}: {why}")
+        try:
+            most_ns = self._options.pair_tolerance_ns
+            tolerance_ns = learnt_tolerance(stamps[0], stamps[1], most_ns)
+        except SequenceError as error:
+            raise SequenceError(f"{self._bag.path}: {self.topics}: {error}") from error
+        return tolerance_ns, min(stamps[0])
+
+    def _stereo_topics(self, given: Cameras | None) -> StereoTopics:
+        left, right = self._options.left, self._options.right
+        stated = given.topics if given is not None else None
+        if left is None and right is None and stated and set(stated) <= self._bag.topics.keys():
+            left, right = stated
+        try:
+            return stereo_topics(self._bag.topics, left, right)
+        except SequenceError as error:
+            raise SequenceError(f"{self._bag.path}: {error}") from error
+
+    def _given(self, options: OpenOptions) -> Cameras:
+        assert options.calibration is not None
+        return read_calibration(
+            options.calibration,
+            size=self._size(),
+            field_of_view_deg=options.field_of_view_deg,
+        )
+
+    def _calibrated(self, options: OpenOptions) -> Cameras:
+        return read_cameras(self._bag, self._decoder, self.topics, options.field_of_view_deg)
+
+    def _size(self) -> tuple[int, int]:
+        """Size of the first left image, px."""
+        topics = self._stereo_topics(None)
+        first = next(self._shots(topics.left), None)
+        if first is None or isinstance(first.content, str):
+            raise SequenceError(f"{self._bag.path}: {topics.left}: no image can be read")
+        return size_of(first.content, topics.left)
