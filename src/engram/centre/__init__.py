@@ -1,1 +1,1 @@
-"""Maps in PostgreSQL, for a fleet map on a server."""
+"""The fleet's shared map as a service."""

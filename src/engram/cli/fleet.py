@@ -77,7 +77,7 @@ def merge(
         merge_maps(
             centre,
             robots,
-            _merging(resolved),
+            merging_of(resolved),
             Heard(),
             settings=resolved.of_robot(),
             dry_run=dry_run,
@@ -102,7 +102,8 @@ def _merges(reports: list[MergeReport]) -> dict[str, Any]:
     return {"merges": [report.to_dict() for report in reports]}
 
 
-def _merging(settings: AllSettings) -> MergeOptions:
+def merging_of(settings: AllSettings) -> MergeOptions:
+    """How the settings say that maps are merged."""
     from engram.fleet.merge import MergeOptions
 
     given = settings.merge
@@ -277,7 +278,7 @@ def build(
     from engram.robot import RobotOptions
 
     resolved = settings.read()
-    merging = _merging(resolved)
+    merging = merging_of(resolved)
     how, seed = _grouping(grouping)
     asked = BuildOptions(
         workers=workers,

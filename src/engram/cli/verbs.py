@@ -11,6 +11,8 @@ import typer
 from typer.core import TyperGroup
 
 from engram.cli import moved
+from engram.cli.agent import agent_group
+from engram.cli.centre import centre_group
 from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
 from engram.cli.fleet import build, download, merge
@@ -34,6 +36,9 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "Settings": {"settings": settings},
 }
 VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}
+
+# Verbs with verbs of their own.
+NESTED: dict[str, typer.Typer] = {"centre": centre_group, "agent": agent_group}
 
 # Where installed packages name verbs of their own: functions, or Typer groups of them.
 ENTRY_POINTS = "engram.verbs"
@@ -84,6 +89,9 @@ def register(app: typer.Typer) -> None:
     for title, verbs in GROUPS.items():
         for name, verb in verbs.items():
             app.command(name, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
+    for name, group in NESTED.items():
+        _all_tell_of_interruption(group)
+        app.add_typer(group, name=name, rich_help_panel="Service")
     for entry in sorted(entry_points(group=ENTRY_POINTS)):
         brought = entry.load()
         if not isinstance(brought, typer.Typer):

@@ -53,8 +53,12 @@ def publish_map(draft: Path, target: Path) -> None:
     SqliteDatabase.publish(draft, target)
 
 
-def check_file(location: Path | str | Place) -> CheckReport:
+def check_file(location: Path | str | Place, *, thin: bool = False) -> CheckReport:
     """Verifies every byte of a map file, even of one too damaged to open.
+
+    Args:
+        location: the map.
+        thin: whether nodes may lack their frames, as in a hand-in.
 
     Raises:
         NotAMapError: the file does not exist or is not a map.
@@ -65,4 +69,4 @@ def check_file(location: Path | str | Place) -> CheckReport:
     except MapCorruptError as error:
         return CheckReport((Problem("file", "", str(error)),), 0, 0, (), 0)
     with closing(database):
-        return check(database)
+        return check(database, thin=thin)

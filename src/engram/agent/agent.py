@@ -1,0 +1,312 @@
+"""The agent: hand-ins out, versions in, and a switch when the robot is parked.
+
+::
+
+    folder/
+      live/map.engram    the map that the robot drives with and adds to
+      base/map.engram    the last good one
+      next/map.engram    the wanted one, verified, until the robot is parked
+      agent.sqlite       outbox, parts that arrived, facts
+      key                the robot's private key
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from engram.agent.fetching import Fetch
+from engram.agent.link import CentreRefusedError, Link, Unreachable, new_client
+from engram.agent.sending import FAILED, Outbox
+from engram.agent.settings import AgentSettings
+from engram.agent.state import AgentState
+from engram.errors import InputError, MapError, StorageFullError
+from engram.files import WriterLock
+from engram.maps import Map, check_file, copy_map
+from engram.monitor import write_whole
+from engram.transfers.signing import Signer, enrolment_text
+
+if TYPE_CHECKING:
+    import httpx
+
+MAP = "map.engram"
+
+
+def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | None = None) -> str:
+    """Enrols a robot with a centre; the key pair is made here and never leaves the folder.
+
+    Returns:
+        The name of its map.
+
+    Raises:
+        InputError: the folder has an agent of another centre already.
+        CentreRefusedError: the code is not valid.
+        Unreachable: the centre does not answer.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    key = folder / "key"
+    if not key.exists():
+        with write_whole(key) as draft:
+            draft.touch(mode=0o600)
+            draft.write_bytes(Signer.new_key())
+    signer = Signer(key.read_bytes())
+    link = Link(client or new_client(url), "", signer, None, lambda _: None)
+    body = {
+        "code": code,
+        "name": name,
+        "public_key": signer.public_key.hex(),
+        "signature": signer.sign(enrolment_text(code)).hex(),
+    }
+    answer = link.bare("/v1/robots/enrol", body)
+    state = AgentState(folder / "agent.sqlite")
+    state.remember(url=url, robot=answer["robot"], map=answer["maps"][0], name=name)
+    state.close()
+    return str(answer["maps"][0])
+
+
+class Agent:
+    """One robot's agent. A context manager.
+
+    Args:
+        folder: of an enrolled robot.
+        settings: limits.
+        client: of the centre; None for the address at which it enrolled.
+        wait: waits some seconds, for the cap of the link.
+        chance: uniform in [0, 1), for the jitter of retries.
+
+    Raises:
+        InputError: the robot is not enrolled.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: AgentSettings | None = None,
+        *,
+        client: httpx.Client | None = None,
+        wait: Callable[[float], object] = lambda _: None,
+        chance: Callable[[], float] = random.random,
+    ) -> None:
+        if not (folder / "agent.sqlite").exists():
+            raise InputError(
+                f"{folder} has no agent; enrol it: engram agent enrol {folder} URL CODE"
+            )
+        self.folder = folder
+        self.settings = settings or AgentSettings()
+        self.state = AgentState(folder / "agent.sqlite")
+        self._chance = chance
+        self.live = folder / "live" / MAP
+        for part in ("live", "base", "next"):
+            (folder / part).mkdir(exist_ok=True)
+        signer = Signer((folder / "key").read_bytes())
+        self._map = self.state.fact("map")
+        self.link = Link(
+            client or new_client(self.state.fact("url")),
+            self.state.fact("robot"),
+            signer,
+            self.settings.bytes_per_s,
+            wait,
+        )
+        self.outbox = Outbox(self.state, self._map, self.live, self.settings.outbox_bytes)
+
+    def __enter__(self) -> Agent:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes its files."""
+        self.state.close()
+
+    def hand_in(self) -> str | None:
+        """Queues what the live map holds; call it after each drive. No link is needed.
+
+        Returns:
+            The hand-in; None if nothing is new, or there is no map yet.
+
+        Raises:
+            StorageFullError: the outbox is full; the live map keeps everything.
+        """
+        if not self.live.exists():
+            return None
+        return self.outbox.queue()
+
+    def drove(self, localised_share: float, driven_m: float) -> bool:
+        """Notes how the live map served on a drive; falls back if a new one does not serve.
+
+        Returns:
+            Whether it fell back to the last good map.
+        """
+        runs = self.state.fact("runs")
+        driven_m += self.state.fact("driven_m", 0.0)
+        self.state.remember(share=localised_share, driven_m=driven_m)
+        if driven_m < self.settings.judged_m or self.state.fact("good") == runs:
+            return False
+        if (
+            localised_share >= self.settings.least_share
+            or not (self.folder / "base" / MAP).exists()
+        ):
+            self.state.remember(good=runs)
+            return False
+        self.fall_back()
+        return True
+
+    def step(self) -> float:
+        """One round: report, send, fetch. Never raises for the link's sake.
+
+        Returns:
+            Seconds until the next round.
+        """
+        try:
+            busy = self._round()
+        except (Unreachable, CentreRefusedError, MapError) as error:
+            failures = self.state.fact("failures", 0) + 1
+            self.state.remember(failures=failures, trouble=str(error))
+            longest: float = self.settings.first_retry_s * 2.0 ** min(failures - 1, 40)
+            return min(longest, self.settings.longest_retry_s) * (0.5 + self._chance() / 2)
+        self.state.remember(failures=0, trouble="")
+        return 0.0 if busy else self.settings.idle_s
+
+    def _round(self) -> bool:
+        wanted = self.link.ask("PUT", f"/v1/maps/{self._map}/robots/me/report", self._report())
+        self.state.remember(wanted=wanted["version"], durable=wanted["durable_revision"])
+        busy = self.outbox.send(self.link, wanted["durable_revision"])
+        return self._fetch(wanted["revision"], wanted["version"]) or busy
+
+    def _report(self) -> dict[str, Any]:
+        fact = self.state.fact
+        kept = [row for row in self.state.outbox() if row["state"] != FAILED]
+        return {
+            "runs": fact("runs"),
+            "localised_share": fact("share"),
+            "driven_m": fact("driven_m"),
+            "outbox": len(kept),
+            "told": str(fact("trouble", ""))[:500],
+        }
+
+    def _fetch(self, revision: int, version: str) -> bool:
+        """Fetches the wanted version, unless it runs, is staged, or did not serve."""
+        known = {self.state.fact("runs"), self.state.fact("staged"), self.state.fact("rejected")}
+        if revision == 0 or version in known:
+            return False
+        path = self.folder / "next" / "download.engram"
+        fetch = Fetch(self.state, self._map, self.live)
+        if not fetch.fetch(self.link, revision, self.settings.download, path):
+            return False
+        self._stage(version, path)
+        return True
+
+    def _stage(self, version: str, download: Path) -> None:
+        """Puts the download into a copy of the live map, and verifies the copy."""
+        staged = self.folder / "next" / MAP
+        _clear(staged)
+        on = None
+        if self.live.exists():
+            from engram.fleet.download import update
+
+            with Map.open(self.live) as store:
+                on = store.revision
+            copy_map(self.live, staged)
+            update(download, staged)
+            problems = check_file(staged).problems
+            if problems:
+                raise MapError(f"the updated map has {len(problems)} faults: {problems[0]}")
+        else:
+            download.replace(staged)
+        self.state.remember(staged=version, staged_on=on)
+
+    def switch(self) -> bool:
+        """Switches to the staged version; call it when the robot is parked.
+
+        The live map's lock is taken meanwhile. A kill leaves the one map or the other.
+
+        Returns:
+            Whether it switched; False if nothing is staged.
+
+        Raises:
+            MapLockedError: the live process still writes to the map.
+        """
+        staged, version = self.folder / "next" / MAP, self.state.fact("staged")
+        if version is None:
+            return False
+        if not staged.exists():  # killed after the rename, before this was noted
+            self._installed(version)
+            return True
+        lock = WriterLock(self.live)
+        try:
+            if self._moved_on():  # a drive came in between: its nodes are not in the copy
+                self.state.remember(staged=None)
+                return False
+            if self.live.exists():
+                self._keep_as_base()
+            staged.replace(self.live)
+        finally:
+            lock.release()
+        self._installed(version)
+        return True
+
+    def fall_back(self) -> None:
+        """Goes back to the last good map; what the other one holds beyond it is handed in first."""
+        base = self.folder / "base" / MAP
+        if not base.exists():
+            raise InputError(f"{self.folder} has no earlier map to fall back to")
+        with suppress(StorageFullError):
+            self.hand_in()
+        lock = WriterLock(self.live)
+        try:
+            base.replace(self.live)
+        finally:
+            lock.release()
+        rejected = self.state.fact("runs")
+        self.state.remember(
+            rejected=rejected, runs=self.state.fact("runs_before"), share=None, driven_m=0.0
+        )
+
+    def status(self) -> dict[str, Any]:
+        """The state, as ``engram agent status --json`` prints it."""
+        names = (
+            "robot", "name", "url", "map", "runs", "wanted", "staged", "rejected", "durable",
+            "share", "driven_m", "failures", "trouble",
+        )  # fmt: skip
+        outbox = [
+            {key: row[key] for key in ("id", "state", "bytes", "revision", "error")}
+            for row in self.state.outbox()
+        ]
+        return {**{name: self.state.fact(name) for name in names}, "outbox": outbox}
+
+    def _moved_on(self) -> bool:
+        if not self.live.exists():
+            return False
+        with Map.open(self.live) as store:
+            return bool(store.revision != self.state.fact("staged_on"))
+
+    def _keep_as_base(self) -> None:
+        base = self.folder / "base" / MAP
+        draft = base.with_name("draft.engram")
+        _clear(draft)
+        try:
+            os.link(self.live, draft)
+        except OSError:
+            shutil.copyfile(self.live, draft)
+        draft.replace(base)
+
+    def _installed(self, version: str) -> None:
+        self.state.remember(
+            runs_before=self.state.fact("runs"),
+            runs=version,
+            staged=None,
+            share=None,
+            driven_m=0.0,
+        )
+
+
+def _clear(path: Path) -> None:
+    """Removes a map file with what SQLite left beside it."""
+    for one in path.parent.glob(f"{path.name}*"):
+        one.unlink()

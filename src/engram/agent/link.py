@@ -1,0 +1,176 @@
+"""The link to the centre: tokens, problems, bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from engram.errors import EngramError, MissingExtraError
+from engram.transfers import PartHash, Unbundler, bundle
+from engram.transfers.signing import Signer, token_text
+
+if TYPE_CHECKING:
+    import httpx
+
+BUNDLE = "application/vnd.engram.bundle"
+_PIECE = 65536
+
+
+class CentreRefusedError(EngramError):
+    """The centre answered with a problem.
+
+    Attributes:
+        status: HTTP's.
+    """
+
+    def __init__(self, status: int, detail: str) -> None:
+        super().__init__(f"the centre refuses ({status}): {detail}")
+        self.status = status
+
+
+class Unreachable(EngramError):  # noqa: N818 - a state of the link, not a fault
+    """The centre cannot be reached now, or broke off."""
+
+
+def new_client(url: str, **options: Any) -> httpx.Client:
+    """A client of a centre.
+
+    Raises:
+        MissingExtraError: httpx is not installed.
+    """
+    try:
+        import httpx
+    except ImportError as error:
+        raise MissingExtraError(
+            "the agent needs httpx: pip install 'engram-localisation[agent]'"
+        ) from error
+    return httpx.Client(base_url=url, timeout=30.0, **options)
+
+
+class Link:
+    """Requests of one robot.
+
+    Args:
+        client: of the centre.
+        robot: the robot's id.
+        signer: its key.
+        bytes_per_s: cap of both directions; None for none.
+        wait: waits some seconds.
+    """
+
+    def __init__(
+        self,
+        client: httpx.Client,
+        robot: str,
+        signer: Signer,
+        bytes_per_s: float | None,
+        wait: Callable[[float], object],
+    ) -> None:
+        self._client = client
+        self._robot = robot
+        self._signer = signer
+        self._bytes_per_s = bytes_per_s
+        self._wait = wait
+        self._token = ""
+        self.sent_bytes = 0
+        self.received_bytes = 0
+
+    def ask(self, method: str, path: str, body: Any = None) -> Any:
+        """One request with JSON in and out.
+
+        Raises:
+            CentreRefusedError: the centre answers with a problem.
+            Unreachable: there is no answer.
+        """
+        return self._ask(method, path, lambda: {"json": body} if body is not None else {})
+
+    def send(self, path: str, parts: Callable[[], Iterator[bytes]]) -> Any:
+        """Sends parts in one bundle; what arrived stays there whatever happens then."""
+        headers = {"Content-Type": BUNDLE}
+        return self._ask(
+            "POST", path, lambda: {"content": self._paced(bundle(parts())), "headers": headers}
+        )
+
+    def receive(self, path: str, wanted: list[PartHash]) -> Iterator[tuple[PartHash, bytes]]:
+        """Parts of a bundle as they arrive, verified.
+
+        Raises:
+            CentreRefusedError: the centre answers with a problem.
+            Unreachable: the link broke; what was yielded is whole.
+        """
+        import httpx
+
+        body = {"want": [one.hex() for one in wanted]}
+        opened = Unbundler()
+        try:
+            with self._client.stream("POST", path, json=body, headers=self._headers()) as answer:
+                if answer.status_code >= 400:
+                    answer.read()
+                    self._refuse(answer)
+                for piece in answer.iter_bytes(_PIECE):
+                    self.received_bytes += len(piece)
+                    yield from opened.feed(piece)
+                    self._pace(len(piece))
+        except httpx.HTTPError as error:
+            raise Unreachable(f"the link broke: {error!r}") from error
+
+    def _ask(self, method: str, path: str, options: Callable[[], dict[str, Any]]) -> Any:
+        answer = self._request(method, path, options())
+        if answer.status_code == 401:
+            self._token = ""
+            answer = self._request(method, path, options())
+        self._refuse(answer)
+        return answer.json() if answer.content else None
+
+    def _request(self, method: str, path: str, options: dict[str, Any]) -> httpx.Response:
+        import httpx
+
+        headers = {**options.pop("headers", {}), **self._headers()}
+        try:
+            answer = self._client.request(method, path, headers=headers, **options)
+        except httpx.HTTPError as error:
+            raise Unreachable(f"the centre cannot be reached: {error!r}") from error
+        self.received_bytes += len(answer.content)
+        self.sent_bytes += int(answer.request.headers.get("content-length", 0))
+        return answer
+
+    def _headers(self) -> dict[str, str]:
+        """With a token, asked for if there is none: the centre's nonce, signed."""
+        if not self._token:
+            nonce = self.bare("/v1/token/nonce", {"robot": self._robot})["nonce"]
+            signature = self._signer.sign(token_text(self._robot, nonce)).hex()
+            body = {"robot": self._robot, "nonce": nonce, "signature": signature}
+            self._token = self.bare("/v1/token", body)["token"]
+        return {"Authorization": f"Bearer {self._token}"}
+
+    def bare(self, path: str, body: Any) -> Any:
+        """One request without a token."""
+        import httpx
+
+        try:
+            answer = self._client.post(path, json=body)
+        except httpx.HTTPError as error:
+            raise Unreachable(f"the centre cannot be reached: {error!r}") from error
+        self._refuse(answer)
+        return answer.json()
+
+    def _paced(self, pieces: Iterator[bytes]) -> Iterator[bytes]:
+        for piece in pieces:
+            yield piece
+            self.sent_bytes += len(piece)
+            self._pace(len(piece))
+
+    def _pace(self, size: int) -> None:
+        if self._bytes_per_s is not None:
+            self._wait(size / self._bytes_per_s)
+
+    @staticmethod
+    def _refuse(answer: httpx.Response) -> None:
+        if answer.status_code in {502, 503, 504}:
+            raise Unreachable(f"the centre is not there now ({answer.status_code})")
+        if answer.status_code >= 400:
+            try:
+                detail = str(answer.json().get("detail", ""))
+            except (ValueError, AttributeError):
+                detail = answer.text[:200]
+            raise CentreRefusedError(answer.status_code, detail)

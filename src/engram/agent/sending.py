@@ -1,0 +1,166 @@
+"""The outbox: hand-ins wait in it until the centre keeps them for good."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from engram.agent.link import CentreRefusedError, Link
+from engram.agent.state import AgentState
+from engram.errors import StorageFullError
+from engram.transfers import Manifest, PartHash, Split, split
+from engram.transfers.manifest import decode_manifest, encode_manifest
+
+QUEUED, SENT, SETTLED, FAILED = "queued", "sent", "settled", "failed"
+_ENDED_BADLY = {"failed", "cancelled"}
+
+
+class Outbox:
+    """Queues hand-ins and sends them.
+
+    Args:
+        state: of the agent.
+        name: of the map at the centre.
+        live: the robot's map.
+        limit_bytes: disk that the outbox may take.
+    """
+
+    def __init__(self, state: AgentState, name: str, live: Path, limit_bytes: int) -> None:
+        self._state = state
+        self._map = name
+        self._live = live
+        self._limit_bytes = limit_bytes
+        self._whole: Split | None = None
+
+    def queue(self) -> str | None:
+        """Queues what the robot's map holds now; None if nothing is new since the last time.
+
+        Raises:
+            StorageFullError: the outbox would take more than it may; nothing is lost, the map
+                holds it all.
+        """
+        taken = split(self._live, known=self._state.shared() | self._queued())
+        key = taken.manifest.id
+        if key == self._state.fact("last_queued"):
+            return None
+        names = [*taken.pages, *taken.blobs]
+        parts = dict(zip(names, taken.parts(names), strict=True))
+        kept = sum(one["bytes"] for one in self._state.outbox())
+        size = sum(map(len, parts.values()))
+        if kept + size > self._limit_bytes:
+            raise StorageFullError(
+                f"the outbox would take {kept + size} bytes of {self._limit_bytes}: it waits for "
+                "the link, or for a larger outbox_bytes"
+            )
+        self._state.queue(key, encode_manifest(taken.manifest), parts)
+        self._state.remember(last_queued=key)
+        return key
+
+    def send(self, link: Link, durable_revision: int) -> bool:
+        """Sends what is queued, oldest first; whether anything changed.
+
+        Raises:
+            Unreachable: the link broke. What arrived need not be sent again.
+        """
+        changed = False
+        for row in self._state.outbox():
+            was = row["state"]
+            if row["state"] != QUEUED and not self._look(link, row, durable_revision):
+                row["state"] = QUEUED  # a centre of yesterday's backup does not know it
+            if row["state"] == QUEUED:
+                self._send(link, row)
+            changed = changed or was == QUEUED
+        return changed
+
+    def _queued(self) -> set[PartHash]:
+        return {
+            one for row in self._state.outbox() for one in self._state.waiting_hashes(row["id"])
+        }
+
+    def _send(self, link: Link, row: dict[str, Any]) -> None:
+        manifest = decode_manifest(row["manifest"])
+        answer = self._begin(link, manifest)
+        key = answer["id"]
+        while answer["wanted"]:
+            wanted = [PartHash(bytes.fromhex(one)) for one in answer["wanted"]]
+            before = answer["wanted"]
+            answer = link.send(f"/v1/handins/{key}/parts", partial(self._parts, row, wanted))
+            if answer["wanted"] and set(answer["wanted"]) == set(before):
+                error = f"{len(wanted)} parts are not on this robot any more"
+                self._state.set_outbox(row["id"], FAILED, None, error)
+                return
+        link.ask("POST", f"/v1/handins/{key}/complete")
+        self._state.share([*manifest.hashes(), *self._state.waiting_hashes(row["id"])])
+        self._state.remember(
+            base=row["manifest"].decode(), handin={**self._handins(), row["id"]: key}
+        )
+        self._state.set_outbox(row["id"], SENT, None, None)
+
+    def _begin(self, link: Link, manifest: Manifest) -> dict[str, Any]:
+        """Announces a hand-in: as what it adds to a manifest that the centre has, if it does."""
+        base = self._state.fact("base")
+        path = f"/v1/maps/{self._map}/handins"
+        if base is not None:
+            try:
+                return _as_dict(
+                    link.ask("POST", path, _json(manifest, decode_manifest(base.encode())))
+                )
+            except CentreRefusedError as error:
+                if error.status != 422:
+                    raise
+        return _as_dict(link.ask("POST", path, _json(manifest, None)))
+
+    def _parts(self, row: dict[str, Any], wanted: list[PartHash]) -> Iterator[bytes]:
+        """Parts from the outbox; what it did not keep, from the robot's map."""
+        for one in wanted:
+            body = self._state.waiting(row["id"], one)
+            if body is not None:
+                yield body
+                continue
+            for other in self._state.outbox():
+                body = body or self._state.waiting(other["id"], one)
+            if body is not None:
+                yield body
+                continue
+            if self._whole is None:
+                self._whole = split(self._live)
+            yield from self._whole.parts([one])
+
+    def _look(self, link: Link, row: dict[str, Any], durable_revision: int) -> bool:
+        """Looks what became of a hand-in; whether the centre knows it."""
+        key = self._handins().get(row["id"])
+        try:
+            answer = link.ask("GET", f"/v1/handins/{key}")
+        except CentreRefusedError as error:
+            if error.status == 404:
+                return False
+            raise
+        if answer["state"] == "open":
+            return False
+        revision = answer["revision"]
+        if answer["state"] == "merged" and revision is not None and revision <= durable_revision:
+            self._state.forget_outbox(row["id"])
+        elif answer["state"] in _ENDED_BADLY:
+            self._state.set_outbox(row["id"], FAILED, None, answer["error"])
+        elif answer["state"] in {"merged", "refused"}:
+            self._state.set_outbox(row["id"], SETTLED, revision, answer["error"])
+        return True
+
+    def _handins(self) -> dict[str, str]:
+        """Names of the hand-ins at the centre, by outbox entry."""
+        kept = {row["id"] for row in self._state.outbox()}
+        named: dict[str, str] = self._state.fact("handin", {})
+        return {one: key for one, key in named.items() if one in kept}
+
+
+def _json(manifest: Manifest, base: Manifest | None) -> dict[str, Any]:
+    import msgspec
+
+    wire: dict[str, Any] = msgspec.to_builtins(manifest.on_wire(base))
+    return wire
+
+
+def _as_dict(answer: Any) -> dict[str, Any]:
+    return dict(answer)

@@ -1,0 +1,1 @@
+"""Who may do what: roles, enrolment, tokens."""

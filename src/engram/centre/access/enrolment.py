@@ -1,0 +1,190 @@
+"""Robots enrol with a one-time code and a key pair of their own; tokens live for minutes.
+
+A robot proves who it is by signing a nonce of the centre: its clock plays no part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+
+from sqlalchemy import Connection, delete, select, update
+
+from engram.centre.access.roles import Role, Subject
+from engram.centre.errors import NotAllowedError, NotKnownError
+from engram.centre.service import Centre
+from engram.centre.settings import DAY_NS
+from engram.centre.store.audit import note
+from engram.centre.store.database import first_row, rows_of
+from engram.centre.store.schema import codes, grants, nonces, robots, subjects, tokens
+from engram.errors import InputError
+from engram.transfers.signing import check_signature, enrolment_text, token_text
+
+_S = 1_000_000_000
+
+
+def new_code(centre: Centre, name: str, follows: str, by: str) -> str:
+    """A code with which one robot enrols on a map."""
+    centre.map_path(name)
+    code = secrets.token_urlsafe(12)
+    now = centre.now_ns()
+    with centre.database.writing() as connection:
+        row = {
+            "hash": _hash(code),
+            "map": name,
+            "follows": follows,
+            "expires_ns": now + centre.settings.code_days * DAY_NS,
+            "used_by": None,
+        }
+        centre.database.add(connection, codes, [row])
+        note(connection, now, by, "code", name, follows=follows)
+    return code
+
+
+def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: bytes) -> Subject:
+    """Enrols a robot; again with the same code and key it is the same robot.
+
+    Raises:
+        NotAllowedError: the code is unknown, expired, or used by another robot, or the signature
+            is not of this key.
+    """
+    check_signature(public_key, signature, enrolment_text(code))
+    robot, now = hashlib.sha256(public_key).hexdigest()[:32], centre.now_ns()
+    with centre.database.writing() as connection:
+        row = first_row(connection, select(codes).where(codes.c.hash == _hash(code)))
+        if row is None or row["expires_ns"] < now or row["used_by"] not in {None, robot}:
+            raise NotAllowedError("the code is unknown, expired or used; ask for a new one")
+        if row["used_by"] is None:
+            connection.execute(
+                update(codes).where(codes.c.hash == row["hash"]).values(used_by=robot)
+            )
+            _add_robot(centre, connection, robot, name, public_key, row)
+            note(connection, now, robot, "enrol", row["map"], name=name)
+        return _subject(connection, robot)
+
+
+def _add_robot(
+    centre: Centre,
+    connection: Connection,
+    robot: str,
+    name: str,
+    public_key: bytes,
+    code: dict[str, object],
+) -> None:
+    known = {
+        "id": robot,
+        "kind": "robot",
+        "name": name,
+        "public_key": public_key,
+        "created_ns": centre.now_ns(),
+        "disabled": 0,
+    }
+    centre.database.add(connection, subjects, [known])
+    grant = {"subject": robot, "map": code["map"], "role": str(Role.ROBOT)}
+    centre.database.put(connection, grants, grant)
+    state = {
+        "robot": robot,
+        "map": code["map"],
+        "follows": code["follows"],
+        "report": "{}",
+        "reported_ns": None,
+    }
+    centre.database.add(connection, robots, [state])
+
+
+def new_nonce(centre: Centre, robot: str) -> str:
+    """What a robot must sign to get a token; the same answer whether or not it is known."""
+    nonce, now = secrets.token_hex(16), centre.now_ns()
+    with centre.database.writing() as connection:
+        connection.execute(delete(nonces).where(nonces.c.expires_ns < now))
+        known = first_row(connection, select(subjects.c.id).where(subjects.c.id == robot))
+        if known is not None:
+            expires_ns = now + centre.settings.nonce_s * _S
+            row = {"nonce": nonce, "subject": robot, "expires_ns": expires_ns}
+            centre.database.add(connection, nonces, [row])
+    return nonce
+
+
+def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
+    """A token for a robot that signed a nonce.
+
+    Raises:
+        NotAllowedError: the nonce is unknown, used or expired, the robot is disabled, or the
+            signature is not its.
+    """
+    now = centre.now_ns()
+    with centre.database.writing() as connection:
+        query = select(nonces).where(nonces.c.nonce == nonce, nonces.c.subject == robot)
+        row = first_row(connection, query)
+        connection.execute(delete(nonces).where(nonces.c.nonce == nonce))
+        known = first_row(connection, select(subjects).where(subjects.c.id == robot))
+    refused = NotAllowedError("no token: ask for a nonce again, and sign it with the robot's key")
+    if row is None or row["expires_ns"] < now or known is None or known["disabled"]:
+        raise refused
+    try:
+        check_signature(known["public_key"] or b"", signature, token_text(robot, nonce))
+    except InputError as error:
+        raise refused from error
+    return _issue(centre, robot, now + centre.settings.token_s * _S)
+
+
+def add_person(centre: Centre, name: str, map_name: str, role: Role) -> str:
+    """A token for a person, without end; `engram centre token` makes them."""
+    person, now = secrets.token_hex(16), centre.now_ns()
+    with centre.database.writing() as connection:
+        known = {
+            "id": person,
+            "kind": "person",
+            "name": name,
+            "public_key": None,
+            "created_ns": now,
+            "disabled": 0,
+        }
+        centre.database.add(connection, subjects, [known])
+        grant = {"subject": person, "map": map_name, "role": str(role)}
+        centre.database.put(connection, grants, grant)
+        note(connection, now, "shell", "token", map_name, name=name, role=str(role))
+    return _issue(centre, person, None)
+
+
+def subject_of(centre: Centre, token: str) -> Subject:
+    """Who holds a token.
+
+    Raises:
+        NotKnownError: nobody, or it has expired.
+    """
+    with centre.database.reading() as connection:
+        row = first_row(connection, select(tokens).where(tokens.c.hash == _hash(token)))
+        expired = row is not None and (row["expires_ns"] or 2**63) < centre.now_ns()
+        if row is None or expired:
+            raise NotKnownError("the token is not known or has expired; ask for a new one")
+        return _subject(connection, row["subject"])
+
+
+def disable(centre: Centre, robot: str, by: str) -> None:
+    """Takes all tokens of a robot or person, and gives no more."""
+    with centre.database.writing() as connection:
+        connection.execute(update(subjects).where(subjects.c.id == robot).values(disabled=1))
+        connection.execute(delete(tokens).where(tokens.c.subject == robot))
+        note(connection, centre.now_ns(), by, "disable", "", robot=robot)
+
+
+def _issue(centre: Centre, subject: str, expires_ns: int | None) -> str:
+    token = secrets.token_urlsafe(32)
+    with centre.database.writing() as connection:
+        connection.execute(delete(tokens).where(tokens.c.expires_ns < centre.now_ns()))
+        row = {"hash": _hash(token), "subject": subject, "expires_ns": expires_ns}
+        centre.database.add(connection, tokens, [row])
+    return token
+
+
+def _subject(connection: Connection, found: str) -> Subject:
+    row = first_row(connection, select(subjects).where(subjects.c.id == found))
+    if row is None or row["disabled"]:
+        raise NotKnownError("whose token this was is not known any more")
+    held = rows_of(connection, select(grants).where(grants.c.subject == found))
+    return Subject(found, row["name"], {one["map"]: Role(one["role"]) for one in held})
+
+
+def _hash(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode()).digest()

@@ -1,0 +1,75 @@
+"""The application: routes, problems, health."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import PlainTextResponse
+from sqlalchemy import func, select
+
+from engram import __version__
+from engram.centre.api import maps, robots, transfers
+from engram.centre.api.context import CentreHere
+from engram.centre.api.problems import add_problems
+from engram.centre.service import Centre
+from engram.centre.store.schema import artifacts, handins
+
+_ABOUT = """The fleet's shared map as a service: robots hand in what they saw, and download what the
+next mission needs. Errors are problem details (RFC 9457). Whatever is sent twice is done once."""
+
+
+def create_app(centre: Centre) -> FastAPI:
+    """The HTTP interface of a centre."""
+    app = FastAPI(title="Engram centre", version=__version__, description=_ABOUT, docs_url=None)
+    app.state.centre = centre
+    app.state.answers = Counter[int]()
+    app.state.seconds = 0.0
+    add_problems(app)
+    for part in (robots, maps, transfers):
+        app.include_router(part.router, prefix="/v1")
+    app.add_api_route("/v1/health", _health, tags=["service"])
+    app.add_api_route("/v1/metrics", _metrics, tags=["service"], response_class=PlainTextResponse)
+    app.middleware("http")(_counted)
+    return app
+
+
+async def _counted(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
+    started = time.perf_counter()
+    response = await answer(request)
+    request.app.state.seconds += time.perf_counter() - started
+    request.app.state.answers[response.status_code] += 1
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Cache-Control"] = response.headers.get("Cache-Control", "no-store")
+    return response
+
+
+def _health(centre: CentreHere) -> dict[str, Any]:
+    """Whether the service answers and reaches its database; nothing about maps."""
+    with centre.database.reading() as connection:
+        connection.execute(select(1))
+    return {"status": "ok", "version": __version__}
+
+
+def _metrics(request: Request, centre: CentreHere) -> str:
+    """Counters for Prometheus; no names of maps or robots."""
+    state = request.app.state
+    lines = ["# TYPE engram_answers_total counter"]
+    lines += [
+        f'engram_answers_total{{status="{code}"}} {count}'
+        for code, count in sorted(state.answers.items())
+    ]
+    lines += ["# TYPE engram_answer_seconds_total counter"]
+    lines += [f"engram_answer_seconds_total {state.seconds:.6f}"]
+    with centre.database.reading() as connection:
+        for table in (handins, artifacts):
+            query = select(table.c.state, func.count()).group_by(table.c.state)
+            lines += [f"# TYPE engram_{table.name} gauge"]
+            lines += [
+                f'engram_{table.name}{{state="{named}"}} {count}'
+                for named, count in connection.execute(query)
+            ]
+    return "\n".join(lines) + "\n"

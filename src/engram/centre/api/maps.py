@@ -1,0 +1,199 @@
+"""Routes: maps, history, refs, reverts, events."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+
+from engram.centre.access.roles import Role
+from engram.centre.api import models
+from engram.centre.api.context import Asking, CentreHere, page_of, takes
+from engram.centre.errors import ChangedError
+from engram.centre.refs import Refs
+from engram.centre.service import Centre
+from engram.centre.store.audit import events_after, note
+from engram.config import plain
+from engram.errors import InputError
+from engram.maps import Map, blame_node, map_log
+
+router = APIRouter(tags=["maps"])
+READERS = [takes(Role.VIEWER, Role.ROBOT)]
+PEOPLE = [takes(Role.VIEWER)]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+Cursor = Annotated[int | None, Query(ge=0, le=2**62)]
+Node = Annotated[str, Path(max_length=36, pattern=r"^[0-9a-fA-F-]+$")]
+_EVENTS_AT_ONCE = 100
+
+
+@router.get("/maps")
+def maps(centre: CentreHere, who: Asking) -> list[dict[str, Any]]:
+    """The maps of the one who asks."""
+    return [
+        {"name": row["name"], "durable_revision": row["durable_revision"]}
+        for row in centre.map_rows()
+        if who.role_on(row["name"]) is not None
+    ]
+
+
+@router.get("/maps/{name}", dependencies=READERS)
+def one_map(name: str, centre: CentreHere) -> dict[str, Any]:
+    """Counts and sizes of a map."""
+    with Map.open(centre.map_path(name)) as store:
+        return {"name": name, **plain(store.info()), "content_hash": store.content_hash()}
+
+
+@router.get("/maps/{name}/revisions", response_model=models.Page, dependencies=READERS)
+def revisions(name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit = 100) -> Any:
+    """The revisions, newest first."""
+    log = sorted(map_log(centre.map_path(name)), key=lambda one: -int(one["number"]))
+    rest = [one for one in log if cursor is None or one["number"] < cursor]
+    return page_of(rest[: limit + 1], limit, lambda one: one["number"])
+
+
+@router.get("/maps/{name}/diff", dependencies=PEOPLE)
+def diff(
+    name: str,
+    before: Annotated[int, Query(ge=0, le=2**53)],
+    after: Annotated[int, Query(ge=0, le=2**53)],
+    centre: CentreHere,
+) -> Any:
+    """What changed between two revisions."""
+    with Map.open(centre.map_path(name)) as store:
+        return plain(store.diff(before, after))
+
+
+@router.get("/maps/{name}/blame/{node}", dependencies=PEOPLE)
+def blame(name: str, node: Node, centre: CentreHere) -> dict[str, Any]:
+    """Where a node comes from; its UUID, or enough of its beginning."""
+    return blame_node(centre.map_path(name), node)
+
+
+@router.get("/maps/{name}/refs", response_model=list[models.Ref], dependencies=READERS)
+def refs(name: str, centre: CentreHere) -> list[dict[str, Any]]:
+    """The refs; `head` is the newest revision."""
+    return Refs(centre).all(name)
+
+
+@router.get("/maps/{name}/refs/{ref}", response_model=models.Ref, dependencies=READERS)
+def one_ref(name: str, ref: str, response: Response, centre: CentreHere) -> dict[str, Any]:
+    """One ref, with its version as ETag."""
+    row = Refs(centre).get(name, ref)
+    response.headers["ETag"] = _etag(row["version"])
+    return row
+
+
+@router.put(
+    "/maps/{name}/refs/{ref}", response_model=models.Ref, dependencies=[takes(Role.OPERATOR)]
+)
+def move_ref(
+    name: str,
+    ref: str,
+    body: models.RefMove,
+    response: Response,
+    centre: CentreHere,
+    who: Asking,
+    if_match: Annotated[str | None, Header(examples=['"3"'])] = None,
+) -> dict[str, Any]:
+    """Moves a ref that still has the version of `If-Match`; `"0"` makes a new one."""
+    version = Refs(centre).move(name, ref, body.revision, who.id, _version(if_match))
+    response.headers["ETag"] = _etag(version)
+    return Refs(centre).get(name, ref)
+
+
+@router.delete("/maps/{name}/refs/{ref}", status_code=204, dependencies=[takes(Role.OPERATOR)])
+def remove_ref(name: str, ref: str, centre: CentreHere, who: Asking) -> None:
+    """Removes a ref."""
+    Refs(centre).remove(name, ref, who.id)
+
+
+@router.post("/maps/{name}/reverts", dependencies=[takes(Role.OPERATOR)])
+def revert(
+    name: str,
+    body: models.RevertRequest,
+    centre: CentreHere,
+    who: Asking,
+    if_match: Annotated[str | None, Header(examples=['"9"'])] = None,
+) -> dict[str, Any]:
+    """Hides what a revision added, if `head` still has the version of `If-Match`.
+
+    Sent again after its answer was lost, it fails with 412 instead of reverting twice.
+    """
+    expected, path = _version(if_match), centre.map_path(name)
+    if not body.dry_run and expected is None:
+        raise ChangedError("say which head this is for: If-Match with the ETag of the ref head")
+    with Map.open(path) as store, store.writing():
+        if expected is not None and store.revision != expected:
+            raise ChangedError(f"head is revision {store.revision}, not {expected}: look again")
+        done = store.revert(
+            body.revision, author=who.name, message=body.message, dry_run=body.dry_run
+        )
+    if done.revision is not None:
+        with centre.database.writing() as connection:
+            detail = {"reverted": body.revision, "revision": done.revision.number}
+            note(connection, centre.now_ns(), who.id, "revert", name, **detail)
+    number = None if done.revision is None else done.revision.number
+    return {
+        "revision": number,
+        "dry_run": body.dry_run,
+        "lost_by_others": dict(done.lost_by_others),
+    }
+
+
+@router.get("/maps/{name}/events", dependencies=PEOPLE)
+def events(
+    name: str,
+    request: Request,
+    centre: CentreHere,
+    last_event_id: Annotated[int, Header(ge=0, le=2**62)] = 0,
+    follow: bool = True,
+) -> StreamingResponse:
+    """Changes of state as they come: server-sent events, numbered."""
+    found = _events(centre, name, last_event_id, request, follow)
+    return StreamingResponse(found, media_type="text/event-stream")
+
+
+async def _events(
+    centre: Centre, name: str, after: int, request: Request, follow: bool
+) -> AsyncIterator[str]:
+    def read() -> list[dict[str, Any]]:
+        with centre.database.reading() as connection:
+            return events_after(connection, after, name, _EVENTS_AT_ONCE)
+
+    yield ": events\n\n"
+    while True:
+        some = await run_in_threadpool(read)
+        for one in some:
+            after = one["number"]
+            yield f"id: {after}\nevent: {one['action']}\ndata: {json.dumps(one)}\n\n"
+        if some:
+            continue
+        if not follow or await request.is_disconnected():
+            return
+        await asyncio.sleep(centre.settings.poll_s)
+
+
+@router.get("/maps/{name}/audit", response_model=models.Page, dependencies=[takes(Role.ADMIN)])
+def audit(name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit = 100) -> Any:
+    """Every change of state, oldest first."""
+    with centre.database.reading() as connection:
+        rows = events_after(connection, cursor or 0, name, limit + 1)
+    return page_of(rows, limit, lambda one: one["number"])
+
+
+def _etag(version: int) -> str:
+    return f'"{version}"'
+
+
+def _version(if_match: str | None) -> int | None:
+    if if_match is None:
+        return None
+    text = if_match.strip().strip('"')
+    if not (text.isascii() and text.isdecimal()) or len(text) > 18:
+        raise InputError(f"If-Match is {if_match!r:.40}; send an ETag as it was given")
+    return int(text)

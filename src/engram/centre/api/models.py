@@ -1,0 +1,197 @@
+"""Bodies of requests and answers, as the documentation of the API shows them."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Hex64 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+_HASH = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
+_ID = "8c5f1d0e6b0d4b6fa7d5a3b1c2e4f607"
+
+
+class Body(BaseModel):
+    """Unknown fields are errors."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Enrolment(Body):
+    """A robot that enrols: it signs ``engram enrol CODE`` with the key that it names."""
+
+    code: Annotated[str, Field(max_length=100, examples=["q8vJx2mWc1-sT0aZ"])]
+    name: Annotated[str, Field(min_length=1, max_length=60, examples=["r1"])]
+    public_key: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", examples=[_HASH])]
+    signature: Annotated[str, Field(pattern=r"^[0-9a-f]{128}$", examples=[_HASH * 2])]
+
+
+class Enrolled(BaseModel):
+    """The robot as the centre knows it."""
+
+    robot: Annotated[str, Field(examples=[_ID])]
+    maps: Annotated[list[str], Field(examples=[["fleet"]])]
+
+
+class NonceRequest(Body):
+    """A robot that wants a token."""
+
+    robot: Annotated[str, Field(max_length=64, examples=[_ID])]
+
+
+class Nonce(BaseModel):
+    """What to sign: ``engram token ROBOT NONCE``."""
+
+    nonce: Annotated[str, Field(examples=[_ID])]
+
+
+class TokenRequest(NonceRequest):
+    """The signed nonce."""
+
+    nonce: Annotated[str, Field(max_length=64, examples=[_ID])]
+    signature: Annotated[str, Field(pattern=r"^[0-9a-f]{128}$", examples=[_HASH * 2])]
+
+
+class Token(BaseModel):
+    """Send it as ``Authorization: Bearer TOKEN``."""
+
+    token: Annotated[str, Field(examples=["3vQb0yJ8…"])]
+    expires_in_s: Annotated[int, Field(examples=[900])]
+
+
+class Page(BaseModel):
+    """Some of a list; ask again with `next` as cursor until it is null."""
+
+    items: list[dict[str, Any]]
+    next: Annotated[str | None, Field(examples=["41"])]
+
+
+class RefMove(Body):
+    """Where a ref is to stand."""
+
+    revision: Annotated[int, Field(ge=1, le=2**53, examples=[7])]
+
+
+class Ref(BaseModel):
+    """A ref. The version is its ETag."""
+
+    name: Annotated[str, Field(examples=["stable"])]
+    revision: Annotated[int, Field(examples=[7])]
+    version: Annotated[int, Field(examples=[3])]
+    moved_ns: int
+    moved_by: str
+
+
+class RevertRequest(Body):
+    """A revision whose additions are to be hidden."""
+
+    revision: Annotated[int, Field(ge=1, le=2**53, examples=[7])]
+    message: Annotated[str, Field(max_length=500, examples=["wrong clock"])] = ""
+    dry_run: bool = False
+
+
+class DownloadRequest(Body):
+    """What a mission needs: the options are those of ``engram download``."""
+
+    ref: Annotated[str, Field(max_length=60, examples=["stable"])] = "head"
+    options: Annotated[
+        dict[str, Any], Field(examples=[{"policy": "tod+paths", "start_h": 9.5, "end_h": 11.0}])
+    ] = {}
+
+
+class Artifact(BaseModel):
+    """A download; `report` has the forecast once it is ready."""
+
+    id: Annotated[str, Field(examples=[_ID])]
+    map: Annotated[str, Field(examples=["fleet"])]
+    revision: Annotated[int, Field(examples=[7])]
+    state: Annotated[str, Field(examples=["ready"])]
+    manifest: str | None
+    report: dict[str, Any] | None
+    error: str | None
+
+
+class Parts(Body):
+    """Parts that are wanted, by SHA-256."""
+
+    want: Annotated[list[Hex64], Field(max_length=20_000, examples=[[_HASH]])]
+
+
+class WirePages(Body):
+    """Pages of one table: the first `kept` of the base, then these."""
+
+    kept: Annotated[int, Field(ge=0, le=2**31)] = 0
+    pages: Annotated[list[Hex64], Field(max_length=2_000_000, examples=[[_HASH]])] = []
+
+
+class ManifestBody(Body):
+    """What a map consists of; see `engram.transfers`."""
+
+    format: Annotated[str, Field(max_length=40, examples=["engram-parts-1"])]
+    content_hash: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", examples=[_ID])]
+    revision: Annotated[int, Field(ge=0, le=2**53, examples=[2])]
+    tables: Annotated[
+        dict[str, WirePages], Field(examples=[{"sessions": {"kept": 0, "pages": [_HASH]}}])
+    ]
+    base: Hex64 | None = None
+
+
+class HandIn(BaseModel):
+    """A hand-in: also the job that merges it."""
+
+    id: Annotated[str, Field(examples=[_ID])]
+    map: Annotated[str, Field(examples=["fleet"])]
+    robot: Annotated[str, Field(examples=[_ID])]
+    state: Annotated[str, Field(examples=["merged"])]
+    manifest: str
+    content_hash: str
+    bytes: int
+    revision: int | None
+    progress: str
+    report: dict[str, Any] | None
+    error: str | None
+    begun_ns: int
+    ended_ns: int | None
+    wanted: Annotated[
+        list[str], Field(description="parts to send, while it is open", examples=[[_HASH]])
+    ] = []
+
+
+class RobotReport(Body):
+    """What a robot runs, and what that came to."""
+
+    runs: Annotated[str | None, Field(max_length=60, examples=["7-18a3f0c2"])] = None
+    content_hash: Annotated[str | None, Field(max_length=32, examples=[_ID])] = None
+    localised_share: Annotated[float | None, Field(ge=0, le=1, examples=[0.97])] = None
+    driven_m: Annotated[float | None, Field(ge=0, le=1e9, examples=[1840.0])] = None
+    outbox: Annotated[int, Field(ge=0, le=10**6, examples=[0])] = 0
+    told: Annotated[str, Field(max_length=500)] = ""
+
+
+class Wanted(BaseModel):
+    """What a robot is to run, and which of its hand-ins it may forget."""
+
+    follows: Annotated[str, Field(examples=["stable"])]
+    revision: Annotated[int, Field(examples=[7])]
+    version: Annotated[
+        str, Field(description="of the revision, never given twice", examples=["7-18a3f0c2"])
+    ]
+    durable_revision: Annotated[int, Field(examples=[5])]
+
+
+class Following(Body):
+    """A ref to follow, or the number of a revision to be pinned to."""
+
+    follows: Annotated[str, Field(min_length=1, max_length=60, examples=["canary"])]
+
+
+class CodeRequest(Body):
+    """A code with which one robot can enrol."""
+
+    follows: Annotated[str, Field(max_length=60, examples=["head"])] = "head"
+
+
+class Code(BaseModel):
+    """Shown once."""
+
+    code: Annotated[str, Field(examples=["q8vJx2mWc1-sT0aZ"])]

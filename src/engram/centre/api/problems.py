@@ -1,0 +1,62 @@
+"""Errors as problem details (RFC 9457)."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from engram.centre.errors import CentreError
+from engram.errors import (
+    EngramError,
+    IncompatibleError,
+    InputError,
+    MapLockedError,
+    RevisionError,
+    StorageFullError,
+)
+
+MEDIA = "application/problem+json"
+
+_STATUS: tuple[tuple[type[EngramError], int], ...] = (
+    (MapLockedError, 409),
+    (RevisionError, 404),
+    (IncompatibleError, 409),
+    (StorageFullError, 507),
+    (InputError, 422),
+)
+
+
+def problem(status: int, title: str, detail: str, **more: Any) -> JSONResponse:
+    """The answer to a request that failed."""
+    body = {"type": "about:blank", "title": title, "status": status, "detail": detail, **more}
+    headers = {"WWW-Authenticate": "Bearer"} if status == HTTPStatus.UNAUTHORIZED else None
+    return JSONResponse(body, status, headers, media_type=MEDIA)
+
+
+def add_problems(app: FastAPI) -> None:
+    """Lets an application answer errors with problem details."""
+
+    @app.exception_handler(EngramError)
+    def foreseen(_: Request, error: EngramError) -> JSONResponse:
+        if isinstance(error, CentreError):
+            return problem(error.status, error.title, str(error))
+        status = next((code for kind, code in _STATUS if isinstance(error, kind)), 500)
+        return problem(status, HTTPStatus(status).phrase, str(error))
+
+    @app.exception_handler(HTTPException)
+    def refused(_: Request, error: HTTPException) -> JSONResponse:
+        return problem(error.status_code, HTTPStatus(error.status_code).phrase, str(error.detail))
+
+    @app.exception_handler(RequestValidationError)
+    def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
+        faults = [
+            {"where": ".".join(map(str, one["loc"])), "what": str(one["msg"])}
+            for one in error.errors()
+        ]
+        detail = "; ".join(f"{one['where']}: {one['what']}" for one in faults)
+        return problem(422, "The request is malformed", detail, faults=faults)

@@ -1,0 +1,54 @@
+"""Errors of the service, each with the status of its answer."""
+
+from __future__ import annotations
+
+from engram.errors import EngramError
+
+
+class CentreError(EngramError):
+    """A request that cannot be served as it is."""
+
+    status = 400
+    title = "The request cannot be served"
+
+
+class UnknownError(CentreError):
+    """There is no such thing, or not for the one who asks."""
+
+    status = 404
+    title = "Not found"
+
+
+class NotKnownError(CentreError):
+    """Who asks is not known: no token, or one that has expired."""
+
+    status = 401
+    title = "A token is needed"
+
+
+class NotAllowedError(CentreError):
+    """Who asks may not do that."""
+
+    status = 403
+    title = "Not allowed"
+
+
+class ChangedError(CentreError):
+    """What the request was made for has changed meanwhile."""
+
+    status = 412
+    title = "Changed meanwhile"
+
+
+class ConflictError(CentreError):
+    """The state does not allow the step."""
+
+    status = 409
+    title = "Not in this state"
+
+
+class QuotaError(CentreError):
+    """More than is granted."""
+
+    status = 429
+    title = "More than is granted"

@@ -1,0 +1,393 @@
+"""Hand-ins: from a manifest to a job.
+
+A hand-in is its manifest, of one robot, on one map: begun twice it is the same. A part is its hash.
+A complete hand-in's row is the job; there is no queue beside it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Sequence
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import Connection, func, or_, select, update
+
+from engram.centre.errors import ConflictError, QuotaError, UnknownError
+from engram.centre.service import Centre
+from engram.centre.settings import DAY_NS
+from engram.centre.store.audit import note
+from engram.centre.store.database import first_row, rows_of
+from engram.centre.store.packs import given_by
+from engram.centre.store.schema import artifact_grants, artifacts, handins, usage
+from engram.errors import MapError
+from engram.maps import Map
+from engram.maps.schema import frames, nodes, vocabularies
+from engram.transfers import Manifest, PartHash, WireManifest
+from engram.transfers.manifest import decode_manifest, encode_manifest
+from engram.transfers.pages import decode_page
+
+
+class HandInState(StrEnum):
+    """Where a hand-in is."""
+
+    OPEN = "open"  # parts are missing
+    COMPLETE = "complete"  # waits for a worker, or is in its hands
+    MERGED = "merged"
+    REFUSED = "refused"  # by the gate; a person may merge it all the same
+    FAILED = "failed"  # it is no map that can be merged here
+    CANCELLED = "cancelled"
+
+
+ENDED = frozenset(
+    {HandInState.MERGED, HandInState.REFUSED, HandInState.FAILED, HandInState.CANCELLED}
+)
+
+
+def handin_id(name: str, robot: str, manifest: str) -> str:
+    """The name of a hand-in, which both sides know without asking."""
+    return hashlib.sha256(f"{name} {robot} {manifest}".encode()).hexdigest()[:32]
+
+
+class HandIns:
+    """The hand-ins of a centre."""
+
+    def __init__(self, centre: Centre) -> None:
+        self._centre = centre
+
+    def begin(self, name: str, robot: str, sent: WireManifest) -> dict[str, Any]:
+        """Begins a hand-in, or finds it.
+
+        Raises:
+            InputError: the manifest is malformed, or continues one that is not known.
+            QuotaError: the robot has too many open ones.
+        """
+        self._centre.map_row(name)
+        base = None if sent.base is None else self._base(name, robot, sent.base)
+        manifest = sent.full(base)
+        key = handin_id(name, robot, manifest.id)
+        now = self._centre.now_ns()
+        with self._centre.database.reading() as connection:
+            known = first_row(connection, select(handins).where(handins.c.id == key))
+        if known is not None:
+            return known
+        self._centre.objects.put(_manifest_key(name, manifest.id), encode_manifest(manifest))
+        row = {
+            "id": key,
+            "map": name,
+            "robot": robot,
+            "manifest": manifest.id,
+            "base": sent.base,
+            "content_hash": manifest.content_hash,
+            "state": str(HandInState.OPEN),
+            "bytes": 0,
+            "begun_ns": now,
+            "place": None,
+            "ended_ns": None,
+            "revision": None,
+            "tries": 0,
+            "cancelled": 0,
+            "ungated": 0,
+            "progress": "",
+            "report": None,
+            "error": None,
+        }
+        with self._centre.database.writing() as connection:
+            self._check_open(connection, name, robot)
+            if self._centre.database.add(connection, handins, [row]):
+                note(connection, now, robot, "hand-in", name, handin=key)
+        return self.get(key)
+
+    def get(self, key: str) -> dict[str, Any]:
+        """The row of a hand-in.
+
+        Raises:
+            UnknownError: there is none.
+        """
+        with self._centre.database.reading() as connection:
+            row = first_row(connection, select(handins).where(handins.c.id == key))
+        if row is None:
+            raise UnknownError(f"there is no hand-in {key!r:.40}")
+        return row
+
+    def listed(
+        self, name: str, robot: str | None, state: str | None, after: int, limit: int
+    ) -> list[dict[str, Any]]:
+        """Hand-ins of a map, newest first, that began before a time."""
+        query = select(handins).where(handins.c.map == name, handins.c.begun_ns < after)
+        if robot is not None:
+            query = query.where(handins.c.robot == robot)
+        if state is not None:
+            query = query.where(handins.c.state == state)
+        query = query.order_by(handins.c.begun_ns.desc(), handins.c.id).limit(limit)
+        with self._centre.database.reading() as connection:
+            return rows_of(connection, query)
+
+    def manifest(self, row: dict[str, Any]) -> Manifest:
+        """The manifest of a hand-in."""
+        key = _manifest_key(row["map"], row["manifest"])
+        return decode_manifest(self._centre.objects.get(key))
+
+    def base_of(self, row: dict[str, Any]) -> Manifest:
+        """The manifest that it continues; an empty one without."""
+        if row["base"] is None:
+            return Manifest("", 0, {})
+        return decode_manifest(self._centre.objects.get(_manifest_key(row["map"], row["base"])))
+
+    def put_parts(self, row: dict[str, Any], some: Sequence[bytes]) -> None:
+        """Stores verified parts of a hand-in; those that are there already cost nothing.
+
+        Raises:
+            ConflictError: it is complete or has ended.
+            QuotaError: more than the robot may hand in.
+        """
+        if row["state"] != HandInState.OPEN:
+            raise ConflictError(f"hand-in {row['id']} is {row['state']}, and takes no parts")
+        size, now = sum(map(len, some)), self._centre.now_ns()
+        with self._centre.database.reading() as connection:
+            used = _used(connection, row["robot"], now)
+            whole = first_row(connection, select(handins.c.bytes).where(handins.c.id == row["id"]))
+        limits = self._centre.settings
+        if used + size > limits.bytes_a_day:
+            raise QuotaError(
+                f"{used + size} bytes today; {limits.bytes_a_day} are granted: continue tomorrow"
+            )
+        if whole is not None and whole["bytes"] + size > limits.handin_bytes:
+            raise QuotaError(
+                f"a hand-in of more than {limits.handin_bytes} bytes; hand in more often"
+            )
+        new = self._centre.packs(row["map"]).add(some, now, row["robot"])
+        with self._centre.database.writing() as connection:
+            connection.execute(
+                update(handins).where(handins.c.id == row["id"]).values(bytes=handins.c.bytes + new)
+            )
+            used = _used(connection, row["robot"], now) + new
+            day = {"subject": row["robot"], "day": now // DAY_NS, "bytes": used}
+            self._centre.database.put(connection, usage, day)
+
+    def wanted(self, row: dict[str, Any]) -> list[PartHash]:
+        """Parts that the robot has yet to send: pages first, then the blobs that they name.
+
+        Of frames only those of nodes that the fleet map lacks; it takes no others.
+        """
+        if row["state"] != HandInState.OPEN:
+            return []
+        manifest, base = self.manifest(row), set(self.base_of(row).hashes())
+        fresh = [one for one in dict.fromkeys(manifest.hashes()) if one not in base]
+        lacking = self._not_given(row, fresh)
+        if lacking:
+            return lacking
+        new = set(fresh)
+        named = self.blobs_needed(row, manifest, new)
+        return self._not_given(row, list(dict.fromkeys(named)))
+
+    def blobs_needed(
+        self, row: dict[str, Any], manifest: Manifest, pages: set[PartHash] | None = None
+    ) -> list[PartHash]:
+        """Blobs that merging reads.
+
+        Args:
+            row: the hand-in.
+            manifest: its manifest.
+            pages: only blobs that these pages name; None for all.
+
+        Raises:
+            MapCorruptError: a page does not hold rows of its table.
+        """
+        packs = self._centre.packs(row["map"])
+
+        def rows(name: str, some: set[PartHash] | None) -> Iterable[tuple[Any, ...]]:
+            table = {"nodes": nodes, "frames": frames, "vocabularies": vocabularies}[name]
+            wanted = [one for one in manifest.pages.get(name, ()) if some is None or one in some]
+            for _, body in packs.read(wanted):
+                yield from decode_page(table, body)
+
+        known = self._known_nodes(row["map"])
+        held = {one[0] for one in rows("nodes", None) if one[1] in known}
+        found = []
+        for one in rows("frames", pages):
+            if one[0] not in held:
+                found += [PartHash(blob) for blob in one[2:4] if blob is not None]
+        return found + [PartHash(one[3]) for one in rows("vocabularies", pages)]
+
+    def complete(self, row: dict[str, Any]) -> dict[str, Any]:
+        """Makes a hand-in a job; done twice it is the same.
+
+        Raises:
+            ConflictError: parts are missing.
+        """
+        if row["state"] != HandInState.OPEN:
+            return row
+        missing = self.wanted(row)
+        if missing:
+            raise ConflictError(
+                f"{len(missing)} parts are missing; ask what is wanted, and send it"
+            )
+        now = self._centre.now_ns()
+        with self._centre.database.writing() as connection:
+            last = connection.execute(select(func.max(handins.c.place))).scalar() or 0
+            changed = connection.execute(
+                update(handins)
+                .where(handins.c.id == row["id"], handins.c.state == str(HandInState.OPEN))
+                .values(state=str(HandInState.COMPLETE), place=last + 1)
+            )
+            if changed.rowcount:
+                note(connection, now, row["robot"], "complete", row["map"], handin=row["id"])
+        return self.get(row["id"])
+
+    def cancel(self, row: dict[str, Any], by: str) -> dict[str, Any]:
+        """Asks for the end of a hand-in: at once where nothing works on it yet."""
+        if row["state"] in ENDED:
+            return row
+        now = self._centre.now_ns()
+        with self._centre.database.writing() as connection:
+            change: dict[str, Any] = {"cancelled": 1}
+            if row["state"] == HandInState.OPEN:
+                change |= {"state": str(HandInState.CANCELLED), "ended_ns": now}
+            connection.execute(update(handins).where(handins.c.id == row["id"]).values(**change))
+            note(connection, now, by, "cancel", row["map"], handin=row["id"])
+        return self.get(row["id"])
+
+    def merge_anyway(self, row: dict[str, Any], by: str) -> dict[str, Any]:
+        """Makes a refused, failed or cancelled hand-in a job again, without the gate.
+
+        Raises:
+            ConflictError: it is in another state.
+        """
+        if row["state"] not in ENDED - {HandInState.MERGED} or row["place"] is None:
+            raise ConflictError(
+                f"hand-in {row['id']} is {row['state']}; only a refused one is tried again"
+            )
+        again = {
+            "state": str(HandInState.COMPLETE),
+            "ungated": 1,
+            "cancelled": 0,
+            "tries": 0,
+            "error": None,
+            "ended_ns": None,
+        }
+        with self._centre.database.writing() as connection:
+            connection.execute(update(handins).where(handins.c.id == row["id"]).values(**again))
+            now = self._centre.now_ns()
+            note(connection, now, by, "merge-anyway", row["map"], handin=row["id"])
+        return self.get(row["id"])
+
+    def end(self, row: dict[str, Any], state: HandInState, **change: Any) -> None:
+        """Ends a job, or opens it again; one transaction, with its event."""
+        now = self._centre.now_ns()
+        if "report" in change:
+            change["report"] = json.dumps(change["report"])
+        ended = now if state in ENDED else None
+        with self._centre.database.writing() as connection:
+            connection.execute(
+                update(handins)
+                .where(handins.c.id == row["id"])
+                .values(state=str(state), ended_ns=ended, progress="", **change)
+            )
+            told = {
+                key: change[key] for key in ("revision", "error") if change.get(key) is not None
+            }
+            note(connection, now, "worker", str(state), row["map"], handin=row["id"], **told)
+
+    def begun(self, row: dict[str, Any]) -> None:
+        """Counts a try, before it is made: what kills its worker is not tried for ever."""
+        with self._centre.database.writing() as connection:
+            connection.execute(
+                update(handins).where(handins.c.id == row["id"]).values(tries=handins.c.tries + 1)
+            )
+
+    def heartbeat(self, key: str, progress: str) -> bool:
+        """Notes how far a job is; whether it is to be cancelled."""
+        with self._centre.database.writing() as connection:
+            connection.execute(update(handins).where(handins.c.id == key).values(progress=progress))
+            asked = connection.execute(select(handins.c.cancelled).where(handins.c.id == key))
+            return bool(asked.scalar())
+
+    def waiting(self, name: str) -> list[dict[str, Any]]:
+        """Jobs of a map, in the order of their completion."""
+        query = (
+            select(handins)
+            .where(handins.c.map == name, handins.c.state == str(HandInState.COMPLETE))
+            .order_by(handins.c.place)
+        )
+        with self._centre.database.reading() as connection:
+            return rows_of(connection, query)
+
+    def source(self, row: dict[str, Any], manifest: Manifest) -> dict[PartHash, bytes]:
+        """Pages and blobs of a hand-in that it may use: given by its robot, or of its base."""
+        base = self.base_of(row)
+        pages = list(dict.fromkeys(manifest.hashes()))
+        trusted = set(base.hashes())
+        self._refuse_foreign(row, [one for one in pages if one not in trusted])
+        blobs = self.blobs_needed(row, manifest)
+        of_base = set(self.blobs_needed(row, base)) if base.pages else set()
+        self._refuse_foreign(row, [one for one in blobs if one not in of_base])
+        return dict(self._centre.packs(row["map"]).read([*pages, *dict.fromkeys(blobs)]))
+
+    def _refuse_foreign(self, row: dict[str, Any], some: list[PartHash]) -> None:
+        lacking = self._not_given(row, some)
+        if lacking:
+            raise MissingPartsError(lacking)
+
+    def _not_given(self, row: dict[str, Any], some: list[PartHash]) -> list[PartHash]:
+        with self._centre.database.reading() as connection:
+            had = given_by(connection, row["map"], row["robot"], some)
+        return [one for one in some if one not in had]
+
+    def _known_nodes(self, name: str) -> set[bytes]:
+        with Map.open(self._centre.map_path(name)) as store:
+            return {one.bytes for one in store.landmark_hashes} | {
+                one.bytes for one in store.omissions
+            }
+
+    def _base(self, name: str, robot: str, manifest: str) -> Manifest | None:
+        """A manifest that the robot handed in to this map, or got from it; else None."""
+        own = select(handins.c.manifest).where(
+            handins.c.map == name,
+            handins.c.robot == robot,
+            handins.c.manifest == manifest,
+            or_(
+                handins.c.state == str(HandInState.MERGED),
+                handins.c.state == str(HandInState.COMPLETE),
+            ),
+        )
+        got = (
+            select(artifacts.c.manifest)
+            .join(artifact_grants, artifact_grants.c.artifact == artifacts.c.id)
+            .where(
+                artifacts.c.map == name,
+                artifact_grants.c.subject == robot,
+                artifacts.c.manifest == manifest,
+            )
+        )
+        with self._centre.database.reading() as connection:
+            if not (connection.execute(own).first() or connection.execute(got).first()):
+                return None
+        return decode_manifest(self._centre.objects.get(_manifest_key(name, manifest)))
+
+    def _check_open(self, connection: Connection, name: str, robot: str) -> None:
+        query = select(func.count()).where(
+            handins.c.map == name,
+            handins.c.robot == robot,
+            handins.c.state == str(HandInState.OPEN),
+        )
+        count = connection.execute(query).scalar_one()
+        if count >= self._centre.settings.open_handins:
+            raise QuotaError(f"{count} hand-ins are open; complete or cancel some")
+
+
+class MissingPartsError(MapError):
+    """A job lacks parts: the fleet map has changed since they were asked for."""
+
+    def __init__(self, lacking: list[PartHash]) -> None:
+        super().__init__(f"{len(lacking)} parts are missing")
+
+
+def _used(connection: Connection, robot: str, now_ns: int) -> int:
+    query = select(usage.c.bytes).where(usage.c.subject == robot, usage.c.day == now_ns // DAY_NS)
+    return connection.execute(query).scalar() or 0
+
+
+def _manifest_key(name: str, manifest: str) -> str:
+    return f"manifests/{name}/{manifest}"

@@ -1,0 +1,131 @@
+"""Refs: names of revisions that robots follow. `head` moves with merges, the others by hand."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from sqlalchemy import delete, select
+
+from engram.centre.errors import ChangedError, UnknownError
+from engram.centre.service import Centre
+from engram.centre.store.audit import note
+from engram.centre.store.database import first_row, rows_of
+from engram.centre.store.schema import refs
+from engram.errors import InputError, RevisionError
+from engram.maps import Map
+
+HEAD = "head"
+_NAME = re.compile(r"[a-z][a-z0-9._-]{0,39}")
+
+
+class Refs:
+    """The refs of a centre's maps."""
+
+    def __init__(self, centre: Centre) -> None:
+        self._centre = centre
+
+    def all(self, name: str) -> list[dict[str, Any]]:
+        """The refs of a map; `head` first."""
+        with self._centre.database.reading() as connection:
+            rows = rows_of(connection, select(refs).where(refs.c.map == name).order_by(refs.c.name))
+        return [self._head(name), *rows]
+
+    def get(self, name: str, ref: str) -> dict[str, Any]:
+        """One ref.
+
+        Raises:
+            UnknownError: the map has none of this name.
+        """
+        if ref == HEAD:
+            return self._head(name)
+        with self._centre.database.reading() as connection:
+            query = select(refs).where(refs.c.map == name, refs.c.name == ref)
+            row = first_row(connection, query)
+        if row is None:
+            raise UnknownError(f"{name} has no ref {ref!r:.60}")
+        return row
+
+    def revision(self, name: str, followed: str) -> int:
+        """The revision that a ref, or a number, stands for.
+
+        Raises:
+            UnknownError: there is none.
+        """
+        if not followed.isdecimal():
+            found: int = self.get(name, followed)["revision"]
+            return found
+        with Map.open(self._centre.map_path(name)) as store:
+            try:
+                return store.resolve(int(followed[:18]))
+            except RevisionError as error:
+                raise UnknownError(str(error)) from error
+
+    def version(self, name: str, revision: int) -> str:
+        """A name of a revision that no other one ever has, even after a backup was restored."""
+        with Map.open(self._centre.map_path(name), at=revision) as store:
+            log = store.log()
+        return f"{revision}-{log[-1].committed_ns:x}" if log else "0"
+
+    def move(self, name: str, ref: str, revision: int, by: str, expected: int | None) -> int:
+        """Moves a ref, or makes it.
+
+        Args:
+            name: of the map.
+            ref: of the ref.
+            revision: where to.
+            by: who.
+            expected: its version so far, 0 for a new one; None for whatever.
+
+        Returns:
+            Its version now.
+
+        Raises:
+            ChangedError: it has another version.
+            InputError: the name cannot be one, or there is no such revision.
+        """
+        if ref == HEAD or not _NAME.fullmatch(ref):
+            raise InputError(f"{ref!r:.60} cannot be moved: a letter, then letters, digits, . _ -")
+        with Map.open(self._centre.map_path(name)) as store:
+            if not 1 <= revision <= store.revision:
+                raise InputError(f"{name} has revisions 1 to {store.revision}, not {revision}")
+        now = self._centre.now_ns()
+        with self._centre.database.writing() as connection:
+            query = select(refs).where(refs.c.map == name, refs.c.name == ref)
+            row = first_row(connection, query)
+            version = 0 if row is None else row["version"]
+            if expected is not None and expected != version:
+                raise ChangedError(f"{ref} is at version {version}, not {expected}: look again")
+            if row is not None and row["revision"] == revision:
+                return version
+            moved = {
+                "map": name,
+                "name": ref,
+                "revision": revision,
+                "version": version + 1,
+                "moved_ns": now,
+                "moved_by": by,
+            }
+            self._centre.database.put(connection, refs, moved)
+            note(connection, now, by, "ref", name, ref=ref, revision=revision)
+        return version + 1
+
+    def remove(self, name: str, ref: str, by: str) -> None:
+        """Removes a ref; robots that follow it stay where they are."""
+        self.get(name, ref)
+        with self._centre.database.writing() as connection:
+            connection.execute(delete(refs).where(refs.c.map == name, refs.c.name == ref))
+            note(connection, self._centre.now_ns(), by, "ref-removed", name, ref=ref)
+
+    def _head(self, name: str) -> dict[str, Any]:
+        with Map.open(self._centre.map_path(name)) as store:
+            log = store.log()
+        newest = log[-1] if log else None
+        return {
+            "map": name,
+            "name": HEAD,
+            "revision": newest.number if newest else 0,
+            "version": newest.number if newest else 0,
+            "moved_ns": newest.committed_ns if newest else 0,
+            "moved_by": newest.author if newest else "",
+        }

@@ -1,0 +1,184 @@
+"""A centre: its folder, its database, its objects, its maps."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select
+
+from engram.centre.errors import UnknownError
+from engram.centre.settings import CentreSettings
+from engram.centre.store.audit import note
+from engram.centre.store.database import ServiceDatabase, first_row, rows_of
+from engram.centre.store.objects import BucketObjects, FolderObjects, Objects
+from engram.centre.store.packs import Packs
+from engram.centre.store.schema import maps
+from engram.config import from_dict, to_dict
+from engram.errors import InputError, MapLockedError
+from engram.files import WriterLock
+from engram.fleet.merge import MergeOptions
+from engram.maps import Map
+
+_NAME = re.compile(r"[a-z][a-z0-9-]{0,39}")
+
+
+@dataclass(frozen=True, slots=True)
+class MapPolicy:
+    """How a map takes hand-ins.
+
+    Attributes:
+        merge: policy and budget of merging.
+        gate: held-out drives that must not localise worse after a merge; paths of the centre.
+        moves: ref that follows every merge that passed the gate; None for none.
+    """
+
+    merge: MergeOptions = field(default_factory=MergeOptions)
+    gate: tuple[str, ...] = ()
+    moves: str | None = None
+
+
+class Centre:
+    """What every part of the service works on. A context manager.
+
+    Args:
+        folder: the centre's; made where there is none.
+        database: address of the database; None for SQLite in the folder.
+        objects: address of the bucket; None for a folder in the folder.
+        settings: limits and times.
+        clock: the time, UTC, ns.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        database: str | None = None,
+        objects: str | None = None,
+        settings: CentreSettings | None = None,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.folder = folder
+        for name in ("maps", "objects", "work"):
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        self.settings = settings or CentreSettings()
+        self.now_ns = clock
+        self.addresses = (database, objects)
+        self.database = ServiceDatabase(database or f"sqlite:///{folder / 'centre.sqlite'}")
+        self.objects: Objects = (
+            FolderObjects(folder / "objects") if objects is None else BucketObjects(objects)
+        )
+        self._packs: dict[str, Packs] = {}
+
+    def __enter__(self) -> Centre:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Closes the database."""
+        self.database.close()
+
+    def packs(self, name: str) -> Packs:
+        """The parts of a map."""
+        if name not in self._packs:
+            self._packs[name] = Packs(self.database, self.objects, name)
+        return self._packs[name]
+
+    def add_map(self, name: str, by: str, policy: MapPolicy | None = None) -> None:
+        """Makes an empty map; one that is there stays.
+
+        Raises:
+            InputError: the name cannot be one.
+        """
+        if not _NAME.fullmatch(name):
+            raise InputError(
+                f"{name!r:.60} cannot name a map: a letter, then letters, digits and -, 40 at most"
+            )
+        path = self.folder / "maps" / f"{name}.engram"
+        if not path.exists():
+            Map.create(path).close()
+        row = {
+            "name": name,
+            "created_ns": self.now_ns(),
+            "durable_revision": 0,
+            "options": json.dumps(to_dict(policy or MapPolicy())),
+        }
+        with self.database.writing() as connection:
+            if self.database.add(connection, maps, [row]):
+                note(connection, self.now_ns(), by, "map", name)
+
+    def map_names(self) -> list[str]:
+        """All maps."""
+        with self.database.reading() as connection:
+            return list(connection.execute(select(maps.c.name).order_by(maps.c.name)).scalars())
+
+    @contextmanager
+    def lane(self, name: str) -> Iterator[bool]:
+        """Whether this worker has a map to itself; its death frees the map."""
+        try:
+            lock = WriterLock(self.folder / "maps" / f"{name}.lane")
+        except MapLockedError:
+            yield False
+            return
+        try:
+            yield True
+        finally:
+            lock.release()
+
+    def map_row(self, name: str) -> dict[str, Any]:
+        """The row of a map.
+
+        Raises:
+            UnknownError: there is none.
+        """
+        with self.database.reading() as connection:
+            row = first_row(connection, select(maps).where(maps.c.name == name))
+        if row is None:
+            raise UnknownError(f"there is no map {name!r:.60}")
+        return row
+
+    def map_rows(self) -> list[dict[str, Any]]:
+        """The rows of all maps."""
+        with self.database.reading() as connection:
+            return rows_of(connection, select(maps).order_by(maps.c.name))
+
+    def map_path(self, name: str) -> Path:
+        """The file of a map.
+
+        Raises:
+            UnknownError: there is none.
+        """
+        self.map_row(name)
+        return self.folder / "maps" / f"{name}.engram"
+
+    def policy(self, name: str) -> MapPolicy:
+        """How a map takes hand-ins."""
+        return from_dict(json.loads(self.map_row(name)["options"]), MapPolicy)
+
+    def set_policy(self, name: str, policy: MapPolicy, by: str) -> None:
+        """Changes how a map takes hand-ins."""
+        row = {**self.map_row(name), "options": json.dumps(to_dict(policy))}
+        with self.database.writing() as connection:
+            self.database.put(connection, maps, row)
+            note(connection, self.now_ns(), by, "policy", name, policy=to_dict(policy))
+
+    def set_durable(self, name: str, revision: int, by: str) -> None:
+        """Notes that a backup holds a map up to a revision: robots may forget what it holds.
+
+        Raises:
+            InputError: the map has no such revision.
+        """
+        with Map.open(self.map_path(name)) as store:
+            if not 0 <= revision <= store.revision:
+                raise InputError(f"{name} has revisions 0 to {store.revision}, not {revision}")
+        row = {**self.map_row(name), "durable_revision": revision}
+        with self.database.writing() as connection:
+            self.database.put(connection, maps, row)
+            note(connection, self.now_ns(), by, "durable", name, revision=revision)

@@ -1,0 +1,121 @@
+"""Runs the service, and a worker beside it."""
+
+from __future__ import annotations
+
+import ipaddress
+import multiprocessing
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from engram.centre.service import Centre
+from engram.centre.worker.loop import work
+from engram.errors import ConfigError, MissingExtraError
+from engram.processes import end_with_parent
+
+_RESTART_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Listening:
+    """Where the service listens.
+
+    Raises:
+        ConfigError: elsewhere than on this machine, without TLS.
+    """
+
+    host: str
+    port: int
+    certificate: Path | None = None
+    key: Path | None = None
+    insecure: bool = False
+
+    def __post_init__(self) -> None:
+        if (self.certificate is None) != (self.key is None):
+            raise ConfigError("--tls-certificate and --tls-key go together")
+        if self.certificate is None and not self.insecure and not _is_here(self.host):
+            raise ConfigError(
+                f"--host {self.host} is reached from elsewhere, and tokens would go unencrypted: "
+                "give --tls-certificate and --tls-key, or --insecure behind a proxy that does TLS"
+            )
+
+
+def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
+    """Serves until it is stopped.
+
+    Raises:
+        MissingExtraError: the extra `centre` is not installed.
+    """
+    try:
+        import uvicorn
+
+        from engram.centre.api.app import create_app
+    except ImportError as error:
+        raise MissingExtraError(
+            "the centre needs its extra: pip install 'engram-localisation[centre]'"
+        ) from error
+    config = uvicorn.Config(
+        create_app(centre),
+        listening.host,
+        listening.port,
+        ssl_certfile=listening.certificate,
+        ssl_keyfile=listening.key,
+        log_level="warning",
+        server_header=False,
+    )
+    server = uvicorn.Server(config)
+    if not worker:
+        server.run()
+        return
+    with _supervised_worker(centre):
+        server.run()
+
+
+def run_worker(folder: Path, database: str | None, objects: str | None) -> None:
+    """Works until SIGTERM or Ctrl-C."""
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    with Centre(folder, database, objects) as centre:
+        work(centre, stop.wait, stop.is_set)
+
+
+@contextmanager
+def _supervised_worker(centre: Centre) -> Iterator[None]:
+    """A worker in a process of its own; another one takes the place of one that dies."""
+    stop = threading.Event()
+    context = multiprocessing.get_context("spawn")
+
+    def keep() -> None:
+        while not stop.is_set():
+            process = context.Process(target=_work_beside, args=(centre.folder, *centre.addresses))
+            process.start()
+            while process.is_alive() and not stop.wait(_RESTART_S):
+                pass
+            process.terminate()
+            process.join()
+
+    thread = threading.Thread(target=keep, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _work_beside(folder: Path, database: str | None, objects: str | None) -> None:
+    """Main function of the worker beside the service."""
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends it
+    run_worker(folder, database, objects)
+
+
+def _is_here(host: str) -> bool:
+    """Whether an address is this machine's own."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,1 @@
+"""What the service keeps beside the maps: its tables, and its objects."""

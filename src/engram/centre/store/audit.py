@@ -1,0 +1,67 @@
+"""The audit log: every change of state, each row bound to the one before by a hash.
+
+It is the stream of events as well.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from sqlalchemy import Connection, func, insert, select
+
+from engram.centre.store.database import rows_of
+from engram.centre.store.schema import audit
+
+
+def note(
+    connection: Connection, at_ns: int, subject: str, action: str, name: str, /, **detail: Any
+) -> None:
+    """Adds a row; call it in the transaction that changes the state.
+
+    Args:
+        connection: in a writing transaction.
+        at_ns: the time.
+        subject: who did it.
+        action: what.
+        name: of the map; "" for none.
+        **detail: plain data.
+    """
+    last = connection.execute(select(func.max(audit.c.number))).scalar() or 0
+    before = connection.execute(select(audit.c.hash).where(audit.c.number == last)).scalar() or ""
+    row = {
+        "number": last + 1,
+        "at_ns": at_ns,
+        "subject": subject,
+        "action": action,
+        "map": name,
+        "detail": json.dumps(detail, sort_keys=True),
+    }
+    connection.execute(insert(audit).values(**row, hash=_hash(before, row)))
+
+
+def events_after(
+    connection: Connection, number: int, name: str | None, limit: int
+) -> list[dict[str, Any]]:
+    """The next rows after a number, of one map or of all."""
+    query = select(audit).where(audit.c.number > number).order_by(audit.c.number).limit(limit)
+    if name is not None:
+        query = query.where(audit.c.map == name)
+    rows = rows_of(connection, query)
+    return [{**row, "detail": json.loads(row["detail"])} for row in rows]
+
+
+def first_broken(connection: Connection) -> int | None:
+    """Number of the first row that was changed, removed or added later; None for a whole log."""
+    before = ""
+    for number, row in enumerate(rows_of(connection, select(audit).order_by(audit.c.number)), 1):
+        told = row.pop("hash")
+        if row["number"] != number or told != _hash(before, row):
+            return number
+        before = told
+    return None
+
+
+def _hash(before: str, row: dict[str, Any]) -> str:
+    return hashlib.sha256((before + json.dumps(row, sort_keys=True)).encode()).hexdigest()

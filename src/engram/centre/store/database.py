@@ -1,0 +1,148 @@
+"""The service's database: SQLite in the centre's folder, or PostgreSQL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy import (
+    Connection,
+    Engine,
+    Select,
+    Table,
+    create_engine,
+    event,
+    insert,
+    inspect,
+    select,
+    text,
+    update,
+)
+from sqlalchemy.dialects.postgresql import insert as insert_postgresql
+from sqlalchemy.dialects.sqlite import insert as insert_sqlite
+from sqlalchemy.exc import ArgumentError, DBAPIError
+
+from engram.centre.store.schema import VERSION, centre, metadata
+from engram.errors import FormatVersionError, InputError, MapError, MissingExtraError
+
+_BUSY_S = 30.0
+# One writer at a time on PostgreSQL too: numbers of the audit and of completion have no gaps.
+_WRITERS = 0x456E6772
+
+
+class ServiceDatabase:
+    """Transactions on the service's tables; makes them where they are missing.
+
+    Args:
+        url: SQLAlchemy's.
+
+    Raises:
+        InputError: the address is not one.
+        FormatVersionError: a newer Engram wrote it.
+        MapError: it cannot be reached.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._engine = _engine(url)
+        self._sqlite = self._engine.dialect.name == "sqlite"
+        with self.writing() as connection:
+            self._migrate(connection)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection for selects."""
+        with _errors(), self._engine.connect() as connection:
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """One durable transaction, alone; rolled back if the block raises."""
+        with _errors(), self._engine.connect() as connection:
+            if self._sqlite:
+                connection.exec_driver_sql("BEGIN IMMEDIATE")
+            else:
+                connection.execute(text(f"SELECT pg_advisory_xact_lock({_WRITERS})"))
+            yield connection
+            connection.commit()
+
+    def add(self, connection: Connection, table: Table, rows: list[dict[str, Any]]) -> int:
+        """Adds rows whose keys are new; returns how many."""
+        if not rows:
+            return 0
+        make = insert_sqlite if self._sqlite else insert_postgresql
+        statement = make(table).on_conflict_do_nothing()
+        return connection.execute(statement, rows).rowcount
+
+    def put(self, connection: Connection, table: Table, row: Mapping[str, Any]) -> None:
+        """Adds a row, or replaces the one with its key."""
+        key = [column.name for column in table.primary_key.columns]
+        make = insert_sqlite if self._sqlite else insert_postgresql
+        rest = {name: value for name, value in row.items() if name not in key}
+        statement = make(table).values(**row)
+        connection.execute(statement.on_conflict_do_update(index_elements=key, set_=rest))
+
+    def close(self) -> None:
+        """Closes all connections."""
+        self._engine.dispose()
+
+    @staticmethod
+    def _migrate(connection: Connection) -> None:
+        """Brings the tables to this version, in the transaction that is open."""
+        if not inspect(connection).has_table(centre.name):
+            metadata.create_all(connection)
+            connection.execute(insert(centre).values(key=1, version=VERSION))
+            return
+        version = connection.execute(select(centre.c.version)).scalar_one()
+        if version > VERSION:
+            raise FormatVersionError(
+                f"the centre's tables are of version {version}, this Engram reads up to {VERSION}: "
+                "upgrade it"
+            )
+        for step in range(version, VERSION):
+            for statement in MIGRATIONS[step]:
+                connection.execute(text(statement))
+        connection.execute(update(centre).values(version=VERSION))
+
+
+# Statements that bring the tables from this version to the next.
+MIGRATIONS: dict[int, tuple[str, ...]] = {}
+
+
+def rows_of(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:
+    """The rows of a select as dicts."""
+    return [dict(row) for row in connection.execute(query).mappings()]
+
+
+def first_row(connection: Connection, query: Select[Any]) -> dict[str, Any] | None:
+    """The first row of a select; None if there is none."""
+    return next(iter(rows_of(connection, query.limit(1))), None)
+
+
+def _engine(url: str) -> Engine:
+    try:
+        engine = create_engine(url, pool_size=8, max_overflow=-1)
+    except ArgumentError as error:
+        raise InputError(f"the address of the database is not one: {error}") from error
+    except ImportError as error:
+        raise MissingExtraError(
+            "a centre on PostgreSQL needs its driver: pip install 'engram-localisation[server]'"
+        ) from error
+    if engine.dialect.name == "sqlite":
+
+        @event.listens_for(engine, "connect")
+        def connect(connection: Any, _: object) -> None:
+            connection.isolation_level = None  # transactions begin explicitly
+            connection.execute(f"PRAGMA busy_timeout={round(_BUSY_S * 1000)}")
+            connection.execute("PRAGMA journal_mode=WAL")
+            connection.execute("PRAGMA synchronous=FULL")
+
+    return engine
+
+
+@contextmanager
+def _errors() -> Iterator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        raise MapError(f"the centre's database: {error.orig}") from error

@@ -1,0 +1,1 @@
+"""Workers: they merge hand-ins and make downloads."""

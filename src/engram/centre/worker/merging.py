@@ -1,0 +1,150 @@
+"""One hand-in into the fleet map: never twice, never lost.
+
+The row says `complete` until the outcome is known. A worker that dies leaves it so, and the next
+one merges again: what was committed is found by the content hash that its revision names.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from engram.centre.handins import HandIns, HandInState, MissingPartsError
+from engram.centre.refs import Refs
+from engram.centre.service import Centre, MapPolicy
+from engram.centre.worker.admission import admit
+from engram.errors import EngramError, MapLockedError, RefusedError, StorageFullError
+from engram.fleet.merge import MergeReport, merge
+from engram.maps import Map
+from engram.monitor import Monitor
+from engram.robot import Settings
+
+_TELL_S = 1.0
+
+
+def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
+    """Merges one complete hand-in.
+
+    Returns:
+        Whether it is settled; False if another worker has the map.
+    """
+    handins = HandIns(centre)
+    if row["tries"] >= centre.settings.merge_tries:
+        fact = f"its worker died {row['tries']} times"
+        handins.end(row, HandInState.FAILED, error=fact)
+        return True
+    handins.begun(row)
+    thin = centre.folder / "work" / f"{row['id']}.engram"
+    try:
+        with _scratch(thin):
+            _admit(centre, handins, row, thin)
+            outcome = _merged(centre, handins, row, thin)
+    except MissingPartsError:  # the map changed since they were asked for, by a revert
+        handins.end(row, HandInState.OPEN)
+    except RefusedError as error:
+        handins.end(row, HandInState.REFUSED, error=str(error))
+    except (MapLockedError, StorageFullError):
+        return False
+    except KeyboardInterrupt:
+        if not handins.get(row["id"])["cancelled"]:
+            raise
+        handins.end(row, HandInState.CANCELLED, error="cancelled")
+    except EngramError as error:
+        handins.end(row, HandInState.FAILED, error=str(error))
+    else:
+        _settle(centre, handins, row, outcome)
+    return True
+
+
+def _admit(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> None:
+    manifest = handins.manifest(row)
+    limits = centre.settings
+    admit(
+        manifest,
+        handins.source(row, manifest),
+        thin,
+        limits.admission_bytes,
+        limits.admission_s,
+    )
+
+
+def _merged(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> MergeReport:
+    policy = centre.policy(row["map"])
+    (report,) = merge(
+        centre.map_path(row["map"]),
+        [thin],
+        policy.merge,
+        _Watching(handins, row["id"]),
+        settings=Settings(),
+        require_better=[] if row["ungated"] else [Path(one) for one in policy.gate],
+    )
+    return report
+
+
+def _settle(centre: Centre, handins: HandIns, row: dict[str, Any], report: MergeReport) -> None:
+    if report.interrupted:
+        handins.end(row, HandInState.CANCELLED, error="cancelled")
+        return
+    told = {**report.to_dict(), "source": f"hand-in {row['id']}"}
+    revision = report.revision
+    if revision is None:  # nothing new; or a worker died between the merge and this row
+        revision = _revision_of(centre.map_path(row["map"]), row["content_hash"])
+    handins.end(row, HandInState.MERGED, revision=revision, report=told)
+    policy: MapPolicy = centre.policy(row["map"])
+    if policy.moves is not None and revision is not None and not row["ungated"]:
+        Refs(centre).move(row["map"], policy.moves, revision, "gate", None)
+
+
+def _revision_of(path: Path, content_hash: str) -> int | None:
+    """The revision that merged a map of this content; None if none did."""
+    with Map.open(path) as store:
+        for one in store.log():
+            merged = one.configuration.get("merge")
+            if isinstance(merged, dict) and merged.get("source") == content_hash:
+                return one.number
+    return None
+
+
+@contextmanager
+def _scratch(path: Path) -> Iterator[None]:
+    """Takes away what a file and its locks leave, before and after."""
+
+    def clear() -> None:
+        for one in path.parent.glob(f"{path.name}*"):
+            one.unlink()
+
+    clear()
+    try:
+        yield
+    finally:
+        clear()
+
+
+class _Watching(Monitor):
+    """Tells how far the merge is, and stops it if it is cancelled."""
+
+    def __init__(self, handins: HandIns, key: str) -> None:
+        self._handins = handins
+        self._key = key
+        self._told_s = 0.0
+        self._what, self._total, self._done = "", 0, 0
+
+    @contextmanager
+    def stage(self, what: str, total: int) -> Iterator[Monitor]:
+        self._what, self._total, self._done = what.split(" /", 1)[0], total, 0
+        yield self
+
+    def advance(self, word: str = "") -> None:
+        del word
+        self._done += 1
+
+    def check(self) -> None:
+        now = time.monotonic()
+        if now - self._told_s < _TELL_S:
+            return
+        self._told_s = now
+        if self._handins.heartbeat(self._key, f"{self._what}: {self._done} of {self._total}"):
+            raise KeyboardInterrupt

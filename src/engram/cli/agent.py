@@ -1,0 +1,122 @@
+"""`engram agent …`: the robot's side of the centre."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import typer
+
+from engram.cli import options
+
+if TYPE_CHECKING:
+    from engram.agent import Agent
+
+agent_group = typer.Typer(
+    help="The robot's side of the centre.", no_args_is_help=True, rich_markup_mode=None
+)
+
+Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The agent's folder.")]
+Config: TypeAlias = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="Limits and download, in TOML.")
+]
+_ROUNDS = 1000
+
+
+def _open(folder: Path, config: Path | None = None) -> Agent:
+    from engram.agent import Agent, AgentSettings
+    from engram.config import load_toml
+
+    settings = AgentSettings() if config is None else load_toml(config.read_text(), AgentSettings)
+    return Agent(folder, settings, wait=threading.Event().wait)
+
+
+@agent_group.command()
+def enrol(
+    folder: Folder,
+    url: Annotated[str, typer.Argument(metavar="URL", help="Of the centre.")],
+    code: Annotated[str, typer.Argument(metavar="CODE", help="From engram centre code.")],
+    *,
+    name: Annotated[str, typer.Option("--name", help="Of the robot.")],
+) -> None:
+    """Enrol this robot with a centre; its key never leaves FOLDER."""
+    from engram.agent import enrol as enrol_robot
+
+    typer.echo(f"{name} is a robot of {enrol_robot(folder, url, code, name)}")
+
+
+@agent_group.command()
+def run(folder: Folder, *, config: Config = None) -> None:
+    """Send what is queued and fetch what is wanted, until it is stopped."""
+    waiting = threading.Event()
+    with _open(folder, config) as agent:
+        while True:
+            waiting.wait(agent.step())
+
+
+@agent_group.command()
+def sync(folder: Folder, *, config: Config = None, as_json: options.Json = False) -> None:
+    """Send and fetch once, as far as the link allows."""
+    with _open(folder, config) as agent:
+        for _ in range(_ROUNDS):
+            if agent.step() > 0:
+                break
+        _print(agent, as_json=as_json)
+
+
+@agent_group.command("hand-in")
+def hand_in(folder: Folder, *, config: Config = None) -> None:
+    """Queue what the live map holds; no link is needed."""
+    with _open(folder, config) as agent:
+        key = agent.hand_in()
+    typer.echo("nothing new" if key is None else f"queued {key[:12]}")
+
+
+@agent_group.command()
+def switch(folder: Folder) -> None:
+    """Switch to the version that was fetched; the robot must be parked."""
+    with _open(folder) as agent:
+        typer.echo("switched" if agent.switch() else "nothing to switch to")
+
+
+@agent_group.command("fall-back")
+def fall_back(folder: Folder) -> None:
+    """Go back to the last good map."""
+    with _open(folder) as agent:
+        agent.fall_back()
+
+
+@agent_group.command()
+def drove(
+    folder: Folder,
+    *,
+    share: Annotated[float, typer.Option("--share", min=0, max=1, help="Of frames localised.")],
+    driven_m: Annotated[float, typer.Option("--metres", min=0, help="Driven.")],
+    config: Config = None,
+) -> None:
+    """Note how the live map served; one that does not serve is taken back."""
+    with _open(folder, config) as agent:
+        typer.echo("fell back" if agent.drove(share, driven_m) else "noted")
+
+
+@agent_group.command()
+def status(folder: Folder, *, as_json: options.Json = False) -> None:
+    """What this robot runs, wants, has queued."""
+    with _open(folder) as agent:
+        _print(agent, as_json=as_json)
+
+
+def _print(agent: Agent, *, as_json: bool) -> None:
+    found = agent.status()
+    if as_json:
+        print(json.dumps(found))
+        return
+    for name, value in found.items():
+        if name != "outbox":
+            typer.echo(f"{name}: {value}")
+    for row in found["outbox"]:
+        typer.echo(
+            f"outbox {row['id'][:12]} {row['state']} {row['bytes']} bytes {row['error'] or ''}"
+        )
