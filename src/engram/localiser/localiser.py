@@ -499,10 +499,9 @@ class Localiser:
         self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
     ) -> None:
         """Records what policies learn from during the drive."""
-        self._recent.add(
-            [outcome.candidate.index for outcome in outcomes],
-            [outcome.accepted for outcome in outcomes],
-        )
+        # A lost robot's failed proposals tell nothing of the appearance here: they are elsewhere.
+        here = [one for one in outcomes if one.candidate.row is not None or one.accepted]
+        self._recent.add([one.candidate.index for one in here], [one.accepted for one in here])
         distance_m, rates = np.full((2, len(outcomes)), np.nan)
         rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
         if neighbourhood is not None and (known := rows >= 0).any():

@@ -13,7 +13,7 @@ from engram.ranking import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 4
+METHOD_VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)
