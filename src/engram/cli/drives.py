@@ -22,9 +22,7 @@ def map_(
     path: options.DrivePath,
     *,
     drive: options.Drive,
-    ranking: options.Ranking = "recall",
-    lanes: options.Lanes = 2,
-    rounds: options.Rounds = 2,
+    effort: options.Effort,
     descriptor: options.Descriptor = None,
     no_thumbnails: options.NoThumbnails = False,
     settings: options.SettingsGiven,
@@ -47,8 +45,9 @@ def map_(
     from engram.robot import RobotOptions, map_drive
 
     sequence = drive.open(path)
-    asked = RobotOptions(policy=ranking, lanes=lanes, rounds=rounds)
-    resolved = _for_people(settings.read().of_robot(descriptor), no_thumbnails)
+    given = settings.read()
+    asked = RobotOptions(**effort.over(given))
+    resolved = _for_people(given.of_robot(descriptor), no_thumbnails)
     with Bars().stage("map", len(sequence)) as monitor:
         report = map_drive(map_path, sequence, resolved, asked, monitor, descriptor=descriptor)
     if as_json:
@@ -67,9 +66,7 @@ def localise(
     path: options.DrivePath,
     *,
     drive: options.Drive,
-    ranking: options.Ranking = "recall",
-    lanes: options.Lanes = 2,
-    rounds: options.Rounds = 2,
+    effort: options.Effort,
     deadline: Annotated[
         float | None,
         typer.Option(
@@ -122,27 +119,22 @@ def localise(
     from engram.robot.explaining import ExplainOptions
 
     found_by = None if relocaliser == "none" else relocaliser
-    sequence, resolved = drive.open(path), settings.read().of_robot()
+    given = settings.read()
+    sequence, resolved, tried = drive.open(path), given.of_robot(), effort.over(given)
     if explain is None:
-        asked = RobotOptions(
-            policy=ranking,
-            lanes=lanes,
-            rounds=rounds,
-            deadline_ms=deadline,
-            relocaliser=found_by,
-        )
+        asked = RobotOptions(**tried, deadline_ms=deadline, relocaliser=found_by)
         outputs = Outputs(trajectory, pictures, rate, as_json, remember)
         with open_map(map_path, at) as opened:
             localise_and_print(opened, sequence, resolved, asked, outputs)
         tell_losses(sequence)
         return
-    given = {
+    refused = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
         "--remember": remember or None,
     }  # fmt: skip
-    for option in (option for option, value in given.items() if value is not None):
+    for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")
-    frame = ExplainOptions(explain, ranking, lanes, rounds, found_by, at)
+    frame = ExplainOptions(explain, tried["policy"], tried["lanes"], tried["rounds"], found_by, at)
     explain_and_print(map_path, sequence, resolved, frame, as_json=as_json)
 
 

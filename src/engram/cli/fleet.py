@@ -114,6 +114,9 @@ def merging_of(settings: AllSettings) -> MergeOptions:
         relocaliser=None if given.relocaliser == "none" else given.relocaliser,
         author=os.environ.get(AUTHOR),
         sure_inliers=given.sure_inliers,
+        unit=given.unit,
+        segment_share=given.segment_share,
+        seed=given.seed,
     )
 
 

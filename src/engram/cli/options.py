@@ -81,7 +81,9 @@ NoThumbnails: TypeAlias = Annotated[
 ]
 Settings: TypeAlias = Annotated[
     Path | None,
-    typer.Option("--config", metavar="FILE", help="Settings in TOML: engram settings show."),
+    typer.Option(
+        "--config", metavar="FILE", help="Settings in TOML, or linegar2015, gadd2016 (the papers')."
+    ),
 ]
 
 
@@ -176,6 +178,38 @@ class Drive:
             left=self.left,
             right=self.right,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """Ranking and budget of a drive; what is not given comes from the settings."""
+
+    ranking: Annotated[
+        str | None,
+        typer.Option(
+            "--ranking",
+            help="Which nodes to try first: recall, path, distance, … [default: recall].",
+        ),
+    ] = None
+    lanes: Annotated[
+        int | None,
+        typer.Option("--lanes", min=1, help="Match attempts in parallel (Np) [default: 2]."),
+    ] = None
+    rounds: Annotated[
+        int | None,
+        typer.Option(
+            "--rounds", min=1, help="Rounds of attempts per frame (Nr); 32 when lost [default: 2]."
+        ),
+    ] = None
+
+    def over(self, settings: AllSettings) -> dict[str, Any]:
+        """Policy, lanes and rounds: as given, else as in the settings."""
+        drive = settings.drive
+        return {
+            "policy": self.ranking or drive.ranking,
+            "lanes": self.lanes or drive.lanes,
+            "rounds": self.rounds or drive.rounds,
+        }
 
 
 @dataclass(frozen=True, slots=True)

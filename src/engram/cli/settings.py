@@ -17,8 +17,9 @@ from msgspec import Meta
 
 from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import ConfigError
+from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.frontend import DescriptorKind
-from engram.robot.settings import Settings
+from engram.robot.settings import Settings, settings_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,33 @@ class MergeSettings:
         int,
         Meta(ge=0, description="inliers needed to drop a node that other drives use; 0: any match"),
     ] = 40
+    unit: Annotated[
+        Unit,
+        Meta(
+            description="what is omitted or taken at once: frame or segment. Source: [G16] Fig. 4"
+        ),
+    ] = Unit.FRAME
+    segment_share: Annotated[
+        float, Meta(ge=0, le=1, description="share of a segment that must localise to omit it")
+    ] = 0.5
+    seed: Annotated[
+        SeedFrom,
+        Meta(description="start of a segment's replay: neighbour or places. Source: [G16] §V-A"),
+    ] = SeedFrom.NEIGHBOUR
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """How `map` and `localise` attempt; options of the command count before them."""
+
+    ranking: Annotated[
+        str, Meta(description="which nodes to try first: recall, path, path-near, distance")
+    ] = "recall"
+    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np. [L15] Fig. 3")] = 2
+    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts, Nr. [L15] Fig. 3")] = 2
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -88,6 +116,7 @@ class DownloadSettings:
 class AllSettings(Settings):
     """What a settings file may contain: the robot's settings, then those of the fleet's verbs."""
 
+    drive: DriveSettings = field(default_factory=DriveSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
     build: BuildSettings = field(default_factory=BuildSettings)
     download: DownloadSettings = field(default_factory=DownloadSettings)
@@ -126,9 +155,7 @@ def read_settings(path: Path | None, changes: Sequence[str] = ()) -> AllSettings
 
 def _toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as settings: {error}") from error
+        return tomllib.loads(settings_text(path))
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
 

@@ -312,6 +312,11 @@ class ExperienceGraph:
         """(E, 2) int32: dense indices of the ends b and a of each edge in `edges`. A view."""
         return self._target.rows.reshape(-1, 2)
 
+    @property
+    def edge_errors(self) -> NDArray[np.float64]:
+        """(E, 8) float64: errors of the edges in `edges`, as of `edge_error_rows`. A view."""
+        return self._errors.rows
+
     def lightest(self, weight: Callable[[Edge], float]) -> Links:
         """The lightest of each set of parallel edges; of equal ones the earlier."""
         weights = np.array([weight(edge) for edge in self._edges], np.float64)

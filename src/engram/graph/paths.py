@@ -41,6 +41,7 @@ class PathMemory:
         self._number: dict[PathId, int] = {}
         self._bits = np.zeros((16, 1), dtype=np.uint64)
         self._observed = _core.ObservedPaths()
+        self._counting: dict[frozenset[PathEntryKind], PathMemory] = {}
         # Number of paths and the core's view of the bits; valid until they grow.
         self._view: tuple[int, _core.PathBits] | None = None
 
@@ -57,6 +58,18 @@ class PathMemory:
         number = self._number.get(path)
         return () if number is None else self._entries[number]
 
+    def counting(self, kinds: Collection[PathEntryKind]) -> PathMemory:
+        """A memory of the same paths that counts only these kinds; it grows with this one."""
+        wanted = frozenset(kinds)
+        if wanted == self.kinds:
+            return self
+        if wanted not in self._counting:
+            other = self._counting[wanted] = PathMemory(self._graph, wanted)
+            for entries in self._entries:
+                for entry in entries:
+                    other.add(entry)
+        return self._counting[wanted]
+
     def add(self, entry: PathEntry) -> None:
         """Add an entry; an existing one with the same (path, sequence) stays instead.
 
@@ -72,6 +85,8 @@ class PathMemory:
             self._make_room()
             self._bits[node, number // 64] |= np.uint64(1 << (number % 64))
             self._observed.add(node, number)
+        for other in self._counting.values():
+            other.add(entry)
 
     def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(P, N) bool: whether each path holds each node; unknown paths hold none.

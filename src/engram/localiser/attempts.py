@@ -213,3 +213,9 @@ def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:
     """The accepted outcome with the most inliers, then the best rank (SPEC §3.2)."""
     successes = [outcome for outcome in outcomes if outcome.accepted]
     return min(successes, key=lambda o: (-o.match.inliers, o.rank), default=None)
+
+
+def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """The outcomes in ranked order up to the first success: what one lane would have attempted."""
+    first = next((at for at, one in enumerate(outcomes) if one.accepted), len(outcomes))
+    return list(outcomes[: first + 1])

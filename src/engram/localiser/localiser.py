@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from engram.frontend import Frame, FrameStatus
 from engram.graph.basin import MatchBasin
+from engram.graph.breadth_first import breadth_first
 from engram.graph.clock import Clocked, day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
@@ -31,7 +32,14 @@ from engram.graph.model import (
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.graph.paths import PathMemory
 from engram.localiser.acceptance import Prediction
-from engram.localiser.attempts import Attempter, Candidate, Matcher, Outcome, best_success
+from engram.localiser.attempts import (
+    Attempter,
+    Candidate,
+    Matcher,
+    Outcome,
+    best_success,
+    up_to_first_success,
+)
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.keeper import KEEPS_NOTHING, Keeper
 from engram.localiser.localisation import (
@@ -42,7 +50,7 @@ from engram.localiser.localisation import (
     StageClock,
 )
 from engram.localiser.relocalisation import Relocaliser
-from engram.localiser.settings import LocaliserConfig
+from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, Success
 from engram.odometry import UNMOVED, Motion, OdometryStatus
 from engram.ranking import (
     Background,
@@ -120,7 +128,7 @@ class Localiser:
         self._budget = budget
         self._relocaliser = relocaliser
         self._basin = basin
-        self._search = graph.neighbourhood if search is None else search
+        self._search = search or self._own_search()
         self._attempter = Attempter(frames, self.config, matcher)
         self._pool = (
             ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")
@@ -290,6 +298,8 @@ class Localiser:
                 outcomes += at_once(attempt, range(start, start + len(lanes)), lanes)
                 if any(outcome.accepted for outcome in outcomes):
                     break
+            if self.config.success is Success.FIRST:
+                outcomes = up_to_first_success(outcomes)
             outcomes = self._hypotheses.judge(self._without_damaged(outcomes))
             clock.lap("attempts")
             self._remember(live, self._near, outcomes)
@@ -344,6 +354,11 @@ class Localiser:
     @property
     def _lost(self) -> bool:
         return not self.certain or self._open_loop_m > self.config.lost_after_m
+
+    def _own_search(self) -> Callable[..., Neighbourhood]:
+        if self.config.neighbourhood is NeighbourhoodSearch.BREADTH_FIRST:
+            return partial(breadth_first, self._graph)
+        return self._graph.neighbourhood
 
     def _neighbourhood(self) -> Neighbourhood | None:
         return None if self.position is None else self._nodes_near(self.position)

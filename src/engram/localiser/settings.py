@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from engram.errors import ConfigError
 from engram.frontend.matching import MatcherConfig
@@ -14,6 +17,27 @@ from engram.ranking import RecentConfig
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
 METHOD_VERSION = 5
+
+
+class NeighbourhoodSearch(StrEnum):
+    """How the candidates near the robot are found."""
+
+    SUREST = "surest"
+    BREADTH_FIRST = "breadth-first"
+
+
+class PathEntries(StrEnum):
+    """Which nodes are on a path when a policy counts paths."""
+
+    ALL = "all"
+    MATCHES = "matches"
+
+
+class Success(StrEnum):
+    """Which success of a round is the localisation."""
+
+    MOST_INLIERS = "most-inliers"
+    FIRST = "first"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +60,7 @@ class LocaliserConfig:
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They make a failed attempt four times cheaper and keep 98.8 % of the matches it would
             accept. Source: `lab/reports/constants.md`.
+        neighbourhood, path_entries, success: see their descriptions.
         recent: how the ranking weights this session's recent attempts.
         matcher, acceptance: settings of the two halves of an attempt.
     """
@@ -50,6 +75,27 @@ class LocaliserConfig:
     guide_below_rad: float = float(np.deg2rad(3.0))
     lost_max_samples: int = 500
     lost_max_hypotheses: int = 100
+    neighbourhood: Annotated[
+        NeighbourhoodSearch,
+        Meta(
+            description="surest predicts a node by its least uncertain chain, proximity edges "
+            "among them; breadth-first by its shortest, within the radius, as [G16] §III-A does"
+        ),
+    ] = NeighbourhoodSearch.SUREST
+    path_entries: Annotated[
+        PathEntries,
+        Meta(
+            description="nodes on a path: all counts those that the drive saved, too; matches only "
+            "those that it matched, as [L15] §IV does"
+        ),
+    ] = PathEntries.ALL
+    success: Annotated[
+        Success,
+        Meta(
+            description="of several successes of a round, most-inliers keeps the best; first ends "
+            "the frame with the highest ranked, as [L15] §III-C does"
+        ),
+    ] = Success.MOST_INLIERS
     recent: RecentConfig = field(default_factory=RecentConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)

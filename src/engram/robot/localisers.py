@@ -13,7 +13,7 @@ from engram.graph.basin import MatchBasin
 from engram.graph.clock import Clocked
 from engram.graph.model import Session, SessionId, path_id
 from engram.graph.neighbourhood import Neighbourhood
-from engram.graph.paths import PathMemory
+from engram.graph.paths import MATCHES_ONLY, PathMemory
 from engram.localiser import (
     RELOCALISERS,
     UNNAMED_LIVE_SESSION,
@@ -22,6 +22,7 @@ from engram.localiser import (
     Matcher,
     Relocaliser,
 )
+from engram.localiser.settings import PathEntries
 from engram.maps import Map
 from engram.places.words import words_of
 from engram.ranking import (
@@ -77,7 +78,7 @@ def localiser_in(
         words.prepare()
     return Localiser(
         opened.graph,
-        path_memory or opened.path_memory,
+        path_memory or _counted_paths(opened, settings),
         opened.frames,
         policy=ranking,
         budget=budget or Budget(),
@@ -94,6 +95,13 @@ def localiser_in(
         background=background,
         clock=clock,
     )
+
+
+def _counted_paths(opened: Map, settings: Settings) -> PathMemory:
+    """The map's paths, with the kinds of entry that the settings count."""
+    if settings.localiser.path_entries is PathEntries.MATCHES:
+        return opened.path_memory.counting(MATCHES_ONLY)
+    return opened.path_memory
 
 
 def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Relocaliser:

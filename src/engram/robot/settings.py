@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import tomllib
+from dataclasses import dataclass, field, fields, replace
+from importlib.resources import files
 from pathlib import Path
 
-from engram.config import load_toml
+from engram.config import from_dict, load_toml
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
@@ -13,6 +15,9 @@ from engram.localiser import Budget, LocaliserConfig
 from engram.mapper import MapperConfig
 from engram.odometry import OdometryConfig
 from engram.ranking import check_for_robot
+
+# Settings files that ship with the package: the rules of one paper each.
+PAPERS = ("linegar2015", "gadd2016")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,11 +99,26 @@ def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:
 
 
 def _read_settings(path: Path) -> Settings:
+    text = settings_text(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as settings: {error}") from error
-    try:
+        if str(path) in PAPERS:  # has rules of the fleet, too
+            own = {one.name for one in fields(Settings)}
+            values = {key: value for key, value in tomllib.loads(text).items() if key in own}
+            return from_dict(values, Settings)
         return load_toml(text, Settings)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
+
+
+def settings_text(path: Path) -> str:
+    """The text of a settings file, or of one that ships with the package, by its name.
+
+    Raises:
+        ConfigError: the file cannot be read.
+    """
+    if str(path) in PAPERS and not path.exists():
+        return (files("engram.robot") / "papers" / f"{path}.toml").read_text(encoding="utf-8")
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as settings: {error}") from error

@@ -18,6 +18,7 @@ from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
 from engram.fleet.merge.state import Merge
+from engram.fleet.merge.whole_segments import SeedFrom, Unit, localises_well
 from engram.frontend import Frame, FrameStatus
 from engram.graph.model import (
     Attempt,
@@ -71,7 +72,7 @@ class MergeOptions:
             input gives the same map.
         relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
         author: who merges; None for the robots whose drives bring something new.
-        sure_inliers: see its description.
+        sure_inliers, unit, segment_share, seed: see their descriptions.
     """
 
     policy: str = "recall"
@@ -88,6 +89,29 @@ class MergeOptions:
             "barely matches. 0 omits on every match, as [G16] does",
         ),
     ] = 40
+    unit: Annotated[
+        Unit,
+        msgspec.Meta(
+            description="what is omitted or taken at once: each frame, or a whole segment, as "
+            "[G16] Fig. 4 draws it"
+        ),
+    ] = Unit.FRAME
+    segment_share: Annotated[
+        float,
+        msgspec.Meta(
+            ge=0,
+            le=1,
+            description="unit segment: share of its frames that must localise for it to be "
+            "omitted; [G16] gives none",
+        ),
+    ] = 0.5
+    seed: Annotated[
+        SeedFrom,
+        msgspec.Meta(
+            description="where the replay of a segment starts: at a neighbour that the fleet map "
+            "knows, or always by place recognition, as [G16] §V-A does"
+        ),
+    ] = SeedFrom.NEIGHBOUR
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -137,20 +161,18 @@ class Replay(Keeper):
         self._run: list[int] = []  # nodes taken in a row, by their dense indices
         self._visited: NodeId | None = None  # matched or taken last
         self._kept: list[KeptNode] = []
+        # Whether the segment is omitted as a whole; None where each frame decides.
+        self._omits: bool | None = None
 
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
         """Replays one segment: omits nodes that localise, takes the rest (SPEC §7 MERGE 3).
 
         Also takes nodes that other drives use and that match only weakly; see `MergeOptions`.
         """
-        seed, self._ahead, self._visited, self._kept = Seed.NONE, None, None, []
-        self._start = self._seed(segment)
-        if self._start is not None:
-            seed = Seed.NEIGHBOUR
-        else:
-            self._ahead = self._look_behind_gap(session, segment)
-            seed = Seed.NONE if self._ahead is None else Seed.GAP
+        self._visited, self._kept = None, []
+        seed = self._find_start(session, segment)
         self._last = segment
+        self._omits = self._covers(session, segment) if self._whole else None
         if self._relocaliser is not None:
             self._relocaliser.forget()
         self._localiser = self._localiser_of(session, segment, self._relocaliser)
@@ -166,6 +188,8 @@ class Replay(Keeper):
         """See `Keeper`: the position of a frame that the robot itself measured to a known node."""
         del motion
         node, (known, self._start) = self._stored.node, (self._start, None)
+        if self._options.seed is SeedFrom.PLACES:
+            return None
         if self._ahead is not None and self._ahead.found.stamp_ns == live.stamp_ns:
             return Hint(self._ahead.found.position, found=self._ahead.found)
         if self._run:
@@ -203,6 +227,32 @@ class Replay(Keeper):
         self._monitor.advance("added" if reason else "covered")
         self._monitor.check()
         return found
+
+    @property
+    def _whole(self) -> bool:
+        return self._options.unit is Unit.SEGMENT
+
+    def _find_start(self, session: Session, segment: Segment) -> Seed:
+        """Looks for the position of the first frame, unless place recognition is to give it."""
+        self._start = self._ahead = None
+        if self._options.seed is SeedFrom.PLACES:
+            return Seed.NONE
+        self._start = self._seed(segment)
+        if self._start is not None:
+            return Seed.NEIGHBOUR
+        self._ahead = None if self._whole else self._look_behind_gap(session, segment)
+        return Seed.NONE if self._ahead is None else Seed.GAP
+
+    def _covers(self, session: Session, segment: Segment) -> bool:
+        """Whether the fleet map shows the segment as a whole."""
+        if self._relocaliser is not None:
+            self._relocaliser.forget()
+        localiser = self._localiser_of(session, segment, self._relocaliser)
+        with Robot(Front(self._settings), localiser) as robot:
+            if self._start is not None:
+                robot.place_at(self._start)
+            frames = (logged for _, logged in self._stream(segment))
+            return localises_well(robot, frames, self._options.segment_share)
 
     # -- the stream
 
@@ -311,6 +361,9 @@ class Replay(Keeper):
 
     def _reason(self, node: Node, frame: Frame, found: Localisation) -> Reason | None:
         """Why a node is taken; None if its match can replace it for all drives that use it."""
+        if self._omits is not None:
+            omitted = self._omits and found.position is not None
+            return None if omitted else Reason.WHOLE_SEGMENT
         if found.localised:
             is_sure = found.inliers >= self._options.sure_inliers
             relied_on = node.id in self._merge.relied_on
@@ -362,8 +415,10 @@ class Replay(Keeper):
 
 
 def _measured(found: Localisation) -> Position:
-    """Position of a localised frame."""
-    assert found.node is not None
+    """Position of a localised frame; of others in a segment that is omitted, by odometry."""
+    if found.node is None:
+        assert found.position is not None
+        return found.position
     assert found.node_from_live is not None
     assert found.covariance is not None
     return Position(found.node, found.node_from_live, found.covariance)

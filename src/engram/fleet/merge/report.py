@@ -34,6 +34,7 @@ class Reason(StrEnum):
     NO_PLACE = "no_place"
     NO_MATCH = "no_match"
     WEAK_MATCH = "weak_match"
+    WHOLE_SEGMENT = "whole_segment"
 
 
 _WORDS = {
@@ -42,6 +43,7 @@ _WORDS = {
     Reason.NO_PLACE: "no similar place in the map",
     Reason.NO_MATCH: "nearby nodes do not match",
     Reason.WEAK_MATCH: "weak match of a node that other drives use",
+    Reason.WHOLE_SEGMENT: "segments that do not localise as a whole",
 }
 
 

@@ -1,0 +1,167 @@
+"""Draws the four pictures of docs/papers.md from the tables of the studies.
+
+    python -m engram_lab.checks.paper_figures             # lab/reports → docs/pictures
+
+At most four curves each, a logarithmic axis where ratios matter, intervals (90 %) as bars.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from engram_lab.intervals import Interval, Resamples, SessionSums
+
+Row = Mapping[str, str]
+LANES = {
+    "distance": "Γ(distance)",
+    "path": "Γ(path), as published",
+    "recall": "recall",
+    "oracle": "oracle",
+}
+GROWTH = {"distance": "Γ(distance)", "path": "Γ(path), as published", "recall": "recall"}
+PARTS = {
+    "held out in copy": "everything",
+    "held out in budget 1/4": "budget,\n¼ of the bytes",
+    "held out in tod": "by hour",
+    "held out in tod+paths": "by hour\nand path",
+}
+MERGED = {"single": "one agent", "4 groups": "four, merged"}
+ARMS = {"A": "Γ(distance)", "B": "recall"}
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a table."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def pooled(rows: Sequence[Row]) -> list[Row]:
+    """The pooled rows of `begbroke` at the studies' usual settings."""
+    usual = {"campaign": "begbroke", "rounds": "1", "T": "10", "radius": "search", "mode": "memo",
+             "paths": "matched+saved", "fold": "all"}  # fmt: skip
+    return [one for one in rows if all(one[name] == value for name, value in usual.items())]
+
+
+def missed(rows: Sequence[Row]) -> Interval:
+    """Route not localised over sessions, per cent, with its interval."""
+    driven_m = np.array([float(one["driven_m"]) for one in rows])
+    share = np.array([float(one["share_not_localised"]) for one in rows])
+    found = Resamples.of(len(rows)).interval(SessionSums(share * driven_m, driven_m))
+    return Interval(100 * found.estimate, 100 * found.low, 100 * found.high)
+
+
+def sessions_of(rows: Sequence[Row], arm: str, experiment: str, name: str) -> list[Row]:
+    """Session rows of one map of the fleet study."""
+    wanted = {"arm": arm, "experiment": experiment, "map": name}
+    return [one for one in rows if all(one[key] == value for key, value in wanted.items())]
+
+
+def bars(axes: Axes, at: float, found: Interval, colour: str) -> None:
+    """One bar with its interval and its value above."""
+    axes.bar(at, found.estimate, 0.38, color=colour)
+    error = [[found.estimate - found.low], [found.high - found.estimate]]
+    axes.errorbar(at, found.estimate, error, color="black", capsize=3)
+    axes.text(at, found.high + 0.8, f"{found.estimate:.1f}", ha="center", fontsize=8)
+
+
+def curve(axes: Axes, rows: Sequence[Row], across: str, measure: str, label: str) -> None:
+    """One curve with its intervals as bars, per cent."""
+    rows = sorted(rows, key=lambda one: float(one[across]))
+    x = [float(one[across]) for one in rows]
+    y, low, high = (
+        np.array([100 * float(one[f"{measure}{end}"]) for one in rows])
+        for end in ("", "_low", "_high")
+    )
+    axes.errorbar(x, y, [y - low, high - y], marker="o", markersize=3, capsize=2, label=label)
+
+
+def lanes(rows: Sequence[Row]) -> Figure:
+    """Route missed against the number of lanes ([L15] Fig. 11)."""
+    figure, axes = _axes("lanes, Np", "route missed, %")
+    usual = [one for one in pooled(rows) if not one["map_sessions"] and one["lanes"].isdigit()]
+    for policy, label in LANES.items():
+        own = [one for one in usual if one["policy"] == policy]
+        curve(axes, own, "lanes", "share_not_localised", label)
+    axes.set_xscale("log", base=2)
+    axes.set_xticks([1, 2, 4, 8, 16], ["1", "2", "4", "8", "16"])
+    return _ended(figure, axes, logarithmic=True)
+
+
+def growth(rows: Sequence[Row]) -> Figure:
+    """P(> 10 m) as the map grows, two lanes ([L15] Fig. 9)."""
+    figure, axes = _axes("drives in the map", "P(> 10 m), %")
+    usual = [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
+    steps = {"1", "2", "4", "8", "16", "20", "24", "31"}
+    for policy, label in GROWTH.items():
+        own = [one for one in usual if one["policy"] == policy and one["map_sessions"] in steps]
+        curve(axes, own, "map_sessions", "p_gt_10m", label)
+    return _ended(figure, axes, logarithmic=True)
+
+
+def merging(rows: Sequence[Row]) -> Figure:
+    """One agent's map against four merged ones ([G16] Fig. 7)."""
+    return _compared(rows, "7", MERGED)
+
+
+def downloads(rows: Sequence[Row]) -> Figure:
+    """Held-out drives in downloads ([G16] Fig. 9)."""
+    return _compared(rows, "9", PARTS)
+
+
+def _compared(rows: Sequence[Row], experiment: str, maps: Mapping[str, str]) -> Figure:
+    figure, axes = _axes("", "route missed, %")
+    for side, (arm, label) in enumerate(ARMS.items()):
+        for place, name in enumerate(maps):
+            found = missed(sessions_of(rows, arm, experiment, name))
+            bars(axes, place + 0.4 * side - 0.2, found, f"C{side}")
+        axes.bar(0, 0, color=f"C{side}", label=label)
+    axes.set_xticks(range(len(maps)), maps.values())
+    return _ended(figure, axes, logarithmic=False)
+
+
+def _axes(across: str, up: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(5.6, 3.2), layout="constrained")
+    axes = figure.add_subplot()
+    axes.set(xlabel=across, ylabel=up)
+    return figure, axes
+
+
+def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
+    if logarithmic:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        axes.yaxis.set_major_formatter("{x:g}")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def main() -> None:
+    """Draws all four."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--reports", type=Path, default=Path("lab/reports"))
+    parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
+    asked = parser.parse_args()
+    ranking = read(asked.reports / "ranking_summary.csv")
+    fleet = read(asked.reports / "fleet_sessions.csv")
+    pictures = {
+        "lanes": lanes(ranking),
+        "growth": growth(ranking),
+        "merge": merging(fleet),
+        "downloads": downloads(fleet),
+    }
+    for name, picture in pictures.items():
+        picture.savefig(asked.out / f"papers_{name}.png", dpi=110)
+
+
+if __name__ == "__main__":
+    main()
