@@ -17,13 +17,14 @@ from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
 from engram.cli.fleet import build, download, merge
 from engram.cli.history import diff, log, revert, show, tag
+from engram.cli.live import live
 from engram.cli.maps import amend, check, info, plot, vocabulary
 from engram.cli.options import spread
 from engram.cli.showing import settings
 from engram.errors import InputError
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
-    "Drives": {"map": map_, "localise": localise, "record": record},
+    "Drives": {"map": map_, "localise": localise, "record": record, "live": live},
     "Maps": {
         "info": info,
         "plot": plot,

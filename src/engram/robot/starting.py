@@ -69,20 +69,21 @@ def robot_in(
     name: str | None = None,
     maps: bool = False,
     remembers: bool = False,
+    front: Front | None = None,
 ) -> Robot:
-    """A live robot; see `Map.robot`."""
+    """A live robot; see `Map.robot`. A `front` continues the odometry of the robot before it."""
     settings = (settings or Settings()).for_descriptor(opened.descriptor)
     owner = Owner(name, camera, settings, options)
     if not (maps or remembers):
         localiser = owner.localiser_in(opened, saves=False)
-        return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
+        return Robot(front or Front(settings), localiser, deadline_ms=options.deadline_ms)
     if name is None:
         raise ConfigError("a robot that keeps its drives needs a name: give name=")
     _check_newest(opened)
     if not maps:
-        return _keeping(owner, IntoMemory(owner, opened))
+        return _keeping(owner, IntoMemory(owner, opened), front)
     commit_spools(Path(opened.location))
-    return _keeping(owner, IntoMap(owner, open_map(opened.location)))
+    return _keeping(owner, IntoMap(owner, open_map(opened.location)), front)
 
 
 def _check_newest(opened: Map) -> None:
@@ -98,6 +99,7 @@ def _check_newest(opened: Map) -> None:
         )
 
 
-def _keeping(owner: Owner, into: Into) -> Robot:
+def _keeping(owner: Owner, into: Into, front: Front | None = None) -> Robot:
     keeper, deadline_ms = LiveKeeper(owner, into), owner.options.deadline_ms
-    return Robot(Front(owner.settings), into.localiser, keeper, deadline_ms=deadline_ms)
+    front = front or Front(owner.settings)
+    return Robot(front, into.localiser, keeper, deadline_ms=deadline_ms)

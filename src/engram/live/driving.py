@@ -1,0 +1,236 @@
+"""The robot of a live process: its map is opened with the first frame, and anew after errors."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from engram.errors import EngramError, InputError
+from engram.frontend import DescriptorKind, StereoPair
+from engram.geometry import StereoCamera
+from engram.localiser import Localisation, Position
+from engram.maps import Map, open_map
+from engram.odometry import Motion
+from engram.robot.front import Arrived, Front
+from engram.robot.live import Saving, SavingState
+from engram.robot.robot import Robot
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_in
+
+# Between attempts to open a map that cannot be opened.
+_AGAIN_AFTER_S = 2.0
+# A stamp that is earlier by less is a frame that came late; by more, a clock that was set back.
+_LATE_FRAME_NS = 1_000_000_000
+# Added to a position that was kept over a restart: wide enough that it proposes and proves nothing.
+_KEPT_SIGMA_M, _KEPT_SIGMA_RAD = 2.0, 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """What a live process drives with.
+
+    Attributes:
+        map_path: the map; made if it does not exist and the robot maps.
+        name: name of the robot.
+        maps: whether it saves frames that it does not localise.
+        settings: the resolved configuration.
+        robot: policy, budget, deadline, relocaliser.
+    """
+
+    map_path: Path
+    name: str = "robot"
+    maps: bool = False
+    settings: Settings = field(default_factory=Settings)
+    robot: RobotOptions = field(default_factory=RobotOptions)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What one frame gave.
+
+    Attributes:
+        motion: motion since the previous usable frame; None if the frame was not taken.
+        found: the localisation; None without a robot, or if the frame was not taken.
+        trouble: what went wrong; "" if nothing did.
+    """
+
+    motion: Motion | None = None
+    found: Localisation | None = None
+    trouble: str = ""
+
+
+class Driving:
+    """Takes frames whatever happens to the map, and says what went wrong.
+
+    Odometry goes on over a switch of maps, an error and a map that cannot be opened. A position
+    is kept over these, so vague that it only proposes where to look. One thread uses it.
+
+    Args:
+        options: map and robot.
+        now: the clock, seconds.
+    """
+
+    def __init__(self, options: LiveOptions, now: Callable[[], float] = time.monotonic) -> None:
+        self.options = options
+        self.trouble = ""
+        self._now = now
+        self._camera: StereoCamera | None = None
+        self._front: tuple[DescriptorKind, Front] | None = None
+        self._map: Map | None = None
+        self._robot: Robot | None = None
+        self._saved = Saving()
+        self._belief: Position | None = None
+        self._stamp_ns: int | None = None
+        self._open_after = -np.inf
+
+    @property
+    def saving(self) -> Saving:
+        """Whether and where the drive is saved; of the last drive while none runs."""
+        return self._saved if self._robot is None else self._robot.saving
+
+    @property
+    def opened(self) -> Map | None:
+        """The map that the robot drives in; None while there is none."""
+        return self._map
+
+    def step(self, arrived: Arrived, arrived_s: float | None = None) -> Step:
+        """Takes a frame: opens the map if it is not open, localises, and survives its errors.
+
+        Args:
+            arrived: the frame.
+            arrived_s: `time.perf_counter` when it arrived; None for now.
+        """
+        frame = arrived if isinstance(arrived, StereoPair) else arrived.frame
+        if trouble := self._misplaced(frame.stamp_ns):
+            return Step(trouble=trouble)
+        if self._camera is not None and frame.camera != self._camera:
+            self.pause()
+            self._front = None
+        self._camera = frame.camera
+        robot = self._robot or self._begun()
+        self._stamp_ns = frame.stamp_ns
+        if robot is None:
+            return Step(self._front_for(None).take(arrived)[1], trouble=self.trouble)
+        try:
+            found = robot.step(arrived, arrived_s=arrived_s)
+        except EngramError as error:
+            self.pause()
+            self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
+            return Step(trouble=self.trouble)
+        self._belief = found.position
+        self.trouble = robot.saving.reason if robot.saving.state is SavingState.FAILED else ""
+        return Step(found.motion, found, self.trouble)
+
+    def map_on(self, on: bool) -> str:
+        """Starts or ends mapping; ending commits what was mapped."""
+        said = self.pause()
+        self.options = replace(self.options, maps=on)
+        return said or f"mapping is {'on' if on else 'off'}"
+
+    def switch(self, path: Path) -> str:
+        """Continues in another map, without losing odometry.
+
+        Raises:
+            EngramError: it cannot be opened; the robot stays in the old one.
+        """
+        if not self.options.maps or path.exists():
+            open_map(path).close()
+        said = self.pause()
+        self.options = replace(self.options, map_path=path)
+        return said or f"the map is {path}"
+
+    def lose(self) -> str:
+        """Discards the position: the robot was carried elsewhere."""
+        self._belief = None
+        if self._robot is not None:
+            self._robot.lose()
+        return "the robot looks for its place in the whole map"
+
+    def pause(self) -> str:
+        """Closes robot and map, and so commits what was mapped; the next frame opens them again.
+
+        Returns:
+            What became of the drive; "" if none was saved.
+        """
+        robot, self._robot = self._robot, None
+        opened, self._map = self._map, None
+        self._open_after = -np.inf
+        if robot is None or opened is None:
+            return ""
+        try:
+            robot.close()
+        except EngramError as error:
+            self.trouble = str(error)
+        finally:
+            self._saved = robot.saving
+            with suppress(EngramError):  # the drive is what counts, and it is committed or reported
+                opened.close()
+        return "" if self._saved.state is SavingState.OFF else self._saved.text()
+
+    def _misplaced(self, stamp_ns: int) -> str:
+        """Why a frame is not taken; after a clock was set back, everything but it begins anew."""
+        if self._stamp_ns is None or stamp_ns > self._stamp_ns:
+            return ""
+        back_ns = self._stamp_ns - stamp_ns
+        if back_ns < _LATE_FRAME_NS:
+            return f"a frame is {back_ns / 1e6:.0f} ms older than the one before it; left out"
+        self.pause()
+        self._front = None
+        self._stamp_ns = None
+        return f"the camera's clock went back by {back_ns / 1e9:.1f} s; the drive begins anew"
+
+    def _begun(self) -> Robot | None:
+        """A robot in the map; None while that cannot be opened."""
+        if self._now() < self._open_after:
+            return None
+        assert self._camera is not None
+        options = self.options
+        try:
+            self._map = self._map_of(options)
+            self._robot = robot_in(
+                self._map,
+                self._camera,
+                options.settings,
+                options.robot,
+                name=options.name,
+                maps=options.maps,
+                front=self._front_for(self._map.descriptor),
+            )
+        except EngramError as error:
+            if self._map is not None:
+                self._map.close()
+            self._map = None
+            self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
+            return None
+        belief, self._belief = self._belief, None
+        if belief is not None and belief.node in self._map.graph:
+            self._robot.place_at(_vague(belief))
+        self.trouble = ""
+        return self._robot
+
+    @staticmethod
+    def _map_of(options: LiveOptions) -> Map:
+        path = options.map_path
+        if path.exists():
+            return open_map(path)
+        if not options.maps:
+            raise InputError(f"{path} does not exist; make it with engram map, or switch maps")
+        return open_map(path, create=True)
+
+    def _front_for(self, descriptor: DescriptorKind | None) -> Front:
+        """Front-end and odometry; the same as before unless the kind of descriptor changes."""
+        settings = self.options.settings.for_descriptor(descriptor)
+        kind = settings.frontend.descriptor
+        if self._front is None or self._front[0] != kind:
+            self._front = kind, Front(settings)
+        return self._front[1]
+
+
+def _vague(position: Position) -> Position:
+    doubt = np.diag(np.repeat([_KEPT_SIGMA_M**2, _KEPT_SIGMA_RAD**2], 3))
+    return Position(position.node, position.node_from_live, position.covariance + doubt)

@@ -1,0 +1,207 @@
+"""The loop of a live process: frames and commands in, poses and status out, never silent."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from threading import Event, Thread
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import EngramError
+from engram.frontend import StereoPair
+from engram.geometry import SE3, propagate_covariance
+from engram.live.driving import Driving, LiveOptions, Step
+from engram.live.transport import Command, FrameEvent, Message, Transport
+
+# Between two messages that the process is alive.
+_HEARTBEAT_S = 0.2
+# Without a frame for longer, the camera counts as silent.
+_SILENT_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """The robot's own odometry since its start: continuous, never corrected by the map.
+
+    Attributes:
+        odom_from_live: pose of the camera in that of its first image.
+        covariance: (6, 6) float64 of `odom_from_live`, left perturbation, [translation, rotation].
+    """
+
+    odom_from_live: SE3 = field(default_factory=SE3.identity)
+    covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def after(self, step: Step) -> Track:
+        """The track after one more frame; it holds still where nothing is known of the motion."""
+        motion = step.motion
+        if motion is None or motion.prev_from_curr is None or motion.covariance is None:
+            return self
+        return Track(
+            self.odom_from_live @ motion.prev_from_curr,
+            propagate_covariance(self.odom_from_live, self.covariance, motion.covariance),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What the process says of itself, five times a second.
+
+    Attributes:
+        status: `starting`, `no images`, `fault`, or the status of the newest frame.
+        trouble: what is wrong, for people; "" if nothing is.
+        frames, dropped: frames taken, and dropped for newer ones, since the start.
+        seen_s: `time.monotonic` at the newest frame; None before the first.
+    """
+
+    status: str = "starting"
+    trouble: str = ""
+    frames: int = 0
+    dropped: int = 0
+    seen_s: float | None = None
+
+
+class LiveProcess:
+    """Runs a robot from a transport until that ends or somebody asks it to stop.
+
+    Args:
+        transport: brings frames and commands.
+        options: map and robot.
+        now: the clock, seconds.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        options: LiveOptions,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._transport = transport
+        self._driving = Driving(options, now)
+        self._now = now
+        self._health = Health()
+        self._track = Track()
+        self._answers: dict[str, Callable[[Message], str]] = {
+            "map": lambda given: self._driving.map_on(bool(given.get("on", True))),
+            "save": lambda _: self._driving.pause() or "nothing was to be saved",
+            "switch": lambda given: self._driving.switch(Path(str(given["map"]))),
+            "relocalise": lambda _: self._driving.lose(),
+        }
+
+    def run(self) -> None:
+        """Serves frames and commands; on leaving, what was mapped is committed."""
+        ended = Event()
+        pulse = Thread(target=self._beat, args=(ended,), name="engram-pulse", daemon=True)
+        pulse.start()
+        try:
+            for event in self._transport.events():
+                if isinstance(event, FrameEvent):
+                    self._take(event)
+                elif isinstance(event, Command) and not self._obey(event):
+                    break
+        finally:
+            said = self._driving.pause()
+            ended.set()
+            pulse.join()
+            self._transport.tell({"is": "ended", "text": said, **self._saving()})
+
+    def _take(self, event: FrameEvent) -> None:
+        step = self._driving.step(event.arrived, event.arrived_s)
+        self._track = self._track.after(step)
+        status = "fault" if step.found is None else step.found.status.value
+        before = self._health
+        self._health = replace(
+            before,
+            status=status,
+            trouble=step.trouble,
+            frames=before.frames + 1,
+            dropped=before.dropped + event.dropped,
+            seen_s=self._now(),
+        )
+        arrived = event.arrived
+        pair = arrived if isinstance(arrived, StereoPair) else arrived.frame
+        self._transport.tell(
+            {
+                "is": "seen",
+                "stamp_ns": pair.stamp_ns,
+                "status": status,
+                "trouble": step.trouble,
+                "odom_from_live": _flat(self._track.odom_from_live.matrix()),
+                "odom_covariance": _flat(self._track.covariance),
+                "ms": 1e3 * (time.perf_counter() - event.arrived_s),
+                **_found(step),
+            }
+        )
+
+    def _obey(self, command: Command) -> bool:
+        """Answers a command; False after `stop`."""
+        if command.do == "stop":
+            return False
+        done, text = False, f"{command.do!r} is not a command: " + ", ".join(self._answers)
+        if command.do in self._answers:
+            try:
+                done, text = True, self._answers[command.do](command.given)
+            except EngramError as error:
+                done, text = False, str(error)
+            except KeyError as error:
+                done, text = False, f"{command.do} needs {error}"
+        reply = {"is": "reply", "id": command.id, "do": command.do, "ok": done, "text": text}
+        self._transport.tell(reply)
+        return True
+
+    def _beat(self, ended: Event) -> None:
+        while not ended.wait(_HEARTBEAT_S):
+            with suppress(OSError):  # nobody listens: whoever does next hears the next
+                self._transport.tell(self.alive())
+
+    def alive(self) -> Message:
+        """The message that the process is alive, and how it is."""
+        health = self._health
+        age_s = None if health.seen_s is None else self._now() - health.seen_s
+        status = health.status
+        if age_s is not None and age_s > _SILENT_S:
+            status = "no images"
+        options = self._driving.options
+        return {
+            "is": "alive",
+            "status": status,
+            "trouble": health.trouble or self._driving.trouble,
+            "age_s": age_s,
+            "frames": health.frames,
+            "dropped": health.dropped,
+            "map": str(options.map_path),
+            "maps": options.maps,
+            **self._saving(),
+        }
+
+    def _saving(self) -> Message:
+        saving = self._driving.saving
+        return {"saving": saving.state.value, "nodes": saving.nodes, "revision": saving.revision}
+
+
+def _found(step: Step) -> Message:
+    """What is said of a localisation; a pose only where there is one, with its covariance."""
+    found = step.found
+    if found is None:
+        return {}
+    said: dict[str, Any] = {
+        "attempts": found.attempts,
+        "inliers": found.inliers,
+        "late": found.late,
+        "open_loop_m": found.open_loop_m,
+        "saved": None if found.saved is None else str(found.saved),
+    }
+    if found.position is not None:
+        said["node"] = str(found.position.node)
+        said["node_from_live"] = _flat(found.position.node_from_live.matrix())
+        said["covariance"] = _flat(found.position.covariance)
+    return said
+
+
+def _flat(array: NDArray[np.float64]) -> list[float]:
+    return [float(value) for value in array.ravel()]

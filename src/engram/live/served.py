@@ -1,0 +1,265 @@
+"""The transport of a robot's middleware: a Unix socket, and images in a shared ring."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from threading import Lock
+from typing import Any, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import CalibrationError, InputError
+from engram.frontend import StereoPair
+from engram.geometry import SE3, StereoCamera
+from engram.geometry.rectification import (
+    DistortionModel,
+    RawCamera,
+    RawStereoCalibration,
+    Rectification,
+    rectify,
+)
+from engram.live.link import Link, LinkError, Ring
+from engram.live.transport import Command, FrameEvent, Message
+
+_IDLE_S = 0.1
+_MODELS = {
+    "plumb_bob": DistortionModel.RADIAL_TANGENTIAL,
+    "rational_polynomial": DistortionModel.RADIAL_TANGENTIAL,
+    "equidistant": DistortionModel.EQUIDISTANT,
+    "fisheye": DistortionModel.EQUIDISTANT,
+}
+
+
+class Served:
+    """Listens on a Unix socket, and serves one client at a time; see `engram.live.link`.
+
+    A client that goes away, or breaks the protocol, leaves the process waiting for the next one. A
+    context manager: the socket's file goes with it.
+
+    Args:
+        path: where the socket's file is made, for its owner alone.
+
+    Raises:
+        InputError: something else lies there, or another process listens.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._listening = _listening(path)
+        self._link: Link | None = None
+        self._sending = Lock()
+        self._images: _Images | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._part()
+        self._listening.close()
+        self._path.unlink(missing_ok=True)
+
+    def events(self) -> Iterator[FrameEvent | Command | None]:
+        """See `Transport`; never ends by itself."""
+        while True:
+            if self._link is None:
+                self._meet()
+                yield None
+                continue
+            try:
+                messages = self._link.receive(_IDLE_S)
+            except (OSError, EOFError, LinkError) as error:
+                self._part(error)
+                continue
+            frames = [one for one in messages if one.get("do") == "frame"]
+            for message in messages:
+                if message.get("do") == "camera":
+                    self._told(message, self._see)
+                elif message.get("do") != "frame":
+                    yield Command(str(message.get("do")), message, message.get("id"))
+            yield self._frame(frames) if frames else None
+
+    def tell(self, message: Message) -> None:
+        """See `Transport`."""
+        with self._sending:
+            if self._link is None:
+                return
+            try:
+                self._link.send(message)
+            except OSError:
+                # Whoever reads finds the broken link and parts; a client that is stuck is dropped.
+                self._link.close()
+
+    def _meet(self) -> None:
+        try:
+            connection, _ = self._listening.accept()
+        except TimeoutError:
+            return
+        with self._sending:
+            self._link = Link(connection)
+
+    def _part(self, error: Exception | None = None) -> None:
+        if isinstance(error, LinkError):
+            self.tell({"is": "reply", "id": None, "do": "link", "ok": False, "text": str(error)})
+        with self._sending:
+            if self._link is not None:
+                self._link.close()
+            self._link = None
+        if self._images is not None:
+            self._images.close()
+        self._images = None
+
+    def _see(self, message: Message) -> None:
+        images = _Images(message)
+        if self._images is not None:
+            self._images.close()
+        self._images = images
+
+    def _frame(self, frames: list[Message]) -> FrameEvent | None:
+        """The newest frame that is still whole."""
+        now = time.perf_counter()
+        for older, message in enumerate(reversed(frames)):
+            if self._images is None:
+                self._refuse(message, "no camera was given yet")
+                return None
+            pair = self._told(message, self._images.pair)
+            if pair is not None:
+                return FrameEvent(pair, now, len(frames) - 1 - older)
+        return None
+
+    def _told(self, message: Message, act: Callable[[Message], Any]) -> Any:
+        """Does what a message says; a message that is wrong is answered, and goes no further."""
+        try:
+            return act(message)
+        except (InputError, LinkError, OSError) as error:
+            self._refuse(message, str(error))
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            self._refuse(message, f"{message.get('do')} is not understood: {error!r}")
+        return None
+
+    def _refuse(self, message: Message, text: str) -> None:
+        do, asked = message.get("do"), message.get("id")
+        self.tell({"is": "reply", "id": asked, "do": do, "ok": False, "text": text})
+
+
+class _Images:
+    """The ring of a client, and its camera."""
+
+    def __init__(self, message: Mapping[str, Any]) -> None:
+        given = message["camera"]
+        self._rectification: Rectification | None = None
+        if "left" in given:
+            self._rectification = rectify(raw_calibration(given["left"], given["right"]))
+            self.camera = self._rectification.camera
+            size = int(given["left"]["width"]), int(given["left"]["height"])
+        else:
+            self.camera = StereoCamera(**{key: given[key] for key in _RECTIFIED})
+            size = self.camera.width, self.camera.height
+        self._ring = Ring.open(str(message["ring"]))
+        if (self._ring.width, self._ring.height) != size:
+            self._ring.close()
+            raise CalibrationError(
+                f"images are {self._ring.width} × {self._ring.height} px, those of the "
+                f"calibration {size[0]} × {size[1]}"
+            )
+
+    def pair(self, message: Mapping[str, Any]) -> StereoPair | None:
+        """The rectified pair of a ticket; None if it was overwritten."""
+        images = self._ring.read(int(message["ticket"]))
+        if images is None:
+            return None
+        left, right = images
+        if self._rectification is not None:
+            tables = self._rectification.left, self._rectification.right
+            left, right = (
+                np.asarray(
+                    cv2.remap(image, table.pixels, table.fractions, cv2.INTER_LINEAR), np.uint8
+                )
+                for image, table in zip((left, right), tables, strict=True)
+            )
+        return StereoPair(int(message["stamp_ns"]), left, right, self.camera)
+
+    def close(self) -> None:
+        """Lets go of the ring."""
+        self._ring.close()
+
+
+_RECTIFIED = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
+
+
+def raw_calibration(left: Mapping[str, Any], right: Mapping[str, Any]) -> RawStereoCalibration:
+    """The calibration of two ROS `CameraInfo`s of one stereo camera.
+
+    Rotation and baseline between the cameras follow from their rectification: with rectified
+    points ``x' = R x`` and ``P_right[0, 3] = -fx · baseline``.
+
+    Args:
+        left, right: `width`, `height`, `k` (9), `d`, `r` (9), `p` (12), `distortion_model`.
+
+    Raises:
+        CalibrationError: a lens model is not supported, or the pair has no baseline.
+    """
+    shift_m = float(right["p"][3]) / float(right["p"][0])
+    if not shift_m < 0:
+        raise CalibrationError(
+            f"P[3] of the right camera_info gives a baseline of {-shift_m:.3f} m, must be > 0: are "
+            "the cameras swapped, or not calibrated as a pair?"
+        )
+    rotation_left, rotation_right = (_matrix(one["r"]) for one in (left, right))
+    right_from_left = SE3(
+        rotation_right.T @ rotation_left, rotation_right.T @ np.array([shift_m, 0.0, 0.0])
+    )
+    return RawStereoCalibration(_raw(left), _raw(right), right_from_left)
+
+
+def _raw(info: Mapping[str, Any]) -> RawCamera:
+    k, coefficients = [float(one) for one in info["k"]], [float(one) for one in info["d"]]
+    model = str(info["distortion_model"])
+    if model not in _MODELS:
+        known = ", ".join(_MODELS)
+        raise CalibrationError(f"distortion model {model!r} is not one of {known}")
+    bent = _MODELS[model] if any(coefficients) else DistortionModel.NONE
+    return RawCamera(
+        k[0],
+        k[4],
+        k[2],
+        k[5],
+        int(info["width"]),
+        int(info["height"]),
+        bent,
+        tuple(coefficients) if bent is not DistortionModel.NONE else (),
+    )
+
+
+def _matrix(values: Any) -> NDArray[np.float64]:
+    return np.array(values, np.float64).reshape(3, 3)
+
+
+def _listening(path: Path) -> socket.socket:
+    """A socket that listens at a path; a file that a dead process left there is replaced."""
+    if path.exists() or path.is_symlink():
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise InputError(f"{path} is not a socket; give another path")
+        with suppress(OSError):
+            Link.connect(str(path)).close()
+            raise InputError(f"another process listens at {path}; give another path")
+        path.unlink()
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    before = os.umask(0o177)
+    try:
+        listening.bind(str(path))
+    except OSError as error:
+        listening.close()
+        raise InputError(f"{path}: cannot listen there: {error}") from error
+    finally:
+        os.umask(before)
+    listening.listen(1)
+    listening.settimeout(_IDLE_S)
+    return listening

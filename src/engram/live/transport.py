@@ -1,0 +1,149 @@
+"""Where a live process gets frames and commands from, and where its messages go."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from threading import Condition
+from typing import Any, Protocol, TypeAlias
+
+from engram.robot.front import Arrived, arriving, paced
+from engram.robot.session import DriveSequence
+
+Message: TypeAlias = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameEvent:
+    """A frame that arrived.
+
+    Attributes:
+        arrived: a pair of rectified images, or a frame of a log.
+        arrived_s: `time.perf_counter` when it did.
+        dropped: frames that were dropped for this one since the last.
+    """
+
+    arrived: Arrived
+    arrived_s: float
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What somebody asks of the process.
+
+    Attributes:
+        do: `map`, `save`, `switch`, `relocalise` or `stop`.
+        given: its arguments.
+        id: repeated in the answer.
+    """
+
+    do: str
+    given: Message = field(default_factory=dict)
+    id: Any = None
+
+
+class Transport(Protocol):
+    """Brings frames and commands to a live process, and takes its messages away."""
+
+    def events(self) -> Iterator[FrameEvent | Command | None]:
+        """What arrived, in order, the newest frame only; None whenever nothing did for a while.
+
+        Ends when nothing more can come.
+        """
+        ...
+
+    def tell(self, message: Message) -> None:
+        """Sends a message, or drops it if nobody listens; any thread may call it."""
+        ...
+
+
+class InProcess:
+    """A transport to callers in the same process; frames that nobody fetched give way to newer.
+
+    Args:
+        hear: called with each message.
+    """
+
+    def __init__(self, hear: Callable[[Message], None]) -> None:
+        self._hear = hear
+        self._changed = Condition()
+        self._commands: deque[Command] = deque()
+        self._frame: FrameEvent | None = None
+        self._closed = False
+
+    def give(self, arrived: Arrived) -> None:
+        """Hands over a frame; replaces one that still waits."""
+        with self._changed:
+            dropped = 0 if self._frame is None else self._frame.dropped + 1
+            self._frame = FrameEvent(arrived, time.perf_counter(), dropped)
+            self._changed.notify()
+
+    def ask(self, do: str, **given: Any) -> None:
+        """Hands over a command; the message with `is` = `reply` answers it."""
+        with self._changed:
+            self._commands.append(Command(do, given))
+            self._changed.notify()
+
+    def close(self) -> None:
+        """No more frames or commands will come; those that wait are still taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def events(self) -> Iterator[FrameEvent | Command | None]:
+        """See `Transport`."""
+        while True:
+            with self._changed:
+                if not (self._commands or self._frame or self._closed):
+                    self._changed.wait(0.1)
+                event: FrameEvent | Command | None
+                if self._commands:
+                    event = self._commands.popleft()
+                else:
+                    event, self._frame = self._frame, None
+                    if event is None and self._closed:
+                        return
+            yield event
+
+    def tell(self, message: Message) -> None:
+        """See `Transport`."""
+        self._hear(message)
+
+
+class Played:
+    """A transport that plays a recorded drive, in real time or as fast as the robot goes.
+
+    Args:
+        sequence: the drive.
+        hear: called with each message.
+        rate_hz: frames a second, of which late ones are dropped; None plays every frame at once.
+    """
+
+    def __init__(
+        self,
+        sequence: DriveSequence,
+        hear: Callable[[Message], None],
+        rate_hz: float | None = None,
+    ) -> None:
+        self._sequence = sequence
+        self._hear = hear
+        self._rate_hz = rate_hz
+
+    def events(self) -> Iterator[FrameEvent | Command | None]:
+        """See `Transport`."""
+        dropped = 0
+        with closing(arriving(self._sequence)) as entries:
+            for due, arrived in paced(entries, self._rate_hz):
+                if self._rate_hz is not None and time.perf_counter() > due + 1 / self._rate_hz:
+                    dropped += 1
+                    continue
+                yield FrameEvent(arrived, due, dropped)
+                dropped = 0
+
+    def tell(self, message: Message) -> None:
+        """See `Transport`."""
+        self._hear(message)

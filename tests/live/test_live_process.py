@@ -1,0 +1,274 @@
+"""A live process over each transport: it localises, obeys, survives, and is never silent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from queue import Empty, Queue
+from threading import Thread
+from typing import Any, Protocol
+
+import numpy as np
+import pytest
+
+from engram.errors import InputError
+from engram.frontend import StereoPair
+from engram.live import InProcess, LiveOptions, LiveProcess, Played, Served
+from engram.live.link import Link, Ring
+from engram.maps import open_map
+from engram.robot import RobotOptions, map_drive, open_drive
+
+OPTIONS = RobotOptions(lanes=1, rounds=4, threads=False)
+
+
+class Client(Protocol):
+    """A robot's middleware."""
+
+    def give(self, pair: StereoPair) -> None: ...
+    def ask(self, do: str, **given: Any) -> None: ...
+    def hear(self) -> dict[str, Any]: ...
+
+
+class Caller:
+    """The middleware in the same process."""
+
+    def __init__(self) -> None:
+        self.heard: Queue[dict[str, Any]] = Queue()
+        self.transport = InProcess(self.heard.put)
+        self.give, self.ask = self.transport.give, self.transport.ask
+
+    def hear(self) -> dict[str, Any]:
+        return self.heard.get(timeout=30)
+
+
+class Middleware:
+    """The middleware at the other end of a socket, with its ring of images."""
+
+    def __init__(self, folder: Path) -> None:
+        self.transport = Served(folder / "socket")
+        self.folder, self.ring = folder, None
+        self.link, self.heard = Link.connect(str(folder / "socket")), []
+
+    def give(self, pair: StereoPair) -> None:
+        if self.ring is None:
+            camera = pair.camera
+            path = str(self.folder / "ring")
+            self.ring = Ring.create(path, camera.width, camera.height)
+            names = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
+            said = {name: getattr(camera, name) for name in names}
+            self.link.send({"do": "camera", "ring": path, "camera": said})
+        ticket = self.ring.write(pair.stamp_ns, pair.left, pair.right)
+        self.link.send({"do": "frame", "ticket": ticket, "stamp_ns": pair.stamp_ns})
+
+    def ask(self, do: str, **given: Any) -> None:
+        self.link.send({"do": do, **given})
+
+    def hear(self) -> dict[str, Any]:
+        if not self.heard:
+            self.heard = self.link.receive(30)
+        return self.heard.pop(0)
+
+
+@contextmanager
+def running(kind: str, folder: Path, options: LiveOptions) -> Iterator[Client]:
+    """A live process on its own thread, and its client."""
+    client = Caller() if kind == "in process" else Middleware(folder)
+    thread = Thread(target=LiveProcess(client.transport, options).run)
+    thread.start()
+    try:
+        yield client
+    finally:
+        client.ask("stop")
+        thread.join(timeout=60)
+        assert not thread.is_alive()
+        if isinstance(client, Middleware):
+            client.transport.__exit__()
+
+
+def until(client: Client, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """The first message like this."""
+    for _ in range(2_000):
+        message = client.hear()
+        if wanted(message):
+            return message
+    raise AssertionError("it was never said")
+
+
+def seen(client: Client, pair: StereoPair) -> dict[str, Any]:
+    client.give(pair)
+    return until(client, lambda one: one["is"] == "seen" and one["stamp_ns"] == pair.stamp_ns)
+
+
+def answered(client: Client, do: str, **given: Any) -> dict[str, Any]:
+    client.ask(do, **given)
+    return until(client, lambda one: one["is"] == "reply" and one["do"] == do)
+
+
+@pytest.fixture(scope="module")
+def town(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("live") / "street.engram"
+    map_drive(path, open_drive(street, frames="::2"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def pairs(street: Path) -> list[StereoPair]:
+    return list(open_drive(street))[:8]  # type: ignore[arg-type]
+
+
+@pytest.fixture(params=["in process", "socket"])
+def client(request: pytest.FixtureRequest, town: Path, tmp_path: Path) -> Iterator[Client]:
+    with running(request.param, tmp_path, LiveOptions(town, robot=OPTIONS)) as one:
+        yield one
+
+
+def test_it_says_where_the_robot_is(client: Client, pairs: list[StereoPair]) -> None:
+    found = [seen(client, pair) for pair in pairs]
+    assert [one["status"] for one in found].count("localised") >= len(pairs) - 1
+    last = found[-1]
+    assert np.array(last["covariance"]).shape == (36,)
+    assert last["odom_from_live"][11] > 0.5  # metres driven ahead
+    assert last["node"]
+
+
+def test_it_is_never_silent(client: Client) -> None:
+    """Without camera and client's word, it says that it lives, and that nothing comes."""
+    for _ in range(3):
+        alive = until(client, lambda one: one["is"] == "alive")
+        assert alive["status"] == "starting"
+        assert alive["age_s"] is None
+
+
+def test_unknown_and_incomplete_commands_are_answered(client: Client) -> None:
+    assert "not a command" in answered(client, "dance")["text"]
+    assert "switch needs 'map'" in answered(client, "switch")["text"]
+
+
+def test_odometry_goes_on_without_a_map(
+    client: Client, pairs: list[StereoPair], town: Path
+) -> None:
+    before = seen(client, pairs[0])
+    refused = answered(client, "switch", map=str(town) + ".none")
+    assert not refused["ok"]
+    assert "no such file" in refused["text"]
+    after = seen(client, pairs[1])
+    assert after["status"] == "localised"
+    assert after["odom_from_live"] != before["odom_from_live"]
+
+
+def test_a_clock_that_goes_back_begins_the_drive_anew(
+    client: Client, pairs: list[StereoPair]
+) -> None:
+    seen(client, replace(pairs[0], stamp_ns=pairs[0].stamp_ns + 10**13))
+    assert "clock went back" in seen(client, pairs[1])["trouble"]
+    assert seen(client, pairs[2])["trouble"] == ""
+    late = replace(pairs[3], stamp_ns=pairs[2].stamp_ns - 1)
+    assert "left out" in seen(client, late)["trouble"]
+    assert [seen(client, pair)["status"] for pair in pairs[4:6]][-1] == "localised"
+
+
+def test_it_maps_and_commits(pairs: list[StereoPair], tmp_path: Path) -> None:
+    path = tmp_path / "new.engram"
+    with running("in process", tmp_path, LiveOptions(path, "r1", maps=True, robot=OPTIONS)) as one:
+        for pair in pairs:
+            seen(one, pair)
+        said = answered(one, "map", on=False)
+    assert "revision 1" in said["text"]
+    with open_map(path) as opened:
+        assert len(opened.graph) > 0
+
+
+def test_a_missing_map_is_reported_and_odometry_continues(
+    pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    with running("in process", tmp_path, LiveOptions(tmp_path / "no.engram")) as one:
+        found = [seen(one, pair) for pair in pairs[:3]]
+    assert {message["status"] for message in found} == {"fault"}
+    assert "does not exist" in found[0]["trouble"]
+    assert found[2]["odom_from_live"][11] > found[1]["odom_from_live"][11]
+    assert "covariance" not in found[2]
+
+
+def test_the_newest_frame_wins(town: Path, pairs: list[StereoPair]) -> None:
+    heard: Queue[dict[str, Any]] = Queue()
+    transport = InProcess(heard.put)
+    for pair in pairs:
+        transport.give(pair)
+    transport.close()
+    LiveProcess(transport, LiveOptions(town, robot=OPTIONS)).run()
+    messages = [heard.get_nowait() for _ in range(heard.qsize())]
+    assert [one["stamp_ns"] for one in messages if one["is"] == "seen"] == [pairs[-1].stamp_ns]
+
+
+def test_a_client_that_breaks_the_protocol_is_left_and_the_next_one_served(
+    town: Path, pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    with running("socket", tmp_path, LiveOptions(town, robot=OPTIONS)) as one:
+        assert isinstance(one, Middleware)
+        one.link.send({"do": "frame", "ticket": 0, "stamp_ns": 1})
+        assert "no camera" in until(one, lambda said: said["is"] == "reply")["text"]
+        one.link.send({"do": "camera", "ring": "/dev/null", "camera": {"fx": "wide"}})
+        assert "not understood" in until(one, lambda said: said["is"] == "reply")["text"]
+        one.link._socket.sendall(b"hello\n")
+        with pytest.raises((EOFError, OSError)):
+            until(one, lambda _: False)
+        one.link, one.heard = Link.connect(str(tmp_path / "socket")), []
+        assert seen(one, pairs[0])["stamp_ns"] == pairs[0].stamp_ns
+
+
+def test_only_a_dead_socket_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="not a socket"):
+        Served(tmp_path / "file")
+    with (
+        Served(tmp_path / "socket"),
+        pytest.raises(InputError, match="another process listens"),
+    ):
+        Served(tmp_path / "socket")
+
+
+def test_a_killed_process_leaves_a_socket_that_the_next_one_takes(
+    town: Path, pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    path = tmp_path / "socket"
+    command = "from engram.cli import main; main()"
+    arguments = [sys.executable, "-c", command, "live", str(town), "--socket", str(path)]
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE) as process:
+        link = connected(path, process)
+        assert link.receive(30)
+        os.kill(process.pid, signal.SIGKILL)
+    link.close()
+    assert path.exists()
+    Served(path).__exit__()
+    assert not path.exists()
+
+
+def connected(path: Path, process: subprocess.Popen[bytes]) -> Link:
+    """A link to a process that is starting."""
+    while process.poll() is None:
+        if path.exists():
+            try:
+                return Link.connect(str(path))
+            except OSError:  # bound, and not yet listening
+                continue
+    assert process.stderr is not None
+    raise AssertionError(process.stderr.read().decode())
+
+
+def test_a_drive_is_played_in_real_time_without_its_late_frames(street: Path, town: Path) -> None:
+    heard: Queue[dict[str, Any]] = Queue()
+    sequence = open_drive(street, frames=":6")
+    LiveProcess(Played(sequence, heard.put, rate_hz=1_000.0), LiveOptions(town)).run()
+    messages = []
+    try:
+        while True:
+            messages.append(heard.get_nowait())
+    except Empty:
+        taken = [one for one in messages if one["is"] == "seen"]
+    assert 1 <= len(taken) < 6
