@@ -25,9 +25,13 @@ def test_help_lists_the_verbs_in_their_groups(engram) -> None:
     assert len(lines) <= 45, "one screen"
 
 
-def test_the_products_verbs_take_at_most_180_arguments_and_options() -> None:
-    taken = {name: sum(one.name != "help" for one in COMMANDS[name].params) for name in VERBS}
-    assert sum(taken.values()) <= 180, taken
+def test_verbs_take_few_arguments_and_options() -> None:
+    taken = {
+        name: sum(one.name != "help" for one in getattr(COMMANDS[name], "params", ()))
+        for name in VERBS
+    }
+    assert max(taken.values()) <= 30, taken
+    assert sum(taken.values()) <= 10 * len(taken), taken
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
@@ -44,13 +48,13 @@ def test_no_verb_takes_an_option_that_meant_two_things() -> None:
     assert not taken & {"--start", "--policy", "--every", "--preload"}
 
 
-def test_every_drive_verb_takes_the_options_of_a_drive() -> None:
-    options = {
+def test_every_drive_verb_takes_the_nine_options_of_a_drive() -> None:
+    nine = {
         "format", "rig", "channel", "frames", "skip_bad", "robot", "recorded_at", "longitude",
-        "zone", "from_", "to", "calibration", "fov", "mask", "left", "right",
+        "zone",
     }  # fmt: skip
     for name in ("map", "localise", "record"):
-        assert options <= {one.name for one in COMMANDS[name].params}
+        assert nine <= {one.name for one in COMMANDS[name].params}
 
 
 def test_version(engram) -> None:
