@@ -10,8 +10,9 @@ the socket: they lie in a ring in a file, best in ``/dev/shm``, which the client
 The client sends:
 
 * ``{"do": "camera", "ring": PATH, "camera": {…}}`` first, and whenever the calibration changes.
-  A rectified camera is ``fx, fy, cx, cy, baseline_m, width, height``; a raw one is ``left, right``,
-  each the ``width, height, k, d, r, p, distortion_model`` of a ROS ``CameraInfo``.
+  A rectified camera is ``fx, fy, cx, cy, baseline_m, width, height``. Or it is ``left, right``,
+  each a ROS ``camera_info`` with the names of its YAML file, and ``rectified``: whether the images
+  are.
 * ``{"do": "frame", "ticket": N, "stamp_ns": T}`` for a pair that was written to the ring.
 * ``{"do": "map", "on": true}``, ``{"do": "save"}``, ``{"do": "switch", "map": PATH}``,
   ``{"do": "relocalise"}``, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer

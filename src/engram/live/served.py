@@ -14,28 +14,16 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from engram.calibration import Cameras
+from engram.calibration.camera_info import cameras_of_infos, parse_camera_info
 from engram.errors import CalibrationError, InputError
 from engram.frontend import StereoPair
-from engram.geometry import SE3, StereoCamera
-from engram.geometry.rectification import (
-    DistortionModel,
-    RawCamera,
-    RawStereoCalibration,
-    Rectification,
-    rectify,
-)
+from engram.geometry import StereoCamera
 from engram.live.link import Link, LinkError, Ring
 from engram.live.transport import Command, FrameEvent, Message
 
 _IDLE_S = 0.1
-_MODELS = {
-    "plumb_bob": DistortionModel.RADIAL_TANGENTIAL,
-    "rational_polynomial": DistortionModel.RADIAL_TANGENTIAL,
-    "equidistant": DistortionModel.EQUIDISTANT,
-    "fisheye": DistortionModel.EQUIDISTANT,
-}
 
 
 class Served:
@@ -154,14 +142,13 @@ class _Images:
 
     def __init__(self, message: Mapping[str, Any]) -> None:
         given = message["camera"]
-        self._rectification: Rectification | None = None
         if "left" in given:
-            self._rectification = rectify(raw_calibration(given["left"], given["right"]))
-            self.camera = self._rectification.camera
-            size = int(given["left"]["width"]), int(given["left"]["height"])
+            left, right = (parse_camera_info(given[side]) for side in ("left", "right"))
+            self._cameras = cameras_of_infos(left, right, rectified=bool(given.get("rectified")))
+            size = left.width, left.height
         else:
-            self.camera = StereoCamera(**{key: given[key] for key in _RECTIFIED})
-            size = self.camera.width, self.camera.height
+            self._cameras = Cameras(StereoCamera(**{key: given[key] for key in _RECTIFIED}))
+            size = self._cameras.camera.width, self._cameras.camera.height
         self._ring = Ring.open(str(message["ring"]))
         if (self._ring.width, self._ring.height) != size:
             self._ring.close()
@@ -176,15 +163,16 @@ class _Images:
         if images is None:
             return None
         left, right = images
-        if self._rectification is not None:
-            tables = self._rectification.left, self._rectification.right
+        rectification = self._cameras.rectification
+        if rectification is not None:
+            tables = rectification.left, rectification.right
             left, right = (
                 np.asarray(
                     cv2.remap(image, table.pixels, table.fractions, cv2.INTER_LINEAR), np.uint8
                 )
                 for image, table in zip((left, right), tables, strict=True)
             )
-        return StereoPair(int(message["stamp_ns"]), left, right, self.camera)
+        return StereoPair(int(message["stamp_ns"]), left, right, self._cameras.camera)
 
     def close(self) -> None:
         """Lets go of the ring."""
@@ -192,54 +180,6 @@ class _Images:
 
 
 _RECTIFIED = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
-
-
-def raw_calibration(left: Mapping[str, Any], right: Mapping[str, Any]) -> RawStereoCalibration:
-    """The calibration of two ROS `CameraInfo`s of one stereo camera.
-
-    Rotation and baseline between the cameras follow from their rectification: with rectified
-    points ``x' = R x`` and ``P_right[0, 3] = -fx · baseline``.
-
-    Args:
-        left, right: `width`, `height`, `k` (9), `d`, `r` (9), `p` (12), `distortion_model`.
-
-    Raises:
-        CalibrationError: a lens model is not supported, or the pair has no baseline.
-    """
-    shift_m = float(right["p"][3]) / float(right["p"][0])
-    if not shift_m < 0:
-        raise CalibrationError(
-            f"P[3] of the right camera_info gives a baseline of {-shift_m:.3f} m, must be > 0: are "
-            "the cameras swapped, or not calibrated as a pair?"
-        )
-    rotation_left, rotation_right = (_matrix(one["r"]) for one in (left, right))
-    right_from_left = SE3(
-        rotation_right.T @ rotation_left, rotation_right.T @ np.array([shift_m, 0.0, 0.0])
-    )
-    return RawStereoCalibration(_raw(left), _raw(right), right_from_left)
-
-
-def _raw(info: Mapping[str, Any]) -> RawCamera:
-    k, coefficients = [float(one) for one in info["k"]], [float(one) for one in info["d"]]
-    model = str(info["distortion_model"])
-    if model not in _MODELS:
-        known = ", ".join(_MODELS)
-        raise CalibrationError(f"distortion model {model!r} is not one of {known}")
-    bent = _MODELS[model] if any(coefficients) else DistortionModel.NONE
-    return RawCamera(
-        k[0],
-        k[4],
-        k[2],
-        k[5],
-        int(info["width"]),
-        int(info["height"]),
-        bent,
-        tuple(coefficients) if bent is not DistortionModel.NONE else (),
-    )
-
-
-def _matrix(values: Any) -> NDArray[np.float64]:
-    return np.array(values, np.float64).reshape(3, 3)
 
 
 def _listening(path: Path) -> socket.socket:
