@@ -187,15 +187,16 @@ def _number_longest(track: NDArray[np.int32], most: int) -> NDArray[np.int32]:
     """Number the tracks from 0; `_UNSEEN` for those seen once and, beyond `most`, the shortest."""
     if len(track) == 0:
         return track
-    track = track - track.min()
-    length = np.bincount(track)
+    # By what lives, not by span: a landmark always in sight keeps its first number for hours.
+    living, place = np.unique(track, return_inverse=True)
+    length = np.bincount(place, minlength=len(living))
     # Lengths are at most the frames of the window; 16 bits are sorted by radix, 64 by merging.
     shortness = (length.max() - length).astype(np.uint16)
     kept = np.argsort(shortness, kind="stable")[:most]
     kept = kept[length[kept] >= 2]
     number = np.full(len(length), _UNSEEN, dtype=np.int32)
     number[kept] = np.arange(len(kept), dtype=np.int32)
-    return number[track]
+    return np.asarray(number[place])
 
 
 def _covariance_of_last_step(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
