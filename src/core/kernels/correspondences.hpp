@@ -130,7 +130,7 @@ struct Block {
                  rz = m[6] * x + m[7] * y + m[8] * z;
     const Floats depth = rz + t[2];
     usable = (depth > static_cast<float>(kNearest_m)) & (load(&matches.valid[i]) > 0.0f);
-    const Floats iz = 1.0f / (usable ? depth : Floats{} + 1.0f);
+    const Floats iz = 1.0f / select(usable, depth, 1.0f);
     const Floats xn = (rx + t[0]) * iz, yn = (ry + t[1]) * iz;
     const auto fx = static_cast<float>(matches.live.fx), fy = static_cast<float>(matches.live.fy);
     const auto baseline = static_cast<float>(matches.live.baseline_m);

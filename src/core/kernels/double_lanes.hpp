@@ -4,19 +4,30 @@
 #include <array>
 #include <cstdint>
 
+#include "kernels/pack.hpp"
+
 namespace engram::ENGRAM_ISA {
 
-typedef double Doubles __attribute__((vector_size(64)));
-typedef int64_t Longs __attribute__((vector_size(64)));
 constexpr int kDoubleLanes = 8;
+typedef Pack<double, kDoubleLanes> Doubles;
+typedef Pack<int64_t, kDoubleLanes> Longs;
 
 typedef std::array<Doubles, 3> Vec3Lanes;
 
-inline double sum(Doubles lanes) {
+inline double sum(const Doubles &lanes) {
   double total = 0;
   for (int lane = 0; lane < kDoubleLanes; ++lane)
     total += lanes[lane];
   return total;
+}
+
+// IEEE 754 fixes it to the last bit.
+inline Doubles square_root(const Doubles &lanes) {
+  Doubles result;
+  for (int k = 0; k < Doubles::kParts; ++k)
+    for (int lane = 0; lane < kDoubleLanes / Doubles::kParts; ++lane)
+      result.part[k][lane] = __builtin_sqrt(lanes.part[k][lane]);
+  return result;
 }
 
 inline Doubles dot(const Vec3Lanes &a, const Vec3Lanes &b) {

@@ -5,10 +5,8 @@
 #include <cmath>
 #include <limits>
 
-#ifdef __AVX512VPOPCNTDQ__
-#include <immintrin.h>
-#endif
-
+#include "kernels/bit_counts.hpp"
+#include "kernels/buffer.hpp"
 #include "kernels/double_lanes.hpp"
 #include "kernels/float_lanes.hpp"
 #include "kernels/projection.hpp"
@@ -21,21 +19,6 @@ namespace {
 constexpr int64_t kColumns = 32; // lanes of Shorts
 constexpr int16_t kFar = 32767;
 
-inline int popcount(uint64_t word) {
-#if defined(__POPCNT__) || defined(__aarch64__)
-  return __builtin_popcountll(word);
-#else
-  // Without an instruction for it: sums of 2, 4, 8 bits side by side. Vectorises.
-  word = word - ((word >> 1) & 0x5555555555555555);
-  word = (word & 0x3333333333333333) + ((word >> 2) & 0x3333333333333333);
-  word = (word + (word >> 4)) & 0x0f0f0f0f0f0f0f0f;
-  word += word >> 8;
-  word += word >> 16;
-  word += word >> 32;
-  return static_cast<int>(word & 0x7f);
-#endif
-}
-
 // A descriptor, wherever it stands in memory, as words that may be loaded.
 template <class Width> struct Descriptor {
   uint64_t words[most_words(Width{})];
@@ -44,16 +27,6 @@ template <class Width> struct Descriptor {
     std::memcpy(words, from, sizeof(uint64_t) * width);
   }
 };
-
-template <class Width> int hamming(const uint64_t *a, const uint64_t *b, Width width) {
-  int bits = 0;
-  for (int word = 0; word < width; ++word) {
-    uint64_t other;
-    std::memcpy(&other, b + word, sizeof other);
-    bits += popcount(a[word] ^ other);
-  }
-  return bits;
-}
 
 double power(double base, int exponent) {
   double result = 1;
@@ -142,40 +115,17 @@ Blocks blocks_of(const FrameView &frame, const MatchSettings &settings, Width wi
 // Bits in which the descriptor differs from each of a block.
 template <class Width>
 Shorts distances_to(const uint64_t *descriptor, const uint64_t *block, Width width) {
-#ifdef __AVX512VPOPCNTDQ__
-  typedef uint64_t Counts __attribute__((vector_size(64)));
-  Counts totals[4] = {};
+  Counts totals[4];
   for (int group = 0; group < 4; ++group)
-    for (int word = 0; word < width; ++word) {
-      Counts other;
-      std::memcpy(&other, block + kColumns * word + 8 * group, sizeof other);
-      totals[group] += (Counts)_mm512_popcnt_epi64((__m512i)(descriptor[word] ^ other));
-    }
-  return (Shorts)((totals[0] | totals[1] << 16) | (totals[2] | totals[3] << 16) << 32);
-#else
-  int32_t totals[kColumns];
-  for (int64_t column = 0; column < kColumns; ++column) {
-    totals[column] = 0;
-    for (int word = 0; word < width; ++word)
-      totals[column] += popcount(descriptor[word] ^ block[kColumns * word + column]);
-  }
-  int16_t distances[kColumns];
-  for (int i = 0; i < 8; ++i)
-    for (int group = 0; group < 4; ++group)
-      distances[4 * i + group] = static_cast<int16_t>(totals[8 * group + i]);
-  return load(distances);
-#endif
+    totals[group] = differing_bits(descriptor, block + 8 * group, kColumns, width);
+  return ((totals[0] | totals[1] << 16) | (totals[2] | totals[3] << 16) << 32).as<Shorts>();
 }
 
-int16_t least_of(Shorts lanes) {
-  typedef int16_t Half __attribute__((vector_size(32)));
-  typedef int16_t Quarter __attribute__((vector_size(16)));
-  Half halves[2];
-  std::memcpy(halves, &lanes, sizeof halves);
-  const Half half = halves[0] < halves[1] ? halves[0] : halves[1];
-  Quarter quarters[2];
-  std::memcpy(quarters, &half, sizeof quarters);
-  const Quarter quarter = quarters[0] < quarters[1] ? quarters[0] : quarters[1];
+int16_t least_of(const Shorts &lanes) {
+  const auto least_of_two = [](auto a, auto b) { return a < b ? a : b; };
+  const auto quarter =
+      least_of_two(least_of_two(quarter_of<0>(lanes), quarter_of<2>(lanes)),
+                   least_of_two(quarter_of<1>(lanes), quarter_of<3>(lanes)));
   int16_t least = kFar;
   for (int lane = 0; lane < 8; ++lane)
     least = std::min(least, quarter[lane]);
@@ -187,15 +137,15 @@ int16_t least_of(Shorts lanes) {
 class Distances {
 public:
   explicit Distances(const Blocks &blocks)
-      : blocks_(blocks), here_(blocks.count()), nearest_(blocks.count(), Shorts{} + kFar),
-        nearest_row_(blocks.count(), Shorts{} - int16_t{1}) {}
+      : blocks_(blocks), here_(blocks.count()), nearest_(blocks.count(), Shorts(kFar)),
+        nearest_row_(blocks.count(), Shorts(-1)) {}
 
   // Returns the least. Out of line, so that the descriptor stays in registers over all blocks.
   template <class Width>
   [[gnu::noinline]] int16_t measure(const uint64_t *descriptor, int16_t row, double least_m, double most_m,
                   Width width) {
     touched_.clear();
-    Shorts smallest = Shorts{} + kFar;
+    Shorts smallest(kFar);
     for (int64_t block = 0; block < blocks_.count(); ++block) {
       if (blocks_.most_m[block] < least_m || blocks_.least_m[block] > most_m)
         continue;
@@ -203,10 +153,10 @@ public:
       if (block == blocks_.count() - 1)
         here |= blocks_.beyond;
       const Shorts before = nearest_[block], closer = here < before;
-      smallest = here < smallest ? here : smallest;
+      smallest = smaller(here, smallest);
       here_[block] = here;
-      nearest_[block] = closer ? here : before;
-      nearest_row_[block] = closer ? Shorts{} + row : nearest_row_[block];
+      nearest_[block] = select(closer, here, before);
+      nearest_row_[block] = select(closer, Shorts(row), nearest_row_[block]);
       touched_.push_back(static_cast<int32_t>(block));
     }
     return least_of(smallest);
@@ -262,36 +212,46 @@ int32_t distinct_column(const Distances &distances, int16_t least, const MatchSe
   return best;
 }
 
-Floats magnitude(Floats lanes) { return lanes < 0.0f ? -lanes : lanes; }
+Floats magnitude(const Floats &lanes) { return (lanes.as<Ints>() & 0x7fffffff).as<Floats>(); }
 
-// Landmarks of a frame in strips across its image, from top to bottom. A window is as wide as the
-// prediction is vague, up to most of the image, so that sixteen landmarks are tested at once.
-class Strips {
+// Memory of Strips and match_near, used again by every call.
+struct Scratch {
+  Buffer<float> places;
+  Buffer<int32_t> starts, rows, nearest, candidates;
+  Buffer<uint64_t> words;
+};
+
+// Landmarks of a frame in strips across its image, from top to bottom, in blocks of sixteen. A
+// window is as wide as the prediction is vague, up to most of the image, so that sixteen landmarks
+// are tested at once. Rows of landmarks are counted in 16 bits.
+template <class Width> class Strips {
 public:
-  Strips(const FrameView &frame, double gate_sigmas) {
-    for (int64_t row = 0; row < frame.count; ++row) {
+  Strips(const FrameView &frame, double gate_sigmas, Width width, Scratch &scratch)
+      : width_(width), count_(frame.count), padded_((frame.count + kLanes - 1) / kLanes * kLanes) {
+    for (int64_t row = 0; row < count_; ++row) {
       right_ = std::max(right_, frame.pixels[2 * row]);
       bottom_ = std::max(bottom_, frame.pixels[2 * row + 1]);
     }
-    count_ = static_cast<int>(std::min(bottom_, kExtent) / kHeight) + 1;
-    starts_.assign(count_ + 1, 0);
-    for (int64_t row = 0; row < frame.count; ++row)
-      ++starts_[strip(frame.pixels[2 * row + 1]) + 1];
-    for (int k = 0; k < count_; ++k)
-      starts_[k + 1] += starts_[k];
-    std::vector<int32_t> next(starts_.begin(), starts_.end() - 1);
-    rows_.resize(frame.count);
-    for (int64_t row = 0; row < frame.count; ++row)
-      rows_[next[strip(frame.pixels[2 * row + 1])]++] = static_cast<int32_t>(row);
-    constexpr float kNowhere = 1e30f; // in the padding
-    for (auto *values : {&u_, &v_, &disparity_, &reach_})
-      values->assign(frame.count + kLanes, kNowhere);
-    for (int64_t place = 0; place < frame.count; ++place) {
+    strips_ = static_cast<int>(std::min(bottom_, kExtent) / kHeight) + 1;
+    sort(frame, scratch);
+    float *places = scratch.places.room_for(4 * padded_);
+    u_ = places, v_ = places + padded_, disparity_ = v_ + padded_, reach_ = disparity_ + padded_;
+    std::fill(places, places + 4 * padded_, kNowhere);
+    words_ = scratch.words.room_for(width * padded_);
+    for (int64_t place = 0; place < count_; ++place) {
       const int32_t row = rows_[place];
       u_[place] = frame.pixels[2 * row], v_[place] = frame.pixels[2 * row + 1];
       disparity_[place] = frame.disparity_px[row];
       reach_[place] = static_cast<float>(gate_sigmas * frame.disparity_sigma_px[row]);
+      uint64_t *words = words_of(place / kLanes) + 8 * (place % 2) + place % kLanes / 2;
+      for (int word = 0; word < width; ++word)
+        std::memcpy(words + kLanes * word, frame.descriptors + width * row + word,
+                    sizeof(uint64_t));
     }
+    nearest_ = scratch.nearest.room_for(2 * padded_);
+    std::fill(nearest_, nearest_ + padded_, kFar);
+    std::fill(nearest_ + padded_, nearest_ + 2 * padded_, -1);
+    candidates_ = scratch.candidates.room_for(padded_ + padded_ / kLanes);
   }
 
   // Whether a place is closer than the margin to the image's landmarks.
@@ -299,40 +259,110 @@ public:
     return u >= -margin && v >= -margin && u <= right_ + margin && v <= bottom_ + margin;
   }
 
-  // Calls visit(row) for the landmarks whose (u, v, disparity) lie within the radius; that of the
-  // disparity is widened by their own doubt.
-  template <class Visit>
-  void visit(const std::array<float, 3> &centre, const std::array<float, 3> &radius,
-             Visit visit) const {
+  // Compares a descriptor of reference landmark `row` with the landmarks whose (u, v, disparity)
+  // lie within the radius; that of the disparity is widened by their own doubt. Returns the least
+  // distance · 2¹⁶ + row, or kNone.
+  int32_t compare(const std::array<float, 3> &centre, const std::array<float, 3> &radius,
+                  const uint64_t *descriptor, int32_t row) {
     const int32_t begin = starts_[strip(centre[1] - radius[1])];
     const int32_t end = starts_[strip(centre[1] + radius[1]) + 1];
-    // A block may reach into the strips below, which are too far away, and into the padding.
-    for (int32_t k = begin; k < end; k += kLanes) {
+    Ints best(kNone);
+    compared_ = 0;
+    for (int32_t k = begin / kLanes * kLanes; k < end; k += kLanes) {
+      const Ints place = Ints::numbers() + k;
+      // A block may reach into the strips above and below, which are too far away.
       const Ints near = (magnitude(load(&u_[k]) - centre[0]) <= radius[0]) &
                         (magnitude(load(&v_[k]) - centre[1]) <= radius[1]) &
                         (magnitude(load(&disparity_[k]) - centre[2]) <=
-                         radius[2] + load(&reach_[k]));
-      for (uint32_t bits = bits_of(near); bits != 0; bits &= bits - 1)
-        if (const int32_t place = k + __builtin_ctz(bits); place < end)
-          visit(rows_[place]);
+                         radius[2] + load(&reach_[k])) &
+                        (place >= begin) & (place < end);
+      if (bits_of(near) == 0)
+        continue;
+      const uint64_t *words = words_of(k / kLanes);
+      const Counts even = differing_bits(descriptor, words, kLanes, width_);
+      const Counts odd = differing_bits(descriptor, words + 8, kLanes, width_);
+      const Ints distance = (even | odd << 32).as<Ints>();
+      const Ints before = load(nearest_ + k), closer = near & (distance < before);
+      select(closer, distance, before).store(nearest_ + k);
+      select(closer, Ints(row), load(nearest_ + padded_ + k)).store(nearest_ + padded_ + k);
+      const Ints key = select(near, distance << 16 | load(rows_ + k), kNone);
+      best = smaller(key, best);
+      key.store(candidates_ + kLanes * compared_);
+      candidates_[padded_ + compared_++] = k;
     }
+    return least_of(best);
   }
+
+  // Whether all that were compared last at a distance up to the limit lie at one corner.
+  bool at_one_corner(int32_t limit, const float *corner, double within_px) const {
+    for (int32_t block = 0; block < compared_; ++block) {
+      const int32_t *keys = candidates_ + kLanes * block;
+      const float *u = u_ + candidates_[padded_ + block], *v = v_ + candidates_[padded_ + block];
+      for (uint32_t bits = bits_of(load(keys) < ((limit + 1) << 16)); bits != 0; bits &= bits - 1)
+        if (const int lane = __builtin_ctz(bits); std::abs(u[lane] - corner[0]) > within_px ||
+                                                  std::abs(v[lane] - corner[1]) > within_px)
+          return false;
+    }
+    return true;
+  }
+
+  // Of each landmark the reference landmark nearest to it, by its row in the frame; −1 for none.
+  void nearest_rows(std::vector<int32_t> &rows) const {
+    rows.resize(count_);
+    for (int64_t place = 0; place < count_; ++place)
+      rows[rows_[place]] = nearest_[padded_ + place];
+  }
+
+  static constexpr int32_t kNone = 0x7fffffff;
 
 private:
   static constexpr float kHeight = 8;
   static constexpr float kExtent = 16384;
+  static constexpr float kNowhere = 1e30f; // in the padding
+
+  // By strip, in a strip by row.
+  void sort(const FrameView &frame, Scratch &scratch) {
+    starts_ = scratch.starts.room_for(2 * strips_ + 1);
+    int32_t *next = starts_ + strips_ + 1;
+    rows_ = scratch.rows.room_for(padded_);
+    std::fill(starts_, starts_ + strips_ + 1, 0);
+    for (int64_t row = 0; row < count_; ++row)
+      ++starts_[strip(frame.pixels[2 * row + 1]) + 1];
+    for (int k = 0; k < strips_; ++k)
+      starts_[k + 1] += starts_[k];
+    std::copy(starts_, starts_ + strips_, next);
+    for (int64_t row = 0; row < count_; ++row)
+      rows_[next[strip(frame.pixels[2 * row + 1])]++] = static_cast<int32_t>(row);
+    std::fill(rows_ + count_, rows_ + padded_, 0);
+  }
+
+  // Of a block's descriptors: word w of place 2 i + odd stands at 16 w + 8 odd + i, so that two
+  // vectors of counts in 64 bits shift into one of 32 bits.
+  uint64_t *words_of(int64_t block) const { return words_ + block * width_ * kLanes; }
+
+  static int32_t least_of(const Ints &lanes) {
+    const auto least_of_two = [](auto a, auto b) { return a < b ? a : b; };
+    const auto four = least_of_two(least_of_two(quarter_of<0>(lanes), quarter_of<2>(lanes)),
+                                   least_of_two(quarter_of<1>(lanes), quarter_of<3>(lanes)));
+    return std::min(std::min(four[0], four[1]), std::min(four[2], four[3]));
+  }
 
   int strip(float v) const {
     const float number = v / kHeight;
-    return number >= static_cast<float>(count_ - 1) ? count_ - 1
-           : number > 0                             ? static_cast<int>(number)
-                                                    : 0;
+    return number >= static_cast<float>(strips_ - 1) ? strips_ - 1
+           : number > 0                              ? static_cast<int>(number)
+                                                     : 0;
   }
 
+  Width width_;
+  int64_t count_, padded_;
   float right_ = 0, bottom_ = 0;
-  int count_;
-  std::vector<int32_t> starts_, rows_;
-  std::vector<float> u_, v_, disparity_, reach_;
+  int strips_, compared_ = 0;
+  int32_t *starts_, *rows_;
+  float *u_, *v_, *disparity_, *reach_;
+  uint64_t *words_;
+  int32_t *nearest_;    // distance by place, then row of the reference by place
+  int32_t *candidates_; // keys of the blocks compared last, then their first places
 };
 
 // Where reference landmarks should be seen, how far from there to look, and whether to look at all.
@@ -384,11 +414,11 @@ private:
     }
     Windows result;
     result.worth = seen[2] > kNearest_m;
-    const Doubles iz = 1.0 / (result.worth ? seen[2] : Doubles{} + 1.0);
+    const Doubles iz = 1.0 / select(result.worth, seen[2], 1.0);
     const Doubles along_u = live_.fx * iz, along_v = live_.fy * iz, d = along_u * live_.baseline_m;
     result.stereo = {along_u * seen[0] + live_.cx, along_v * seen[1] + live_.cy, d};
     // By the point, in the live camera; then by the pose, and by the depth along the ray.
-    const Doubles zero{};
+    const Doubles zero(0);
     const Vec3Lanes gradients[3] = {{along_u, zero, -along_u * seen[0] * iz},
                                     {zero, along_v, -along_v * seen[1] * iz},
                                     {zero, zero, -d * iz}};
@@ -402,18 +432,16 @@ private:
       const Doubles variance = pixel_variance + depth_variance * by_depth * by_depth +
                                variance_along({moving[0], moving[1], moving[2], turning[0],
                                                turning[1], turning[2]});
-      for (int lane = 0; lane < kDoubleLanes; ++lane) {
-        const double radius = settings_.gate_sigmas * std::sqrt(std::max(variance[lane], 0.0));
-        // So that what is no number becomes the bound.
-        result.radius[k][lane] =
-            radius < settings_.max_radius_px ? radius : settings_.max_radius_px;
-      }
+      const Doubles radius =
+          settings_.gate_sigmas * square_root(select(variance < 0.0, Doubles(0), variance));
+      // So that what is no number becomes the bound.
+      result.radius[k] = select(radius < settings_.max_radius_px, radius, settings_.max_radius_px);
     }
     return result;
   }
 
   Doubles variance_along(const std::array<Doubles, 6> &row) const {
-    Doubles total{};
+    Doubles total(0);
     for (int a = 0; a < 6; ++a) {
       Doubles cross = 0.5 * covariance_[7 * a] * row[a];
       for (int b = 0; b < a; ++b)
@@ -458,16 +486,22 @@ void match_all(const FrameView &reference, const FrameView &live, const MatchSet
       pairs.push_back({pair.reference, blocks.rows[pair.live], pair.distance});
 }
 
+// The greatest distance of a rival: distance · ratio ≤ least.
+int32_t greatest_rival(int32_t least, double ratio) {
+  auto rival = static_cast<int32_t>(least / ratio) + 1;
+  while (rival * ratio > least)
+    --rival;
+  return rival;
+}
+
 template <class Width>
 void match_near(const FrameView &reference, const FrameView &live, const Prediction &prediction,
                 const MatchSettings &settings, std::vector<RowPair> &pairs, Width width) {
   pairs.clear();
   if (reference.count == 0 || live.count == 0)
     return;
-  const Strips strips(live, settings.gate_sigmas);
-  std::vector<int32_t> nearest_distance(live.count, kFar), nearest_row(live.count, -1);
-  std::vector<std::pair<int32_t, int32_t>> candidates; // distance, live row
-  candidates.reserve(live.count);
+  static thread_local Scratch scratch;
+  Strips<Width> strips(live, settings.gate_sigmas, width, scratch);
   const Predictor predictor(reference, live.camera, prediction, settings);
   Windows windows;
   for (int64_t i = 0; i < reference.count; ++i) {
@@ -483,27 +517,17 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
       centre[k] = static_cast<float>(windows.stereo[k][lane]);
       radius[k] = static_cast<float>(windows.radius[k][lane]);
     }
-    candidates.clear();
-    std::pair<int32_t, int32_t> best{kFar, -1};
-    strips.visit(centre, radius, [&](int32_t j) {
-      const int32_t distance = hamming(descriptor.words, live.descriptors + width * j, width);
-      candidates.emplace_back(distance, j);
-      best = std::min(best, candidates.back());
-      const bool closer = distance < nearest_distance[j];
-      nearest_distance[j] = closer ? distance : nearest_distance[j];
-      nearest_row[j] = closer ? static_cast<int32_t>(i) : nearest_row[j];
-    });
-    if (best.first > settings.max_guided_distance)
+    const auto row = static_cast<int32_t>(i);
+    const int32_t key = strips.compare(centre, radius, descriptor.words, row);
+    const int32_t least = key >> 16, best = key & 0xffff;
+    if (key == strips.kNone || least > settings.max_guided_distance)
       continue;
-    const float *corner = live.pixels + 2 * best.second;
-    const bool distinct = std::none_of(candidates.begin(), candidates.end(), [&](const auto &c) {
-      return c.first * settings.guided_ratio <= best.first &&
-             (std::abs(live.pixels[2 * c.second] - corner[0]) > settings.same_corner_px ||
-              std::abs(live.pixels[2 * c.second + 1] - corner[1]) > settings.same_corner_px);
-    });
-    if (distinct)
-      pairs.push_back({static_cast<int32_t>(i), best.second, best.first});
+    if (strips.at_one_corner(greatest_rival(least, settings.guided_ratio), live.pixels + 2 * best,
+                             settings.same_corner_px))
+      pairs.push_back({row, best, least});
   }
+  static thread_local std::vector<int32_t> nearest_row;
+  strips.nearest_rows(nearest_row);
   std::erase_if(pairs, [&](const RowPair &p) { return nearest_row[p.live] != p.reference; });
 }
 

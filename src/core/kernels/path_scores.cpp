@@ -7,9 +7,7 @@
 #include <string>
 #include <vector>
 
-#ifdef __AVX512VPOPCNTDQ__
-#include <immintrin.h>
-#endif
+#include "kernels/bit_counts.hpp"
 
 // How |Y| x |W| co-occurrence counts over thousands of paths fit into a fraction of a millisecond:
 // a node is on few of all paths, so for a candidate only the rows of *its* paths are added up. A row
@@ -20,34 +18,29 @@
 namespace engram::ENGRAM_ISA {
 namespace {
 
-typedef uint64_t u64x8 __attribute__((vector_size(64)));
+typedef Counts u64x8;
 
 constexpr int64_t lanes = 8;
 constexpr int64_t nodes_per_vector = 512;
 constexpr int plane_count = 24; // counts below 2^24
 constexpr int64_t octet = 8;    // values whose masks share all planes but the lowest three
 
-#ifdef __AVX512VPOPCNTDQ__
-u64x8 popcount(u64x8 x) { return (u64x8)_mm512_popcnt_epi64((__m512i)x); }
-bool any(u64x8 x) { return _mm512_test_epi64_mask((__m512i)x, (__m512i)x) != 0; }
+bool any(const u64x8 &x) {
+#ifdef __AVX512BW__
+  return _mm512_test_epi64_mask((__m512i)x.part[0], (__m512i)x.part[0]) != 0;
 #else
-u64x8 popcount(u64x8 x) {
-  x -= (x >> 1) & 0x5555555555555555;
-  x = (x & 0x3333333333333333) + ((x >> 2) & 0x3333333333333333);
-  x = (x + (x >> 4)) & 0x0F0F0F0F0F0F0F0F;
-  x += x >> 8;
-  x += x >> 16;
-  return (x + (x >> 32)) & 0x7F;
-}
-bool any(u64x8 x) {
-  return (x[0] | x[1] | x[2] | x[3] | x[4] | x[5] | x[6] | x[7]) != 0;
-}
+  uint64_t bits = 0;
+  for (int lane = 0; lane < lanes; ++lane)
+    bits |= x[lane];
+  return bits != 0;
 #endif
+}
 
-uint64_t sum_of(u64x8 x) {
-  x += __builtin_shuffle(x, u64x8{4, 5, 6, 7, 0, 1, 2, 3});
-  x += __builtin_shuffle(x, u64x8{2, 3, 0, 1, 6, 7, 4, 5});
-  return x[0] + x[1];
+uint64_t sum_of(const u64x8 &x) {
+  uint64_t total = 0;
+  for (int lane = 0; lane < lanes; ++lane)
+    total += x[lane];
+  return total;
 }
 
 // Swaps the off-diagonal blocks of the 2 width x 2 width blocks that two rows are part of.
@@ -83,21 +76,11 @@ void transpose(u64x8 *rows) {
 
 // Lane g of row l goes to lane l of row g.
 void transpose_words(const u64x8 *in, int64_t in_step, u64x8 *out, int64_t out_step) {
-  u64x8 a[8], b[8];
-  for (int i = 0; i < 4; ++i) {
-    a[2 * i] = __builtin_shuffle(in[i * in_step], in[(i + 4) * in_step],
-                                 u64x8{0, 8, 1, 9, 2, 10, 3, 11});
-    a[2 * i + 1] = __builtin_shuffle(in[i * in_step], in[(i + 4) * in_step],
-                                     u64x8{4, 12, 5, 13, 6, 14, 7, 15});
-  }
-  for (int i = 0; i < 4; ++i) {
-    b[2 * i] = __builtin_shuffle(a[i], a[i + 4], u64x8{0, 8, 1, 9, 2, 10, 3, 11});
-    b[2 * i + 1] = __builtin_shuffle(a[i], a[i + 4], u64x8{4, 12, 5, 13, 6, 14, 7, 15});
-  }
-  for (int i = 0; i < 4; ++i) {
-    out[(2 * i) * out_step] = __builtin_shuffle(b[i], b[i + 4], u64x8{0, 8, 1, 9, 2, 10, 3, 11});
-    out[(2 * i + 1) * out_step] =
-        __builtin_shuffle(b[i], b[i + 4], u64x8{4, 12, 5, 13, 6, 14, 7, 15});
+  for (int64_t g = 0; g < lanes; ++g) {
+    uint64_t row[lanes];
+    for (int64_t l = 0; l < lanes; ++l)
+      row[l] = in[l * in_step][static_cast<int>(g)];
+    out[g * out_step] = u64x8::load(row);
   }
 }
 

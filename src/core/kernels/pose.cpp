@@ -100,13 +100,13 @@ Score score(const Correspondences &matches, const Pose &pose, float chi2, float 
   const FloatPose live_from_reference(pose);
   Score result{0, 0};
   for (int64_t start = 0; start < matches.padded; start += kBetweenChecks) {
-    Floats cost{};
-    Ints inliers{};
+    Floats cost(0);
+    Ints inliers(0);
     const int64_t end = std::min(start + kBetweenChecks, matches.padded);
     for (int64_t i = start; i < end; i += kLanes) {
       const Block block(matches, i, live_from_reference);
       const Ints inlier = block.usable & (block.chi2 < chi2);
-      cost += (inlier ? block.chi2 : Floats{} + chi2) * load(&matches.valid[i]);
+      cost += select(inlier, block.chi2, chi2) * load(&matches.valid[i]);
       inliers -= inlier;
     }
     result.cost += sum(cost);
@@ -151,18 +151,20 @@ template <int size> struct NormalEquations {
 // is C⁻¹ = D⁻¹ − κ hhᵀ, come down to a symmetric 3×3 matrix M and a vector m:
 //     H = (M, ([x]× M)ᵀ; [x]× M, −[x]× M [x]×),  g = (m, x × m).
 template <int size> struct Sums {
-  Floats moving[6]; // M: xx, yx, yy, zx, zy, zz
-  Floats mixed[9];  // [x]× M, row-major
-  Floats turning[6];
-  Floats gradient[size];
-  Floats by_offset[2][6], offsets[3]; // rows of the reference's and the live camera's offset
-  Floats cost;
+  // Where they stand: M (xx, yx, yy, zx, zy, zz); [x]× M, row-major; −[x]× M [x]×;
+  // g; the cost; rows of the reference's and the live camera's offset; the offsets' own block.
+  static constexpr int kMoving = 0, kMixed = 6, kTurning = 15, kGradient = 21,
+                       kCost = kGradient + size, kByOffset = kCost + 1, kOffsets = kByOffset + 12,
+                       kCount = size == kPose ? kByOffset : kOffsets + 3,
+                       kPadded = (kCount + 3) / 4 * 4;
+
+  Floats all[kPadded];
 
   void add(const Block &b, const FloatPose &pose, Floats valid, float scale) {
     const float *r = pose.m;
     const Floats robust = 1.0f / (1.0f + b.chi2 / scale);
-    const Floats weight = b.usable ? robust * robust : Floats{};
-    cost += b.usable ? b.chi2 * robust : valid * scale;
+    const Floats weight = select(b.usable, robust * robust, 0.0f);
+    all[kCost] += select(b.usable, b.chi2 * robust, valid * scale);
     Vec3Floats u, v, d, along; // a of each residual, and hᵀA
     for (int k = 0; k < 3; ++k) {
       u[k] = -(b.along_u * r[k] + b.u_by_z * r[6 + k]);
@@ -180,53 +182,61 @@ template <int size> struct Sums {
       for (int column = 0; column <= row; ++column)
         matrix[entry++] = pu * u[column] + pv * v[column] + pd * d[column] - pk * along[column];
     }
-    add_pose({b.x, b.y, b.z}, matrix, vector);
+    add_pose({b.x, b.y, b.z}, matrix, vector, all);
     if constexpr (size == kPoseAndOffsets)
       add_offsets(b, weight, d, along);
   }
 
   NormalEquations<size> equations() const {
+    float totals[kPadded];
+    for (int k = 0; k < kPadded; k += 4) {
+      const FourFloats four = sums(all[k], all[k + 1], all[k + 2], all[k + 3]);
+      std::memcpy(totals + k, &four, sizeof four);
+    }
     NormalEquations<size> result;
-    const auto set = [&](int row, int column, Floats lanes) {
-      result.hessian[size * row + column] = result.hessian[size * column + row] = sum(lanes);
+    const auto set = [&](int row, int column, float total) {
+      result.hessian[size * row + column] = result.hessian[size * column + row] = total;
     };
     int entry = 0;
     for (int row = 0; row < 3; ++row)
       for (int column = 0; column <= row; ++column, ++entry) {
-        set(row, column, moving[entry]);
-        set(3 + row, 3 + column, turning[entry]);
+        set(row, column, totals[kMoving + entry]);
+        set(3 + row, 3 + column, totals[kTurning + entry]);
       }
     for (int row = 0; row < 3; ++row)
       for (int column = 0; column < 3; ++column)
-        set(3 + row, column, mixed[3 * row + column]);
+        set(3 + row, column, totals[kMixed + 3 * row + column]);
     if constexpr (size == kPoseAndOffsets) {
-      for (int row = 0; row < 2; ++row)
-        for (int column = 0; column < 6; ++column)
-          set(6 + row, column, by_offset[row][column]);
-      set(6, 6, offsets[0]), set(7, 6, offsets[1]), set(7, 7, offsets[2]);
+      for (int column = 0; column < 6; ++column) {
+        set(6, column, totals[kByOffset + column]);
+        set(7, column, totals[kByOffset + 6 + column]);
+      }
+      set(6, 6, totals[kOffsets]), set(7, 6, totals[kOffsets + 1]);
+      set(7, 7, totals[kOffsets + 2]);
     }
     for (int row = 0; row < size; ++row)
-      result.gradient[row] = sum(gradient[row]);
-    result.cost = sum(cost);
+      result.gradient[row] = totals[kGradient + row];
+    result.cost = totals[kCost];
     return result;
   }
 
 private:
-  void add_pose(const Vec3Floats &x, const Floats matrix[6], const Vec3Floats &vector) {
+  static void add_pose(const Vec3Floats &x, const Floats matrix[6], const Vec3Floats &vector,
+                       Floats *all) {
     const Vec3Floats turned = cross(x, vector);
     const Vec3Floats columns[3] = {cross(x, {matrix[0], matrix[1], matrix[3]}),
                                    cross(x, {matrix[1], matrix[2], matrix[4]}),
                                    cross(x, {matrix[3], matrix[4], matrix[5]})};
     int entry = 0;
     for (int row = 0; row < 3; ++row) {
-      gradient[row] += vector[row];
-      gradient[3 + row] += turned[row];
+      all[kGradient + row] += vector[row];
+      all[kGradient + 3 + row] += turned[row];
       for (int column = 0; column < 3; ++column)
-        mixed[3 * row + column] += columns[column][row];
+        all[kMixed + 3 * row + column] += columns[column][row];
       const Vec3Floats both = cross(x, {columns[0][row], columns[1][row], columns[2][row]});
       for (int column = 0; column <= row; ++column, ++entry) {
-        moving[entry] += matrix[entry];
-        turning[entry] += both[column];
+        all[kMoving + entry] += matrix[entry];
+        all[kTurning + entry] += both[column];
       }
     }
   }
@@ -243,16 +253,16 @@ private:
     }
     const Vec3Floats turned_reference = cross(x, by_reference), turned_live = cross(x, by_live);
     for (int k = 0; k < 3; ++k) {
-      by_offset[0][k] += by_reference[k];
-      by_offset[0][3 + k] += turned_reference[k];
-      by_offset[1][k] += by_live[k];
-      by_offset[1][3 + k] += turned_live[k];
+      all[kByOffset + k] += by_reference[k];
+      all[kByOffset + 3 + k] += turned_reference[k];
+      all[kByOffset + 6 + k] += by_live[k];
+      all[kByOffset + 9 + k] += turned_live[k];
     }
-    offsets[0] += reference * b.by_offset * b.depth_information;
-    offsets[1] += reference * hd;
-    offsets[2] += wd - pk * hd;
-    gradient[6] += reference * b.hr;
-    gradient[7] += wd * b.rd - pk * b.hr;
+    all[kOffsets] += reference * b.by_offset * b.depth_information;
+    all[kOffsets + 1] += reference * hd;
+    all[kOffsets + 2] += wd - pk * hd;
+    all[kGradient + 6] += reference * b.hr;
+    all[kGradient + 7] += wd * b.rd - pk * b.hr;
   }
 };
 

@@ -75,9 +75,9 @@ Matrix multiply(const Matrix &a, const Symmetric &b) {
 Symmetric inverse(const Symmetric &m) {
   const Doubles a = m[3] * m[5] - m[4] * m[4], b = m[2] * m[4] - m[1] * m[5],
                 c = m[1] * m[4] - m[2] * m[3];
-  const Doubles determinant = m[0] * a + m[1] * b + m[2] * c, zero{};
+  const Doubles determinant = m[0] * a + m[1] * b + m[2] * c;
   const Longs regular = determinant > 0.0;
-  const Doubles s = regular ? 1.0 / (regular ? determinant : zero + 1.0) : zero;
+  const Doubles s = select(regular, 1.0 / select(regular, determinant, 1.0), 0.0);
   return {s * a,
           s * b,
           s * c,
@@ -293,9 +293,8 @@ private:
                          points[2] - pose.translation[2]};
     for (int i = 0; i < 3; ++i)
       result.in_cam[i] = r[i] * away[0] + r[3 + i] * away[1] + r[6 + i] * away[2];
-    const Doubles zero{}, one = zero + 1.0;
     result.in_front = result.in_cam[2] > kNearest_m;
-    const Doubles iz = result.inverse_z = 1.0 / (result.in_front ? result.in_cam[2] : one);
+    const Doubles iz = result.inverse_z = 1.0 / select(result.in_front, result.in_cam[2], 1.0);
     result.stereo = {camera_.fx * result.in_cam[0] * iz + camera_.cx - measured.stereo[0],
                      camera_.fy * result.in_cam[1] * iz + camera_.cy - measured.stereo[1],
                      camera_.fx * camera_.baseline_m * iz + offset_ - measured.stereo[2]};
@@ -303,8 +302,8 @@ private:
     result.chi2 = measured.pixel_information * (s[0] * s[0] + s[1] * s[1]) +
                   measured.disparity_information * s[2] * s[2];
     result.shrink = 1.0 / (1.0 + result.chi2 / settings_.chi2); // Geman–McClure
-    const Doubles behind = measured.pixel_information > 0.0 ? zero + settings_.chi2 : zero;
-    result.cost = result.in_front ? result.chi2 * result.shrink : behind;
+    const Doubles behind = select(measured.pixel_information > 0.0, Doubles(settings_.chi2), 0.0);
+    result.cost = select(result.in_front, result.chi2 * result.shrink, behind);
     return result;
   }
 
@@ -319,7 +318,7 @@ private:
   // Fills the shares of all observations at the present estimate; returns the robust cost.
   double linearise() {
     OffsetLanes offset{};
-    Doubles cost{};
+    Doubles cost(0);
     for (size_t g = 0; g < groups_.size(); ++g)
       for (int p = 0; p < frames_; ++p)
         if (const size_t slot = g * frames_ + p; present_[slot])
@@ -338,8 +337,8 @@ private:
   Doubles linearise_one(const Pose &pose, const Vector &points, const Measured &measured,
                         Share &share, OffsetLanes &offset) const {
     const Residuals there = residuals_of(pose, points, measured);
-    const Doubles iz = there.inverse_z, zero{};
-    const Doubles robust = there.in_front ? there.shrink * there.shrink : zero;
+    const Doubles iz = there.inverse_z;
+    const Doubles robust = select(there.in_front, there.shrink * there.shrink, 0.0);
     const Doubles pixel = robust * measured.pixel_information;
     const Doubles disparity = robust * measured.disparity_information;
     const Doubles along_u = camera_.fx * iz, along_v = camera_.fy * iz;
@@ -366,7 +365,7 @@ private:
   }
 
   double cost_only() const {
-    Doubles cost{};
+    Doubles cost(0);
     for (size_t g = 0; g < groups_.size(); ++g)
       for (int p = 0; p < frames_; ++p)
         if (const size_t slot = g * frames_ + p; present_[slot])
@@ -506,8 +505,7 @@ private:
         if (!present_[slot_of(g, p)])
           continue;
         const double *moved = &solution[6 * p];
-        const Doubles zero{};
-        const Vector turned = cross(x, {zero + moved[3], zero + moved[4], zero + moved[5]});
+        const Vector turned = cross(x, {moved[3], moved[4], moved[5]});
         const Vector shifted = {turned[0] - moved[0], turned[1] - moved[1], turned[2] - moved[2]};
         right = right - multiply(shares_[slot_of(g, p)].hessian, shifted);
       }

@@ -5,10 +5,7 @@
 #include <cstring>
 #include <utility>
 
-#if defined(__AVX512VPOPCNTDQ__)
-#include <immintrin.h>
-#endif
-
+#include "kernels/bit_counts.hpp"
 #include "kernels/width.hpp"
 
 namespace engram::ENGRAM_ISA {
@@ -17,48 +14,21 @@ namespace {
 constexpr int lanes = 8;
 constexpr uint64_t none = ~uint64_t{0};
 
-typedef uint64_t u64x8 __attribute__((vector_size(64)));
-
-u64x8 load(const uint64_t *from) {
-  u64x8 vector;
-  std::memcpy(&vector, from, sizeof vector);
-  return vector;
-}
-
-u64x8 popcount(u64x8 x) {
-#if defined(__AVX512VPOPCNTDQ__)
-  return (u64x8)_mm512_popcnt_epi64((__m512i)x);
-#elif defined(__POPCNT__)
-  for (int lane = 0; lane < lanes; ++lane)
-    x[lane] = static_cast<uint64_t>(__builtin_popcountll(x[lane]));
-  return x;
-#else
-  x -= (x >> 1) & 0x5555555555555555;
-  x = (x & 0x3333333333333333) + ((x >> 2) & 0x3333333333333333);
-  x = (x + (x >> 4)) & 0x0F0F0F0F0F0F0F0F;
-  x += x >> 8;
-  x += x >> 16;
-  return (x + (x >> 32)) & 0x7F;
-#endif
-}
-
-u64x8 smaller(u64x8 a, u64x8 b) { return a < b ? a : b; }
-u64x8 larger(u64x8 a, u64x8 b) { return a > b ? a : b; }
+typedef Counts u64x8;
 
 // Distance in the high half, number of the centre in the low one: the least key is the nearest
 // centre, and of equally near ones the first.
 template <class Width>
 u64x8 keys_of(const Columns &centres, int64_t first, const uint64_t *descriptor, Width width) {
-  u64x8 distance = {};
-  for (int word = 0; word < width; ++word)
-    distance += popcount(load(&centres.words[centres.stride * word + first]) ^ descriptor[word]);
+  const u64x8 distance =
+      differing_bits(descriptor, &centres.words[first], centres.stride, width);
   const auto number = static_cast<uint64_t>(first);
-  return (distance << 32) | (u64x8{0, 1, 2, 3, 4, 5, 6, 7} + number);
+  return (distance << 32) | (u64x8::numbers() + number);
 }
 
 // What of the eight lies below the end; the rest can never be the nearest.
 u64x8 up_to(u64x8 keys, int64_t end) {
-  return (keys & 0xFFFFFFFF) < static_cast<uint64_t>(end) ? keys : keys | none;
+  return select((keys & 0xFFFFFFFF) < static_cast<uint64_t>(end), keys, none);
 }
 
 uint64_t least(u64x8 keys) {
@@ -72,7 +42,7 @@ uint64_t least(u64x8 keys) {
 template <class Width>
 uint64_t nearest(const Columns &centres, int64_t first, int64_t end, const uint64_t *descriptor,
                  Width width) {
-  u64x8 best = u64x8{} + none;
+  u64x8 best = u64x8(none);
   for (int64_t j = first; j < end; j += lanes)
     best = smaller(best, up_to(keys_of(centres, j, descriptor, width), end));
   return least(best);
@@ -85,7 +55,7 @@ public:
 
   void begin() {
     for (int place = 0; place < beam_; ++place)
-      best_[place] = u64x8{} + none;
+      best_[place] = u64x8(none);
   }
 
   // Every lane keeps its own `beam` least keys, so that no branch depends on the data.
@@ -96,7 +66,11 @@ public:
       insert(up_to(keys_of(centres, j, descriptor, width), end));
   }
 
-  void keep(uint64_t key) { insert(u64x8{key, none, none, none, none, none, none, none}); }
+  void keep(uint64_t key) {
+    u64x8 keys(none);
+    keys[0] = key;
+    insert(keys);
+  }
 
   // The least keys of all lanes; returns how many there are.
   int finish(uint64_t *keys) const {
