@@ -5,6 +5,7 @@
     EngramError
     ├── InputError               an input cannot be used: correct it and call again
     │   ├── SequenceError        images, stamps or layout of a drive
+    │   │   └── UnfitDriveError  a fatal finding of the doctor: repair the drive, or force it
     │   ├── CalibrationError     a calibration that is missing, malformed or does not fit
     │   └── ConfigError          a setting: unknown key, wrong type, out of range
     ├── MapError                 a stored file: a map or a frame log
@@ -35,6 +36,10 @@ class InputError(EngramError, ValueError):
 
 class SequenceError(InputError):
     """Images, stamps or the layout of a drive cannot be used; names the file and the fault."""
+
+
+class UnfitDriveError(SequenceError):
+    """The doctor found something in a drive that would ruin a map."""
 
 
 class CalibrationError(InputError):

@@ -36,7 +36,7 @@ from engram.robot import (
 
 OpenDrive = Callable[[], DriveSequence]
 # Stages that are the robot's own business, whatever map it has.
-_BEFORE_THE_MAP = ("read", "frontend", "odometry")
+_BEFORE_THE_MAP = ("read", "frontend", "odometry", "doctor")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,10 +10,10 @@ from typing import Annotated, Any, cast
 import typer
 
 from engram import __version__
-from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.cli.endings import EXIT_UNFIT_DRIVE, PartlyDoneError, VerbInterruptedError
 from engram.cli.moved import moved_option
 from engram.cli.verbs import Program, register
-from engram.errors import EngramError, InputError
+from engram.errors import EngramError, InputError, UnfitDriveError
 from engram.untrusted import printable
 
 app = typer.Typer(
@@ -97,7 +97,9 @@ def _moved(error: Any) -> str | None:
 
 
 def _status_of(error: EngramError | VerbInterruptedError) -> int:
-    return EXIT_INTERRUPTED if isinstance(error, VerbInterruptedError) else EXIT_BAD_INPUT
+    if isinstance(error, VerbInterruptedError):
+        return EXIT_INTERRUPTED
+    return EXIT_UNFIT_DRIVE if isinstance(error, UnfitDriveError) else EXIT_BAD_INPUT
 
 
 def _complain(error: Exception, done: Mapping[str, Any] | None = None) -> None:

@@ -25,13 +25,17 @@ def map_(
     effort: options.Effort,
     descriptor: options.Descriptor = None,
     no_thumbnails: options.NoThumbnails = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Map a drive that the doctor finds unfit, too.")
+    ] = False,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Add a drive to a map.
 
     Creates the map if it does not exist. Where the drive localises in the map, nothing is saved;
-    elsewhere it becomes a new experience. The same command resumes an interrupted drive.
+    elsewhere it becomes a new experience. The same command resumes an interrupted drive. A drive
+    with a fatal fault is refused before anything is written, with exit status 3: engram doctor.
 
     \b
     Examples:
@@ -46,7 +50,7 @@ def map_(
 
     sequence = drive.open(path)
     given = settings.read()
-    asked = RobotOptions(**effort.over(given))
+    asked = RobotOptions(**effort.over(given), force=force)
     resolved = _for_people(given.of_robot(descriptor), no_thumbnails)
     with Bars().stage("map", len(sequence)) as monitor:
         report = map_drive(map_path, sequence, resolved, asked, monitor, descriptor=descriptor)

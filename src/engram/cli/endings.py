@@ -7,6 +7,9 @@ from typing import Any
 
 from engram.errors import EngramError
 
+# A drive has a fatal fault.
+EXIT_UNFIT_DRIVE = 3
+
 
 class VerbInterruptedError(Exception):
     """A verb was stopped by Ctrl-C before it had a result."""

@@ -78,6 +78,7 @@ def localise_and_print(
         **summarise(results),
         "skipped_pairs": sequence.skipped,
         "interrupted": interrupted,
+        "findings": robot.diagnosis.to_dict()["findings"],
     }
     if outputs.remember:
         summary["remembered"] = {"state": robot.saving.state, "revision": robot.saving.revision}

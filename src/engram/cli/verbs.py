@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from engram.cli import moved
 from engram.cli.agent import agent_group
 from engram.cli.centre import centre_group
+from engram.cli.doctor import doctor
 from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
 from engram.cli.fleet import build, download, merge
@@ -24,7 +25,13 @@ from engram.cli.showing import settings
 from engram.errors import InputError
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
-    "Drives": {"map": map_, "localise": localise, "record": record, "live": live},
+    "Drives": {
+        "doctor": doctor,
+        "map": map_,
+        "localise": localise,
+        "record": record,
+        "live": live,
+    },
     "Maps": {
         "info": info,
         "plot": plot,

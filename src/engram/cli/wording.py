@@ -83,12 +83,13 @@ def warnings(summary: Mapping[str, Any]) -> list[str]:
             f"{'was' if len(damaged) == 1 else 'were'} skipped, such as {damaged[0]}; "
             "engram check lists them"
         )
-    frames = summary["frames"]
-    if frames > 1 and summary["statuses"]["no_odometry"] > frames / 2:
-        lines.append(
-            "warning: most frames have no odometry. Are left and right swapped? Are the pairs "
-            "synchronised and rectified, and is the baseline in metres?"
-        )
+    for one in summary["findings"]:
+        if one["severity"] != "note":
+            unit = f" {one['unit']}" if one["unit"] else ""
+            lines.append(
+                f"warning: {one['code']}: {one['message']} ({one['value']:.3g}{unit}, limit "
+                f"{one['limit']:.3g}). {one['cure']}"
+            )
     return lines
 
 
@@ -103,7 +104,7 @@ def _stages(stages_ms: Mapping[str, Mapping[str, float]]) -> list[str]:
 
 
 def _after_mapping(report: Mapping[str, Any], map_path: Path | str) -> str:
-    if report["statuses"]["no_odometry"] > report["frames"] / 2:
+    if any(one["severity"] == "fatal" for one in report["findings"]):
         return f"correct the drive, then engram revert {map_path} {report['revision']}"
     return f"engram localise {map_path} ANOTHER_DRIVE, or engram plot {map_path} map.png"
 

@@ -1,6 +1,7 @@
 """Whole drives: open, replay, record, map, localise, summarise."""
 
 from engram.maps import open_map
+from engram.robot.examining import examine_drive
 from engram.robot.front import Front, arriving
 from engram.robot.inspecting import check_map, describe_map, seal_map
 from engram.robot.mapping import MapReport, map_drive
@@ -22,6 +23,7 @@ __all__ = [
     "arriving",
     "check_map",
     "describe_map",
+    "examine_drive",
     "extract_log",
     "load_settings",
     "localise_drive",

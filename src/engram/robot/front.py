@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
 from queue import Queue
@@ -12,11 +13,12 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.doctor import Diagnosis, Examination, diagnose
 from engram.frontend import Frame, FrameStatus, Frontend, StereoPair
 from engram.localiser import StageClock
 from engram.odometry import GapFiller, Motion, Odometry
 from engram.robot.settings import Settings
-from engram.sequences import FrameSequence, LoggedFrame, StereoSequence
+from engram.sequences import LoggedFrame
 
 T = TypeVar("T")
 Arrived: TypeAlias = StereoPair | LoggedFrame
@@ -32,13 +34,36 @@ class Front:
     """From images to a frame and its motion: front-end, odometry, gap filling.
 
     A frame log already contains frame and odometry.
+
+    Attributes:
+        examination: what the doctor saw of the first frames.
     """
 
     def __init__(self, settings: Settings) -> None:
+        self.examination = Examination(settings.doctor)
+        self._settings = settings
         self._frontend = Frontend(settings.frontend)
-        self._odometry = Odometry(settings.odometry)
+        # Motions of frames that were taken ahead.
+        self._ahead: deque[Motion] = deque()
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets all motion: what comes next is another drive, or another part of one."""
+        self._odometry = Odometry(self._settings.odometry)
         self._gaps = GapFiller()
         self._frozen = _FrozenStream()
+        self.examination.begin()
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """What the doctor finds in the first frames so far."""
+        return diagnose(self.examination.evidence)
+
+    def take_ahead(self, arrived: Arrived) -> LoggedFrame:
+        """Takes a frame before the robot does, which is then given the result."""
+        frame, motion = self._taken(arrived, None, StageClock())
+        self._ahead.append(motion)
+        return LoggedFrame(frame, motion.odometry)
 
     def take(
         self,
@@ -54,11 +79,18 @@ class Front:
                 drive or for none.
             clock: measures the duration of front-end and odometry.
         """
+        if self._ahead and isinstance(arrived, LoggedFrame):
+            return arrived.frame, self._ahead.popleft()
+        return self._taken(arrived, motion, clock or StageClock())
+
+    def _taken(
+        self, arrived: Arrived, motion: Motion | None, clock: StageClock
+    ) -> tuple[Frame, Motion]:
         if isinstance(arrived, LoggedFrame):
             if motion is None:
                 motion = self._gaps.motion(arrived.odometry, arrived.frame.stamp_ns)
+            self.examination.see(arrived, arrived.frame, motion)
             return arrived.frame, motion
-        clock = clock or StageClock()
         frame = self._frontend.extract(arrived)
         if self._frozen.repeats(arrived):
             frame = replace(frame, status=FrameStatus.FROZEN)
@@ -67,6 +99,8 @@ class Front:
             motion = self._gaps.motion(self._odometry.step(frame), frame.stamp_ns)
             clock.lap("odometry")
         self._frozen.note(motion)
+        self.examination.see(arrived, frame, motion)
+        clock.lap("doctor")
         return frame, motion
 
 
@@ -116,10 +150,9 @@ def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]
         yield due, item
 
 
-def arriving(sequence: StereoSequence | FrameSequence) -> Generator[Arrived]:
+def arriving(sequence: Iterable[Arrived]) -> Generator[Arrived]:
     """The pairs or logged frames of a drive, decoded ahead of the consumer; see `read_ahead`."""
-    items: Iterable[Arrived] = sequence
-    return read_ahead(items, _READ_AHEAD)
+    return read_ahead(sequence, _READ_AHEAD)
 
 
 def read_ahead(items: Iterable[T], depth: int) -> Generator[T]:

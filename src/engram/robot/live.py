@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Protocol
 
+from engram.doctor import Finding
 from engram.errors import MapError, MapLockedError
 from engram.frontend import DescriptorKind, Frame, Frontend, StereoPair
 from engram.geometry import StereoCamera
@@ -35,6 +37,7 @@ class SavingState(StrEnum):
     FAILED = "failed"
     SPOOLED = "spooled"
     COMMITTED = "committed"
+    SEALED = "sealed"
 
 
 @dataclass(slots=True)
@@ -44,8 +47,9 @@ class Saving:
     Attributes:
         state: `FAILED` after a write error: the robot continues to localise, and what it had saved
             is kept; `SPOOLED` if another process writes to the map, so that the drive's memory
-            waits in a file beside it.
-        reason: why saving failed, or where the memory waits.
+            waits in a file beside it; `SEALED` if the doctor found something fatal: nothing was
+            committed, and a mapped session waits for ``engram check --seal``.
+        reason: why saving failed or was not committed, or where the memory waits.
         session: the drive.
         revision: number of the revision that holds the drive.
         nodes: number of saved nodes.
@@ -71,6 +75,11 @@ class Saving:
                 )
             case SavingState.FAILED:
                 return f"saving failed: {self.reason}"
+            case SavingState.SEALED:
+                return (
+                    f"not committed, for the drive is unfit: {self.reason}; engram check --seal "
+                    "commits what was mapped all the same"
+                )
         return f"saving is {self.state}"
 
 
@@ -142,8 +151,14 @@ class Into(Protocol):
         """
         ...
 
-    def end(self, saving: Saving, *, well: bool) -> None:
-        """Commits the drive as a revision; `well` if everything was written so far."""
+    def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
+        """Commits the drive as a revision, unless it is unfit.
+
+        Args:
+            saving: is told what became of it.
+            well: whether everything was written so far.
+            unfit: whether the doctor found something fatal.
+        """
         ...
 
     def close(self) -> None:
@@ -186,7 +201,7 @@ class IntoMap:
         )
         return self._drive.mapper
 
-    def end(self, saving: Saving, *, well: bool) -> None:
+    def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
         """See `Into`; commits what was written, even if a later write failed."""
         drive = self._drive
         if drive is None:
@@ -198,6 +213,8 @@ class IntoMap:
         except MapError:
             if well:
                 raise
+        if unfit:
+            return
         saving.revision = drive.commit().number
         saving.state = SavingState.COMMITTED if well else saving.state
 
@@ -236,8 +253,8 @@ class IntoMemory:
         self._saver = Saver(self._spool, checkpoint_every=mapper.checkpoint_every, waits=False)
         return Memory(self.localiser, self._saver, path_id(session.id))
 
-    def end(self, saving: Saving, *, well: bool) -> None:
-        """See `Into`."""
+    def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
+        """See `Into`; the memory of an unfit drive is dropped."""
         if self._saver is None or self._spool is None:
             return
         try:
@@ -247,6 +264,9 @@ class IntoMemory:
                 raise
         finally:
             self._spool.close()
+        if unfit:
+            self._spool.path.unlink(missing_ok=True)
+            return
         try:
             committed = commit_spools(self._map_path)
         except MapLockedError:
@@ -286,16 +306,23 @@ class LiveKeeper(Keeper):
         except MapError as error:
             self._fail(error)
 
-    def close(self) -> None:
-        """Ends the drive and commits it as a revision.
+    def close(self, fatal: Sequence[Finding] = ()) -> None:
+        """Ends the drive and commits it as a revision, unless the doctor found it unfit.
+
+        Args:
+            fatal: what it found.
 
         Raises:
             MapError: it cannot be written, though no earlier write failed.
         """
         failed = self.saving.state is SavingState.FAILED
+        unfit = bool(fatal) and not self._owner.options.force
         try:
             if self.saving.session is not None:
-                self._into.end(self.saving, well=not failed)
+                self._into.end(self.saving, well=not failed, unfit=unfit)
+                if unfit and not failed:
+                    reasons = "; ".join(one.message for one in fatal)
+                    self.saving.state, self.saving.reason = SavingState.SEALED, reasons
         except MapError as error:
             if not failed:
                 self._fail(error)

@@ -8,12 +8,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from engram.doctor import Diagnosis
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, Frontend
 from engram.graph.model import Session
 from engram.localiser import Localisation, Position
 from engram.maps import Map, SessionState, open_map
 from engram.monitor import QUIET, Monitor
+from engram.robot.examining import LookedAhead, facts_of, refuse_unfit
 from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
 from engram.robot.results import summarise
@@ -36,6 +38,7 @@ class MapReport:
         resumed: whether the run continued an earlier one.
         interrupted: whether the run was stopped; its progress is saved and can be resumed.
         skipped: pairs left out under `skip_bad`.
+        diagnosis: what the doctor found in the first frames; None if nothing was done.
         results: one per live frame.
     """
 
@@ -45,6 +48,7 @@ class MapReport:
     resumed: bool = False
     interrupted: bool = False
     skipped: int = 0
+    diagnosis: Diagnosis | None = None
     results: list[Localisation] = field(default_factory=list)
 
     @property
@@ -63,6 +67,7 @@ class MapReport:
             "interrupted": self.interrupted,
             "nodes_saved": self.saved,
             "skipped_pairs": self.skipped,
+            "findings": [] if self.diagnosis is None else self.diagnosis.to_dict()["findings"],
             **summarise(self.results),
         }
 
@@ -96,6 +101,8 @@ def map_drive(
         ConfigError: the frame log or the map has another kind of descriptor than required.
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; the earlier frames are saved.
+        UnfitDriveError: the doctor found something fatal, and `options.force` is not set; nothing
+            was written.
     """
     map_path = Path(map_path)
     settings, options = settings or Settings(), options or RobotOptions()
@@ -141,14 +148,38 @@ def _map(
 ) -> None:
     """Drives through the sequence; commits at the end, or leaves the session for a later run."""
     settings = settings.for_descriptor(opened.descriptor)
-    session = report.session
+    front = Front(settings)
+    front.examination.evidence.facts = facts_of(sequence)
+    try:
+        with closing(LookedAhead(front, sequence, monitor)) as drive:
+            report.diagnosis = front.diagnosis
+            refuse_unfit(report.diagnosis, sequence.info.name, options)
+            _map_on(opened, drive, front, settings, options, monitor, start, report)
+    except KeyboardInterrupt:
+        report.interrupted = True
+
+
+def _map_on(
+    opened: Map,
+    drive: LookedAhead,
+    front: Front,
+    settings: Settings,
+    options: RobotOptions,
+    monitor: Monitor,
+    start: Callable[[Map], Position | None] | None,
+    report: MapReport,
+) -> None:
+    """The same for a drive that is fit, or forced."""
+    sequence, session, diagnosis = drive.sequence, report.session, report.diagnosis
+    assert diagnosis is not None
+    forced = ", ".join(one.code for one in diagnosis.fatal)
     writer = begin_or_resume(
         opened,
         session,
         sequence.camera,
         _made_by(sequence, settings),
-        configuration_of(settings, options),
-        f"map {sequence.info.name}",
+        {**configuration_of(settings, options), "doctor": diagnosis.to_dict()},
+        f"map {sequence.info.name}" + (f" (forced: {forced})" if forced else ""),
         options.author,
     )
     words = node_words(opened, settings, options.relocaliser)
@@ -168,17 +199,14 @@ def _map(
     if position is not None:
         localiser.place_at(position)
     saved = SavedDrive(opened, writer, localiser, settings, words)
-    robot = Robot(Front(settings), localiser, saved.mapper, deadline_ms=options.deadline_ms)
+    robot = Robot(front, localiser, saved.mapper, deadline_ms=options.deadline_ms)
     try:
-        with robot, closing(robot.drive(sequence, monitor)) as found:
+        with robot, closing(robot.drive(drive, monitor)) as found:
             report.results.extend(one for one in found if not one.resumed)
         saved.finish()
-    except KeyboardInterrupt:
-        report.interrupted = True
     finally:
         saved.close()
-    if not report.interrupted:
-        report.revision = saved.commit().number
+    report.revision = saved.commit().number
 
 
 def _made_by(sequence: DriveSequence, settings: Settings) -> tuple[DescriptorKind, str]:

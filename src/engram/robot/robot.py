@@ -5,31 +5,34 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Self
 
-from engram.errors import ConfigError, InputError
+from engram.doctor import Diagnosis
+from engram.errors import ConfigError
 from engram.frontend import Frame, StereoPair
 from engram.geometry import SE3
 from engram.localiser import (
     KEEPS_NOTHING,
     Keeper,
     Localisation,
+    LocalisationStatus,
     Localiser,
     Position,
     StageClock,
 )
 from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
-from engram.odometry import Motion
+from engram.odometry import Motion, OdometryStatus, OdometryStep
 from engram.robot.front import Arrived, Front, arriving, paced
 from engram.robot.live import LiveKeeper, Saving
-from engram.sequences import FrameSequence, StereoSequence
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.
 _REMEMBERED = 200
+# So many rising stamps before the newest one are a clock that was set back, not stray frames.
+_SET_BACK = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +81,8 @@ class Robot:
         self._deadline_ms = deadline_ms
         self._saving = Saving() if self._live is None else self._live.saving
         self._stamp_ns: int | None = None
+        # Rising stamps of the newest frames that came too late.
+        self._early_ns: list[int] = []
         self._track: deque[tuple[int, Localisation]] = deque(maxlen=_REMEMBERED)
 
     def __enter__(self) -> Self:
@@ -95,7 +100,7 @@ class Robot:
         live, self._live = self._live, None
         try:
             if live is not None:
-                live.close()
+                live.close(self.diagnosis.fatal)
         finally:
             self._localiser.close()
 
@@ -103,6 +108,11 @@ class Robot:
     def outcomes(self) -> list[Outcome]:
         """Outcomes of the attempts for the last frame, in ranked order."""
         return self._localiser.outcomes
+
+    @property
+    def diagnosis(self) -> Diagnosis:
+        """What the doctor finds in the first frames of the drive; see `DoctorConfig`."""
+        return self._front.diagnosis
 
     @property
     def saving(self) -> Saving:
@@ -119,6 +129,11 @@ class Robot:
     ) -> Localisation:
         """Localises one pair or logged frame; call it for each, in temporal order.
 
+        A frame whose stamp is not later than that of the frame before is not used: its result has
+        the status `NO_ODOMETRY`. After three of them with rising stamps the clock counts as set
+        back: a robot that keeps nothing begins anew, as after `lose`; one that keeps its drive does
+        not, as a drive has one clock.
+
         Args:
             arrived: a pair of images, (h, w) uint8 grey, rectified, synchronised; or a frame of
                 a frame log.
@@ -133,13 +148,14 @@ class Robot:
             the frame was matched.
 
         Raises:
-            InputError: the stamp is not later than that of the previous frame.
             MapError: landmarks cannot be read, or the results cannot be written.
         """
         clock = StageClock(arrived_s)
         if deadline_ms is None:
             deadline_ms = self._deadline_ms
-        frame, motion = self._front.take(self._checked(arrived), motion, clock)
+        if not self._in_order(arrived):
+            return self._left_out(arrived)
+        frame, motion = self._front.take(arrived, motion, clock)
         deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
         self._localiser.move(motion)
         found = self._known(frame, motion)
@@ -156,7 +172,7 @@ class Robot:
 
     def drive(
         self,
-        sequence: StereoSequence | FrameSequence,
+        sequence: Iterable[Arrived],
         monitor: Monitor = QUIET,
         rate_hz: float | None = None,
     ) -> Generator[Localisation]:
@@ -190,8 +206,9 @@ class Robot:
 
     def follow(self, arrived: Arrived, *, motion: Motion | None = None) -> None:
         """Carries the position on by the motion to this frame, without localising it."""
-        _, motion = self._front.take(self._checked(arrived), motion)
-        self._localiser.move(motion)
+        if self._in_order(arrived):
+            _, motion = self._front.take(arrived, motion)
+            self._localiser.move(motion)
 
     def place_at(self, hint: Position) -> None:
         """Sets the position before the next step, such as an operator's or a stored one.
@@ -255,22 +272,46 @@ class Robot:
             self._localiser.place_at(hint.position, hint.open_loop_m, hint.guessed_m)
         return hint.found
 
-    def _checked(self, arrived: Arrived) -> Arrived:
-        """The same item, checked for increasing stamps; the first one begins a live drive.
-
-        Raises:
-            InputError: the stamp is not later than the last one.
-        """
-        pair = arrived if isinstance(arrived, StereoPair) else arrived.frame
-        if self._stamp_ns is not None and pair.stamp_ns <= self._stamp_ns:
-            raise InputError(
-                f"stamp {pair.stamp_ns} ns is not later than {self._stamp_ns} ns, that of the "
-                "previous frame; give the frames of a drive in temporal order, each once"
-            )
-        if self._stamp_ns is None and self._live is not None:
+    def _in_order(self, arrived: Arrived) -> bool:
+        """Whether the stamp is later than the last one; the first frame begins a live drive."""
+        stamp_ns, last_ns = _stamp_ns(arrived), self._stamp_ns
+        if last_ns is not None and stamp_ns <= last_ns:
+            self._front.examination.misordered(stamp_ns, last_ns)
+            if not self._set_back(stamp_ns):
+                return False
+        elif last_ns is None and self._live is not None:
             self._live.begin(arrived)
-        self._stamp_ns = pair.stamp_ns
-        return arrived
+        self._early_ns.clear()
+        self._stamp_ns = stamp_ns
+        return True
+
+    def _set_back(self, stamp_ns: int) -> bool:
+        """Whether the clock was set back, so that the robot begins anew at this frame."""
+        if self._early_ns and stamp_ns <= self._early_ns[-1]:
+            self._early_ns.clear()
+        self._early_ns.append(stamp_ns)
+        if len(self._early_ns) < _SET_BACK or self._keeper is not KEEPS_NOTHING:
+            return False
+        self._front.restart()
+        self._localiser.lose()
+        self._track.clear()
+        return True
+
+    def _left_out(self, arrived: Arrived) -> Localisation:
+        """The result for a frame that is not used."""
+        return Localisation(
+            stamp_ns=_stamp_ns(arrived),
+            status=LocalisationStatus.NO_ODOMETRY,
+            attempts=0,
+            candidates=0,
+            open_loop_m=0.0,
+            motion=Motion(OdometryStep(OdometryStatus.UNUSABLE_FRAME)),
+            position=self._localiser.position,
+        )
+
+
+def _stamp_ns(arrived: Arrived) -> int:
+    return arrived.stamp_ns if isinstance(arrived, StereoPair) else arrived.frame.stamp_ns
 
 
 def _word(found: Localisation) -> str:

@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from engram.config import from_dict, load_toml
+from engram.doctor.settings import DoctorConfig
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
@@ -28,6 +29,7 @@ class Settings:
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     localiser: LocaliserConfig = field(default_factory=LocaliserConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
+    doctor: DoctorConfig = field(default_factory=DoctorConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
         """These settings for a map's kind of descriptor; None keeps their own.
@@ -64,6 +66,7 @@ class RobotOptions:
         relocaliser: key of `RELOCALISERS`, for a lost robot; None for none.
         threads: whether the lanes run on threads; without a deadline the results are the same.
         author: author of revisions; None for the robot.
+        force: whether a drive with a fatal finding of the doctor is mapped all the same.
     """
 
     policy: str = "recall"
@@ -73,6 +76,7 @@ class RobotOptions:
     relocaliser: str | None = "fabmap"
     threads: bool = True
     author: str | None = None
+    force: bool = False
 
     def __post_init__(self) -> None:
         check_for_robot(self.policy)

@@ -49,6 +49,22 @@ class StampedFile:
     fault: str | None = None
 
 
+class StampFault(str):
+    """The fault of a place whose stamp is not later than the last good one.
+
+    Attributes:
+        backwards: whether it is earlier, not equal.
+    """
+
+    backwards: bool
+
+    def __new__(cls, text: str, *, backwards: bool) -> StampFault:
+        """The fault as a text."""
+        fault = super().__new__(cls, text)
+        fault.backwards = backwards
+        return fault
+
+
 def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
     """The stamps of a file with one stamp a line, ns. Empty lines at the end are ignored.
 
@@ -258,5 +274,6 @@ def _order_faults(stamps_ns: Sequence[int], source: Path, names: Sequence[str]) 
             faults.append(None)
             continue
         how = "repeats the stamp" if stamp_ns == last_ns else "is stamped before the stamp"
-        faults.append(f"{source}: {name} ({stamp_ns} ns) {how} of the one before ({last_ns} ns)")
+        text = f"{source}: {name} ({stamp_ns} ns) {how} of the one before ({last_ns} ns)"
+        faults.append(StampFault(text, backwards=stamp_ns < last_ns))
     return faults

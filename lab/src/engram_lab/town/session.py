@@ -37,17 +37,20 @@ class SimulatedDrive:
         campaign: what to drive through.
         session: number of the drive.
         threads: of the renderer, 1 to 256.
+        robot: drives in place of the plan's.
 
     Raises:
         ConfigError: no such session, or another number of threads.
     """
 
-    def __init__(self, campaign: Campaign, session: int, threads: int = 1) -> None:
+    def __init__(
+        self, campaign: Campaign, session: int, threads: int = 1, robot: Robot | None = None
+    ) -> None:
         if not 1 <= threads <= _MOST_THREADS:
             raise ConfigError(f"threads is {threads}, must be 1 to {_MOST_THREADS}")
         self.campaign = campaign
         self.plan: SessionPlan = campaign.session(session)
-        self.robot: Robot = robot_named(self.plan.robot)
+        self.robot: Robot = robot or robot_named(self.plan.robot)
         self.conditions = Conditions(
             self.plan.start, self.plan.weather, self.plan.seed, campaign.place
         )

@@ -33,7 +33,7 @@ from engram_lab.studies.memo import MatchMemo
 from engram_lab.studies.store import joined, missing, read_runs, write_runs
 
 # Stages that are the robot's own business, whatever map it has.
-_BEFORE_THE_MAP = ("read", "frontend", "odometry")
+_BEFORE_THE_MAP = ("read", "frontend", "odometry", "doctor")
 _ASKS_FOR_MORE = {"tod+paths": "tod", "tod": "copy"}
 # The next drive is localised in the same ones.
 kept_maps = KeptMaps(files=6, cache_bytes=64 * 2**20)  # one per worker

@@ -1,0 +1,1 @@
+"""Injected faults: what a robot claims when its camera, its clock or its map is wrong."""

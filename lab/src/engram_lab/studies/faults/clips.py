@@ -1,0 +1,166 @@
+"""Short rendered drives with images and truth, kept in the user's cache: rendered once, read often.
+
+A clip is a stretch of a small town, seen by one rig on one day. Limits are set on the clips of
+`SETTING`, and judged on those of `JUDGING`: other towns, and rigs that the limits never saw.
+
+python -m engram_lab.studies.faults.clips             # renders what is missing
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import StereoPair
+from engram.geometry import SE3, StereoCamera
+from engram.monitor import write_whole
+from engram_lab.town import WORLD_VERSION
+from engram_lab.town.campaigns import SessionPlan, campaign_named
+from engram_lab.town.robots import ROBOTS, Robot
+from engram_lab.town.session import SimulatedDrive
+from engram_lab.town.simulating import campaigns_folder
+
+RIGS: dict[str, Robot] = {
+    **ROBOTS,
+    "shuttle": Robot(
+        "shuttle",
+        StereoCamera(381.36, 381.36, 319.5, 239.5, 0.30, 640, 480),
+        height_m=2.1,
+        pitch_rad=0.05,
+    ),
+}
+# The drive that is mapped: a clear morning, number 1 of the village's.
+MAPPED = 1
+# Weathers and hours of the others, by their numbers in the village, dealt to the towns in turn.
+_OTHERS = (4, 6, 12, 9, 21, 17, 5, 7, 10, 0, 20, 22, 3, 18, 13, 8, 2, 19, 23, 14)
+_LIVE = 5
+
+
+@dataclass(frozen=True, slots=True)
+class ClipPlan:
+    """What a clip shows.
+
+    Attributes:
+        rig: key in `RIGS`.
+        town: seed of the town.
+        session: number of the village's drive whose day, hour and weather it has.
+        start, count: the frames of the drive.
+        reverse: driven the other way round.
+    """
+
+    rig: str
+    town: int
+    session: int
+    start: int = 20
+    count: int = 100
+    reverse: bool = False
+
+    @property
+    def name(self) -> str:
+        """Such as ``wildcat-31-04``."""
+        return f"{self.rig}-{self.town}-{self.session:02d}{'-reverse' if self.reverse else ''}"
+
+    def path(self, folder: Path | None = None) -> Path:
+        """Where it is kept."""
+        return (folder or campaigns_folder()) / f"clips-v{WORLD_VERSION}" / f"{self.name}.npz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clip:
+    """A rendered clip.
+
+    Attributes:
+        plan: what it shows.
+        pairs: its frames.
+        world_from_cam: the truth, one pose a frame.
+    """
+
+    plan: ClipPlan
+    pairs: list[StereoPair]
+    world_from_cam: list[SE3]
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+
+def clips_of(towns: tuple[tuple[int, str], ...], count: int) -> list[ClipPlan]:
+    """The mapped drive of each town, then some others of other days."""
+    plans = []
+    for number, (town, rig) in enumerate(towns):
+        others = [_OTHERS[(number * _LIVE + k) % len(_OTHERS)] for k in range(_LIVE)]
+        plans += [ClipPlan(rig, town, one, count=count) for one in (MAPPED, *others)]
+    return plans
+
+
+SETTING = clips_of(((21, "wildcat"), (22, "courier")), 60)
+JUDGING = clips_of(
+    (
+        (31, "wildcat"), (32, "courier"), (33, "bicycle"), (34, "kitti"), (35, "shuttle"),
+        (36, "wildcat"), (37, "courier"), (38, "bicycle"), (39, "kitti"), (40, "shuttle"),
+    ),
+    100,
+)  # fmt: skip
+
+
+def read_clip(plan: ClipPlan, folder: Path | None = None) -> Clip:
+    """A clip of the cache, rendered first if it is not there."""
+    path = plan.path(folder)
+    if not path.exists():
+        _render(plan, path)
+    with np.load(path) as kept:
+        left, right, stamps, poses = (kept[name] for name in ("left", "right", "stamps", "poses"))
+    camera = RIGS[plan.rig].camera
+    pairs = [
+        StereoPair(int(stamp), left[k], right[k], camera) for k, stamp in enumerate(stamps.tolist())
+    ]
+    return Clip(plan, pairs, [SE3.from_matrix(pose) for pose in poses])
+
+
+def _render(plan: ClipPlan, path: Path) -> None:
+    drive = drive_of(plan)
+    pairs = list(drive.frames(plan.start, plan.start + plan.count))
+    poses: list[NDArray[np.float64]] = [
+        one.matrix() for one in drive.world_from_cams()[plan.start : plan.start + plan.count]
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with write_whole(path) as draft, draft.open("wb") as file:
+        np.savez(
+            file,
+            left=np.array([one.left for one in pairs]),
+            right=np.array([one.right for one in pairs]),
+            stamps=np.array([one.stamp_ns for one in pairs], np.int64),
+            poses=np.array(poses),
+        )
+
+
+def drive_of(plan: ClipPlan) -> SimulatedDrive:
+    """The whole drive that a clip is a part of: the village's day on the hamlet's route."""
+    town = campaign_named("hamlet", plan.town)
+    days: tuple[SessionPlan, ...] = campaign_named("village", plan.town).sessions
+    sessions = tuple(replace(day, reverse=plan.reverse) for day in days)
+    return SimulatedDrive(replace(town, sessions=sessions), plan.session, robot=RIGS[plan.rig])
+
+
+def missing(plans: list[ClipPlan]) -> Iterator[ClipPlan]:
+    """Those that are not in the cache."""
+    return (plan for plan in plans if not plan.path().exists())
+
+
+def main() -> None:
+    """Renders what is missing, and says so."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.parse_args()
+    for plan in missing([*SETTING, *JUDGING]):
+        _render(plan, plan.path())
+        print(plan.path(), flush=True)
+
+
+if __name__ == "__main__":
+    main()

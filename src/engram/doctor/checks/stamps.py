@@ -1,0 +1,76 @@
+"""Stamps: their order, their clock, gaps between them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from engram.doctor.examination import Array, Evidence
+from engram.graph.model import Clock
+
+# Units in which somebody may have counted frames, ns.
+_UNITS_NS = (1, 1_000, 1_000_000, 1_000_000_000)
+# Intervals on either side with which one is compared.
+_AROUND = 5
+
+
+def backwards(seen: Evidence) -> float | None:
+    """Frames stamped earlier than the frame before."""
+    return float(seen.backwards)
+
+
+def repeated(seen: Evidence) -> float | None:
+    """Frames with the stamp of the frame before."""
+    return float(seen.repeated)
+
+
+def counted(seen: Evidence) -> float | None:
+    """Share of frames whose stamp is their number, in ns, µs, ms or s."""
+    if seen.facts.step != 1 or len(seen) < seen.config.least_frames:
+        return None
+    stamps = np.array(seen.stamps_ns, np.int64)
+    most = 0.0
+    for unit_ns in _UNITS_NS:
+        whole = (stamps % unit_ns == 0) & (stamps // unit_ns <= 10 * len(stamps))
+        steps = np.diff(stamps) == unit_ns
+        most = max(most, float(min(whole.mean(), steps.mean())))
+    return most
+
+
+def jump_s(seen: Evidence) -> float | None:
+    """The longest interval."""
+    intervals_s = seen.intervals_s
+    return float(intervals_s.max()) if len(intervals_s) else None
+
+
+def gap_ratio(seen: Evidence) -> float | None:
+    """The longest interval, in the median of those around it; steps of the clock do not count."""
+    intervals_s = seen.intervals_s
+    intervals_s = intervals_s[intervals_s <= seen.config.jump_s]
+    if len(intervals_s) < seen.config.least_frames:
+        return None
+    return float((intervals_s / _usual(intervals_s)).max())
+
+
+def rate_hz(seen: Evidence) -> float | None:
+    """Frames per second."""
+    intervals_s = seen.intervals_s
+    if len(intervals_s) < seen.config.least_frames:
+        return None
+    return float(1 / max(float(np.median(intervals_s)), 1e-9))
+
+
+def clock_unknown(seen: Evidence) -> float | None:
+    """1 if nobody knows what hour the stamps mean, or where on earth that was."""
+    facts = seen.facts
+    return float(facts.clock is not Clock.UTC or (facts.zone is None and facts.longitude_deg is None))
+
+
+def hours_needed(seen: Evidence) -> float | None:
+    """The same, where missions by hour need it."""
+    return clock_unknown(seen) if seen.facts.by_hour else None
+
+
+def _usual(intervals_s: Array) -> Array:
+    padded = np.pad(intervals_s, _AROUND, mode="reflect")
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * _AROUND + 1)
+    return np.maximum(np.median(around, axis=1), 1e-9)

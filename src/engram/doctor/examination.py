@@ -1,0 +1,198 @@
+"""Collects evidence about a drive from frames as they are computed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.doctor.settings import DoctorConfig
+from engram.doctor.sides import Alignment, SideMatches, match_sides
+from engram.frontend import Frame, FrameStatus, StereoPair
+from engram.geometry import SE3, StereoCamera
+from engram.graph.model import Clock
+from engram.odometry import Motion, OdometryStatus
+from engram.sequences import LoggedFrame
+
+Array = NDArray[np.float64]
+
+# Pixels are looked at in steps of this, both ways.
+_STEP = 8
+_WHITE, _BLACK = 250, 8
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What is known of a drive beside its frames.
+
+    Attributes:
+        clock: meaning of the stamps.
+        zone: time zone, if known.
+        longitude_deg: where the drive was, if known.
+        by_hour: whether missions by hour need its clock.
+        step: every so many-th frame of the drive was chosen.
+        bits: bits of the brightest pixel of 16-bit images; None for 8-bit ones.
+    """
+
+    clock: Clock = Clock.UNKNOWN
+    zone: str | None = None
+    longitude_deg: float | None = None
+    by_hour: bool = False
+    step: int = 1
+    bits: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What one pair looks like; left and right, each from every 64th pixel.
+
+    Attributes:
+        brightness: mean grey levels.
+        saturated, black: largest share of white and of black pixels.
+        repeats: whether the image is exactly that of the pair before.
+        contrast: standard deviations, grey levels.
+    """
+
+    brightness: tuple[float, float]
+    saturated: float
+    black: float
+    repeats: tuple[bool, bool]
+    contrast: tuple[float, float]
+
+
+@dataclass(slots=True)
+class Evidence:
+    """What was seen of a drive; one entry a frame unless said otherwise.
+
+    Attributes:
+        config: the limits.
+        camera: of the drive; None before the first frame.
+        facts: what is known beside the frames.
+        stamps_ns: stamps in the order of arrival.
+        first: whether a stretch begins with the frame, so that nothing is known of the time before.
+        statuses: of the frames.
+        odometry: whether odometry measured the motion, or had none to measure.
+        moved: `prev_from_curr`, None where it was not measured.
+        looks: of the images; empty for a frame log.
+        disparity_px: median of the landmarks.
+        sharpness: of every few pairs.
+        matches: left-right matches of every few pairs, and the number of their frame.
+        backwards, repeated: frames left out as their stamp is earlier than, or that of, the frame
+            before.
+        outside_m: way by motion from outside or a map, and by odometry, over the same stretches.
+        alignments: of some pairs, worked out once at the end; None before.
+    """
+
+    config: DoctorConfig
+    camera: StereoCamera | None = None
+    facts: Facts = field(default_factory=Facts)
+    stamps_ns: list[int] = field(default_factory=list)
+    first: list[bool] = field(default_factory=list)
+    statuses: list[FrameStatus] = field(default_factory=list)
+    odometry: list[bool] = field(default_factory=list)
+    moved: list[SE3 | None] = field(default_factory=list)
+    looks: list[Look] = field(default_factory=list)
+    disparity_px: list[float] = field(default_factory=list)
+    sharpness: list[float] = field(default_factory=list)
+    matches: list[tuple[int, SideMatches]] = field(default_factory=list)
+    backwards: int = 0
+    repeated: int = 0
+    outside_m: list[tuple[float, float]] = field(default_factory=list)
+    alignments: list[Alignment] | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def intervals_s(self) -> Array:
+        """Between successive frames of a stretch."""
+        stamps, first = np.array(self.stamps_ns, np.int64), np.array(self.first, np.bool_)
+        return (np.diff(stamps) / 1e9)[~first[1:]] if len(stamps) else np.zeros(0)
+
+    @property
+    def moved_m(self) -> Array:
+        """Distance of each step; nan where it was not measured."""
+        return np.array([np.nan if one is None else one.distance_m for one in self.moved])
+
+
+class Examination:
+    """Looks at the first frames of a drive, or of several stretches of it.
+
+    Args:
+        config: how many frames, and the limits.
+    """
+
+    def __init__(self, config: DoctorConfig | None = None) -> None:
+        self.evidence = Evidence(config or DoctorConfig())
+        self._last: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
+        self._begins = True
+
+    @property
+    def full(self) -> bool:
+        """Whether enough frames were seen; further ones are not looked at."""
+        return len(self.evidence) >= self.evidence.config.frames
+
+    def begin(self) -> None:
+        """Begins another stretch: nothing is known of the time before its first frame."""
+        self._begins, self._last = True, None
+
+    def see(self, arrived: StereoPair | LoggedFrame, frame: Frame, motion: Motion) -> None:
+        """Looks at one frame.
+
+        Args:
+            arrived: its images, or the logged frame.
+            frame: what the front-end made of it.
+            motion: the motion that led to it.
+        """
+        if self.full:
+            return
+        seen, number = self.evidence, len(self.evidence)
+        seen.camera = frame.camera
+        seen.stamps_ns.append(frame.stamp_ns)
+        seen.first.append(self._begins)
+        seen.statuses.append(frame.status)
+        step = motion.odometry
+        seen.odometry.append(step.status in {OdometryStatus.OK, OdometryStatus.FIRST})
+        seen.moved.append(step.prev_from_curr)
+        disparity_px = frame.landmarks.disparity_px
+        seen.disparity_px.append(float(np.median(disparity_px)) if len(disparity_px) else 0.0)
+        self._begins = False
+        if isinstance(arrived, StereoPair):
+            self._look(arrived, number)
+
+    def misordered(self, stamp_ns: int, last_ns: int) -> None:
+        """Counts a frame that is left out for its stamp."""
+        if not self.full:
+            self.evidence.backwards += stamp_ns < last_ns
+            self.evidence.repeated += stamp_ns == last_ns
+
+    def _look(self, pair: StereoPair, number: int) -> None:
+        small = pair.left[::_STEP, ::_STEP].copy(), pair.right[::_STEP, ::_STEP].copy()
+        last, self._last = self._last, small
+        self.evidence.looks.append(
+            Look(
+                (float(small[0].mean()), float(small[1].mean())),
+                max(float((one >= _WHITE).mean()) for one in small),
+                max(float((one <= _BLACK).mean()) for one in small),
+                (False, False) if last is None else _equal(small, last),
+                (float(small[0].std()), float(small[1].std())),
+            )
+        )
+        if number % self.evidence.config.every == 0:
+            self.evidence.sharpness.append(min(_sharpness(pair.left), _sharpness(pair.right)))
+            self.evidence.matches.append((number, match_sides(pair)))
+
+
+def _equal(
+    now: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    last: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+) -> tuple[bool, bool]:
+    return np.array_equal(now[0], last[0]), np.array_equal(now[1], last[1])
+
+
+def _sharpness(image: NDArray[np.uint8]) -> float:
+    """Mean square of the second difference along every eighth row, over the variance."""
+    rows = image[::_STEP].astype(np.float32)
+    second = rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:]
+    return float((second**2).mean() / max(float(rows.var()), 1e-6))

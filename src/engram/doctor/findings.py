@@ -1,0 +1,89 @@
+"""What an examination of a drive comes to: findings, each with value, limit and cure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from engram.config import plain
+
+
+class Severity(StrEnum):
+    """How bad a finding is.
+
+    `FATAL`: what is mapped from such a drive is wrong or useless. `WARNING`: it serves less well
+    than it could. `NOTE`: something that only some uses need.
+    """
+
+    FATAL = "fatal"
+    WARNING = "warning"
+    NOTE = "note"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with a drive.
+
+    Attributes:
+        code: name of the check, see `CHECKS`.
+        severity: how bad it is.
+        message: what is wrong, in words.
+        value: what was measured.
+        limit: what it may be.
+        unit: of both.
+        cure: what to do.
+    """
+
+    code: str
+    severity: Severity
+    message: str
+    value: float
+    limit: float
+    unit: str
+    cure: str
+
+    def text(self) -> str:
+        """For people: two lines."""
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            f"{self.severity}: {self.code}: {self.message} "
+            f"({self.value:.3g}{unit}, limit {self.limit:.3g}{unit})\n  {self.cure}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """All findings of an examination, the worst first.
+
+    Attributes:
+        frames: how many frames were examined.
+        findings: what is wrong.
+        untold: checks that could not be made, and what they would need, by code.
+    """
+
+    frames: int
+    findings: tuple[Finding, ...]
+    untold: dict[str, str]
+
+    @property
+    def fatal(self) -> tuple[Finding, ...]:
+        """The findings for which the drive should not be mapped."""
+        return tuple(one for one in self.findings if one.severity is Severity.FATAL)
+
+    def text(self) -> str:
+        """For people."""
+        lines = [one.text() for one in self.findings]
+        lines += [f"cannot be told: {code}: {needs}" for code, needs in self.untold.items()]
+        alarms = sum(one.severity is not Severity.NOTE for one in self.findings)
+        found = "nothing wrong" if not alarms else f"{len(self.fatal)} of {alarms} findings fatal"
+        return "\n".join([f"{self.frames} frames examined: {found}", *lines])
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``doctor --json`` prints."""
+        return {
+            "frames": self.frames,
+            "fatal": bool(self.fatal),
+            "findings": [plain(one) for one in self.findings],
+            "untold": self.untold,
+        }

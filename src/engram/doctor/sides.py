@@ -1,0 +1,151 @@
+"""Corners that the left and the right image share, wherever they lie.
+
+The front-end searches along the row and to the left only, as a calibrated pair demands. Here
+nothing is demanded, so that what is wrong with a pair shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.frontend import StereoPair
+from engram.geometry import StereoCamera
+
+Array = NDArray[np.float64]
+
+_CORNERS = 400
+_FAST_THRESHOLD = 7
+_CELL_PX = 32
+# Most different bits of a BRIEF descriptor of 256: a random pair differs in 128 ± 8.
+_MOST_BITS = 64
+_RATIO = 0.85
+# Vertical offsets further than this from the usual one are wrong matches.
+_WRONG_PX = 40.0
+# Fewest matches that must agree on the alignment of a pair, or of a part of the image.
+_LEAST_MATCHES = 20
+_LEAST_CELLS = 3
+_AGREE_PX = 1.5
+_LEAST_SCATTER_PX = 0.3
+_SAMPLES = 200
+_FURTHEST_M = 3.0
+_DAMPING = 1e-3
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SideMatches:
+    """Corners that both images show.
+
+    Attributes:
+        pixels: (M, 2) float64, left u, v, px.
+        shift: (M, 2) float64, left minus right u and v, px: disparity and vertical offset.
+    """
+
+    pixels: Array
+    shift: Array
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def match_sides(pair: StereoPair) -> SideMatches:
+    """Mutually nearest corners of a pair, the wrong ones mostly removed."""
+    (left, of_left), (right, of_right) = _corners(pair.left), _corners(pair.right)
+    if min(len(left), len(right)) < 2:
+        return SideMatches(np.zeros((0, 2)), np.zeros((0, 2)))
+    bits = _core.hamming_matrix(of_left, of_right)
+    nearest = bits.argmin(axis=1)
+    rows = np.arange(len(left))
+    best = bits[rows, nearest].astype(np.float64)
+    bits[rows, nearest] = 999
+    kept = (best <= _MOST_BITS) & (best < _RATIO * bits.min(axis=1))
+    bits[rows, nearest] = best
+    kept &= bits.argmin(axis=0)[nearest] == rows
+    pixels, shift = left[kept], left[kept] - right[nearest[kept]]
+    near = np.abs(shift[:, 1] - np.median(shift[:, 1])) < _WRONG_PX if len(shift) else kept[:0]
+    return SideMatches(pixels[near], shift[near])
+
+
+def _corners(image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.uint8]]:
+    """The best corners of each cell, (N, 2) px, with their descriptors (N, 32)."""
+    positions, scores, offsets = _core.detect_corners(image, _FAST_THRESHOLD)
+    height, width = image.shape
+    best = _core.order_corners(positions, scores, width, height, _CELL_PX)[:_CORNERS]
+    described = _core.describe(_core.smooth(image), np.ascontiguousarray(positions[best]))
+    return positions[best].astype(np.float64) + offsets[best], described
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """How the right image of one pair lies beside the left one.
+
+    Attributes:
+        offset_px: vertical offset, left minus right, at the principal point.
+        forward_m: way forwards from where the left image was taken to where the right one was.
+        sigma_m: standard deviation of that.
+    """
+
+    offset_px: float
+    forward_m: float
+    sigma_m: float
+
+
+def align(matches: SideMatches, camera: StereoCamera, seed: int = 0) -> Alignment | None:
+    """Fits the vertical offsets of one pair's matches; None if too few agree.
+
+    If the right image is taken t_z further ahead, rays meet where dv = −t_z·(y·d − x·dv)/b, with
+    x, y the left pixel from the principal point over f (the epipolar constraint of a translation
+    (b, 0, t_z)). An offset, a roll and a scale shift rows, too. The best of random quadruples,
+    refined: far points, whose offset says nothing of t_z, are often the majority.
+    """
+    if len(matches) < _LEAST_MATCHES:
+        return None
+    across = (matches.pixels[:, 0] - camera.cx) / camera.fx
+    down = (matches.pixels[:, 1] - camera.cy) / camera.fy
+    disparity, offset = matches.shift.T
+    nearness = (down * disparity - across * offset) / camera.baseline_m
+    rows = np.column_stack([np.ones_like(across), across, down, -nearness])
+    found = _consensus(rows, offset, np.random.default_rng(seed))
+    damping = _DAMPING * np.eye(4)
+    for _ in range(_ROUNDS):
+        agree = np.abs(offset - rows @ found) < _AGREE_PX
+        if agree.sum() < _LEAST_MATCHES:
+            return None
+        normal = rows[agree].T @ rows[agree] + damping
+        found = np.linalg.solve(normal, rows[agree].T @ offset[agree])
+    scatter = max(float(np.std((offset - rows @ found)[agree])), _LEAST_SCATTER_PX)
+    sigma = scatter * float(np.sqrt(np.linalg.inv(normal)[3, 3]))
+    return Alignment(float(found[0]), float(found[3]), sigma)
+
+
+def _consensus(rows: Array, values: Array, rng: np.random.Generator) -> Array:
+    """The solution of one quadruple of rows, or 0, that fits most rows."""
+    drawn = rng.integers(0, len(rows), (_SAMPLES, 4))
+    sound = np.abs(np.linalg.det(rows[drawn])) > 1e-6
+    solved = np.linalg.solve(rows[drawn][sound], values[drawn][sound][..., None])[..., 0]
+    tried = np.vstack([solved[np.abs(solved[:, 3]) < _FURTHEST_M], np.zeros(4)])
+    misfit = np.minimum(np.abs(values - tried @ rows.T), _AGREE_PX).sum(axis=1)
+    best: Array = tried[int(misfit.argmin())]
+    return best
+
+
+def rows_off(samples: list[SideMatches], camera: StereoCamera) -> float | None:
+    """Root of the mean square, over a 4×3 grid of the image, of the vertical offset there, px.
+
+    Cells where no offset has a majority of the matches of all pairs do not count; None without
+    any.
+    """
+    pixels = np.concatenate([np.zeros((0, 2)), *(one.pixels for one in samples)])
+    offset = np.concatenate([np.zeros(0), *(one.shift[:, 1] for one in samples)])
+    cells = (pixels[:, 0] * 4 // camera.width) * 3 + pixels[:, 1] * 3 // camera.height
+    means = []
+    for cell in np.unique(cells):
+        here = offset[cells == cell]
+        near = here[np.abs(here - np.median(here)) < _AGREE_PX]
+        if len(near) >= max(_LEAST_MATCHES, 0.6 * len(here)):
+            means.append(float(near.mean()))
+    return float(np.sqrt(np.mean(np.square(means)))) if len(means) >= _LEAST_CELLS else None

@@ -1,0 +1,225 @@
+"""All checks of the doctor, in one table: what is measured, its limit, what it means, the cure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from engram.doctor.checks import motion, optics, pictures, sides, stamps
+from engram.doctor.examination import Evidence
+from engram.doctor.findings import Diagnosis, Finding, Severity
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One check.
+
+    Attributes:
+        code: name of its finding; two checks may share one, the first that alarms counts.
+        severity: of its finding.
+        measure: the value; None if it cannot be told.
+        limit: field of `DoctorConfig` that bounds the value, or the bound itself.
+        unit: of the value.
+        message: what is wrong beyond the limit, in words.
+        cure: what to do then.
+        below: whether values below the limit are the alarm, not those above.
+        needs: what it would take to tell, for the report; "" if nobody need know.
+        explains: codes whose findings would only be its consequences.
+    """
+
+    code: str
+    severity: Severity
+    measure: Callable[[Evidence], float | None]
+    limit: str | float
+    unit: str
+    message: str
+    cure: str
+    below: bool = False
+    needs: str = ""
+    explains: tuple[str, ...] = ()
+
+    def finding(self, seen: Evidence) -> Finding | float | None:
+        """The finding; else the value, which is None if it cannot be told."""
+        value = self.measure(seen)
+        limit = getattr(seen.config, self.limit) if isinstance(self.limit, str) else self.limit
+        if value is None or not (value < limit if self.below else value > limit):
+            return value
+        return Finding(
+            self.code, self.severity, self.message, value, float(limit), self.unit, self.cure
+        )
+
+
+_FATAL, _WARNING, _NOTE = Severity
+_CONSEQUENCES = ("no_odometry", "rows_misaligned", "rows_slightly_off", "scale_off", "upside_down")
+
+CHECKS: tuple[Check, ...] = (
+    Check(
+        "stamps_backwards", _FATAL, stamps.backwards, 0, "frames",
+        "stamps run backwards",
+        "record again with a clock that only runs forwards, or sort the frames; --skip-bad leaves "
+        "these frames out",
+    ),
+    Check(
+        "stamps_counted", _FATAL, stamps.counted, 0.9, "of the frames",
+        "the stamps are the numbers of the frames, 0, 1, 2 …, not times",
+        "write the time of each frame, in seconds; speeds, gaps and hours come from it",
+        explains=("low_frame_rate",),
+    ),
+    Check(
+        "sides_swapped", _FATAL, sides.swapped, "negative_share", "of the matches",
+        "left and right are swapped: near things lie further right in the right image",
+        "exchange the two folders or topics, and the two halves of a raw calibration",
+        explains=_CONSEQUENCES,
+    ),
+    Check(
+        "images_rotated", _FATAL, sides.rotated, "negative_share", "of the matches",
+        "each image is turned by 180° in its place",
+        "turn the images back, or exchange left and right: a rig that hangs upside down has both",
+        explains=_CONSEQUENCES,
+    ),
+    Check(
+        "not_synchronised", _FATAL, sides.forward_m, "forward_m", "m",
+        "left and right are of different instants: the robot moved on between them",
+        "trigger both cameras at once, or pair by the time of exposure; check for a dropped frame",
+        explains=_CONSEQUENCES,
+    ),
+    Check(
+        "not_synchronised", _FATAL, sides.row_jump_px, "row_jump_px", "px",
+        "left and right are of different instants: their rows jump from pair to pair",
+        "trigger both cameras at once, or pair by the time of exposure; check for a dropped frame",
+        explains=_CONSEQUENCES,
+    ),
+    Check(
+        "rows_misaligned", _FATAL, sides.row_offset_px, "row_offset_px", "px",
+        "rows of left and right do not lie in line",
+        "calibrate again; raw images need a [raw] calibration, so that they are rectified",
+        explains=("no_odometry", "rows_slightly_off"),
+    ),
+    Check(
+        "frozen_stream", _FATAL, motion.frozen_frames, "frozen_frames", "images in a row",
+        "a camera repeats an old image under new stamps",
+        "look at the camera's driver and its bandwidth; record again",
+    ),
+    Check(
+        "no_odometry", _FATAL, motion.without_odometry, "no_odometry", "of the frames",
+        "most frames have no odometry",
+        "look at the images: dark, covered or without texture? is the baseline in metres, and the "
+        "calibration that of these images?",
+    ),
+    Check(
+        "rows_slightly_off", _WARNING, sides.row_offset_px, "slight_row_offset_px", "px",
+        "rows of left and right lie slightly out of line: half of the landmarks are lost",
+        "calibrate again when you can",
+    ),
+    Check(
+        "upside_down", _WARNING, sides.upside_down, "upright", "",
+        "the camera hangs upside down: near things are above far ones",
+        "that works, if all drives of the map are like this; else turn the images",
+        below=True,
+    ),
+    Check(
+        "scale_off", _WARNING, motion.scale_off, "scale", "of the way",
+        "focal length or baseline is wrong: odometry's way differs from the one measured outside",
+        "calibrate again; check the baseline with a ruler",
+        needs="motion from outside (--motion FILE) or a map of the place (--map MAP)",
+    ),
+    Check(
+        "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",
+        "frames bear the stamp of the frame before",
+        "the driver sends frames twice, or the clock is too coarse; they are left out",
+    ),
+    Check(
+        "stamp_jump", _WARNING, stamps.jump_s, "jump_s", "s",
+        "the stamps jump forwards",
+        "if the clock was set during the drive, split the drive there",
+    ),
+    Check(
+        "frame_gaps", _WARNING, stamps.gap_ratio, "gap_ratio", "usual intervals",
+        "frames are missing",
+        "the map may fall into parts at gaps; check bandwidth and disk",
+    ),
+    Check(
+        "low_frame_rate", _WARNING, stamps.rate_hz, "least_rate_hz", "Hz",
+        "few frames per second: odometry has no prediction from one to the next",
+        "record with at least 4 Hz, better 10",
+        below=True,
+    ),
+    Check(
+        "repeated_images", _WARNING, motion.frozen_frames, 0, "images in a row",
+        "an image is that of the frame before",
+        "the frame counts as unusable; look at the camera's driver",
+    ),
+    Check(
+        "overexposed", _WARNING, pictures.saturated, "spoilt_frames", "of the frames",
+        "much of the image is white",
+        "limit the exposure, or meter the lower half of the image",
+    ),
+    Check(
+        "black", _WARNING, pictures.black, "spoilt_frames", "of the frames",
+        "much of the image is black",
+        "allow a longer exposure or more gain; is the lens covered?",
+    ),
+    Check(
+        "exposure_steps", _WARNING, pictures.exposure_step, "exposure_step", "factors of two",
+        "the exposure jumps from frame to frame",
+        "use the camera's smooth exposure control, the same for both sides",
+    ),
+    Check(
+        "sides_exposed_differently", _WARNING, pictures.exposure_difference,
+        "exposure_difference", "factors of two",
+        "left and right differ in brightness",
+        "let one camera control the exposure of both",
+    ),
+    Check(
+        "blurred", _WARNING, pictures.sharpness, "sharpness", "",
+        "the images are blurred",
+        "focus or clean the lens, shorten the exposure, compress less",
+        below=True,
+    ),
+    Check(
+        "few_grey_levels", _WARNING, pictures.bits, "bits", "bits",
+        "16-bit images use only their lowest bits, such as 10 of 16",
+        "shift the values up, or write 8-bit images",
+        below=True,
+    ),
+    Check(
+        "low_resolution", _WARNING, optics.px_per_deg, "least_px_per_deg", "px per degree",
+        "few pixels per degree: landmarks further off cannot be told apart",
+        "use larger images or a narrower lens",
+        below=True,
+    ),
+    Check(
+        "short_baseline", _WARNING, optics.disparity_px, "least_disparity_px", "px",
+        "the baseline is too short for the scene: most landmarks are too far off to measure",
+        "use a rig with a longer baseline, or a longer focal length",
+        below=True,
+    ),
+    Check(
+        "clock_unknown", _WARNING, stamps.hours_needed, 0.5, "",
+        "missions by hour need a UTC clock and a zone or longitude",
+        "give --recorded-at, and --zone or --longitude",
+        explains=("clock_unstated",),
+    ),
+    Check(
+        "clock_unstated", _NOTE, stamps.clock_unknown, 0.5, "",
+        "the hour of the drive is unknown",
+        "for downloads by hour give --recorded-at, and --zone or --longitude",
+    ),
+)  # fmt: skip
+
+
+def diagnose(seen: Evidence) -> Diagnosis:
+    """Runs all checks; consequences of a finding are left out."""
+    found: list[Finding] = []
+    explained: set[str] = set()
+    untold: dict[str, str] = {}
+    for check in CHECKS if len(seen) or seen.backwards else ():
+        result = check.finding(seen)
+        if result is None and check.needs:
+            untold[check.code] = check.needs
+        if isinstance(result, Finding) and check.code not in explained:
+            found.append(result)
+            explained |= {check.code, *check.explains}
+    ranks = list(Severity)
+    found.sort(key=lambda one: ranks.index(one.severity))
+    return Diagnosis(len(seen), tuple(found), untold)

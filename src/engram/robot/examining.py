@@ -1,0 +1,134 @@
+"""The doctor's part in a drive: a whole examination, and the look ahead before mapping."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import chain
+
+import numpy as np
+
+from engram.doctor import Diagnosis, Facts
+from engram.errors import UnfitDriveError
+from engram.geometry import StereoCamera
+from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
+from engram.robot.front import Arrived, Front, arriving
+from engram.robot.session import DriveSequence
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences import FrameLog, ImageSequence, LoggedFrame, SequenceInfo
+from engram.sequences.listing import StampFault
+
+# A long drive is examined in so many stretches, as it may begin at rest or in the dark.
+_STRETCHES = 4
+
+
+def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
+    """What is known of a drive beside its frames."""
+    info = sequence.info
+    step = sequence.frames.step if isinstance(sequence, ImageSequence) else 1
+    return Facts(info.clock, info.zone, info.longitude_deg, by_hour, step)
+
+
+def examine_drive(
+    sequence: ImageSequence | FrameLog,
+    settings: Settings | None = None,
+    monitor: Monitor = QUIET,
+    *,
+    by_hour: bool = False,
+) -> Diagnosis:
+    """Examines up to `DoctorConfig.frames` frames of a drive, in stretches spread over it.
+
+    Open the drive with `skip_bad`: then stamps out of order are a finding, not an error.
+
+    Args:
+        sequence: the drive.
+        settings: the resolved configuration; None for the defaults.
+        monitor: receives each frame, and may stop the examination.
+        by_hour: whether missions by hour need the drive's clock.
+
+    Raises:
+        SequenceError: an image cannot be used.
+    """
+    front = Front(settings or Settings())
+    evidence = front.examination.evidence
+    evidence.facts = facts_of(sequence, by_hour=by_hour)
+    with interruptible(monitor) as watched:
+        for stretch in stretches(len(sequence), evidence.config.frames):
+            front.restart()
+            for number in stretch:
+                front.take(sequence.read(number))
+                watched.advance("examined")
+                watched.check()
+    for fault in sequence.skipped_reasons:
+        if isinstance(fault, StampFault):
+            evidence.backwards += fault.backwards
+            evidence.repeated += not fault.backwards
+    return front.diagnosis
+
+
+def stretches(length: int, most: int) -> list[range]:
+    """Up to `most` frames of a drive: all of them, or runs of successive ones spread over it."""
+    if length <= most:
+        return [range(length)]
+    each = max(most // _STRETCHES, 1)
+    starts = np.linspace(0, length - each, min(_STRETCHES, most)).round().astype(int)
+    return [range(int(start), int(start) + each) for start in starts]
+
+
+class LookedAhead:
+    """A drive whose first frames were taken ahead, so that the doctor saw them before the map.
+
+    Images of those frames are not kept: they come as logged frames, the others as they are. It can
+    be iterated over once.
+
+    Args:
+        front: takes the frames, and later those of the robot that drives on.
+        sequence: the drive.
+        monitor: may stop it.
+    """
+
+    def __init__(self, front: Front, sequence: DriveSequence, monitor: Monitor = QUIET) -> None:
+        self.sequence = sequence
+        self._rest = arriving(sequence)
+        self._ahead: list[LoggedFrame] = []
+        with deferred_interrupt() as raise_if_asked:
+            while not front.examination.full:
+                arrived = next(self._rest, None)
+                if arrived is None:
+                    break
+                self._ahead.append(front.take_ahead(arrived))
+                monitor.check()
+                raise_if_asked()
+
+    @property
+    def info(self) -> SequenceInfo:
+        """What is known of the drive as a whole."""
+        return self.sequence.info
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The one camera of the drive."""
+        return self.sequence.camera
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __iter__(self) -> Iterator[Arrived]:
+        ahead, self._ahead = self._ahead, []
+        return chain(ahead, self._rest)
+
+    def close(self) -> None:
+        """Ends the thread that reads ahead."""
+        self._rest.close()
+
+
+def refuse_unfit(diagnosis: Diagnosis, name: str, options: RobotOptions) -> None:
+    """Refuses a drive with a fatal finding, unless it is forced.
+
+    Raises:
+        UnfitDriveError: what is wrong with it.
+    """
+    if diagnosis.fatal and not options.force:
+        findings = "\n".join(one.text() for one in diagnosis.fatal)
+        raise UnfitDriveError(
+            f"{name}: not mapped, nothing was written; --force maps it all the same\n{findings}"
+        )
