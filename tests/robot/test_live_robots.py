@@ -211,3 +211,28 @@ def test_a_closed_robot_leaves_no_threads(path: Path) -> None:
     before = threading.active_count()
     mapped(path)
     assert threading.active_count() == before
+
+
+def test_what_an_unfit_robot_mapped_is_sealed_and_not_committed(path: Path) -> None:
+    with (
+        open_map(path, create=True) as town,
+        town.robot(CAMERA, name="r1", maps=True) as robot,
+    ):
+        run(robot, [*FIRST[:12], FIRST[3], *FIRST[12:]])
+    assert robot.saving.state is SavingState.SEALED
+    assert "stamps run backwards" in robot.saving.text()
+    with open_map(path) as town:
+        assert town.revision == 0
+        (waiting,) = town.interrupted()
+        assert waiting.nodes > 15
+
+
+def test_what_an_unfit_robot_remembers_is_dropped(path: Path) -> None:
+    mapped(path)
+    with open_map(path) as town, town.robot(CAMERA, name="r2", remembers=True) as robot:
+        run(robot, [*AGAIN[:12], AGAIN[3], *AGAIN[12:]])
+    assert robot.saving.state is SavingState.SEALED
+    assert "stamps run backwards" in robot.saving.reason
+    with open_map(path) as town:
+        assert town.revision == 1
+    assert not list(path.parent.glob("*-memory-*"))

@@ -15,11 +15,19 @@ from tests.synthetic_world import World, drive
 
 import engram
 from engram import _core
-from engram.errors import InputError
-from engram.localiser import Budget, Hint, Keeper, Localisation, Localiser, Position
+from engram.localiser import (
+    Budget,
+    Hint,
+    Keeper,
+    Localisation,
+    LocalisationStatus,
+    Localiser,
+    Position,
+)
 from engram.maps import open_map
 from engram.robot import Front, Robot, RobotOptions, Settings, map_drive, open_drive, robot_on
 from engram.robot.localisers import localiser_in
+from engram.sequences import LoggedFrame
 
 ROAD = np.arange(0.0, 20.0, 0.7)
 PACKAGE = str(Path(engram.__file__).parent)
@@ -87,14 +95,53 @@ def test_four_hops_from_the_loop_to_the_kernel(
         assert stack == ["drive", "step", "localise", "attempt", "match_frames"]
 
 
-def test_a_stamp_that_goes_back_is_refused(localiser: Localiser) -> None:
+def test_a_frame_stamped_too_early_is_left_out_and_reported(localiser: Localiser) -> None:
     robot = Robot(Front(Settings()), localiser)
     for seen in LIVE[:4]:
         robot.step(seen.logged)
     for earlier in (LIVE[3], LIVE[2]):
-        with pytest.raises(InputError, match="is not later than"):
-            robot.step(earlier.logged)
+        left_out = robot.step(earlier.logged)
+        assert left_out.status is LocalisationStatus.NO_ODOMETRY
+        assert left_out.node_from_live is None
     assert robot.step(LIVE[4].logged).localised
+    assert {one.code for one in robot.diagnosis.findings} >= {
+        "stamps_backwards",
+        "stamps_repeated",
+    }
+
+
+def test_a_clock_that_is_set_back_for_good_makes_the_robot_begin_anew(
+    localiser: Localiser,
+) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    for seen in LIVE[:4]:
+        robot.step(seen.logged)
+    hour_ns = 3600 * 10**9
+    frames = [replace(one.frame, stamp_ns=one.frame.stamp_ns - hour_ns) for one in LIVE[4:12]]
+    found = [
+        robot.step(LoggedFrame(frame, one.odometry))
+        for frame, one in zip(frames, LIVE[4:12], strict=True)
+    ]
+    assert not any(one.localised for one in found)
+    assert found[1].status is LocalisationStatus.NO_ODOMETRY
+    assert found[2].status is LocalisationStatus.LOST
+    assert all(one.position is None for one in found[2:])
+
+
+def test_a_clock_that_is_set_forwards_by_hours_is_reported_and_does_no_harm(
+    localiser: Localiser,
+) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    frames = [
+        replace(one.frame, stamp_ns=one.frame.stamp_ns + (k >= 6) * 3600 * 10**9)
+        for k, one in enumerate(LIVE[:12])
+    ]
+    found = [
+        robot.step(LoggedFrame(frame, one.odometry))
+        for frame, one in zip(frames, LIVE[:12], strict=True)
+    ]
+    assert all(one.localised for one in found)
+    assert "stamp_jump" in {one.code for one in robot.diagnosis.findings}
 
 
 def test_a_pose_between_two_frames_lies_between_them(localiser: Localiser) -> None:

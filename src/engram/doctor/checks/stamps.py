@@ -62,7 +62,8 @@ def rate_hz(seen: Evidence) -> float | None:
 def clock_unknown(seen: Evidence) -> float | None:
     """1 if nobody knows what hour the stamps mean, or where on earth that was."""
     facts = seen.facts
-    return float(facts.clock is not Clock.UTC or (facts.zone is None and facts.longitude_deg is None))
+    somewhere = facts.zone is None and facts.longitude_deg is None
+    return float(facts.clock is not Clock.UTC or somewhere)
 
 
 def hours_needed(seen: Evidence) -> float | None:

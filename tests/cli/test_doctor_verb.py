@@ -1,0 +1,68 @@
+"""`engram doctor`, and what `map` does with a drive that it finds unfit."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from engram.maps import open_map
+
+UNFIT = 3
+
+
+@pytest.fixture
+def swapped(street: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "swapped"
+    shutil.copytree(street, folder)
+    (folder / "left").rename(folder / "aside")
+    (folder / "right").rename(folder / "left")
+    (folder / "aside").rename(folder / "right")
+    return folder
+
+
+def test_a_healthy_drive_passes(engram, street: Path) -> None:
+    ran = engram("doctor", street)
+    assert ran.status == 0
+    assert "12 frames examined: nothing wrong" in ran.out
+    assert "cannot be told: scale_off" in ran.out
+
+
+def test_a_fatal_finding_has_an_exit_status_of_its_own(engram, swapped: Path) -> None:
+    ran = engram("doctor", swapped, "--json")
+    assert ran.status == UNFIT
+    assert ran.json["fatal"]
+    worst = ran.json["findings"][0]
+    assert (worst["code"], worst["severity"]) == ("sides_swapped", "fatal")
+    assert worst["value"] > worst["limit"]
+
+
+def test_stamps_out_of_order_are_a_finding_not_an_error(engram, street: Path, tmp_path) -> None:
+    folder = tmp_path / "backwards"
+    shutil.copytree(street, folder)
+    stamps = (folder / "times.txt").read_text().splitlines()
+    stamps[6], stamps[7] = stamps[7], stamps[6]
+    (folder / "times.txt").write_text("\n".join(stamps))
+    ran = engram("doctor", folder, "--json")
+    assert ran.status == UNFIT
+    assert ran.json["findings"][0]["code"] == "stamps_backwards"
+
+
+def test_an_unfit_drive_is_mapped_only_by_force_and_the_revision_says_so(
+    engram, swapped: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "town.engram"
+    refused = engram("map", path, swapped)
+    assert refused.status == UNFIT
+    assert "sides_swapped" in refused.err
+    with open_map(path) as town:
+        assert town.revision == 0
+        assert town.interrupted() == []
+    forced = engram("map", path, swapped, "--force", "--json")
+    assert forced.status == 0
+    assert forced.json["findings"][0]["code"] == "sides_swapped"
+    with open_map(path) as town:
+        (revision,) = town.log()
+    assert revision.message.endswith("(forced: sides_swapped)")
+    assert revision.configuration["doctor"]["fatal"]

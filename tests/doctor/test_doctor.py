@@ -1,0 +1,187 @@
+"""Each fault of a drive is a finding; a healthy drive has none."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+
+from engram.doctor import CHECKS, Diagnosis, DoctorConfig, Examination, Facts, Severity, diagnose
+from engram.doctor.sides import align, match_sides
+from engram.frontend import StereoPair
+from engram.graph.model import Clock
+from engram.robot import Front, Settings
+from engram.robot.examining import stretches
+from engram_lab.bench.data import synthetic_drive
+from engram_lab.studies.faults.injected import (
+    Frozen,
+    LateSide,
+    blurred,
+    brightened,
+    exchanged,
+    halved,
+    lowered,
+    on_both,
+    turned,
+)
+
+RNG = np.random.default_rng(1)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> list[StereoPair]:
+    return list(synthetic_drive(frames=13, step_m=0.8))
+
+
+def examined(pairs: Sequence[StereoPair], facts: Facts | None = None) -> Diagnosis:
+    front = Front(Settings())
+    front.examination.evidence.facts = facts or Facts()
+    last_ns = None
+    for pair in pairs:
+        if last_ns is not None and pair.stamp_ns <= last_ns:
+            front.examination.misordered(pair.stamp_ns, last_ns)
+            continue
+        front.take(pair)
+        last_ns = pair.stamp_ns
+    return front.diagnosis
+
+
+def codes(diagnosis: Diagnosis) -> set[str]:
+    return {one.code for one in diagnosis.findings if one.severity is not Severity.NOTE}
+
+
+def test_a_healthy_drive_has_no_findings(pairs) -> None:
+    assert codes(examined(pairs)) == set()
+
+
+def test_a_robot_at_rest_has_no_findings(pairs) -> None:
+    def noisy(image: np.ndarray) -> np.ndarray:
+        return np.clip(image + RNG.normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+
+    rest = [replace(on_both(pairs[0], noisy), stamp_ns=one.stamp_ns) for one in pairs]
+    assert codes(examined(rest)) == set()
+
+
+def each(change: Callable[[StereoPair], StereoPair]) -> Callable[..., list[StereoPair]]:
+    return lambda pairs: [change(pair) for pair in pairs]
+
+
+def numbered(pairs: list[StereoPair]) -> list[StereoPair]:
+    return [replace(pair, stamp_ns=10**9 * k) for k, pair in enumerate(pairs)]
+
+
+def later(pairs: list[StereoPair], number: int, by_s: float) -> list[StereoPair]:
+    return [
+        replace(pair, stamp_ns=pair.stamp_ns + round(by_s * 1e9) * (k >= number))
+        for k, pair in enumerate(pairs)
+    ]
+
+
+FAULTS: dict[str, tuple[str, Callable[[list[StereoPair]], list[StereoPair]]]] = {
+    "swapped": ("sides_swapped", each(exchanged)),
+    "rotated": ("images_rotated", each(lambda one: on_both(one, turned))),
+    "upside down": ("upside_down", each(lambda one: exchanged(on_both(one, turned)))),
+    "late": (
+        "not_synchronised",
+        lambda pairs: [one.pair for one in LateSide().apply(pairs, 1, 1, RNG)][1:],
+    ),
+    "rows": ("rows_misaligned", each(lambda one: replace(one, right=lowered(one.right, 2.5)))),
+    "rolled": (
+        "rows_misaligned",
+        each(lambda one: replace(one, right=lowered(one.right, 0, 0.012))),
+    ),
+    "rows slightly": (
+        "rows_slightly_off",
+        each(lambda one: replace(one, right=lowered(one.right, 1.0))),
+    ),
+    "frozen": (
+        "frozen_stream",
+        lambda pairs: [one.pair for one in Frozen().apply(pairs, 5, 6, RNG)],
+    ),
+    "right frozen": (
+        "frozen_stream",
+        lambda pairs: [one.pair for one in Frozen(("right",)).apply(pairs, 5, 6, RNG)],
+    ),
+    "one stale": (
+        "repeated_images",
+        lambda pairs: [one.pair for one in Frozen().apply(pairs, 1, 6, RNG)],
+    ),
+    "dark": ("no_odometry", each(lambda one: on_both(one, lambda i: brightened(i, 0.02)))),
+    "bright": ("overexposed", each(lambda one: on_both(one, lambda i: brightened(i, 6)))),
+    "one side dark": (
+        "sides_exposed_differently",
+        each(lambda one: replace(one, right=brightened(one.right, 0.5))),
+    ),
+    "blurred": ("blurred", each(lambda one: on_both(one, lambda i: blurred(i, 5)))),
+    "small": ("low_resolution", each(lambda one: halved(one, 4.0))),
+    "numbered": ("stamps_counted", numbered),
+    "backwards": ("stamps_backwards", lambda pairs: later(pairs, 8, -0.5)),
+    "repeated": ("stamps_repeated", lambda pairs: later(pairs, 8, -0.1)),
+    "stall": ("frame_gaps", lambda pairs: later(pairs, 8, 0.8)),
+    "an hour": ("stamp_jump", lambda pairs: later(pairs, 8, 3600)),
+    "slow": ("low_frame_rate", lambda pairs: [replace(p, stamp_ns=p.stamp_ns * 4) for p in pairs]),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_is_found(pairs, fault: str) -> None:
+    code, inject = FAULTS[fault]
+    found = examined(inject(pairs))
+    assert code in codes(found)
+    (one,) = (finding for finding in found.findings if finding.code == code)
+    assert one.cure
+    assert f"{one.limit:.3g}" in one.text()
+
+
+def test_consequences_of_swapped_sides_are_not_findings_of_their_own(pairs) -> None:
+    assert codes(examined([exchanged(pair) for pair in pairs])) == {"sides_swapped"}
+
+
+def test_the_way_between_the_instants_of_left_and_right_is_measured(pairs) -> None:
+    ways = []
+    for before, pair in itertools.pairwise(pairs):
+        found = align(match_sides(replace(pair, right=before.right)), pair.camera)
+        ways += [] if found is None else [found.forward_m]
+    assert np.median(ways) == pytest.approx(-0.8, abs=0.15)
+
+
+def test_an_unknown_hour_matters_where_missions_by_hour_need_it(pairs) -> None:
+    needed = Facts(Clock.UNKNOWN, by_hour=True)
+    assert codes(examined(pairs, needed)) == {"clock_unknown"}
+    known = Facts(Clock.UTC, zone="Europe/London", by_hour=True)
+    assert codes(examined(pairs, known)) == set()
+
+
+def test_no_more_frames_are_looked_at_than_asked_for(pairs) -> None:
+    front = Front(Settings(doctor=DoctorConfig(frames=4)))
+    for pair in pairs[:6]:
+        front.take(pair)
+    assert front.diagnosis.frames == 4
+    assert len(front.examination.evidence.matches) == 2
+
+
+def test_nothing_is_said_of_no_frames() -> None:
+    assert diagnose(Examination().evidence).findings == ()
+
+
+def test_every_check_has_a_limit_a_cure_and_one_severity_for_its_code() -> None:
+    severities: dict[str, Severity] = {}
+    for check in CHECKS:
+        assert isinstance(check.limit, int | float) or hasattr(DoctorConfig(), check.limit)
+        assert check.message
+        assert check.cure
+        assert severities.setdefault(check.code, check.severity) is check.severity
+        assert set(check.explains) <= {one.code for one in CHECKS}
+
+
+@given(length=st.integers(1, 5000), most=st.integers(1, 300))
+def test_stretches_are_parts_of_the_drive_without_overlap(length: int, most: int) -> None:
+    frames = [number for stretch in stretches(length, most) for number in stretch]
+    assert frames == sorted(set(frames))
+    assert 0 <= frames[0] <= frames[-1] < length
+    assert len(frames) <= most
