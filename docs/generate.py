@@ -12,6 +12,7 @@ import engram
 from engram.cli.app import app
 from engram.cli.settings import AllSettings, every_setting
 from engram.cli.verbs import GROUPS
+from engram.doctor import CHECKS, DoctorConfig
 
 
 def write_references(folder: Path) -> None:
@@ -21,6 +22,7 @@ def write_references(folder: Path) -> None:
         ("commands", commands()),
         ("settings", settings()),
         ("python", public_names()),
+        ("findings", findings()),
     ):
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
 
@@ -47,6 +49,16 @@ def settings() -> str:
         for one in every_setting(AllSettings())
     ]
     return "\n".join(rows).replace("<", "&lt;") + "\n"
+
+
+def findings() -> str:
+    """A table of the doctor's checks."""
+    rows = ["| code | severity | alarm | meaning | cure |", "| --- | --- | --- | --- | --- |"]
+    for one in CHECKS:
+        limit = getattr(DoctorConfig(), one.limit) if isinstance(one.limit, str) else one.limit
+        alarm = f"{'under' if one.below else 'over'} {limit:g} {one.unit}".rstrip()
+        rows.append(f"| `{one.code}` | {one.severity} | {alarm} | {one.message} | {one.cure} |")
+    return "\n".join(rows) + "\n"
 
 
 def public_names() -> str:

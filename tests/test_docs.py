@@ -34,6 +34,7 @@ EXAMPLES = {
     DOCS / "robot-tutorial.md": "drives",
     DOCS / "study.md": "drives",
     DOCS / "data.md": "mapped",
+    DOCS / "doctor.md": "mapped",
     DOCS / "trouble.md": "mapped",
     DOCS / "budget.md": "mapped",
     DOCS / "ranking.md": "mapped",

@@ -9,7 +9,7 @@ import pytest
 
 from engram.maps import open_map
 
-UNFIT = 3
+UNFIT = 4
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def doctor(
 
     Looks at up to 200 frames: whether left and right are in place, in line and of one instant, at
     stamps, odometry, images and optics. Each finding has a value, its limit and a cure. Exit
-    status 3 if one is fatal: engram map refuses such a drive.
+    status 4 if one is fatal: engram map refuses such a drive.
 
     \b
     Examples:
@@ -34,6 +34,7 @@ def doctor(
       engram doctor drives/monday --json
       engram doctor drives/monday --hours --zone Europe/London
     """
+    from engram.cli.losses import tell_losses
     from engram.cli.progress import Bars
     from engram.robot import examine_drive
 
@@ -45,3 +46,4 @@ def doctor(
     print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
     if diagnosis.fatal:
         raise typer.Exit(EXIT_UNFIT_DRIVE)
+    tell_losses(sequence)

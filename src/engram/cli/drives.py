@@ -35,7 +35,7 @@ def map_(
 
     Creates the map if it does not exist. Where the drive localises in the map, nothing is saved;
     elsewhere it becomes a new experience. The same command resumes an interrupted drive. A drive
-    with a fatal fault is refused before anything is written, with exit status 3: engram doctor.
+    with a fatal fault is refused before anything is written, with exit status 4: engram doctor.
 
     \b
     Examples:
@@ -114,7 +114,6 @@ def localise(
       engram localise town.engram drives/tuesday --ranking distance --lanes 1 --json
       engram localise town.engram drives/tuesday --rate 20 --deadline 40
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures matches
-      engram localise town.engram drives/tuesday --remember
       engram localise town.engram drives/tuesday --explain 120
     """
     from engram.cli.explaining import explain_and_print

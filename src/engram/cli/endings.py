@@ -8,7 +8,7 @@ from typing import Any
 from engram.errors import EngramError
 
 # A drive has a fatal fault.
-EXIT_UNFIT_DRIVE = 3
+EXIT_UNFIT_DRIVE = 4
 
 
 class VerbInterruptedError(Exception):

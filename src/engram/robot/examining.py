@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, islice
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
 from engram.robot.front import Arrived, Front, arriving
 from engram.robot.session import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
-from engram.sequences import FrameLog, ImageSequence, LoggedFrame, SequenceInfo
+from engram.sequences import Drive, FrameLog, ImageSequence, LoggedFrame, SequenceInfo
 from engram.sequences.listing import StampFault
 
 # A long drive is examined in so many stretches, as it may begin at rest or in the dark.
@@ -29,13 +29,15 @@ def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
 
 
 def examine_drive(
-    sequence: ImageSequence | FrameLog,
+    sequence: Drive,
     settings: Settings | None = None,
     monitor: Monitor = QUIET,
     *,
     by_hour: bool = False,
 ) -> Diagnosis:
     """Examines up to `DoctorConfig.frames` frames of a drive, in stretches spread over it.
+
+    Of a bag, which is a stream, the first ones.
 
     Open the drive with `skip_bad`: then stamps out of order are a finding, not an error.
 
@@ -52,17 +54,25 @@ def examine_drive(
     evidence = front.examination.evidence
     evidence.facts = facts_of(sequence, by_hour=by_hour)
     with interruptible(monitor) as watched:
-        for stretch in stretches(len(sequence), evidence.config.frames):
-            front.restart()
-            for number in stretch:
-                front.take(sequence.read(number))
-                watched.advance("examined")
-                watched.check()
+        for arrived in _chosen(sequence, front, evidence.config.frames):
+            front.take(arrived)
+            watched.advance("examined")
+            watched.check()
     for fault in sequence.skipped_reasons:
         if isinstance(fault, StampFault):
             evidence.backwards += fault.backwards
             evidence.repeated += not fault.backwards
     return front.diagnosis
+
+
+def _chosen(sequence: Drive, front: Front, most: int) -> Iterator[Arrived]:
+    """The frames that are examined; the front begins anew with each stretch of them."""
+    if not isinstance(sequence, ImageSequence | FrameLog):
+        yield from islice(sequence, most)
+        return
+    for stretch in stretches(len(sequence), most):
+        front.restart()
+        yield from map(sequence.read, stretch)
 
 
 def stretches(length: int, most: int) -> list[range]:
