@@ -190,16 +190,3 @@ def test_map_says_what_became_of_every_frame_and_what_to_try_next(
     found = engram("localise", town, street)
     assert "12 frames: 12 localised, 0 dead reckoning, 0 lost, 0 no odometry" in found.out
     assert "ms per frame" in found.out
-
-
-def test_swapped_cameras_are_suspected_when_odometry_fails(
-    engram, street: Path, tmp_path: Path
-) -> None:
-    swapped = tmp_path / "swapped"
-    swapped.mkdir()
-    for old, new in (("left", "right"), ("right", "left")):
-        (swapped / new).symlink_to(street / old)
-    for name in ("times.txt", "calibration.toml"):
-        (swapped / name).symlink_to(street / name)
-    ran = engram("map", tmp_path / "town.engram", swapped)
-    assert "left and right swapped?" in ran.err
