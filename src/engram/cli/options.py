@@ -16,6 +16,7 @@ import typer
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
     from engram.sequences.opening import Drive as OpenDrive
+    from engram.sequences.options import OpenOptions
 
 
 def map_file(text: str) -> Path:
@@ -158,26 +159,35 @@ class Drive:
     def open(self, path: Path) -> OpenDrive:
         """The drive; see `engram.sequences.open_sequence` for the errors."""
         from engram.robot import open_drive
+
+        return open_drive(path, format=self.format, **self.given())
+
+    def options(self) -> OpenOptions:
+        """How it is opened; see `engram.sequences.options.OpenOptions` for the errors."""
+        from engram.sequences.opening import options_of
+
+        return options_of(**self.given())
+
+    def given(self) -> dict[str, Any]:
+        """Arguments of `engram.sequences.open_sequence` but for path and format."""
         from engram.sequences import TimeRange
 
-        return open_drive(
-            path,
-            format=self.format,
-            rig=self.rig,
-            channel=self.channel,
-            frames=self.frames,
-            skip_bad=self.skip_bad,
-            robot=self.robot,
-            start=self.recorded_at,
-            longitude_deg=self.longitude,
-            zone=self.zone,
-            times=TimeRange.parse(self.from_, self.to),
-            calibration=self.calibration,
-            field_of_view_deg=self.fov,
-            mask=self.mask,
-            left=self.left,
-            right=self.right,
-        )
+        return {
+            "rig": self.rig,
+            "channel": self.channel,
+            "frames": self.frames,
+            "skip_bad": self.skip_bad,
+            "robot": self.robot,
+            "start": self.recorded_at,
+            "longitude_deg": self.longitude,
+            "zone": self.zone,
+            "times": TimeRange.parse(self.from_, self.to),
+            "calibration": self.calibration,
+            "field_of_view_deg": self.fov,
+            "mask": self.mask,
+            "left": self.left,
+            "right": self.right,
+        }
 
 
 @dataclass(frozen=True, slots=True)

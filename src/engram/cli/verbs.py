@@ -46,7 +46,10 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
 VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}
 
 # Verbs with verbs of their own.
-NESTED: dict[str, typer.Typer] = {"centre": centre_group, "agent": agent_group}
+NESTED: dict[str, dict[str, typer.Typer]] = {
+    "Drives": {"drive": drive_group},
+    "Service": {"centre": centre_group, "agent": agent_group},
+}
 
 # Where installed packages name verbs of their own: functions, or Typer groups of them.
 ENTRY_POINTS = "engram.verbs"
@@ -97,9 +100,10 @@ def register(app: typer.Typer) -> None:
     for title, verbs in GROUPS.items():
         for name, verb in verbs.items():
             app.command(name, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
-    for name, group in NESTED.items():
-        _all_tell_of_interruption(group)
-        app.add_typer(group, name=name, rich_help_panel="Service")
+    for title, groups in NESTED.items():
+        for name, group in groups.items():
+            _all_tell_of_interruption(group)
+            app.add_typer(group, name=name, rich_help_panel=title)
     for entry in sorted(entry_points(group=ENTRY_POINTS)):
         brought = entry.load()
         if not isinstance(brought, typer.Typer):

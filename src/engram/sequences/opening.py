@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.bags import BagSequence, is_bag, open_bag
@@ -110,6 +110,41 @@ def open_sequence(
     path: str | Path,
     *,
     format: str | None = None,  # noqa: A002, the word of the command line
+    **given: Any,
+) -> Drive:
+    """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
+
+    Image layouts give an `ImageSequence`, bags a `BagSequence` (both are a `StereoSequence`), frame
+    logs a `FrameLog` (a `FrameSequence`).
+
+    Args:
+        path: folder or file of the drive.
+        format: key of `SEQUENCES`; None recognises the layout by its files.
+        **given: arguments of `options_of`.
+
+    Raises:
+        SequenceError: the path does not exist, has no known layout, or its images or stamps
+            cannot be used; the message names file and fault.
+        CalibrationError: its calibration is missing, malformed, or does not fit.
+        ConfigError: an argument is out of range or does not fit the layout.
+        MapError: a frame log is damaged, locked, or of a newer format.
+        MissingExtraError: it is a bag, and the extra `bags` is not installed.
+    """
+    path, options = Path(path), options_of(**given)
+    name = recognise(path) if format is None else _known(format)
+    layout = SEQUENCES[name]
+    if options.rig not in layout.rigs:
+        raise ConfigError(
+            f"{path}: layout {name!r} has no rig {options.rig.value!r}, only "
+            f"{', '.join(known.value for known in layout.rigs)}"
+        )
+    if not layout.has_topics and {options.left, options.right} != {None}:
+        raise ConfigError(f"{path}: --left and --right name topics of a bag; this is {name!r}")
+    return layout.open(path, options)
+
+
+def options_of(
+    *,
     rig: Rig | str = Rig.GREY,
     channel: Channel | str = Channel.GREY,
     frames: FrameRange | str | None = None,
@@ -125,15 +160,10 @@ def open_sequence(
     mask: str | Path | None = None,
     left: str | None = None,
     right: str | None = None,
-) -> Drive:
-    """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
-
-    Image layouts give an `ImageSequence`, bags a `BagSequence` (both are a `StereoSequence`), frame
-    logs a `FrameLog` (a `FrameSequence`).
+) -> OpenOptions:
+    """The options of `open_sequence`, from plain values.
 
     Args:
-        path: folder or file of the drive.
-        format: key of `SEQUENCES`; None recognises the layout by its files.
         rig: "grey" or "colour" (or "color"), if the robot has both (KITTI).
         channel: "grey", or one channel of colour images: "red", "green", "blue".
         frames: which frames are used, as `FrameRange` or text START:STOP:STEP.
@@ -153,14 +183,9 @@ def open_sequence(
         left, right: topics of a bag's images; None finds them by their names.
 
     Raises:
-        SequenceError: the path does not exist, has no known layout, or its images or stamps
-            cannot be used; the message names file and fault.
-        CalibrationError: its calibration is missing, malformed, or does not fit.
-        ConfigError: an argument is out of range or does not fit the layout.
-        MapError: a frame log is damaged, locked, or of a newer format.
+        ConfigError: an argument is out of range.
     """
-    path = Path(path)
-    options = OpenOptions(
+    return OpenOptions(
         rig=parse_choice(Rig, rig),
         channel=parse_choice(Channel, channel),
         frames=FrameRange.parse(frames) if isinstance(frames, str) else frames or FrameRange(),
@@ -177,16 +202,6 @@ def open_sequence(
         left=left,
         right=right,
     )
-    name = recognise(path) if format is None else _known(format)
-    layout = SEQUENCES[name]
-    if options.rig not in layout.rigs:
-        raise ConfigError(
-            f"{path}: layout {name!r} has no rig {options.rig.value!r}, only "
-            f"{', '.join(known.value for known in layout.rigs)}"
-        )
-    if not layout.has_topics and (left is not None or right is not None):
-        raise ConfigError(f"{path}: --left and --right name topics of a bag; this is {name!r}")
-    return layout.open(path, options)
 
 
 def recognise(path: Path) -> str:

@@ -77,6 +77,12 @@ class BagSequence:
         self._reasons: list[str] = []
 
     @property
+    def frame(self) -> str:
+        """Name of the left camera's frame, of its first image; "" if it has none."""
+        first = next(self._shots(self.topics.left), None)
+        return "" if first is None or isinstance(first.content, str) else _frame(first.content)
+
+    @property
     def frames(self) -> str:
         """Which of the left images are used."""
         return str(self._options.frames)
@@ -217,3 +223,7 @@ class BagSequence:
         if first is None or isinstance(first.content, str):
             raise SequenceError(f"{self._bag.path}: {topics.left}: no image can be read")
         return size_of(first.content, topics.left)
+
+
+def _frame(message: Any) -> str:
+    return str(message.header.frame_id).lstrip("/")

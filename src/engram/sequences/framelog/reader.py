@@ -38,13 +38,20 @@ def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
     """A frame log as a drive; `FrameLog` lists other errors.
 
     Raises:
-        ConfigError: a colour channel is selected.
+        ConfigError: an option for images is given.
     """
     if options.channel is not Channel.GREY:
         raise ConfigError(
             f"{path}: a frame log has no images to take channel {options.channel.value!r} of; "
             "choose the channel when recording it"
         )
+    for option, value in (
+        ("--calibration", options.calibration),
+        ("--fov", options.field_of_view_deg),
+        ("--mask", options.mask),
+    ):
+        if value is not None:
+            raise ConfigError(f"{path}: a frame log has no images: give {option} when recording it")
     return FrameLog(path, options)
 
 
@@ -77,7 +84,12 @@ class FrameLog:
         except MapCorruptError as error:
             raise self._named(error) from error
         self._info = with_options(self._header.info, options)
-        self._numbers = options.frames.indices(len(stamps_ns))
+        first_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
+        self._numbers = [
+            number
+            for number in options.frames.indices(len(stamps_ns))
+            if options.times.holds(int(stamps_ns[number]), first_ns)
+        ]
         if not self._numbers:
             raise SequenceError(
                 f"{self._path}: no frame is chosen of the {len(stamps_ns)} in the log "

@@ -1,0 +1,209 @@
+"""`engram drive info` and `engram drive calibration`: what a drive holds, before it is used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from engram.cli import options
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from engram.calibration import Cameras
+    from engram.sequences import BagSequence, ImageSequence
+    from engram.sequences.bags.inspecting import BagFacts
+
+drive_group = typer.Typer(
+    help="Look at a drive: topics, calibration.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+
+
+@drive_group.command("info")
+def info(
+    path: options.DrivePath,
+    *,
+    opening: options.Drive,
+    as_json: options.Json = False,
+) -> None:
+    """Show what a drive holds, and how to map it.
+
+    Of a bag: its topics with type, rate, size and gaps, the calibration and the transforms found,
+    and the command that maps it.
+
+    \b
+    Examples:
+      engram drive info monday.bag
+      engram drive info monday/ --left /front/left/image_raw
+    """
+    from engram.config import plain
+    from engram.sequences.bags import is_bag
+    from engram.sequences.bags.inspecting import describe_bag
+    from engram.untrusted import printable
+
+    if is_bag(path) and opening.format in {None, "bag"}:
+        facts = describe_bag(path, opening.options())
+        typer.echo(json.dumps(plain(facts)) if as_json else printable(_bag_text(facts)))
+        if facts.lost or facts.question:
+            raise typer.Exit(3 if facts.lost else 2)
+        return
+    found = _drive_facts(path, opening)
+    typer.echo(json.dumps(found) if as_json else printable(_drive_text(found)))
+
+
+@drive_group.command("calibration")
+def calibration(
+    path: options.DrivePath,
+    *,
+    opening: options.Drive,
+    picture: Annotated[
+        Path | None,
+        typer.Option("--picture", metavar="PNG", help="[default: DRIVE-calibration.png here]"),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Show a drive's calibration, and draw a rectified pair.
+
+    Prints a table, as comments, and TOML: save it as calibration.toml, edit it, and give it back
+    with --calibration. The picture shows one rectified pair; the same point lies on the same line
+    in both images.
+
+    \b
+    Examples:
+      engram drive calibration monday.bag > calibration.toml
+      engram drive calibration monday.bag --calibration calibration.toml --fov 90
+    """
+    import cv2
+
+    from engram.config import plain
+    from engram.errors import ConfigError
+    from engram.monitor import write_whole
+    from engram.sequences import FrameLog
+    from engram.untrusted import printable
+    from engram.viewing.rectified import rectified_picture, row_offsets_px
+
+    sequence = opening.open(path)
+    if isinstance(sequence, FrameLog):
+        raise ConfigError(f"{path}: a frame log has no images to calibrate; name its drive")
+    pair = next(iter(sequence))
+    offsets = row_offsets_px(pair)
+    out = picture or Path(f"{sequence.info.name}-calibration.png")
+    caption = f"{sequence.info.name}, {len(offsets)} matched corners{_rows_text(offsets)}"
+    _, content = cv2.imencode(".png", rectified_picture(pair, printable(caption)))
+    with write_whole(out) as draft:
+        draft.write_bytes(content.tobytes())
+    lines = _calibration_lines(sequence, offsets)
+    if as_json:
+        camera = {name: getattr(sequence.camera, name) for name in _CAMERA}
+        typer.echo(json.dumps(plain({**camera, "picture": out, "rows_px": offsets.tolist()})))
+        return
+    typer.echo(printable("\n".join(f"# {line}" for line in lines)))
+    typer.echo(_toml(sequence.cameras))
+    typer.echo(f"one rectified pair: {out}", err=True)
+
+
+_CAMERA = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
+
+
+def _calibration_lines(
+    sequence: ImageSequence | BagSequence, offsets: NDArray[np.float64]
+) -> list[str]:
+    import numpy as np
+
+    camera, cameras = sequence.camera, sequence.cameras
+    view_deg = np.rad2deg(2 * np.arctan(camera.width / 2 / camera.fx))
+    if cameras.raw is not None:
+        images = f"raw, {cameras.raw.left.distortion} lenses; rectified on reading"
+    else:
+        images = "rectified" if cameras.rectification is None else "raw; rectified by a table"
+    mounting = "unknown"
+    if camera.cam_from_rig is not None:
+        x, y, z = camera.cam_from_rig.inverse().translation
+        mounting = f"left camera at ({x:.3f}, {y:.3f}, {z:.3f}) m in the robot's frame"
+    return [
+        f"drive          {sequence.info.name} ({sequence.info.format})",
+        f"images         {camera.width} × {camera.height} px, {images}",
+        f"rectified      fx {camera.fx:.3f}  fy {camera.fy:.3f}  cx {camera.cx:.3f}  "
+        f"cy {camera.cy:.3f} px",
+        f"field of view  {view_deg:.1f}° wide",
+        f"baseline       {camera.baseline_m:.6f} m",
+        f"mounting       {mounting}",
+        f"rows           {len(offsets)} matched corners{_rows_text(offsets)}",
+    ]
+
+
+def _rows_text(offsets: NDArray[np.float64]) -> str:
+    """How well the rows of the pair agree."""
+    import numpy as np
+
+    if not len(offsets):
+        return ""
+    middle = np.median(offsets)
+    spread = np.median(np.abs(offsets - middle))
+    return f", right image {middle:+.2f} px off in height (median; half within {spread:.2f} px)"
+
+
+def _toml(cameras: Cameras) -> str:
+    from engram.calibration import calibration_toml
+    from engram.errors import CalibrationError
+
+    try:
+        return calibration_toml(cameras)
+    except CalibrationError as error:
+        return f"# {error}"
+
+
+def _bag_text(facts: BagFacts) -> str:
+    width = max(len(topic.name) for topic in facts.topics)
+    lines = [
+        f"{facts.path}: {facts.size_bytes / 1e6:.1f} MB in {facts.files} "
+        f"{'file' if facts.files == 1 else 'files'}, {facts.duration_s:.1f} s"
+    ]
+    for topic in facts.topics:
+        gaps = f"{topic.gaps} gaps, longest {topic.longest_gap_s:.2f} s" if topic.gaps else ""
+        lines.append(
+            f"  {topic.name:{width}}  {topic.messages:>7} × {topic.type:32} "
+            f"{topic.rate_hz:7.1f} Hz {topic.size_bytes / 1e6:9.1f} MB  {gaps}".rstrip()
+        )
+    if facts.left is not None:
+        lines.append(f"stereo: {facts.left}, {facts.right}")
+        lines.append(f"calibration: {facts.calibration}")
+        lines.append(f"mounting: {facts.mounting or 'unknown'}")
+    if facts.transforms:
+        lines.append(f"static transforms: {', '.join(facts.transforms)}")
+    if facts.question:
+        lines.append(f"missing: {facts.question}")
+    lines += [f"lost: {loss}" for loss in facts.lost]
+    lines.append(f"next: {facts.command}")
+    return "\n".join(lines)
+
+
+def _drive_facts(path: Path, opening: options.Drive) -> dict[str, object]:
+    sequence = opening.open(path)
+    stamps_ns = getattr(sequence, "stamps_ns", None)
+    seconds = 0.0 if stamps_ns is None else float(stamps_ns[-1] - stamps_ns[0]) / 1e9
+    return {
+        "path": str(path),
+        "format": sequence.info.format,
+        "clock": str(sequence.info.clock),
+        "pairs": len(sequence),
+        "duration_s": seconds,
+        **{name: getattr(sequence.camera, name) for name in _CAMERA},
+        "command": f"engram map MAP.engram {path}",
+    }
+
+
+def _drive_text(facts: dict[str, object]) -> str:
+    return (
+        f"{facts['path']}: {facts['format']}, {facts['pairs']} pairs in "
+        f"{facts['duration_s']:.1f} s, clock {facts['clock']}\n"
+        f"camera: {facts['width']}×{facts['height']} px, fx {facts['fx']:.1f} px, baseline "
+        f"{facts['baseline_m']:.4f} m\n"
+        f"next: {facts['command']}"
+    )
