@@ -6,6 +6,7 @@ P1 P2 Q`` to extrinsics.yml; ``T`` is in the unit of the board's squares.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -34,13 +35,13 @@ def is_file_storage(entries: dict[str, Any]) -> bool:
 
 
 def parse_file_storage(
-    entries: dict[str, Any], size: tuple[int, int] | None
+    entries: dict[str, Any], size: Callable[[], tuple[int, int]] | None
 ) -> RawStereoCalibration:
     """The pair of a file, or of two files whose entries are joined.
 
     Args:
         entries: the entries.
-        size: of the drive's images, px, which the sample's files do not state.
+        size: gives that of the drive's images, px, which the sample's files do not state.
 
     Raises:
         CalibrationError: an entry is missing or malformed.
@@ -78,7 +79,7 @@ def _model(entries: dict[str, Any]) -> DistortionModel:
     )
 
 
-def _size(entries: dict[str, Any], size: tuple[int, int] | None) -> tuple[int, int]:
+def _size(entries: dict[str, Any], size: Callable[[], tuple[int, int]] | None) -> tuple[int, int]:
     for name in _SIZES:
         if name in entries:
             width, height = numbers(entries, name, {2})
@@ -88,4 +89,4 @@ def _size(entries: dict[str, Any], size: tuple[int, int] | None) -> tuple[int, i
         return pixels(entries, str(names[0])), pixels(entries, str(names[1]))
     if size is None:
         raise CalibrationError("states no image size: add image_width and image_height")
-    return size
+    return size()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -39,7 +39,7 @@ def read_calibration(
     path: Path,
     *,
     rectified: bool = False,
-    size: tuple[int, int] | None = None,
+    size: Callable[[], tuple[int, int]] | None = None,
     field_of_view_deg: float | None = None,
 ) -> Cameras:
     """The stereo pair of a calibration file; its format is recognised by its content.
@@ -47,7 +47,7 @@ def read_calibration(
     Args:
         path: the file; for pairs of files, the left camera's.
         rectified: whether the drive's images are rectified, for formats that describe both.
-        size: of the drive's images, px, for formats that state none.
+        size: gives that of the drive's images, px, for formats that state none.
         field_of_view_deg: of the rectified images; None for that of the file.
 
     Raises:

@@ -14,6 +14,7 @@ from engram.cli import moved
 from engram.cli.agent import agent_group
 from engram.cli.centre import centre_group
 from engram.cli.doctor import doctor
+from engram.cli.drive import drive_group
 from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
 from engram.cli.fleet import build, download, merge

@@ -39,7 +39,7 @@ def cameras_of(
     return read_calibration(
         options.calibration,
         rectified=rectified,
-        size=None if folder is None else image_size(image_files(folder)[0]),
+        size=None if folder is None else (lambda: image_size(image_files(folder)[0])),
         field_of_view_deg=options.field_of_view_deg,
     )
 

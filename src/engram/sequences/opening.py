@@ -30,6 +30,7 @@ from engram.sequences.options import (
     parse_choice,
     parse_start,
 )
+from engram.sequences.robotcar import find_robotcar, is_robotcar
 
 Drive: TypeAlias = ImageSequence | BagSequence | FrameLog
 
@@ -90,6 +91,11 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             "TUM-VI, mav0/cam0 and mav0/cam1 as in EuRoC, with dso/camchain.yaml beside mav0",
             is_tumvi,
             _images(find_tumvi),
+        ),
+        "robotcar": SequenceFormat(
+            "Oxford RobotCar, stereo/left/ and stereo/right/, models/ there or above",
+            is_robotcar,
+            _images(find_robotcar),
         ),
         "bag": SequenceFormat(
             "ROS bag, a file NAME.bag, NAME.mcap or NAME.db3, or a folder of them",

@@ -111,6 +111,48 @@ def read_euroc_truth(path: str | Path, body_from_cam: SE3) -> Trajectory:
     return _trajectory(path, _read(path, stamped, delimiter=","))
 
 
+def read_mocap_truth(path: str | Path) -> Trajectory:
+    """TUM-VI's `mav0/mocap0/data.csv`: stamp_ns, position, quaternion wxyz of the IMU.
+
+    Raises:
+        SequenceError: a line is something else, or the stamps do not rise.
+    """
+    return read_euroc_truth(path, SE3.identity())
+
+
+def csv_trajectory(
+    path: Path, columns: Sequence[str], ns_per_unit: int, pose: Callable[[list[float]], SE3]
+) -> Trajectory:
+    """A trajectory from a CSV file whose first line names its columns.
+
+    Args:
+        path: the file.
+        columns: names of the stamp and of the values.
+        ns_per_unit: unit of the stamps, which are whole numbers.
+        pose: makes world_from_cam of the values.
+
+    Raises:
+        SequenceError: a column is missing, a row is malformed, or the stamps do not rise.
+    """
+    lines = read_text(path).splitlines()
+    names = [name.strip().lstrip("#").strip() for name in lines[0].split(",")] if lines else []
+    missing = [name for name in columns if name not in names]
+    if missing:
+        raise SequenceError(f"{path}: has no column {', '.join(missing)}; it has {names}")
+    places = [names.index(name) for name in columns]
+    rows = []
+    for number, line in enumerate(lines[1:], start=2):
+        fields = line.split(",")
+        try:
+            values = _floats([fields[place] for place in places[1:]], len(places) - 1)
+            rows.append(
+                (_stamp(nanoseconds(fields[places[0]].strip())) * ns_per_unit, pose(values))
+            )
+        except (InputError, ValueError, IndexError) as error:
+            raise SequenceError(f"{path}: line {number}: {error}") from error
+    return _trajectory(path, rows)
+
+
 def read_tum(path: str | Path) -> Trajectory:
     """TUM format: lines `seconds x y z qx qy qz qw`; lines that begin with # are comments.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.calibration import Cameras, read_calibration
-from engram.errors import SequenceError
+from engram.errors import CalibrationError, SequenceError
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
 from engram.graph.model import Clock
@@ -64,6 +64,8 @@ class BagSequence:
         self._decoder = Decoder(self._bag.is_ros1)
         given = None if options.calibration is None else self._given(options)
         self.topics = self._stereo_topics(given)
+        if given is not None and self.topics.are_rectified and given.rectification is not None:
+            given = self._given(options, rectified=True)
         tolerance_ns, self._first_ns = self._learn()
         self.pairing = Pairing(tolerance_ns)
         self.cameras = given or self._calibrated(options)
@@ -201,17 +203,25 @@ class BagSequence:
         if left is None and right is None and stated and set(stated) <= self._bag.topics.keys():
             left, right = stated
         try:
-            return stereo_topics(self._bag.topics, left, right)
+            raw = given is not None and given.rectification is not None
+            return stereo_topics(self._bag.topics, left, right, prefer_raw=raw)
         except SequenceError as error:
             raise SequenceError(f"{self._bag.path}: {error}") from error
 
-    def _given(self, options: OpenOptions) -> Cameras:
+    def _given(self, options: OpenOptions, *, rectified: bool = False) -> Cameras:
         assert options.calibration is not None
-        return read_calibration(
+        given = read_calibration(
             options.calibration,
-            size=self._size(),
+            rectified=rectified,
+            size=self._size,
             field_of_view_deg=options.field_of_view_deg,
         )
+        if rectified and given.rectification is not None:
+            raise CalibrationError(
+                f"{self._bag.path}: {options.calibration} describes raw images, but {self.topics} "
+                "are rectified: name the raw topics with --left and --right"
+            )
+        return given
 
     def _calibrated(self, options: OpenOptions) -> Cameras:
         return read_cameras(self._bag, self._decoder, self.topics, options.field_of_view_deg)

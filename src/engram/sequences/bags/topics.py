@@ -66,13 +66,19 @@ def image_topics(topics: Mapping[str, Topic]) -> list[str]:
 
 
 def stereo_topics(
-    topics: Mapping[str, Topic], left: str | None = None, right: str | None = None
+    topics: Mapping[str, Topic],
+    left: str | None = None,
+    right: str | None = None,
+    *,
+    prefer_raw: bool = False,
 ) -> StereoTopics:
     """The image topics of a bag's stereo pair.
 
     Args:
         topics: all topics.
         left, right: what the caller named; None finds it.
+        prefer_raw: whether of one camera's topics the raw one is wanted, which the caller's
+            calibration describes.
 
     Raises:
         SequenceError: a named topic has no images, or there is no pair, or more than one.
@@ -88,7 +94,7 @@ def stereo_topics(
     pairs = [
         pair for pair in _pairs(images) if left in {None, pair.left} and right in {None, pair.right}
     ]
-    best = _best_of_each_rig(pairs) if left is None and right is None else pairs
+    best = _best_of_each_rig(pairs, prefer_raw) if left is None and right is None else pairs
     if len(best) == 1:
         return best[0]
     if best:
@@ -111,19 +117,20 @@ def _pairs(images: Collection[str]) -> Iterator[StereoTopics]:
                 break
 
 
-def _best_of_each_rig(pairs: Collection[StereoTopics]) -> list[StereoTopics]:
+def _best_of_each_rig(pairs: Collection[StereoTopics], prefer_raw: bool) -> list[StereoTopics]:
     """One pair of topics for each rig: the part of the name before the camera's word tells rigs."""
     rigs: dict[str, StereoTopics] = {}
-    for pair in sorted(pairs, key=lambda pair: (_rank(pair.left), pair.left)):
+    for pair in sorted(pairs, key=lambda pair: (_rank(pair, prefer_raw), pair.left)):
         place = next(pair.left.index(word) for word, _ in _SIDES if word in pair.left)
         rigs.setdefault(pair.left[:place], pair)
     return sorted(rigs.values(), key=lambda pair: pair.left)
 
 
-def _rank(name: str) -> tuple[int, bool]:
-    bare = name.removesuffix(_COMPRESSED)
+def _rank(pair: StereoTopics, prefer_raw: bool) -> tuple[bool, int, bool]:
+    bare = pair.left.removesuffix(_COMPRESSED)
     order = [re.search(pattern, bare) is not None for pattern in _PREFERRED]
-    return (order.index(True) if any(order) else len(order), bare != name)
+    place = order.index(True) if any(order) else len(order)
+    return prefer_raw and pair.are_rectified, place, bare != pair.left
 
 
 def info_topic(image: str, topics: Mapping[str, Topic]) -> str | None:

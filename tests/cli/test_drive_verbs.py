@@ -1,0 +1,94 @@
+"""`engram drive`, and what the verbs of drives say of bags."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.sequences.bag_maker import StereoBag, bag, rectified_infos
+
+from engram.calibration import read_calibration
+from engram.sequences import open_sequence
+
+
+@pytest.fixture(scope="module")
+def street_bag(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rendered street as a bag."""
+    drive = open_sequence(street)
+    pairs = [(pair.stamp_ns + 10**18, pair.left, pair.right) for pair in drive]
+    folder = tmp_path_factory.mktemp("bags")
+    return StereoBag(pairs, rectified_infos(drive.camera)).write(folder / "street", "mcap")
+
+
+def test_info_lists_topics_and_the_command_to_run(engram, street_bag: Path) -> None:
+    ran = engram("drive", "info", street_bag)
+    assert ran.status == 0
+    line = next(one for one in ran.out.splitlines() if "/stereo/left/image_raw" in one)
+    assert "12 × sensor_msgs/msg/Image" in line
+    assert "10.0 Hz" in line
+    assert f"next: engram map MAP.engram {street_bag}" in ran.out
+    facts = engram("drive", "info", street_bag, "--json").json
+    assert facts["left"] == "/stereo/left/image_raw"
+    assert facts["duration_s"] == pytest.approx(1.1)
+
+
+def test_info_asks_for_what_is_missing(engram, tmp_path: Path) -> None:
+    with bag(tmp_path / "b", "mcap") as maker:
+        for topic in ("/front/left/image_raw", "/front/right/image_raw"):
+            maker.image(topic, 10**18, np.zeros((64, 64), np.uint8))
+    ran = engram("drive", "info", tmp_path / "b")
+    assert ran.status == 2
+    assert "missing: has no CameraInfo" in ran.out
+    assert "--calibration FILE" in ran.out.splitlines()[-1]
+
+
+def test_info_of_a_folder(engram, street: Path) -> None:
+    ran = engram("drive", "info", street)
+    assert "folder, 12 pairs in 1.1 s" in ran.out
+
+
+def test_names_from_a_bag_cannot_reach_the_terminal_as_commands(engram, tmp_path: Path) -> None:
+    with bag(tmp_path / "b", "mcap") as maker:
+        for topic in ("/\x1b]0;owned\x07left/image", "/\x1b]0;owned\x07right/image"):
+            maker.image(topic, 10**18, np.zeros((64, 64), np.uint8))
+    for arguments in (("drive", "info"), ("map", tmp_path / "m.engram")):
+        ran = engram(*arguments, tmp_path / "b")
+        assert not {"\x1b", "\x07"} & set(ran.out + ran.err)
+
+
+def test_a_calibration_can_be_edited_and_given_back(engram, street_bag, tmp_path) -> None:
+    ran = engram("drive", "calibration", street_bag, "--picture", tmp_path / "pair.png")
+    assert ran.status == 0
+    assert "baseline" in ran.out
+    file = tmp_path / "calibration.toml"
+    file.write_text(ran.out)
+    drive = open_sequence(street_bag)
+    assert read_calibration(file).camera == drive.camera
+    picture = cv2.imread(str(tmp_path / "pair.png"))
+    assert picture.shape[1] == 2 * drive.camera.width + 4
+    file.write_text(ran.out.replace("baseline_m = ", "baseline_m = 1"))
+    again = open_sequence(street_bag, calibration=file)
+    assert again.camera.baseline_m > 1
+
+
+def test_a_bag_is_mapped_and_localised_in(engram, street, street_bag, tmp_path) -> None:
+    town = tmp_path / "town.engram"
+    ran = engram("map", town, street_bag)
+    assert ran.status == 0
+    assert "12 of 12 left images paired (100.0 %)" in ran.err
+    report = engram("localise", town, street, "--json").json
+    assert {frame["status"] for frame in report["frames"]} == {"localised"}
+
+
+def test_a_damaged_bag_is_used_and_told_by_the_exit_status(engram, street_bag, tmp_path) -> None:
+    whole = next(street_bag.glob("*.mcap"))
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes())
+    os.truncate(cut, int(cut.stat().st_size * 0.6))
+    ran = engram("map", tmp_path / "town.engram", cut)
+    assert ran.status == 3
+    assert "the bag is damaged; what could be read was used" in ran.err
+    assert "nodes saved" in ran.out

@@ -1,0 +1,162 @@
+"""Readers of Oxford RobotCar and TUM-VI, on small folders in their documented layouts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from engram.errors import CalibrationError, SequenceError
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Clock
+from engram.sequences import ImageSequence, open_sequence, session_of
+from engram.sequences.robotcar import read_ins_truth
+from engram.sequences.trajectories import read_mocap_truth
+
+from .synthetic import HEIGHT, WIDTH, picture, write_image
+
+START_US = 1_400_505_794_000_000  # 2014-05-19 13:23 UTC
+PAIRS = 5
+INS = (
+    "timestamp,ins_status,latitude,longitude,altitude,northing,easting,down,utm_zone,"
+    "velocity_north,velocity_east,velocity_down,roll,pitch,yaw\n"
+)
+
+
+def write_robotcar(folder: Path, shift_px: float = 2.0) -> Path:
+    """A traversal whose tables shift the images by some pixels."""
+    path = folder / "2014-05-19-13-20-57"
+    for index in range(PAIRS):
+        for side, name in enumerate(("left", "right")):
+            image = cv2.GaussianBlur(picture(index, side), (0, 0), 3)
+            write_image(path / "stereo" / name / f"{START_US + index * 62_500}.png", image)
+    models = folder / "models"
+    models.mkdir()
+    columns, rows = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
+    for name in ("stereo_wide_left", "stereo_wide_right"):
+        (models / f"{name}.txt").write_text("40.0 40.0 23.5 15.5\n0 0 1 0\n1 0 0 0\n0 1 0 0\n")
+        table = np.stack([columns + shift_px, rows])
+        (models / f"{name}_distortion_lut.bin").write_bytes(table.astype("<f8").tobytes())
+    return path
+
+
+class TestRobotCar:
+    def test_pairs_are_debayered_and_rectified_by_the_tables(self, tmp_path) -> None:
+        drive = open_sequence(write_robotcar(tmp_path))
+        assert isinstance(drive, ImageSequence)
+        assert drive.info.format == "robotcar"
+        assert len(drive) == PAIRS
+        pair = drive.read(1)
+        assert pair.stamp_ns == (START_US + 62_500) * 1000
+        raw = cv2.GaussianBlur(picture(1, 0), (0, 0), 3)
+        grey = cv2.cvtColor(cv2.cvtColor(raw, cv2.COLOR_BayerGBRG2BGR), cv2.COLOR_BGR2GRAY)
+        np.testing.assert_array_equal(pair.left[:, :-2], grey[:, 2:])
+
+    def test_the_camera_is_the_wide_pair(self, tmp_path) -> None:
+        camera = open_sequence(write_robotcar(tmp_path)).camera
+        assert (camera.fx, camera.cx, camera.baseline_m) == (40.0, 23.5, 0.24)
+
+    def test_other_tables_are_another_camera(self, tmp_path) -> None:
+        (tmp_path / "a").mkdir()
+        (tmp_path / "b").mkdir()
+        one = open_sequence(write_robotcar(tmp_path / "a"))
+        other = open_sequence(write_robotcar(tmp_path / "b", shift_px=1.0))
+        assert one.camera != other.camera
+
+    def test_the_hour_is_that_of_the_sun_at_oxford(self, tmp_path) -> None:
+        drive = open_sequence(write_robotcar(tmp_path))
+        assert drive.info.clock is Clock.UTC
+        session = session_of(drive.info, drive.camera, START_US * 1000, "")
+        assert hour_of_day(session, START_US * 1000) == pytest.approx(13.303, abs=0.001)
+
+    def test_images_without_a_partner_are_left_out(self, tmp_path) -> None:
+        path = write_robotcar(tmp_path)
+        (path / "stereo" / "right" / f"{START_US}.png").unlink()
+        assert len(open_sequence(path)) == PAIRS - 1
+
+    def test_missing_models_say_where_to_get_them(self, tmp_path) -> None:
+        path = write_robotcar(tmp_path)
+        (tmp_path / "models" / "stereo_wide_left.txt").unlink()
+        with pytest.raises(CalibrationError, match=r"models.*software kit"):
+            open_sequence(path)
+
+    def test_a_table_of_another_size_is_refused(self, tmp_path) -> None:
+        path = write_robotcar(tmp_path)
+        (tmp_path / "models" / "stereo_wide_right_distortion_lut.bin").write_bytes(bytes(80))
+        with pytest.raises(CalibrationError, match=r"80 bytes, must be 16 for each of 48×32"):
+            open_sequence(path)
+
+    def test_truth_from_the_ins(self, tmp_path) -> None:
+        path = tmp_path / "ins.csv"
+        rows = [
+            f"{START_US + 20_000 * k},INS_SOLUTION_GOOD,51.76,-1.26,110,"
+            f"{5735000 + 2 * k},{620000 + k},-110,30U,0,0,0,0,0,{0.1 * k}"
+            for k in range(3)
+        ]
+        path.write_text(INS + "\n".join(rows) + "\n")
+        truth = read_ins_truth(path)
+        np.testing.assert_allclose(truth.world_from_cam[2].translation, [4, 2, 0], atol=1e-9)
+        yaw = np.arctan2(*truth.world_from_cam[2].rotation[[1, 0], 0])
+        assert yaw == pytest.approx(0.2)
+        assert truth.stamps_ns[1] - truth.stamps_ns[0] == 20_000_000
+
+    def test_rtk_has_other_columns_and_a_missing_one_is_named(self, tmp_path) -> None:
+        path = tmp_path / "rtk.csv"
+        path.write_text("timestamp,northing,easting,down,roll,pitch\n1,2,3,4,5,6\n")
+        with pytest.raises(SequenceError, match="no column yaw"):
+            read_ins_truth(path)
+
+
+CAMCHAIN = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [0.0034, 0.0007, -0.002, 0.0002]
+  distortion_model: equidistant
+  intrinsics: [19.0, 19.0, 23.5, 15.5]
+  resolution: [48, 32]
+  T_cam_imu: [[1, 0, 0, 0.05], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  rostopic: /cam0/image_raw
+cam1:
+  camera_model: pinhole
+  distortion_coeffs: [0.0034, 0.0007, -0.002, 0.0002]
+  distortion_model: equidistant
+  intrinsics: [19.0, 19.0, 23.5, 15.5]
+  resolution: [48, 32]
+  T_cn_cnm1: [[1, 0, 0, -0.101], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  rostopic: /cam1/image_raw
+"""
+
+
+class TestTumVi:
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        path = tmp_path / "dataset-room1_512_16"
+        for side in range(2):
+            folder = path / "mav0" / f"cam{side}"
+            stamps = [1_520_530_308_199_447_626 + 50_000_000 * index for index in range(PAIRS)]
+            for index, stamp in enumerate(stamps):
+                image = picture(index, side).astype(np.uint16) * 257
+                write_image(folder / "data" / f"{stamp}.png", image)
+            lines = "\n".join(f"{stamp},{stamp}.png" for stamp in stamps)
+            (folder / "data.csv").write_text(f"#timestamp [ns],filename\n{lines}\n")
+        (path / "dso").mkdir()
+        (path / "dso" / "camchain.yaml").write_text(CAMCHAIN)
+        return path
+
+    def test_it_is_told_from_euroc_and_rectified_to_a_pinhole(self, path: Path) -> None:
+        drive = open_sequence(path, field_of_view_deg=80.0)
+        assert isinstance(drive, ImageSequence)
+        assert drive.info.format == "tum-vi"
+        assert len(list(drive)) == PAIRS
+        view = np.rad2deg(2 * np.arctan(WIDTH / 2 / drive.camera.fx))
+        assert view == pytest.approx(80.0, abs=0.01)
+        assert drive.camera.baseline_m == pytest.approx(0.101)
+        assert drive.camera.cam_from_rig is not None
+        assert drive.camera.cam_from_rig.translation[0] == pytest.approx(0.05)
+
+    def test_truth_from_motion_capture(self, tmp_path) -> None:
+        file = tmp_path / "data.csv"
+        file.write_text("#timestamp [ns],px,py,pz,qw,qx,qy,qz\n5,1,2,3,1,0,0,0\n9,1,2,4,1,0,0,0\n")
+        truth = read_mocap_truth(file)
+        np.testing.assert_allclose(truth.world_from_cam[1].translation, [1, 2, 4])
