@@ -36,6 +36,8 @@ EXAMPLES = {
     DOCS / "data.md": "mapped",
     DOCS / "doctor.md": "mapped",
     DOCS / "trouble.md": "mapped",
+    DOCS / "goals.md": "mapped",
+    DOCS / "mend.md": "mapped",
     DOCS / "budget.md": "mapped",
     DOCS / "ranking.md": "mapped",
     DOCS / "operate.md": "fleet",

@@ -242,7 +242,7 @@ def test_a_budget_is_kept_and_more_of_it_promises_more(centre, tmp_path):
         assert out.stat().st_size == report.size_bytes <= budget
         assert report.expected_missed <= before
         before = report.expected_missed
-    assert report.nodes == whole.of_nodes
+    assert report.nodes >= 0.98 * whole.of_nodes  # 99 % of the budget ends the search
     small = robots_of(tmp_path / "30.engram")
     # Nine in the morning: the mornings are worth more than the evenings.
     assert small.get("r1", 0) + small.get("r3", 0) > 2 * (small.get("r2", 0) + small.get("r4", 0))

@@ -185,3 +185,20 @@ def test_format_4_reads_as_it_was_written(tmp_path):
         (shown,) = store.sessions.values()
         assert (shown.robot, shown.zone) == ("robot-1", "Europe/Prague")
     assert check_file(path).problems == ()
+
+
+def test_format_5_reads_as_it_was_written(tmp_path):
+    path = shutil.copy(DATA / "format-5.engram", tmp_path / "fifth.engram")
+    with Map.open(path) as store:
+        (removal,) = store.removals
+        assert removal.reason == "a test"
+        assert len(store.load().edges) == 1
+        assert store.info().edges == 1
+        assert store.anchors[0].x_m == 1.0
+        assert store.anchors[0].z_m is None
+        assert store.goals["dock"].node == node(session("robot-1"), 1).id
+        assert len(store.placements) == 3
+    with Map.open(path, at=1) as store:
+        assert len(store.load().edges) == 2
+        assert store.removals == ()
+    assert check_file(path).problems == ()

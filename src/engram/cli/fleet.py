@@ -45,6 +45,12 @@ def merge(
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw the fleet map before and after."),
     ] = None,
+    geometry: Annotated[
+        bool, typer.Option("--geometry", help="Count the wrong edges of each result.")
+    ] = False,
+    require_geometry: Annotated[
+        bool, typer.Option("--require-geometry", help="Refuse a merge that brings wrong edges.")
+    ] = False,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -62,6 +68,7 @@ def merge(
       engram merge fleet.engram r1.engram --require-better held-out.framelog
     """
     from engram.cli.progress import Bars
+    from engram.fleet.merge import GeometryGate
     from engram.fleet.merge import merge as merge_maps
 
     reports: list[MergeReport] = []
@@ -83,6 +90,9 @@ def merge(
             dry_run=dry_run,
             require_better=require_better or (),
             picture=picture,
+            geometry=GeometryGate(refuses=require_geometry)
+            if geometry or require_geometry
+            else None,
         )
     except EngramError as error:
         raise PartlyDoneError(error, _merges(reports)) from error
@@ -261,6 +271,9 @@ def build(
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the groups' maps in FLEET.build.")
     ] = False,
+    geometry: Annotated[
+        bool, typer.Option("--geometry", help="List the wrong edges of the result.")
+    ] = False,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -300,10 +313,16 @@ def build(
         judge=_judge(order, validate or [], resolved.build.max_gap_m),
     )
     report = build_map(centre, drives, resolved.of_robot(), asked, keep=keep, monitor=Bars())
+    looked = None
+    if geometry and not report.interrupted:
+        from engram.repair import check_geometry
+
+        looked = check_geometry(centre, monitor=Bars())
     if as_json:
-        print(json.dumps(report.to_dict()))
+        told = report.to_dict()
+        print(json.dumps(told if looked is None else {**told, "geometry": looked.to_dict()}))
     else:
-        typer.echo(report.text())
+        typer.echo(report.text() if looked is None else f"{report.text()}\n{looked.text()}")
     if report.interrupted:
         raise typer.Exit(130)
 

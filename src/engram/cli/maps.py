@@ -104,21 +104,38 @@ def check(
     seal: Annotated[
         bool, typer.Option("--seal", help="Commit what interrupted sessions had saved.")
     ] = False,
+    geometry: Annotated[
+        bool, typer.Option("--geometry", help="Look for edges that join different places.")
+    ] = False,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Preview their removal; with --yes remove them.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Commit the repair.")] = False,
+    pictures: Annotated[
+        Path | None,
+        typer.Option("--pictures", metavar="FOLDER", help="Draw both sides of such edges."),
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Verify a map.
 
     Compares every byte with its hash, and every edge and path with its nodes. Exits with status 1
-    if anything is wrong.
+    if anything is wrong. With --geometry it looks for wrong edges instead; a repair is a revision,
+    which revert takes back.
 
     \b
     Examples:
       engram check town.engram
+      engram check town.engram --geometry --pictures suspects
+      engram check town.engram --geometry --repair --yes
       engram check town.engram --seal
       engram check town.engram --clean
     """
     from engram.robot import check_map, seal_map
 
+    if geometry or repair:
+        _check_geometry(map_path, pictures, as_json=as_json, commits=repair and yes)
+        return
     sealed = seal_map(map_path) if seal else []
     report = check_map(map_path, clean=clean)
     if as_json:
@@ -131,6 +148,19 @@ def check(
             typer.echo("no session was interrupted")
         _print_check(report)
     if report["problems"]:
+        raise typer.Exit(1)
+
+
+def _check_geometry(map_path: Path, pictures: Path | None, *, as_json: bool, commits: bool) -> None:
+    from engram.cli.history import user
+    from engram.cli.progress import Bars
+    from engram.repair import check_geometry
+
+    report = check_geometry(
+        map_path, repair=commits, author=user(), pictures=pictures, monitor=Bars()
+    )
+    typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
+    if report.findings.wrong and report.revision is None:
         raise typer.Exit(1)
 
 

@@ -18,6 +18,7 @@ from engram.cli.drive import drive_group
 from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
 from engram.cli.fleet import build, download, merge
+from engram.cli.frame import anchor, export, goal
 from engram.cli.history import diff, log, revert, show, tag
 from engram.cli.live import live
 from engram.cli.maps import amend, check, info, plot, vocabulary
@@ -39,6 +40,9 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "check": check,
         "amend": amend,
         "vocabulary": vocabulary,
+        "anchor": anchor,
+        "goal": goal,
+        "export": export,
     },
     "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
     "Fleet": {"merge": merge, "download": download, "build": build},

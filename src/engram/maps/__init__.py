@@ -15,6 +15,7 @@ from engram.maps.history import (
 )
 from engram.maps.map import Map, open_map
 from engram.maps.map_files import check_file, compact_map, copy_map, publish_map
+from engram.maps.map_frame import FramePose, MapFrame, Moves, moves
 from engram.maps.provenance import Origin
 from engram.maps.records import (
     CheckReport,
@@ -34,11 +35,14 @@ from engram.maps.writer import RevisionWriter
 __all__ = [
     "FORMAT_VERSION",
     "CheckReport",
+    "FramePose",
     "InterruptedSession",
     "Map",
     "MapContents",
     "MapDifference",
+    "MapFrame",
     "MapInfo",
+    "Moves",
     "Origin",
     "Problem",
     "RevertReport",
@@ -57,6 +61,7 @@ __all__ = [
     "diff_revisions",
     "map_log",
     "map_tags",
+    "moves",
     "open_map",
     "publish_map",
     "revert_revision",

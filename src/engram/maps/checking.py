@@ -24,6 +24,7 @@ from engram.geometry import StereoCamera
 from engram.graph.model import NodeId, PathEntryKind, SessionId
 from engram.maps.attempts import unpack
 from engram.maps.database import Database
+from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.records import CheckReport, Problem
 from engram.maps.rows import (
     Row,
@@ -46,6 +47,7 @@ from engram.maps.schema import (
     edges,
     frames,
     frontends,
+    goals,
     hidden,
     map_format,
     metadata,
@@ -54,6 +56,8 @@ from engram.maps.schema import (
     omitted_landmarks,
     path_entries,
     paths,
+    placements,
+    removals,
     revisions,
     sessions,
     statistics,
@@ -370,6 +374,20 @@ def _check_amendment(_: _Checking, row: Row) -> None:
     amendment_from_row(row, _NO_SESSION)
 
 
+def _check_removal(_: _Checking, row: Row) -> None:
+    removal = removal_from_row(row, {row["a"]: _NOBODY, row["b"]: _NOBODY})
+    _check_rotation(removal.a_from_b.rotation)
+
+
+def _check_placement(_: _Checking, row: Row) -> None:
+    pose = transform_from_bytes(row["map_from_node"], "the transform")
+    _check_rotation(pose.rotation)
+
+
+def _check_goal(_: _Checking, row: Row) -> None:
+    _check_rotation(goal_from_row(row, {row["node"]: _NOBODY}).node_from_goal.rotation)
+
+
 def _check_vocabulary(checking: _Checking, row: Row) -> None:
     checking.blobs += 1
     if content_digest(row["body"]) != row["hash"]:
@@ -421,6 +439,9 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     statistics: _check_statistic,
     vocabularies: _check_vocabulary,
     amendments: _check_amendment,
+    removals: _check_removal,
+    placements: _check_placement,
+    goals: _check_goal,
     hidden: _check_hidden,
     tags: _check_tag,
     words: _check_words,

@@ -27,6 +27,10 @@ _TOLD = {
     "omissions": "nodes omitted",
     "vocabularies": "vocabularies",
     "amendments": "amendments",
+    "removals": "edges removed",
+    "placements": "nodes placed",
+    "anchors": "anchors",
+    "goals": "goals",
     "hidden": "rows hidden or shown again",
 }
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
@@ -25,6 +25,7 @@ from engram.maps.database import Database, Lock, Place
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.keys import KeyBook
+from engram.maps.laying_out import new_places
 from engram.maps.map_files import open_database
 from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision, RevisionStatus, SessionState
@@ -519,6 +520,7 @@ class Map(MapReader):
             own,
             self._writing_ended,
             session=session,
+            places=partial(new_places, self),
             **kind,
         )
         return self._writing

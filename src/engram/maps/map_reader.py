@@ -14,12 +14,14 @@ from sqlalchemy import Connection, select
 
 from engram.errors import InputError
 from engram.frontend import DescriptorKind
-from engram.geometry import CameraId, StereoCamera
+from engram.geometry import SE3, CameraId, StereoCamera
 from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
 from engram.graph.graph import ExperienceGraph
+from engram.graph.marks import Anchor, Goal, Removal
 from engram.graph.model import (
     Amendment,
+    EdgeKind,
     NodeId,
     Omission,
     PathId,
@@ -27,12 +29,14 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.graph.paths import PathMemory
-from engram.maps import reading
+from engram.maps import marks, reading
 from engram.maps.checking import check
 from engram.maps.content import content_hash, record_hashes
 from engram.maps.database import Database
 from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import FrameReader
+from engram.maps.laying_out import frame_of, graph_of
+from engram.maps.map_frame import MapFrame
 from engram.maps.provenance import Origin, origin_of
 from engram.maps.records import (
     CheckReport,
@@ -62,6 +66,11 @@ _T = TypeVar("_T")
 # Cached properties to clear after a write.
 _SMALL = (
     "amendments",
+    "removals",
+    "seen_removals",
+    "goals",
+    "anchors",
+    "placements",
     "cameras",
     "vocabulary",
     "descriptor",
@@ -85,10 +94,7 @@ class _Contents:
 
     @staticmethod
     def of(contents: MapContents) -> _Contents:
-        graph = ExperienceGraph()
-        for node in contents.nodes:
-            graph.add_node(node)
-        graph.add_edges(contents.edges)
+        graph = graph_of(contents.nodes, contents.edges)
         path_memory = PathMemory(graph)
         for entry in contents.path_entries:
             path_memory.add(entry)
@@ -202,6 +208,46 @@ class MapReader:
     def amendments(self) -> tuple[Amendment, ...]:
         """Amendments of its sessions, in the order in which they apply."""
         return self._read(reading.load_amendments)
+
+    @cached_property
+    def removals(self) -> tuple[Removal, ...]:
+        """Edges that no longer count, oldest first."""
+        return self._read(marks.load_removals)
+
+    @cached_property
+    def seen_removals(self) -> set[tuple[NodeId, NodeId, EdgeKind, int]]:
+        """Keys of all removals that ever counted, reverted ones included."""
+        return self._read(marks.seen_removals)
+
+    @cached_property
+    def placements(self) -> dict[NodeId, SE3]:
+        """The stored ``map_from_node`` of nodes; `frame` also places the others."""
+        return self.read_placements()
+
+    def read_placements(self) -> dict[NodeId, SE3]:
+        """`placements`, with those that an open revision has written by now."""
+        return self._read(marks.load_placements)
+
+    @property
+    def frame(self) -> MapFrame:
+        """The map frame: where its nodes and goals lie, for messages, display and exports."""
+        return self.derived(frame_of, self.revision, len(self.graph))
+
+    def grown_graph(self) -> ExperienceGraph | None:
+        """The graph in memory if it has all nodes of the map; None if it would have to be read."""
+        known = self._contents
+        whole = known is not None and len(known.graph) == self.node_count()
+        return known.graph if known is not None and whole else None
+
+    @cached_property
+    def anchors(self) -> tuple[Anchor, ...]:
+        """Its anchors: those of the last anchoring."""
+        return self._read(marks.load_anchors)
+
+    @cached_property
+    def goals(self) -> dict[str, Goal]:
+        """Its goals by name."""
+        return self._read(marks.load_goals)
 
     @cached_property
     def cameras(self) -> dict[CameraId, StereoCamera]:

@@ -28,6 +28,7 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.maps.attempts import AttemptTable, concatenate, unpack
+from engram.maps.marks import counting
 from engram.maps.records import MapContents, MapInfo, Revision
 from engram.maps.rows import (
     Row,
@@ -315,13 +316,13 @@ def _camera_id(known: dict[int, StereoCamera], row: Row, what: str) -> CameraId:
 
 
 def _newest_edges(connection: Connection, view: View) -> list[Row]:
-    """The newest edge of each (a, b, kind), in order of writing."""
+    """The newest edge of each (a, b, kind) that was not removed, in order of writing."""
     newest: dict[tuple[int, int, str], Row] = {}
     for row in view.rows(connection, edges):
         key = (row["a"], row["b"], row["kind"])
         newest.pop(key, None)
         newest[key] = row
-    return list(newest.values())
+    return counting(connection, view, list(newest.values()))
 
 
 def _edges(connection: Connection, view: View, node_ids: dict[int, NodeId]) -> tuple[Edge, ...]:

@@ -137,6 +137,13 @@ def revision_contents(connection: Connection, revision_key: int) -> dict[str, fl
     return contents
 
 
+def changes_layout(contents: Mapping[str, float]) -> bool:
+    """Whether a revision of these contents may change where nodes lie in the map frame."""
+    unplaced = contents["nodes"] > contents["placements"]
+    joins = contents["edges"] and not contents["placements"]
+    return bool(unplaced or joins or contents["removals"])
+
+
 def collect_abandoned(connection: Connection) -> int:
     """Removes the rows of abandoned revisions, but not their records; returns the number."""
     lost = select(nodes.c.key).where(nodes.c.revision.in_(_ABANDONED))

@@ -16,18 +16,23 @@ from engram.maps.keys import KeyBook
 from engram.maps.rows import Row, edge_row, sealed, verified
 from engram.maps.schema import (
     amendments,
+    anchors,
     attempts,
     cameras,
     edges,
     frames,
     frontends,
+    goals,
     hidden,
     nodes,
     omissions,
     omitted_landmarks,
     path_entries,
     paths,
+    placements,
+    removals,
     sessions,
+    statistics,
     vocabularies,
 )
 from engram.maps.words import words_row, write_words
@@ -47,8 +52,13 @@ _TABLES = (
     path_entries,
     omissions,
     omitted_landmarks,
+    statistics,
     vocabularies,
     amendments,
+    removals,
+    placements,
+    anchors,
+    goals,
     hidden,
 )
 

@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import SchemaItem
 from sqlalchemy.types import TypeEngine
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 
 # SQLite's INTEGER and REAL are 64 bits wide.
 _INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
@@ -264,6 +264,52 @@ amendments = _table(
     _int("amended_ns"),
 )
 
+# Edges that no longer count: those of this key that measure the same.
+removals = _table(
+    "removals",
+    _key(),
+    _int("revision"),
+    _int("a"),
+    _int("b"),
+    _text("kind"),
+    _bytes("a_from_b"),
+    _text("reason"),
+    _int("removed_ns"),
+)
+
+# Where nodes lie in the map frame. Of one node's rows the newest counts.
+placements = _table(
+    "placements",
+    _key(),
+    _int("revision"),
+    _int("node"),
+    _bytes("map_from_node"),
+    Index("placements_by_node", "node"),
+)
+
+# Known positions of nodes in the map frame. Those of the newest revision that has any count.
+anchors = _table(
+    "anchors",
+    _key(),
+    _int("revision"),
+    _int("node"),
+    _float("x_m"),
+    _float("y_m"),
+    _float("z_m", nullable=True),
+    _float("sigma_m"),
+    _text("source"),
+)
+
+# Named poses, each relative to a node. Of one name the newest counts.
+goals = _table(
+    "goals",
+    _key(),
+    _int("revision"),
+    _text("name"),
+    _int("node"),
+    _bytes("node_from_goal"),
+)
+
 # Rows refer to earlier tables only.
 VERSIONED: tuple[Table, ...] = (
     sessions,
@@ -278,13 +324,22 @@ VERSIONED: tuple[Table, ...] = (
     statistics,
     vocabularies,
     amendments,
+    removals,
+    placements,
+    anchors,
+    goals,
     hidden,
 )
 KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)
 
 # Tables by the format that introduced them; all others are of format 1. In a map of an older format
 # they read as empty.
-NEWER: dict[int, tuple[Table, ...]] = {2: (tags, words), 3: (omitted_landmarks,), 4: (amendments,)}
+NEWER: dict[int, tuple[Table, ...]] = {
+    2: (tags, words),
+    3: (omitted_landmarks,),
+    4: (amendments,),
+    5: (removals, placements, anchors, goals),
+}
 # Tables with the columns of format 1 whose constraints a later format loosened.
 LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
 

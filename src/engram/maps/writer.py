@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from engram.frontend import DescriptorKind, Frame
 from engram.frontend.blobs import blob_hash, content_digest, encode_landmarks, encode_thumbnail
 from engram.geometry import StereoCamera
 from engram.graph.attempts import Attempts
+from engram.graph.marks import Mark
 from engram.graph.model import (
     Amendment,
     Attempt,
@@ -34,15 +35,24 @@ from engram.maps.database import Database
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.maps.keys import KeyBook
+from engram.maps.marks import mark_row
 from engram.maps.records import Revision, RevisionStatus, StoredNode, StoredSession
 from engram.maps.revisions import (
     change_revision,
+    changes_layout,
     commit_revision,
     open_sessions,
     revision_contents,
 )
 from engram.maps.row_buffer import RowBuffer
-from engram.maps.rows import camera_row, check_edge, checked_int, session_row, transform_bytes
+from engram.maps.rows import (
+    camera_row,
+    check_edge,
+    checked_int,
+    session_row,
+    to_json,
+    transform_bytes,
+)
 from engram.maps.schema import (
     amendments,
     cameras,
@@ -55,6 +65,7 @@ from engram.maps.schema import (
     path_entries,
     paths,
     sessions,
+    statistics,
     vocabularies,
 )
 from engram.maps.view import View
@@ -86,6 +97,8 @@ class RevisionWriter:
         session: the drive of a resumable revision; None for others.
         stored: the checkpointed part of a resumed session; None for a new revision.
         committed_ns: time of the commit to store, UTC, ns; None for the actual time.
+        places: gives, for the contents of the revision, the places in the map frame that it
+            changes; called before the commit.
 
     Attributes:
         resumable: whether it is of one drive.
@@ -103,6 +116,7 @@ class RevisionWriter:
         session: Session | None = None,
         stored: StoredSession | None = None,
         committed_ns: int | None = None,
+        places: Callable[[Mapping[str, float]], Sequence[Mark]] = lambda _: (),
     ) -> None:
         assert view.own is not None
         self.resumable = session is not None
@@ -117,6 +131,7 @@ class RevisionWriter:
         self._status = RevisionStatus.ABANDONED if stored is None else RevisionStatus.OPEN
         self._on_end = on_end
         self._committed_ns = committed_ns
+        self._places = places
         self._ended = False
         with database.reading() as connection:
             self._descriptor = reading.descriptor_of(connection, view)
@@ -395,6 +410,22 @@ class RevisionWriter:
         )
         return True
 
+    def add_mark(self, mark: Mark) -> None:
+        """Stores a removal, placement, anchor or goal.
+
+        Raises:
+            InputError: a node is not in the map, or a value cannot be stored.
+        """
+        self._check_open()
+        table, values = mark_row(mark, lambda node: self._node_key(node, type(mark).__name__))
+        self._rows.new(table, **values)
+        self._checkpoint_if_due()
+
+    def put_statistic(self, name: str, body: Mapping[str, Any]) -> None:
+        """Stores plain JSON data under a name; the newest counts."""
+        self._check_open()
+        self._rows.new(statistics, name=name, body=to_json(body))
+
     def put_vocabulary(self, body: bytes) -> None:
         """Stores an encoded vocabulary; the newest counts."""
         self._check_open()
@@ -442,8 +473,12 @@ class RevisionWriter:
             StorageFullError: as `checkpoint`.
         """
         self.checkpoint()
-        with self._database.reading() as connection:
-            contents = revision_contents(connection, self._revision_key)
+        contents = self._contents()
+        if changes_layout(contents):
+            for one in self._places(contents):
+                self.add_mark(one)
+            self.checkpoint()
+            contents = self._contents()
         with self._database.writing() as connection:
             if self.resumable:
                 self._rows.repack_attempts(connection)
@@ -482,6 +517,10 @@ class RevisionWriter:
             self.abandon()
 
     # -- inside
+
+    def _contents(self) -> dict[str, float]:
+        with self._database.reading() as connection:
+            return revision_contents(connection, self._revision_key)
 
     def _end(self) -> None:
         self._ended = True

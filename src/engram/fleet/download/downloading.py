@@ -20,6 +20,7 @@ from engram.errors import InputError
 from engram.files import check_parent, draft_folder
 from engram.fleet.download.bridges import components
 from engram.fleet.download.coverage import Coverage, expected_missed
+from engram.fleet.download.marks import write_marks
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Part
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
@@ -264,6 +265,7 @@ def _write_draft(part: Part, options: DownloadOptions, folder: Path, monitor: Mo
         ) as writer,
     ):
         part.write(writer, stage)
+        write_marks(writer, part)
         writer.commit()
         if stock.words is not None:
             stock.words.give(draft, part.node_ids)

@@ -20,12 +20,14 @@ from engram.config import plain
 from engram.errors import IncompatibleError, InputError
 from engram.files import draft_folder
 from engram.fleet.download.downloading import choose_part, revision_of
+from engram.fleet.download.marks import lacking_marks
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Part
 from engram.fleet.download.selections import SELECTIONS, check_options
 from engram.fleet.download.stock import Mask, Stock
 from engram.fleet.merge.positions import position_of, uncertainty_m2
 from engram.fleet.merge.state import FIRST_REPLAYED
+from engram.graph.marks import Removed
 from engram.graph.model import Edge, EdgeKind, NodeId, PathEntry, PathEntryKind, PathId, Session
 from engram.maps import Map, MapContents, RevisionWriter
 from engram.monitor import QUIET, Monitor
@@ -197,6 +199,9 @@ class _Update:
         self._part.write_attempts(writer, attempts)
         for omission in omissions:
             writer.add_omission(omission)
+        marks = lacking_marks(self._part, self._map)
+        for mark in marks:
+            writer.add_mark(mark)
         vocabulary = self._stock.store.vocabulary
         learnt = vocabulary is not None and vocabulary != self._map.vocabulary
         if vocabulary is not None and learnt:
@@ -207,7 +212,7 @@ class _Update:
             "attempts": len(attempts),
             "ties": len(ties),
         }
-        return bool(edges or ties or entries or len(attempts) or omissions or learnt)
+        return bool(edges or ties or entries or len(attempts) or omissions or marks or learnt)
 
     def _lacking_nodes(self) -> Mask:
         known = {node.id for node in self._own.nodes}
@@ -216,8 +221,11 @@ class _Update:
     def _lacking_edges(self) -> Iterator[Edge]:
         """Edges that the robot's map lacks, or knows less exactly."""
         known = {_key(edge): uncertainty_m2(edge.covariance) for edge in self._own.edges}
+        removed = Removed(self._map.removals)
         for edge in self._part.edges():
-            if uncertainty_m2(edge.covariance) < known.get(_key(edge), np.inf):
+            if edge not in removed and uncertainty_m2(edge.covariance) < known.get(
+                _key(edge), np.inf
+            ):
                 yield edge
 
     def _lacking_ties(self, copied: set[tuple[NodeId, NodeId, EdgeKind]]) -> Iterator[Edge]:

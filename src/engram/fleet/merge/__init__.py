@@ -1,12 +1,14 @@
 """Merging robots' maps into the fleet's."""
 
 from engram.fleet.merge.gate import Gate, what_is_worse
+from engram.fleet.merge.geometry import GeometryGate
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
 
 __all__ = [
     "Gate",
+    "GeometryGate",
     "MergeOptions",
     "MergeReport",
     "Reason",

@@ -13,11 +13,12 @@ from engram.errors import InputError
 from engram.files import draft_folder
 from engram.fleet.merge.checks import check_fits, check_readable
 from engram.fleet.merge.gate import Gate
+from engram.fleet.merge.geometry import GeometryGate
 from engram.fleet.merge.pictures import picture_before_and_after
 from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.state import Merge
-from engram.fleet.merge.steps import merge_one
+from engram.fleet.merge.steps import Gates, merge_one
 from engram.maps import FORMAT_VERSION, Map, copy_map, publish_map
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.robot import Settings
@@ -34,6 +35,7 @@ def merge(
     dry_run: bool = False,
     require_better: Sequence[Path] = (),
     picture: Path | None = None,
+    geometry: GeometryGate | None = None,
 ) -> list[MergeReport]:
     """Merges robots' maps into the fleet map, in the order given; creates it if missing.
 
@@ -50,6 +52,7 @@ def merge(
         dry_run: merge into a copy of the fleet map and discard it.
         require_better: held-out drives that must not localise worse in the result.
         picture: an image file for a plan view of the fleet map before and after.
+        geometry: looks for wrong edges in each result; None for no look.
 
     Returns:
         One report for each map, up to the one in which the command was interrupted.
@@ -59,7 +62,7 @@ def merge(
             picture cannot be written there. Nothing was merged.
         ConfigError: a drive is not held out. Nothing was merged.
         IncompatibleError: a map does not fit the fleet map.
-        RefusedError: held-out drives localise worse in the result.
+        RefusedError: held-out drives localise worse in the result, or it has new wrong edges.
         MapError: a map cannot be read or written. If a map cannot be opened or its records are
             damaged, nothing was merged; otherwise earlier merges are kept.
         KeyboardInterrupt: Ctrl-C came before the first merge or after the last one, so there was
@@ -69,6 +72,7 @@ def merge(
     if picture is not None:
         check_picture(picture)
     gate = Gate(require_better, settings) if require_better else None
+    gates = Gates(gate, geometry)
     _check_given(centre, robots, gate)
     reports: list[MergeReport] = []
     with _place(centre, dry_run=dry_run) as drafted:
@@ -77,10 +81,9 @@ def merge(
             before = store.revision
         # One for all robots, so that a Ctrl-C at the end of a merge is not lost.
         with interruptible(monitor) as watched:
-            if gate is not None:
-                gate.look_at(place, watched)
+            gates.look_at(place, watched)
             for robot in robots:
-                reports.append(_merged(place, robot, settings, options, gate, watched))
+                reports.append(_merged(place, robot, settings, options, gates, watched))
                 reports[-1].dry_run = dry_run
                 if not (reports[-1].interrupted or dry_run or place == centre):
                     publish_map(place, centre)
@@ -114,7 +117,7 @@ def _merged(
     path: Path,
     settings: Settings,
     options: MergeOptions,
-    gate: Gate | None,
+    gates: Gates,
     monitor: Monitor,
 ) -> MergeReport:
     """One merge in a freshly opened map, so that the result does not depend on earlier ones."""
@@ -125,7 +128,7 @@ def _merged(
             _check_before_raising(place, robot)
             with Map.open(place, writes=True) as store:
                 settings = settings.for_descriptor(robot.descriptor)
-                report = merge_one(store, robot, settings, options, gate, monitor)
+                report = merge_one(store, robot, settings, options, gates, monitor)
             if report.revision is None:
                 monitor.check()
         except KeyboardInterrupt:

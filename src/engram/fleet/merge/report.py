@@ -11,7 +11,7 @@ from typing import Any
 
 from engram.config import plain
 from engram.graph.model import Session
-from engram.maps import Map
+from engram.maps import Map, Moves
 
 # Drives listed in the text; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
@@ -216,6 +216,8 @@ class MergeReport:
         seconds: wall time.
         components: connected components of the fleet map afterwards.
         held_out: localisation of held-out drives before and after; None without a gate.
+        moved: what moved in the map frame; None if the map is unchanged.
+        wrong_edges: wrong edges of the result; None if nobody looked.
         segments: one report each, in the order of replay.
         notes: warnings.
     """
@@ -241,6 +243,8 @@ class MergeReport:
     seconds: float = 0.0
     components: int = 0
     held_out: HeldOutReport | None = None
+    moved: Moves | None = None
+    wrong_edges: list[dict[str, Any]] | None = None
     segments: list[SegmentReport] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -265,7 +269,8 @@ class MergeReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``merge --json`` prints for this map."""
-        return {**plain(self), "changed": self.changed}
+        moved = None if self.moved is None else self.moved.to_dict()
+        return {**plain(self), "changed": self.changed, "moved": moved}
 
     def text(self) -> str:
         """The report as text."""
@@ -283,6 +288,12 @@ class MergeReport:
                 lines.append(f"  … and {len(drives) - _SHOWN_DRIVES} more drives")
         if self.held_out is not None:
             lines.append(f"  {self.held_out.text()}")
+        if self.wrong_edges is not None:
+            lines.append(
+                f"  {len(self.wrong_edges)} wrong edges; engram check --geometry lists them"
+            )
+        if self.moved:
+            lines += [f"  {line}" for line in self.moved.text().splitlines()]
         lines += [f"  note: {note}" for note in self.notes]
         return "\n".join(lines)
 

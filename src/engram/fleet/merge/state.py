@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from typing import TypeAlias
@@ -14,6 +14,7 @@ from engram.fleet.merge.positions import position_of, uncertainty_m2
 from engram.fleet.merge.report import MergeReport
 from engram.frontend import Frame
 from engram.graph.attempts import Attempts
+from engram.graph.marks import Goal, Removal, Removed
 from engram.graph.model import (
     Edge,
     EdgeKind,
@@ -113,6 +114,8 @@ class Merge:
             or any(map(self.lacks_edge, self.edges))
             or any(map(self.lacks_omission, self.robot.omissions))
             or not set(self.robot.amendments) <= set(self.centre.amendments)
+            or any(self.new_removals())
+            or any(self.new_goals())
             or len(self.new_attempts(known, self.centre.attempts)) > 0
         )
 
@@ -123,7 +126,28 @@ class Merge:
             and edge.a in self.graph
             and edge.b in self.graph
             and self.graph.find_edge(edge.a, edge.b, edge.kind) is None
+            and edge not in self.removed
         )
+
+    @cached_property
+    def removed(self) -> Removed:
+        """Edges that do not count in the fleet map."""
+        return Removed(self.centre.removals)
+
+    def new_removals(self) -> Iterator[Removal]:
+        """The robot's removals between nodes of the fleet map that it has never had."""
+        for one in self.robot.removals:
+            known = one.a in self.graph and one.b in self.graph
+            if known and one.key not in self.centre.seen_removals:
+                yield one
+
+    def new_goals(self) -> Iterator[Goal]:
+        """The robot's goals at known nodes, by names that the fleet map lacks."""
+        for goal in self.robot.goals.values():
+            position = self.equivalent(goal.node)
+            if position is not None and goal.name not in self.centre.goals:
+                node_from_goal = position.node_from_live @ goal.node_from_goal
+                yield Goal(goal.name, position.node, node_from_goal)
 
     def lacks_omission(self, omitted: NodeId) -> Position | None:
         """Position of a node that the robot's map had omitted; None if the fleet map knows it."""
@@ -191,7 +215,9 @@ class Merge:
         self.writer.add_omission(omission)
 
     def add_edge(self, edge: Edge) -> None:
-        """Adds an edge that the graph lacks, or replaces one of larger variance."""
+        """Adds an edge that the graph lacks, or replaces one of larger variance; no removed one."""
+        if edge in self.removed:
+            return
         known = self.graph.find_edge(edge.a, edge.b, edge.kind)
         if known is None or uncertainty_m2(edge.covariance) < uncertainty_m2(known.covariance):
             self.graph.add_edge(edge)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,7 @@ from engram import __version__
 from engram.config import to_dict
 from engram.fleet.merge.checks import check_fits, check_readable, notes
 from engram.fleet.merge.gate import Gate
+from engram.fleet.merge.geometry import GeometryGate
 from engram.fleet.merge.positions import recomposed, uncertainty_m2
 from engram.fleet.merge.replay import MergeOptions, Replay
 from engram.fleet.merge.report import MergeReport
@@ -22,7 +25,7 @@ from engram.fleet.merge.state import Merge
 from engram.frontend import DescriptorKind
 from engram.graph.attempts import Attempts
 from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
-from engram.maps import Map
+from engram.maps import Map, moves
 from engram.monitor import Monitor
 from engram.places import RECOGNISERS
 from engram.places.words import NodeWords, vocabulary_or_default
@@ -30,12 +33,47 @@ from engram.robot import Settings
 from engram.robot.localisers import drives_of
 
 
+@dataclass(frozen=True, slots=True)
+class Gates:
+    """What a merge has to pass.
+
+    Attributes:
+        held_out: held-out drives must not localise worse; None for no such check.
+        geometry: looks for wrong edges; None for no look.
+    """
+
+    held_out: Gate | None = None
+    geometry: GeometryGate | None = None
+
+    def any(self) -> bool:
+        """Whether there is anything to pass."""
+        return self.held_out is not None or self.geometry is not None
+
+    def look_at(self, place: Path, monitor: Monitor) -> None:
+        """Looks at the fleet map before the first merge."""
+        for gate in (self.held_out, self.geometry):
+            if gate is not None:
+                gate.look_at(place, monitor)
+
+    def check(self, merge: Merge, monitor: Monitor) -> None:
+        """Checks the open revision of a merge.
+
+        Raises:
+            RefusedError: it does not pass.
+        """
+        centre, source = merge.centre, merge.robot.location
+        if self.held_out is not None:
+            merge.report.held_out = self.held_out(centre, source, monitor)
+        if self.geometry is not None:
+            merge.report.wrong_edges = self.geometry(centre, source, monitor)
+
+
 def merge_one(
     centre: Map,
     robot: Map,
     settings: Settings,
     options: MergeOptions,
-    gate: Gate | None,
+    gates: Gates,
     monitor: Monitor,
 ) -> MergeReport:
     """Merges one robot's map into the fleet map: one revision, or none if nothing is new.
@@ -45,7 +83,7 @@ def merge_one(
         robot: the robot's map.
         settings: of localiser and mapper.
         options: policy and budget.
-        gate: checks the result before it is committed; None for no check.
+        gates: check the result before it is committed.
         monitor: receives progress; its `check` is called wherever the merge can still be undone.
 
     Raises:
@@ -63,15 +101,17 @@ def merge_one(
     report.known = len(nodes) - len(new) - report.known_omissions
     if new or merge.has_more():
         check_readable(robot, new)
+        places, goals = centre.placements, list(centre.goals.values())
         with centre.begin_revision(**_about(merge, new, settings, options)) as merge.writer:
             with monitor.stage(f"merge {robot.location}", len(new)) as stage:
                 _take_over(merge, new, Replay(merge, settings, options, stage))
             monitor.check()
-            if gate is not None:
+            if gates.any():
                 merge.writer.checkpoint()
-                report.held_out = gate(centre, robot.location, monitor)
+                gates.check(merge, monitor)
                 monitor.check()
             report.revision = merge.writer.commit().number
+        report.moved = moves(places, centre.placements, goals)
         if options.relocaliser in RECOGNISERS:  # these use the nodes' visual words
             _keep_words(merge, settings.frontend.descriptor)
     _say_what_hangs_together(merge, before)
@@ -132,6 +172,10 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
     _join_components(merge)
     _carry_omissions(merge)
     _carry_attempts(merge, replay)
+    for removal in merge.new_removals():
+        merge.writer.add_mark(removal)
+    for goal in merge.new_goals():
+        merge.writer.add_mark(goal)
     merge.report.taken = sum(one.taken for one in merge.report.segments)
     merge.report.omitted += sum(one.omitted for one in merge.report.segments)
 

@@ -1,0 +1,456 @@
+"""Where nodes lie in the map frame: laid out once, then kept.
+
+The map frame is for messages, display and exports, never for localising. It has x and y
+horizontal and z up. Nodes that have a place keep it; new ones are laid out around them, by robust
+least squares over all edges. Components whose relative pose is unknown stand side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import DisjointSet
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from engram.config import check_bounds
+from engram.geometry import SE3
+from engram.graph.adjusting import AdjustConfig, Measured, Poses, Priors, adjust
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, NodeId
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+# Forward of the camera (z) along x, its right (x) along −y, its down (y) along −z: REP 103.
+_MAP_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+# Variance added to edges by kind, so that first guesses lead along odometry, which joins no
+# look-alikes, m².
+_DOUBT_M2 = {
+    EdgeKind.ODOMETRY: 0.0,
+    EdgeKind.BRIDGE: 1.0,
+    EdgeKind.TIE: 1.0,
+    EdgeKind.MATCH: 4.0,
+    EdgeKind.PROXIMITY: 4.0,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PlacingConfig:
+    """Settings of the map frame.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    adjust: AdjustConfig = field(default_factory=AdjustConfig)
+    level_rad: Annotated[
+        float,
+        Meta(ge=0, description="standard deviation of the slope of the ground, rad; 0: unknown"),
+    ] = 0.1
+    apart_m: Annotated[
+        float, Meta(ge=0, description="gap between components that stand side by side, m")
+    ] = 20.0
+    fits_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="disagreement with the places of its ends up to which an edge holds two "
+            "placed parts together, m; parts that nothing holds together are laid out anew, "
+            "the larger one excepted",
+        ),
+    ] = 5.0
+    moved_m: Annotated[
+        float, Meta(ge=0, description="a repair leaves nodes where they are that it would move "
+                    "by less, m")
+    ] = 1.0  # fmt: skip
+    same_m: Annotated[float, Meta(gt=0, description="movements below it are not written, m")] = (
+        0.001
+    )
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+DEFAULT_CONFIG = PlacingConfig()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Anchored:
+    """Known positions of nodes, for re-anchoring.
+
+    Attributes:
+        at: (P,) int64, dense indices of the nodes.
+        positions: (P, 3) float64, metres in the new frame; NaN for an unknown height.
+        sigmas_m: (P,) float64, their standard deviations.
+    """
+
+    at: Indices
+    positions: Array
+    sigmas_m: Array
+
+
+def place(
+    graph: ExperienceGraph,
+    placed: Mapping[NodeId, SE3],
+    config: PlacingConfig = DEFAULT_CONFIG,
+) -> Poses:
+    """Lays out the nodes that have no place around those that have one.
+
+    Args:
+        graph: the experience graph.
+        placed: ``map_from_node`` of nodes that have a place.
+        config: settings.
+
+    Returns:
+        The pose of every node, by dense index. Placed nodes keep theirs, except where two placed
+        parts turn out to belong together: then the smaller one moves.
+    """
+    poses, fixed = Poses.identity(len(graph)), np.zeros(len(graph), np.bool_)
+    for node, pose in placed.items():
+        if node in graph:
+            poses.set(graph.index(node), pose)
+            fixed[graph.index(node)] = True
+    return _Placing(graph, config).around(poses, fixed)
+
+
+def replace_after_removal(
+    graph: ExperienceGraph,
+    placed: Mapping[NodeId, SE3],
+    config: PlacingConfig = DEFAULT_CONFIG,
+) -> Poses:
+    """Lays out what removed edges had put in a wrong place; everything else stays.
+
+    The whole graph is adjusted from where it is. Nodes that this moves by more than
+    `PlacingConfig.moved_m` against the rest are laid out anew around those that stay.
+    """
+    poses = place(graph, placed, config)
+    placing = _Placing(graph, config)
+    adjusted = placing.adjusted_whole(poses)
+    stays = np.ones(len(graph), np.bool_)
+    for members in placing.components():
+        apart = _misfit_m(poses, adjusted, members)
+        stays[members] = apart <= config.moved_m
+    return placing.around(poses, stays) if not stays.all() else poses
+
+
+def anchor(
+    graph: ExperienceGraph,
+    placed: Mapping[NodeId, SE3],
+    anchored: Anchored,
+    config: PlacingConfig = DEFAULT_CONFIG,
+) -> Poses:
+    """Lays out the anchored components anew, so that their anchors lie where they are known to.
+
+    Other components keep their shape, and stand beside.
+    """
+    poses = place(graph, placed, config)
+    placing = _Placing(graph, config)
+    taken = np.zeros(len(graph), np.bool_)
+    for members in placing.components():
+        inside = np.isin(anchored.at, members)
+        if inside.any():
+            part = Anchored(
+                anchored.at[inside], anchored.positions[inside], anchored.sigmas_m[inside]
+            )
+            poses = placing.fitted(poses, members, part)
+            taken[members] = True
+    for members in placing.components():
+        if not taken[members].any():
+            poses = placing.set_beside(poses, members, taken)
+            taken[members] = True
+    return poses
+
+
+class _Placing:
+    """The measurements of a graph, and the steps of a layout."""
+
+    def __init__(self, graph: ExperienceGraph, config: PlacingConfig) -> None:
+        self._graph = graph
+        self._config = config
+        ends = graph.edge_ends.astype(np.int64)[:, ::-1]  # of a and b
+        self._edges, self._ends = _used(graph.edges, ends, len(graph))
+        self._measured = Measured.of(self._edges, self._ends, config.adjust)
+        self._labels = _labels(self._ends, len(graph))
+
+    def components(self) -> list[Indices]:
+        """Dense indices of each component, the largest first; of equal ones the earlier."""
+        counts = np.bincount(self._labels)
+        order = sorted(range(len(counts)), key=lambda label: (-counts[label], label))
+        return [np.flatnonzero(self._labels == label) for label in order]
+
+    def around(self, poses: Poses, fixed: NDArray[np.bool_]) -> Poses:
+        """Lays out the nodes that are not fixed."""
+        poses, fixed = poses.copy(), fixed.copy()
+        taken = fixed.copy()
+        fresh = []
+        for members in self.components():
+            if not fixed[members].any():
+                fresh.append(members)
+                continue
+            self._keep_largest_part(poses, members, fixed)
+            poses = self._solved(poses, members, fixed)
+            taken[members] = True
+        for members in fresh:
+            poses = self._laid_out_alone(poses, members)
+            poses = self.set_beside(poses, members, taken)
+            taken[members] = True
+        return poses
+
+    def adjusted_whole(self, poses: Poses) -> Poses:
+        """All components adjusted from where they are, each with its first node fixed."""
+        free = np.ones(len(self._graph), np.bool_)
+        for members in self.components():
+            free[members[0]] = False
+        start = poses.copy()
+        for members in self.components():
+            self._chain(start, members, ~free)
+        priors = self._level(len(free))
+        return adjust(start, self._measured, free, self._config.adjust, priors).poses
+
+    def fitted(self, poses: Poses, members: Indices, anchored: Anchored) -> Poses:
+        """A component moved to its anchors, then adjusted to them."""
+        map_from_old = fit_level(poses.translations[anchored.at], anchored.positions)
+        for node in members.tolist():
+            poses.set(node, map_from_old @ poses.pose(node))
+        free = np.zeros(len(self._graph), np.bool_)
+        free[members] = True
+        level = self._level(len(free))
+        priors = replace(
+            level, at=anchored.at, positions=anchored.positions, sigmas_m=anchored.sigmas_m
+        )
+        # From here on it is nearly right, so the kernel may be narrow.
+        config = replace(self._config.adjust, widest=4.0)
+        return adjust(poses, self._measured, free, config, priors).poses
+
+    def set_beside(self, poses: Poses, members: Indices, taken: NDArray[np.bool_]) -> Poses:
+        """Moves a component to the right of all others; the first one stays at its origin."""
+        if not taken.any():
+            return poses
+        right_m = poses.translations[taken, 0].max() + self._config.apart_m
+        shift = np.array([right_m - poses.translations[members, 0].min(), 0.0, 0.0])
+        poses = poses.copy()
+        poses.translations[members] += shift
+        return poses
+
+    def _keep_largest_part(self, poses: Poses, members: Indices, fixed: NDArray[np.bool_]) -> None:
+        """Of placed parts that no fitting edge holds together only the largest stays."""
+        inside = fixed & (self._labels == self._labels[members[0]])
+        both = inside[self._ends].all(axis=1)
+        off_m = np.linalg.norm(self._measured.residuals(poses)[:, :3], axis=1)
+        parts = DisjointSet(np.flatnonzero(inside).tolist())
+        for a, b in self._ends[both & (off_m <= self._config.fits_m)].tolist():
+            parts.merge(a, b)
+        # Through nodes that are not placed a part may hang together, too: those between them.
+        largest = max(parts.subsets(), key=lambda part: (len(part), -min(part)))
+        if parts.n_subsets > 1:
+            self._join_through_new(poses, parts, fixed)
+            largest = max(parts.subsets(), key=lambda part: (len(part), -min(part)))
+        fixed[inside] = False
+        fixed[sorted(largest)] = True
+
+    def _join_through_new(self, poses: Poses, parts: DisjointSet, fixed: NDArray[np.bool_]) -> None:
+        """Joins placed parts whose chain through new nodes fits their places."""
+        new = ~fixed[self._ends].all(axis=1)
+        trial = poses.copy()
+        reached = self._chain(trial, np.flatnonzero(~fixed), fixed)
+        off_m = np.linalg.norm(self._measured.residuals(trial)[:, :3], axis=1)
+        joined: dict[int, int] = {}
+
+        def root(node: int) -> int | None:
+            return node if fixed[node] else joined.get(node)
+
+        for node in np.flatnonzero(~fixed).tolist():
+            joined[node] = int(reached[node])
+        for row in np.flatnonzero(new & (off_m <= self._config.fits_m)).tolist():
+            a, b = (root(int(end)) for end in self._ends[row])
+            if a in parts and b in parts:
+                parts.merge(a, b)
+
+    def _solved(self, poses: Poses, members: Indices, fixed: NDArray[np.bool_]) -> Poses:
+        free = np.zeros(len(self._graph), np.bool_)
+        free[members] = ~fixed[members]
+        if not free.any():
+            return poses
+        self._chain(poses, members, fixed)
+        return adjust(
+            poses, self._measured, free, self._config.adjust, self._level(len(free))
+        ).poses
+
+    def _laid_out_alone(self, poses: Poses, members: Indices) -> Poses:
+        """A component by itself: its first node at the origin, level, looking along x."""
+        first = int(members[0])
+        poses.set(first, SE3(_MAP_FROM_CAMERA.copy(), np.zeros(3)))
+        fixed = np.zeros(len(self._graph), np.bool_)
+        fixed[first] = True
+        self._chain(poses, members, fixed)
+        free = np.zeros(len(self._graph), np.bool_)
+        free[members] = True
+        free[first] = False
+        poses = adjust(poses, self._measured, free, self._config.adjust).poses
+        ups = self._level(len(free)).ups
+        up = np.einsum("nij,nj->i", poses.rotations[members], ups[members])
+        levelled = _level_turn(up, poses.rotations[first][:, 2])
+        poses = poses.copy()
+        poses.rotations[members] = levelled @ poses.rotations[members]
+        poses.translations[members] = poses.translations[members] @ levelled.T
+        return poses
+
+    def _chain(self, poses: Poses, members: Indices, fixed: NDArray[np.bool_]) -> Indices:
+        """Places nodes along the surest chains from fixed ones; returns the root of each."""
+        wanted = np.zeros(len(self._graph), np.bool_)
+        wanted[members] = True
+        return follow_chains(poses, self._edges, self._ends, (wanted & ~fixed, fixed))
+
+    def _level(self, count: int) -> Priors:
+        """That cameras stand upright on the ground, as their motion shows."""
+        ups = np.tile([0.0, -1.0, 0.0], (count, 1))
+        cameras = [node.camera for node in self._graph.nodes]
+        forward: dict[str, Array] = {}
+        for edge, (_, b) in zip(self._edges, self._ends.tolist(), strict=True):
+            if edge.kind is EdgeKind.ODOMETRY:
+                known = forward.setdefault(cameras[b], np.zeros(3))
+                known += edge.a_from_b.translation
+        for node, camera in enumerate(cameras):
+            ups[node] = _up(forward.get(camera, np.zeros(3)))
+        return replace(Priors.none(count), ups=ups, level_rad=self._config.level_rad)
+
+
+def follow_chains(
+    poses: Poses,
+    edges: Sequence[Edge],
+    ends: Indices,
+    wanted_and_fixed: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+) -> Indices:
+    """Places nodes along the surest chains from fixed ones.
+
+    Args:
+        poses: of all nodes; those of the wanted ones are set.
+        edges: E edges.
+        ends: (E, 2) int64, dense indices of their ends a and b.
+        wanted_and_fixed: (N,) bool each.
+
+    Returns:
+        (N,) int64: the fixed node from which each one was reached; itself if none.
+    """
+    wanted, fixed = wanted_and_fixed
+    reached, roots = np.arange(len(fixed)), np.flatnonzero(fixed)
+    if not len(roots) or not len(edges):
+        return reached
+    spread = [np.trace(edge.covariance[:3, :3]) + _DOUBT_M2[edge.kind] for edge in edges]
+    variance = np.array(spread) + 1e-9
+    low, high = ends.min(axis=1), ends.max(axis=1)
+    # Of parallel edges the surest counts.
+    best = {(int(low[row]), int(high[row])): int(row) for row in np.argsort(-variance)}
+    rows = np.array(list(best.values()), np.int64)
+    shape = (len(fixed),) * 2
+    links = coo_matrix((variance[rows], (low[rows], high[rows])), shape=shape).tocsr()
+    distance, before, sources = dijkstra(
+        links, directed=False, indices=roots, min_only=True, return_predecessors=True
+    )
+    for node in np.argsort(distance, kind="stable").tolist():
+        if not wanted[node] or not np.isfinite(distance[node]):
+            continue
+        last = int(before[node])
+        row = best[min(node, last), max(node, last)]
+        step = edges[row].a_from_b
+        step = step if ends[row, 0] == last else step.inverse()
+        poses.set(node, (poses.pose(last) @ step).renormalised())
+        reached[node] = sources[node]
+    return reached
+
+
+def chain_poses(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[Poses, Indices]:
+    """Poses of all nodes along the surest chains, and the first node of each component."""
+    labels = _labels(ends, count)
+    roots = np.unique(labels, return_index=True)[1]
+    fixed = np.zeros(count, np.bool_)
+    fixed[roots] = True
+    poses = Poses.identity(count)
+    follow_chains(poses, edges, ends, (~fixed, fixed))
+    return poses, roots
+
+
+def fit_level(old: Array, new: Array) -> SE3:
+    """The turn about the vertical and the shift that bring positions nearest to others.
+
+    Robust: pairs that lie far off after a first fit lose their weight.
+
+    Args:
+        old: (P, 3) float64, metres.
+        new: (P, 3) float64, metres; NaN for an unknown height.
+    """
+    heights = np.isfinite(new[:, 2])
+    weights = np.ones(len(old))
+    for _ in range(20):
+        total = weights.sum()
+        mean_old, mean_new = (weights @ points[:, :2] / total for points in (old, new))
+        x, y = (old[:, :2] - mean_old).T
+        u, v = (new[:, :2] - mean_new).T
+        yaw = np.arctan2(weights @ (x * v - y * u), weights @ (x * u + y * v))
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        shift = np.append(mean_new, 0.0) - turn @ np.append(mean_old, 0.0)
+        off_m = np.linalg.norm((old @ turn.T + shift - new)[:, :2], axis=1)
+        scale = max(float(np.median(off_m)), 0.1)
+        weights = 1.0 / (1.0 + (off_m / (2 * scale)) ** 2)
+    if heights.any():
+        shift[2] = np.median(new[heights, 2] - old[heights, 2])
+    return SE3(turn, shift)
+
+
+def _used(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[list[Edge], Indices]:
+    """The measured edges, and those predicted ones without which parts would be apart."""
+    derived = np.array([edge.kind is EdgeKind.PROXIMITY for edge in edges], np.bool_)
+    parts = DisjointSet(range(count))
+    for a, b in ends[~derived].tolist():
+        parts.merge(a, b)
+    kept = ~derived
+    spread = [
+        float(np.trace(edges[row].covariance[:3, :3])) for row in np.flatnonzero(derived).tolist()
+    ]
+    for row in np.flatnonzero(derived)[np.argsort(spread, kind="stable")].tolist():
+        kept[row] = parts.merge(int(ends[row, 0]), int(ends[row, 1]))
+    rows = np.flatnonzero(kept)
+    return [edges[row] for row in rows.tolist()], ends[rows].reshape(-1, 2)
+
+
+def _labels(ends: Indices, count: int) -> Indices:
+    parts = DisjointSet(range(count))
+    for a, b in ends.tolist():
+        parts.merge(a, b)
+    number: dict[int, int] = {}
+    return np.array(
+        [number.setdefault(parts[node], len(number)) for node in range(count)], np.int64
+    )
+
+
+def _misfit_m(before: Poses, after: Poses, members: Indices) -> Array:
+    """How far nodes moved against the others, by a robust fit of one to the other."""
+    old, new = after.translations[members], before.translations[members]
+    fitted = fit_level(old, new)
+    return np.asarray(np.linalg.norm(fitted @ old - new, axis=1))
+
+
+def _up(forward: Array) -> Array:
+    """The direction in a camera that is up: against its y axis, square to how it moves."""
+    up = np.array([0.0, -1.0, 0.0])
+    length = float(np.linalg.norm(forward))
+    if length > 1.0:
+        along = forward / length
+        up = up - (up @ along) * along
+    return np.asarray(up / np.linalg.norm(up))
+
+
+def _level_turn(up: Array, forward: Array) -> Array:
+    """(3, 3): the turn that brings `up` to z, and `forward` over x."""
+    z = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-9 else np.array([0.0, 0.0, 1.0])
+    x = forward - (forward @ z) * z
+    length = np.linalg.norm(x)
+    x = x / length if length > 1e-6 else np.cross(z, np.array([0.0, 1.0, 0.0]))
+    return np.stack([x, np.cross(z, x), z])

@@ -1,0 +1,257 @@
+"""The map frame: where nodes and goals lie, for messages, display and exports."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import InputError
+from engram.geometry import SE3
+from engram.graph.adjusting import Poses
+from engram.graph.graph import ExperienceGraph
+from engram.graph.marks import Goal, Placement
+from engram.graph.model import NodeId
+from engram.graph.placing import DEFAULT_CONFIG
+
+# Metres per degree of latitude, and the least movement that is worth a word.
+_DEGREE_M = 111_320.0
+_WORTH_M = 0.05
+# Directions in which a goal and the node that it is stored in may differ, before distance counts.
+_ALIKE_RAD = np.pi / 2
+_TURNED_AWAY_M = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class FramePose:
+    """A pose in the map frame, from above.
+
+    Attributes:
+        x_m, y_m, z_m: position, metres.
+        yaw_rad: direction of view, from x towards y.
+    """
+
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_rad: float
+
+    @staticmethod
+    def of(map_from_camera: SE3) -> FramePose:
+        """The pose of a camera, of which z looks forward."""
+        ahead = map_from_camera.rotation[:, 2]
+        x_m, y_m, z_m = map_from_camera.translation.tolist()
+        return FramePose(x_m, y_m, z_m, float(np.arctan2(ahead[1], ahead[0])))
+
+    def to_dict(self) -> dict[str, float]:
+        """Plain values; the direction in degrees."""
+        return {
+            "x_m": round(self.x_m, 4),
+            "y_m": round(self.y_m, 4),
+            "z_m": round(self.z_m, 4),
+            "yaw_deg": round(float(np.rad2deg(self.yaw_rad)), 3),
+        }
+
+
+class MapFrame:
+    """Where the nodes of a map lie: x, y horizontal and z up, metres.
+
+    Nodes keep their place from one revision to the next, unless somebody re-anchors the map or a
+    repair shows that they were in a wrong place. Components whose relative pose is unknown stand
+    side by side. Nothing localises by it.
+
+    Args:
+        graph: the graph of the map.
+        poses: ``map_from_node`` by dense index.
+        origin: latitude and longitude of the frame's origin, degrees; None if unknown.
+
+    Attributes:
+        poses, origin: as given.
+    """
+
+    def __init__(
+        self, graph: ExperienceGraph, poses: Poses, origin: tuple[float, float] | None = None
+    ) -> None:
+        self._graph = graph
+        self.poses = poses
+        self.origin = origin
+        ahead = poses.rotations[:, :2, 2]
+        self._yaws_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(N, 3) float64, metres: the camera of each node, by dense index. Read-only."""
+        return self.poses.translations
+
+    def pose(self, node: NodeId) -> SE3:
+        """``map_from_node``, the pose of a node's camera.
+
+        Raises:
+            InputError: the map has no such node.
+        """
+        return self.poses.pose(self._graph.index(node))
+
+    def placements(self) -> list[Placement]:
+        """Where every node lies."""
+        return [
+            Placement(node.id, self.poses.pose(at)) for at, node in enumerate(self._graph.nodes)
+        ]
+
+    def goal(self, x_m: float, y_m: float, yaw_rad: float, name: str = "") -> Goal:
+        """A pose in the map frame as a goal, which stays valid when the frame moves.
+
+        It is stored relative to the nearest node, rather to one that looks the same way. Height
+        and slope are the node's.
+
+        Args:
+            x_m, y_m: its position, metres.
+            yaw_rad: its direction, from x towards y.
+            name: its name.
+
+        Raises:
+            InputError: the map has no nodes, or a number is not finite.
+        """
+        if not len(self._graph):
+            raise InputError("the map has no nodes: there is nothing to store a goal in")
+        if not np.isfinite((x_m, y_m, yaw_rad)).all():
+            raise InputError(f"goal {name!r}: x {x_m}, y {y_m}, yaw {yaw_rad} must be finite")
+        offset = self.poses.translations[:, :2] - (x_m, y_m)
+        turned = np.abs(np.angle(np.exp(1j * (self._yaws_rad - yaw_rad))))
+        distance_m = np.hypot(*offset.T) + _TURNED_AWAY_M * (turned > _ALIKE_RAD)
+        at = int(np.argmin(distance_m))
+        turn = _about_vertical(yaw_rad - float(self._yaws_rad[at]))
+        height_m = float(self.poses.translations[at, 2])
+        map_from_goal = SE3(turn @ self.poses.rotations[at], np.array([x_m, y_m, height_m]))
+        node_from_goal = self.poses.pose(at).inverse() @ map_from_goal
+        return Goal(name, self._graph.node(at).id, node_from_goal)
+
+    def locate(self, goal: Goal) -> FramePose:
+        """Where a goal lies now.
+
+        Raises:
+            InputError: the map does not have its node.
+        """
+        return FramePose.of(self.pose(goal.node) @ goal.node_from_goal)
+
+    def geographic(self, x_m: float, y_m: float) -> tuple[float, float] | None:
+        """Latitude and longitude of a position, degrees; None without anchors that tell."""
+        if self.origin is None:
+            return None
+        latitude = self.origin[0] + y_m / _DEGREE_M
+        return latitude, self.origin[1] + x_m / (
+            _DEGREE_M * float(np.cos(np.deg2rad(self.origin[0])))
+        )
+
+
+def local_m(
+    latitude_deg: NDArray[np.float64],
+    longitude_deg: NDArray[np.float64],
+    origin: tuple[float, float],
+) -> NDArray[np.float64]:
+    """(P, 2) float64, metres east and north of an origin; undoes `MapFrame.geographic`."""
+    per_degree = _DEGREE_M * float(np.cos(np.deg2rad(origin[0])))
+    return np.stack(
+        [(longitude_deg - origin[1]) * per_degree, (latitude_deg - origin[0]) * _DEGREE_M], axis=1
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Moves:
+    """What moved in the map frame.
+
+    Attributes:
+        nodes: number of nodes that moved by 5 cm or more, of those placed before.
+        of_nodes: number of nodes placed before.
+        median_m, largest_m: how far they moved.
+        goals: how far each goal moved, metres, of those that did.
+        lost_goals: goals whose node is gone.
+    """
+
+    nodes: int
+    of_nodes: int
+    median_m: float
+    largest_m: float
+    goals: Mapping[str, float]
+    lost_goals: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.nodes or self.goals or self.lost_goals)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "nodes": self.nodes,
+            "of_nodes": self.of_nodes,
+            "median_m": round(self.median_m, 3),
+            "largest_m": round(self.largest_m, 3),
+            "goals": {name: round(far_m, 3) for name, far_m in self.goals.items()},
+            "lost_goals": list(self.lost_goals),
+        }
+
+    def text(self) -> str:
+        """In words; "" if nothing moved."""
+        said = []
+        if self.nodes:
+            said.append(
+                f"{self.nodes} of {self.of_nodes} nodes moved in the map frame: median "
+                f"{self.median_m:.2f} m, largest {self.largest_m:.2f} m"
+            )
+        said += [f"goal {name} moved by {far_m:.2f} m" for name, far_m in self.goals.items()]
+        said += [f"goal {name} lost its node" for name in self.lost_goals]
+        return "\n".join(said)
+
+
+def moves(
+    before: Mapping[NodeId, SE3], after: Mapping[NodeId, SE3], goals: Iterable[Goal] = ()
+) -> Moves:
+    """What moved between two layouts.
+
+    Args:
+        before, after: ``map_from_node`` of the placed nodes.
+        goals: goals known before.
+    """
+    both = [node for node in before if node in after]
+    apart_m = np.array([_apart_m(before[node], after[node]) for node in both])
+    moved = apart_m[apart_m >= _WORTH_M]
+    far_m, lost = {}, []
+    for goal in goals:
+        if goal.node not in before:
+            continue
+        if goal.node not in after:
+            lost.append(goal.name)
+            continue
+        at, to = (known[goal.node] @ goal.node_from_goal for known in (before, after))
+        if _apart_m(at, to) >= _WORTH_M:
+            far_m[goal.name] = _apart_m(at, to)
+    median_m, largest_m = (
+        (float(np.median(moved)), float(moved.max())) if len(moved) else (0.0,) * 2
+    )
+    return Moves(len(moved), len(both), median_m, largest_m, far_m, tuple(lost))
+
+
+def changed(before: Mapping[NodeId, SE3], graph: ExperienceGraph, poses: Poses) -> list[Placement]:
+    """The placements that a revision has to write: of new nodes, and of those that moved."""
+    written = []
+    for at, node in enumerate(graph.nodes):
+        pose = poses.pose(at)
+        known = before.get(node.id)
+        if known is None or _moved(known, pose):
+            written.append(Placement(node.id, pose))
+    return written
+
+
+def _moved(one: SE3, other: SE3) -> bool:
+    apart = one.inverse() @ other
+    return apart.distance_m > DEFAULT_CONFIG.same_m or apart.angle_rad > DEFAULT_CONFIG.same_m
+
+
+def _apart_m(one: SE3, other: SE3) -> float:
+    return float(np.linalg.norm(one.translation - other.translation))
+
+
+def _about_vertical(yaw_rad: float) -> NDArray[np.float64]:
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

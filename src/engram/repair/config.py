@@ -1,0 +1,93 @@
+"""Settings of the search for wrong edges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from msgspec import Meta
+
+from engram.config import check_bounds
+from engram.graph.adjusting import AdjustConfig
+
+
+@dataclass(frozen=True, slots=True)
+class RepairConfig:
+    """Settings of `find_wrong_edges`.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    adjust: AdjustConfig = field(default_factory=AdjustConfig)
+    gross_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="disagreement with the rest of the map from which an edge is suspected, m; "
+            "smaller errors do not lead a robot to another place",
+        ),
+    ] = 2.0
+    gross_rad: Annotated[float, Meta(ge=0, description="the same of its direction, rad")] = 0.25
+    gross_chi2: Annotated[
+        float, Meta(gt=0, description="the same in squared standard deviations")
+    ] = 50.0
+    cycle_m: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="length of another way between its ends up to which agreement with it "
+            "confirms an edge, m: odometry drifts by less than `gross_m` over it",
+        ),
+    ] = 40.0
+    looks: Annotated[
+        int, Meta(ge=1, description="pairs of nodes that are matched to judge one edge, at most")
+    ] = 16
+    look_within_m: Annotated[
+        float, Meta(gt=0, description="way from an edge's ends to such nodes, m, at most")
+    ] = 20.0
+    look_apart_m: Annotated[
+        float, Meta(gt=0, description="distance at which two nodes show enough of the same, m")
+    ] = 4.0
+    look_rad: Annotated[
+        float, Meta(gt=0, description="angle at which two nodes show enough of the same, rad")
+    ] = 0.5
+    look_every_m: Annotated[
+        float, Meta(gt=0, description="least distance between nodes of two pairs, m")
+    ] = 1.5
+    agree_m: Annotated[
+        float, Meta(gt=0, description="distance within which a match confirms an edge, m")
+    ] = 0.7
+    agree_rad: Annotated[
+        float, Meta(gt=0, description="angle within which a match confirms an edge, rad")
+    ] = 0.1
+    agree_inliers: Annotated[
+        int, Meta(ge=0, description="fewest inliers of a match that confirms an edge")
+    ] = 10
+    contradicted_surety: Annotated[
+        float,
+        Meta(description="surety that an edge is wrong which the rest of the map contradicts"),
+    ] = 1.8
+    alone_surety: Annotated[
+        float, Meta(description="surety that an edge is wrong which nothing confirms")
+    ] = 0.6
+    per_failing_look: Annotated[
+        float, Meta(ge=0, description="surety that a second look adds which does not agree")
+    ] = 0.1
+    most_by_looks: Annotated[
+        float, Meta(ge=0, description="surety that such looks add together, at most")
+    ] = 0.8
+    per_look: Annotated[
+        float, Meta(ge=0, description="surety that a second look takes away which agrees")
+    ] = 0.15
+    per_fix: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="surety that a fix of a drive takes away which crossed the edge, of five "
+            "at most",
+        ),
+    ] = 0.2
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
