@@ -23,7 +23,7 @@ function(add_all_kernels module sources)
   if(CMAKE_SYSTEM_PROCESSOR MATCHES "x86_64|AMD64|amd64")
     target_compile_definitions(${module} PRIVATE ENGRAM_X86)
     add_kernels(${module} v3 "${sources}" -march=x86-64-v3)
-    add_kernels(${module} v4 "${sources}" -march=x86-64-v4 -mavx512vpopcntdq
+    add_kernels(${module} v4 "${sources}" -march=x86-64-v4 -mavx512vpopcntdq -mavx512vnni
                 -mprefer-vector-width=512)
   endif()
 endfunction()

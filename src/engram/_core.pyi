@@ -144,6 +144,23 @@ class MatchSettings:
     same_camera: bool
     def __init__(self) -> None: ...
 
+class PatchNetwork:
+    def __init__(
+        self,
+        first: NDArray[np.int8],
+        second: NDArray[np.int8],
+        third: NDArray[np.int8],
+        linear: NDArray[np.int8],
+        first_scaling: NDArray[np.int32],
+        second_scaling: NDArray[np.int32],
+        third_scaling: NDArray[np.int32],
+        thresholds: NDArray[np.int32],
+        shifts: NDArray[np.int32],
+    ) -> None: ...
+    def describe(
+        self, image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
+    ) -> NDArray[np.uint8]: ...
+
 class Features:
     def __init__(
         self,

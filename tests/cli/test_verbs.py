@@ -182,8 +182,8 @@ def test_a_kind_of_descriptor_that_is_insisted_on_is_not_passed_over(
     assert engram("record", street, log).status == 0
     ran = engram("map", new, log, "--descriptor", "teblid")
     assert ran.status == 2
-    assert "has brief descriptors, not teblid" in ran.err
-    assert "record it again with --descriptor teblid" in ran.err
+    assert "has brief features, not teblid" in ran.err
+    assert "record it again with --features teblid" in ran.err
     assert not new.exists()
     ran = engram("map", town, street, "--robot", "r2", "--descriptor", "teblid", "--json")
     assert ran.json["error"]["kind"] == "ConfigError"

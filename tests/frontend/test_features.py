@@ -30,9 +30,18 @@ from engram.frontend import (
     MatcherConfig,
     StereoPair,
     match_frames,
+    network,
 )
 from engram.frontend.blobs import decode_landmarks, encode_landmarks
-from engram.frontend.features import describe_brief, describe_teblid, detect_corners, fitted_matcher
+from engram.frontend.contract import check_kind
+from engram.frontend.features import (
+    NET,
+    describe_brief,
+    describe_teblid,
+    detect_corners,
+    feature_kind,
+    fitted_matcher,
+)
 from engram.geometry import StereoCamera
 from engram.maps import Map
 from engram.places import (
@@ -52,7 +61,7 @@ STEP_PX = 12  # of the picture, from frame to frame
 DISPARITY_PX = 12
 FRAMES = 6
 STEP_M = CAMERA.baseline_m * STEP_PX / DISPARITY_PX
-KINDS = (BRIEF, TEBLID, BOTH)
+KINDS = (BRIEF, TEBLID, NET, BOTH)
 
 
 def describe_both(image: np.ndarray, pixels: np.ndarray, octaves: np.ndarray) -> np.ndarray:
@@ -145,7 +154,7 @@ def test_a_drive_is_mapped_and_another_is_localised_in_it(
     kind: DescriptorKind, tmp_path: Path
 ) -> None:
     city = tmp_path / "city.engram"
-    mapped = run("map", city, write_drive(tmp_path / "a", 1), "--descriptor", kind)
+    mapped = run("map", city, write_drive(tmp_path / "a", 1), "--features", kind)
     assert mapped["nodes_saved"] >= 2
     with Map.open(city) as store:
         assert store.descriptor == kind
@@ -259,7 +268,7 @@ def test_the_table_leaves_the_hashes_of_the_first_kinds_as_they_were() -> None:
 
 
 def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ConfigError, match=r"'orb' .*both, brief, teblid"):
+    with pytest.raises(ConfigError, match=r"'orb' .*both, brief, net, teblid"):
         FrontendConfig(descriptor=DescriptorKind("orb"))
 
 
@@ -275,3 +284,45 @@ def test_an_installed_package_brings_a_kind(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(features, "_brought", lambda: {"brought": Entry()})
     monkeypatch.setattr(features, "FEATURES", dict(FEATURES))
     assert features.feature_kind("brought").descriptor_bytes == 8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_meets_the_contract(kind: DescriptorKind) -> None:
+    assert [one for one in check_kind(FEATURES[kind]) if not one.met] == []
+
+
+def test_a_kind_that_breaks_the_contract_is_found_out() -> None:
+    def nothing(image: np.ndarray, pixels: np.ndarray, octaves: np.ndarray) -> np.ndarray:
+        return np.zeros((len(pixels), 64), np.uint8)
+
+    broken = FeatureKind(BOTH, 64, detect_corners, nothing)
+    FEATURES[BOTH] = broken
+    demands = [one.demand for one in check_kind(broken) if not one.met]
+    assert [demand.split()[0] for demand in demands] == ["different", "100"]
+
+
+def test_a_learned_kind_is_named_with_its_model_and_found_without_it() -> None:
+    assert feature_kind("net").name == NET == f"net@{network.MODEL}"
+    assert FrontendConfig(descriptor=DescriptorKind("net")).descriptor == NET
+    assert Settings().for_descriptor(DescriptorKind("net")).frontend.descriptor == NET
+
+
+def test_another_model_is_refused_with_the_command_that_helps(tmp_path: Path) -> None:
+    with pytest.raises(IncompatibleError, match=r"of model 12345678.*engram record --features net"):
+        feature_kind("net@12345678")
+    with pytest.raises(IncompatibleError, match=r"brief are of model 1234.*has brief"):
+        feature_kind("brief@1234")
+
+
+def test_weights_of_another_model_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(network, "MODEL", "12345678")
+    with pytest.raises(IncompatibleError, match="must be 12345678; install Engram again"):
+        network.weights()
+
+
+def test_the_verb_lists_and_checks_kinds() -> None:
+    listed = run("features", "list")
+    assert {"kind": NET, "bits": 256} in listed["kinds"]
+    assert all(met for _, met, _ in run("features", "check", "net")["checks"][NET])
+    ran = CliRunner().invoke(app, ["features", "check", "orb"])
+    assert isinstance(ran.exception, IncompatibleError)

@@ -5,16 +5,16 @@ import pytest
 
 from engram_lab.fits import calibration
 from engram_lab.fits.calibration import (
-    VISITS,
     Appearance,
-    Places,
     appearance,
     appearance_table,
     falloff_table,
     inliers_of,
+    reference_frames,
     world_hash,
 )
 from engram_lab.town import textures
+from engram_lab.town.visits import VISITS, Places
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_light_costs_inliers_as_it_was_calibrated_to(seen: Appearance) -> None:
 
 def test_a_visit_matches_itself_at_every_place() -> None:
     places = Places(1, every_m=75.0)
-    frames = places.frames(VISITS["morning"])
+    frames = reference_frames(places, VISITS["morning"])
     # About half of the corners get a disparity, and each is its own best match.
     assert inliers_of(frames, frames).min() > 150
 

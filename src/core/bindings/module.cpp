@@ -11,6 +11,7 @@ void bind_graph_search(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
 void bind_matching(nb::module_ &module);
 void bind_ordering(nb::module_ &module);
+void bind_patch_network(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
 void bind_places(nb::module_ &module);
 void bind_recall(nb::module_ &module);
@@ -26,6 +27,7 @@ NB_MODULE(_core, module) {
   bind_hamming(module);
   bind_matching(module);
   bind_ordering(module);
+  bind_patch_network(module);
   bind_path_scores(module);
   bind_places(module);
   bind_recall(module);

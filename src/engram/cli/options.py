@@ -75,7 +75,12 @@ Relocaliser: TypeAlias = Annotated[
 ]
 Descriptor: TypeAlias = Annotated[
     str | None,
-    typer.Option("--descriptor", help="brief or teblid, for a new map or log [default: brief]."),
+    typer.Option(
+        "--features",
+        "--descriptor",
+        metavar="KIND",
+        help="Of a new map or log: engram features list [default: brief].",
+    ),
 ]
 NoThumbnails: TypeAlias = Annotated[
     bool, typer.Option("--no-thumbnails", help="Store no small pictures for people.")

@@ -17,6 +17,7 @@ from engram.cli.doctor import doctor
 from engram.cli.drive import drive_group
 from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
+from engram.cli.features import features
 from engram.cli.fleet import build, download, merge
 from engram.cli.frame import anchor, export, goal
 from engram.cli.history import diff, log, revert, show, tag
@@ -46,7 +47,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     },
     "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
     "Fleet": {"merge": merge, "download": download, "build": build},
-    "Settings": {"settings": settings},
+    "Settings": {"settings": settings, "features": features},
 }
 VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}
 

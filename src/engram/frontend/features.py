@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.errors import IncompatibleError
+from engram.frontend import network
 from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, StereoPair
 from engram.frontend.matching import MatcherConfig
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from engram.frontend.frontend import FrontendConfig
 
 ENTRY_POINTS = "engram.features"
+NET = DescriptorKind(f"net@{network.MODEL}")
 
 # OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 suit corners without a
 # size best.
@@ -81,7 +83,8 @@ class FeatureKind:
     """One kind of feature: binary descriptors, compared by the number of different bits.
 
     Attributes:
-        name: its name in settings, maps and frame logs.
+        name: its name in maps and frame logs; `NAME@MODEL` where a learned model describes, MODEL
+            being a hash of its weights. Settings and commands may leave out the model.
         descriptor_bytes: width of a descriptor, a multiple of 8 up to 2048.
         detect: finds the landmarks.
         describe: describes them, if `detect` does not.
@@ -178,11 +181,28 @@ def describe_teblid(
     return np.asarray(descriptors, dtype=np.uint8)
 
 
+def detect_corners_with_net(pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
+    """`detect_corners` and `describe_net`."""
+    found = detect_corners_with_brief(pair, config, landmarks)
+    assert found.descriptors is not None, "BRIEF comes with the corners"
+    described = network.beside_brief(pair.left, found.pixels, found.octaves, found.descriptors)
+    return replace(found, descriptors=described)
+
+
+def describe_net(
+    image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
+) -> NDArray[np.uint8]:
+    """192 bits of the network beside 64 of BRIEF: (N, 32) uint8. For arguments see `Describe`."""
+    brief = describe_brief(image, pixels, octaves)
+    return network.beside_brief(image, pixels, octaves, brief)
+
+
 FEATURES: dict[DescriptorKind, FeatureKind] = {
     kind.name: kind
     for kind in (
         FeatureKind(BRIEF, 32, detect_corners_with_brief, describe_brief),
         FeatureKind(TEBLID, 32, detect_corners, describe_teblid),
+        FeatureKind(NET, 32, detect_corners_with_net, describe_net),
     )
 }
 
@@ -190,19 +210,46 @@ FEATURES: dict[DescriptorKind, FeatureKind] = {
 def feature_kind(name: str) -> FeatureKind:
     """The kind of that name, from the table or an installed package.
 
+    Args:
+        name: with or without its model.
+
     Raises:
-        IncompatibleError: the kind is unknown.
+        IncompatibleError: the kind is unknown, or its model is another one here.
     """
     known = FEATURES.get(DescriptorKind(name))
     if known is not None:
         return known
+    plain, _, model = name.partition("@")
     brought = _brought()
-    if name not in brought:
+    if plain in brought:
+        kind: FeatureKind = brought[plain].load()
+        FEATURES[kind.name] = kind
+    here = [kind for kind in FEATURES.values() if plain_name(kind.name) == plain]
+    if here and model in {"", here[0].name.partition("@")[2]}:
+        return here[0]
+    if here:
         raise IncompatibleError(
-            f"descriptors of kind {name!r} are unknown; known: "
-            f"{', '.join(sorted(FEATURES.keys() | brought))}; install the package that adds them"
+            f"descriptors of kind {plain} are of model {model or 'none'}, this installation has "
+            f"{here[0].name}: install the Engram that made them, or make them again from the "
+            f"images: engram record --features {plain}"
         )
-    return FEATURES.setdefault(DescriptorKind(name), brought[name].load())
+    names = sorted({plain_name(kind) for kind in FEATURES} | brought.keys())
+    raise IncompatibleError(
+        f"descriptors of kind {name!r} are unknown; known: {', '.join(names)}; "
+        "install the package that adds them"
+    )
+
+
+def known_kinds() -> list[FeatureKind]:
+    """All kinds, those of installed packages too, in the order of their names."""
+    for name in _brought():
+        feature_kind(name)
+    return [FEATURES[name] for name in sorted(FEATURES)]
+
+
+def plain_name(kind: str) -> str:
+    """A kind's name without its model, as people write it."""
+    return kind.partition("@")[0]
 
 
 @lru_cache(maxsize=1)

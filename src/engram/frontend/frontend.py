@@ -29,7 +29,7 @@ class FrontendConfig:
     """Settings of the front-end.
 
     Attributes:
-        descriptor: kind of descriptor; a map matches only its own kind.
+        descriptor: kind of features; a map matches only its own kind.
         landmarks: most landmarks in a 512×384 image; other sizes scale with area^0.6 (1000 at
             1242×375), as a larger image shows more detail of the same scene.
         octaves: pyramid levels, each half the size of the previous one, 1 to 4.
@@ -72,9 +72,10 @@ class FrontendConfig:
     def __post_init__(self) -> None:
         check_bounds(self)
         try:
-            feature_kind(self.descriptor)
+            kind = feature_kind(self.descriptor)
         except IncompatibleError as error:
             raise ConfigError(f"frontend: {error}") from error
+        object.__setattr__(self, "descriptor", kind.name)  # with its model
 
 
 class Frontend:

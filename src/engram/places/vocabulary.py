@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.errors import IncompatibleError, InputError, MapCorruptError
 from engram.frontend import DescriptorKind, feature_kind
+from engram.frontend.features import plain_name
 from engram.places.chow_liu import WordStatistics
 from engram.places.tree import TreeArrays
 
@@ -153,7 +154,7 @@ def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     Raises:
         IncompatibleError: the kind is unknown.
     """
-    file = resources.files("engram.places") / "data" / f"{descriptor}.safetensors"
+    file = resources.files("engram.places") / "data" / f"{plain_name(descriptor)}.safetensors"
     if file.is_file():
         return decode_vocabulary(file.read_bytes())
     root_and_word = np.zeros((2, feature_kind(descriptor).descriptor_bytes), np.uint8)

@@ -10,7 +10,7 @@ from typing import Any
 
 from engram.doctor import Diagnosis
 from engram.errors import ConfigError
-from engram.frontend import DescriptorKind, Frontend
+from engram.frontend import DescriptorKind, Frontend, feature_kind
 from engram.graph.model import Session
 from engram.localiser import Localisation, Position
 from engram.maps import Map, SessionState, open_map
@@ -107,7 +107,7 @@ def map_drive(
     map_path = Path(map_path)
     settings, options = settings or Settings(), options or RobotOptions()
     if descriptor is not None and isinstance(sequence, FrameLog):
-        mend = f"record it again with --descriptor {descriptor}"
+        mend = f"record it again with --features {descriptor}"
         _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
     session = session_of_drive(sequence)
     report = MapReport(session)
@@ -131,10 +131,8 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
     Raises:
         ConfigError: they differ.
     """
-    if found is not None and found != asked:
-        raise ConfigError(
-            f"{what} has {found} descriptors, not {asked}; omit --descriptor, or {mend}"
-        )
+    if found is not None and found != feature_kind(asked).name:
+        raise ConfigError(f"{what} has {found} features, not {asked}; omit --features, or {mend}")
 
 
 def _map(

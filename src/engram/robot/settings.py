@@ -41,7 +41,7 @@ class Settings:
         """
         before = self.frontend.descriptor
         frontend = self.frontend
-        if descriptor not in {None, before}:
+        if descriptor is not None:
             frontend = replace(frontend, descriptor=descriptor)
         kind = frontend.descriptor
         odometry = fitted_matcher(self.odometry.matcher, before, kind)

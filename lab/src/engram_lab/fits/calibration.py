@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +22,14 @@ from engram_lab.fits.reference_matcher import (
     reference_frame,
     reference_match,
 )
-from engram_lab.town.camera_model import CLEAN, CONSTANTS, CameraModel
+from engram_lab.town.camera_model import CONSTANTS
 from engram_lab.town.campaigns import WORLD_VERSION
-from engram_lab.town.conditions import WEATHERS, Conditions
-from engram_lab.town.drive import DrivingStyle, Pose, driving_line, pose_on
-from engram_lab.town.rendering import TownRenderer
-from engram_lab.town.robots import ROBOTS, Robot, robot_named
-from engram_lab.town.streets import loop_of_length
+from engram_lab.town.conditions import WEATHERS
+from engram_lab.town.drive import DrivingStyle
+from engram_lab.town.robots import ROBOTS
 from engram_lab.town.textures import Style
-from engram_lab.town.town import Today, Town
+from engram_lab.town.visits import VISITS, Places, Visit
 
-LOOP_M = 150.0
 MAPPED = "morning"
 # The towns that the knobs were set on, and two that were looked at only afterwards.
 TUNED_TOWNS = (1, 2, 3)
@@ -42,35 +38,6 @@ UNSEEN_TOWNS = (4, 5)
 CLIP_FRAMES = 51
 CLIP_SPACING_M = 1.197
 CLIP_STEPS = (1, 2, 4, 6)
-_PLACES_EVERY_M = 5.0
-
-
-@dataclass(frozen=True, slots=True)
-class Visit:
-    """One pass through the places: when, in what weather, on which day's parking."""
-
-    name: str
-    start: datetime
-    weather: str
-    day: int
-
-
-def _at(month: int, day: int, hour: float) -> datetime:
-    return datetime(2025, month, day, int(hour), round(60 * (hour % 1)), tzinfo=UTC)
-
-
-VISITS = {
-    visit.name: visit
-    for visit in (
-        Visit("morning", _at(7, 14, 8.0), "clear", 14),
-        Visit("next morning", _at(7, 15, 8.0), "clear", 15),
-        Visit("an hour later", _at(7, 15, 9.0), "clear", 15),
-        Visit("late afternoon", _at(7, 15, 17.0), "clear", 15),
-        Visit("overcast", _at(7, 15, 11.0), "overcast", 15),
-        Visit("night", _at(7, 15, 23.0), "fair", 15),
-        Visit("snow", datetime(2025, 12, 28, 11, tzinfo=UTC), "snow", 180),
-    )
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,56 +79,14 @@ def world_hash() -> str:
     )
 
 
-class Places:
-    """A loop's places, seen on any visit.
-
-    Args:
-        seed: of the town.
-        style: of its textures.
-        robot: whose camera.
-        every_m: way between places.
-    """
-
-    def __init__(
-        self, seed: int = 1, style: Style | None = None, robot: str = "wildcat",
-        every_m: float = _PLACES_EVERY_M,
-    ) -> None:  # fmt: skip
-        plan, route = loop_of_length(LOOP_M, seed)
-        self.robot: Robot = robot_named(robot)
-        self._town = Town(plan, route, style or Style())
-        self._line = driving_line(plan, route, reverse=False)
-        self._starts_m = np.arange(0, self._line.length_m, every_m)
-
-    def __len__(self) -> int:
-        return len(self._starts_m)
-
-    def pairs(
-        self, visit: Visit, ahead_m: float = 0.0, aside_m: float = 0.0
-    ) -> list[tuple[SE3, StereoPair]]:
-        """True pose and images at each place, moved so far ahead and to the left."""
-        conditions = Conditions(visit.start, visit.weather, visit.day)
-        today = Today(visit.day, conditions.hour, conditions.season, 0.45)
-        renderer = TownRenderer(self._town, today)
-        camera, found = self.robot.camera, []
-        for k, start_m in enumerate(self._starts_m):
-            world_from_cam = pose_on(self._line, self.robot, start_m + ahead_m, aside_m)
-            moment = conditions.at(float(start_m), 0.0)
-            luminance, inverse_depths = renderer.render(world_from_cam, camera, moment)
-            twist = np.array([0, 0, 5.5, 0, 0, 0])
-            pose = Pose(world_from_cam, float(start_m), 0.0, 5.5, twist)
-            model = CameraModel(self.robot, 1000 * visit.day + visit.start.hour, CLEAN)
-            left, right = model.expose(luminance, inverse_depths, pose, moment.rain, k)
-            found.append((world_from_cam, StereoPair(k, left, right, camera)))
-        return found
-
-    def frames(
-        self, visit: Visit, ahead_m: float = 0.0, aside_m: float = 0.0
-    ) -> list[tuple[SE3, ReferenceFrame]]:
-        """True pose and reference frame at each place."""
-        return [(pose, reference_frame(pair)) for pose, pair in self.pairs(visit, ahead_m, aside_m)]
-
-
 Frames = list[tuple[SE3, ReferenceFrame]]
+
+
+def reference_frames(
+    places: Places, visit: Visit, ahead_m: float = 0.0, aside_m: float = 0.0
+) -> Frames:
+    """True pose and reference frame at each place."""
+    return [(pose, reference_frame(pair)) for pose, pair in places.pairs(visit, ahead_m, aside_m)]
 
 
 def inliers_of(node_frames: Frames, live_frames: Frames) -> NDArray[np.int64]:
@@ -217,11 +142,11 @@ def appearance(
         visits: that are compared; all of them for the table.
         monitor: hears of each visit that is done.
     """
-    morning = places.frames(VISITS[MAPPED])
+    morning = reference_frames(places, VISITS[MAPPED])
     inliers: dict[str, NDArray[np.int64]] = {}
     for name in visits:
         if name != MAPPED:
-            inliers[name] = inliers_of(morning, places.frames(VISITS[name], 0.35, 0.35))
+            inliers[name] = inliers_of(morning, reference_frames(places, VISITS[name], 0.35, 0.35))
         monitor.advance(name)
     return Appearance(np.array([frame.corners for _, frame in morning]), inliers)
 

@@ -1,12 +1,16 @@
 """Makes the vocabularies that ship with the package, from drives through simulated towns.
 
-Run as ``python -m engram_lab.fits.vocabularies FOLDER``: renders what FOLDER does not hold yet
-(2,442 frames, half an hour on a core), then trains and writes the package's own data. The towns
-have seeds of their own: no campaign of an evaluation shares a street with them.
+    python -m engram_lab.fits.vocabularies FOLDER
+    python -m engram_lab.fits.vocabularies FOLDER --kinds net
+
+Trains and writes the package's own data. `brief` and `teblid` learn from drives: what FOLDER does
+not hold yet is rendered (2,442 frames, half an hour on a core). `net` learns from the places that
+its network was trained on, seen under every light (2,052 frames). The towns have seeds of their
+own: no evaluation shares a street with them.
 """
 
+import argparse
 import dataclasses
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import places
-from engram.frontend import BRIEF, TEBLID, DescriptorKind, Frontend, FrontendConfig
+from engram.frontend import (
+    BRIEF,
+    TEBLID,
+    DescriptorKind,
+    Frontend,
+    FrontendConfig,
+    feature_kind,
+)
+from engram.frontend.features import plain_name
 from engram.places import TrainingConfig, encode_vocabulary, train_vocabulary
+from engram_lab.eyes import training_scene
 from engram_lab.town import SimulatedDrive, campaign_named
 
 # Campaign, seed, sessions, metres between frames: places apart from each other, all conditions.
@@ -25,6 +38,8 @@ DRIVES = (
     ("oxford", 103, (0, 5), 8.0),
 )
 TRAINED_ON = "simulated drives: village 101, keble 102, oxford 103; no real image"
+TOWNS = (201, 202, 203, 204)
+TRAINED_ON_PLACES = "places of simulated towns 201 to 204, 19 visits each; no real image"
 # Two of them take 620 kB together.
 CONFIG = TrainingConfig(words=5000, samples=80)
 
@@ -60,13 +75,32 @@ def frames_of(files: list[Path], kind: DescriptorKind) -> list[NDArray[np.uint8]
     return frames
 
 
+def frames_of_places(kind: DescriptorKind) -> list[NDArray[np.uint8]]:
+    """Descriptors of each place on each visit."""
+    describe = feature_kind(kind).describe
+    return [
+        describe(np.ascontiguousarray(scene.left[key]), marks.pixels, marks.octaves)
+        for scene in map(training_scene, TOWNS)
+        for key, marks in scene.landmarks.items()
+    ]
+
+
 def main() -> None:
-    files = render(Path(sys.argv[1]))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("folder", type=Path, help="keeps the descriptors of the drives")
+    parser.add_argument("--kinds", default="brief,teblid", help="joined by commas")
+    asked = parser.parse_args()
     data = Path(places.__file__).parent / "data"
-    for kind in (BRIEF, TEBLID):
-        vocabulary = train_vocabulary(frames_of(files, kind), kind, CONFIG, trained_on=TRAINED_ON)
+    for name in asked.kinds.split(","):
+        kind = feature_kind(name).name
+        drives = kind in {BRIEF, TEBLID}
+        frames = frames_of(render(asked.folder), kind) if drives else frames_of_places(kind)
+        about = TRAINED_ON if drives else TRAINED_ON_PLACES
+        vocabulary = train_vocabulary(frames, kind, CONFIG, trained_on=about)
         body = encode_vocabulary(vocabulary)
-        (data / f"{kind}.safetensors").write_bytes(body)
+        (data / f"{plain_name(kind)}.safetensors").write_bytes(body)
         print(f"{kind}: {len(vocabulary)} words, {len(body)} bytes")
 
 

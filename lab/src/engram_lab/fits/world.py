@@ -29,11 +29,8 @@ from engram_lab.fits.calibration import (
     CLIP_FRAMES,
     CLIP_SPACING_M,
     CLIP_STEPS,
-    LOOP_M,
     UNSEEN_TOWNS,
-    VISITS,
     Appearance,
-    Places,
     Row,
     appearance,
     appearance_table,
@@ -49,6 +46,7 @@ from engram_lab.studies.store import read_runs
 from engram_lab.town import Campaign, SimulatedDrive, Size, campaign_named
 from engram_lab.town.campaigns import by_day
 from engram_lab.town.simulating import simulate
+from engram_lab.town.visits import LOOP_M, VISITS, Places
 
 LAPS = 40
 # The laps whose five folds leave 20 to build from.

@@ -1,0 +1,220 @@
+"""What each kind of features recognises: the same places under other lights, and false places.
+
+    python -m engram_lab.checks.eyes --kinds brief,net --out lab/reports/eyes
+
+Matches whole frames, unguided, from rendered towns that no descriptor was trained on and, where
+ENGRAM_DATA names them, of real clips. A match counts if it has the kind's least inliers and its
+pose is within 0.25 m of the truth. OUT.csv gets a row for each figure.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from engram.cli.progress import Bars
+from engram.frontend import Frame, Frontend, FrontendConfig, Match, feature_kind, match_frames
+from engram.frontend.features import FeatureKind, fitted_matcher
+from engram.frontend.frame import BRIEF
+from engram.frontend.matching import MatcherConfig
+from engram.geometry import SE3
+from engram.monitor import Monitor, write_whole
+from engram_lab.checks import eyes_real
+from engram_lab.eyes import Scene, judged_scene, training_scene
+from engram_lab.programs import command_line
+
+LEAST_INLIERS = 20
+WITHIN_M = 0.25
+PAIRS = (
+    ("morning", "late afternoon"),
+    ("morning", "night"),
+    ("overcast", "night"),
+    ("morning", "snow"),
+    ("morning", "fog"),
+    ("night", "rain at night"),
+    ("overcast", "rain"),
+    ("rain", "rain again"),
+)
+TOWNS = ((1, 4), (2, 301))
+# Two towns that nothing else uses: random visits of a place, and places of different towns.
+CALIBRATION = (207, 208)
+_RANDOM, _SAME, _OTHER = 3000, 500, 6000
+_SEED = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Eyes:
+    """A kind of features as it is judged.
+
+    Attributes:
+        kind: of the table.
+        matcher: its matcher settings.
+        frontend: makes its frames.
+    """
+
+    kind: FeatureKind
+    matcher: MatcherConfig
+    frontend: Frontend
+
+    @staticmethod
+    def of(name: str) -> Eyes:
+        """A kind by its name."""
+        kind = feature_kind(name)
+        config = FrontendConfig(descriptor=kind.name, thumbnails=False)
+        return Eyes(kind, fitted_matcher(MatcherConfig(), BRIEF, kind.name), Frontend(config))
+
+    def match(self, reference: Frame, live: Frame) -> Match:
+        """Searches the whole frame."""
+        return match_frames(reference, live, self.matcher, _SEED)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One figure of one kind.
+
+    Attributes:
+        where: towns or clip.
+        what: compared.
+        value: measured.
+        of: how many could be.
+        wrong: matches with a wrong pose.
+    """
+
+    where: str
+    what: str
+    value: float
+    of: float = 100.0
+    wrong: int = 0
+
+
+def error_m(match: Match, reference_from_live: SE3) -> float:
+    """Distance of a measured from the true position; infinite without a pose."""
+    if match.reference_from_live is None:
+        return float("inf")
+    off = match.reference_from_live.translation - reference_from_live.translation
+    return float(np.linalg.norm(off))
+
+
+def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Row]:
+    """Places of some towns under two lights, and pairs of places of different towns."""
+    scenes = [judged_scene(seed, monitor) for seed in seeds]
+    frames = [scene.frames(eyes.frontend) for scene in scenes]
+    where = "towns " + ", ".join(map(str, seeds))
+    for a, b in PAIRS:
+        right, wrong, places = 0, 0, 0
+        for scene, seen in zip(scenes, frames, strict=True):
+            for place in range(scene.left.shape[1]):
+                match = eyes.match(seen[a, place], seen[b, place])
+                off_m = error_m(match, _between(scene, (a, place), (b, place)))
+                places += 1
+                if match.inliers >= LEAST_INLIERS:
+                    right, wrong = right + (off_m < WITHIN_M), wrong + (off_m >= WITHIN_M)
+        yield Row(where, f"{a} / {b}", right, places, wrong)
+    draws = np.random.default_rng(11)
+    pairs = [tuple(draws.choice(len(seeds), 2, replace=False)) for _ in range(_RANDOM)]
+    falsely = sum(
+        eyes.match(_any(frames[a], draws), _any(frames[b], draws)).inliers >= LEAST_INLIERS
+        for a, b in pairs
+    )
+    yield Row(where, "false accepts between the two towns", falsely, _RANDOM)
+
+
+def _between(scene: Scene, a: tuple[str, int], b: tuple[str, int]) -> SE3:
+    """True a_from_b."""
+    world_from_a, world_from_b = (
+        scene.world_from_cam[scene.visits.index(visit), place] for visit, place in (a, b)
+    )
+    return SE3.from_matrix(np.linalg.inv(world_from_a) @ world_from_b)
+
+
+def _any(frames: Mapping[tuple[str, int], Frame], draws: np.random.Generator) -> Frame:
+    every = sorted(frames)
+    return frames[every[int(draws.integers(len(every)))]]
+
+
+def calibration_rows(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
+    """Right matches at equal false accepts, by the number of inliers."""
+    scenes = [training_scene(seed, monitor=monitor) for seed in CALIBRATION]
+    frames = [scene.frames(eyes.frontend) for scene in scenes]
+    draws, right = np.random.default_rng(1), []
+    for _ in range(_SAME):
+        town = int(draws.integers(2))
+        scene = scenes[town]
+        a, b = (scene.visits[int(k)] for k in draws.choice(len(scene.visits), 2, replace=False))
+        place = int(draws.integers(scene.left.shape[1]))
+        match = eyes.match(frames[town][a, place], frames[town][b, place])
+        off_m = error_m(match, _between(scene, (a, place), (b, place)))
+        right.append(match.inliers if off_m < WITHIN_M else 0)
+    falsely = [
+        eyes.match(_any(frames[0], draws), _any(frames[1], draws)).inliers for _ in range(_OTHER)
+    ]
+    where = "towns " + ", ".join(map(str, CALIBRATION))
+    for least in (20, 22, 24, 26, 28):
+        count, wrong = (int((np.array(part) >= least).sum()) for part in (right, falsely))
+        yield Row(where, f"random visits, ≥ {least} inliers", count, _SAME, wrong)
+
+
+def rows_of(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
+    """All figures of a kind."""
+    for seeds in TOWNS:
+        yield from town_rows(eyes, seeds, monitor)
+    yield from calibration_rows(eyes, monitor)
+    if data := os.environ.get("ENGRAM_DATA"):
+        for judge in eyes_real.CLIPS:
+            for what, value, of, wrong in judge(eyes.frontend, eyes.match, Path(data)):
+                yield Row("real", what, value, of, wrong)
+
+
+def table(found: Mapping[str, Sequence[Row]]) -> str:
+    """The kinds side by side, in Markdown."""
+    names = list(found)
+    lines = [
+        "| " + " | ".join(["where", "what", "of", *names]) + " |",
+        "|" + " --- |" * (3 + len(names)),
+    ]
+    for rows in zip(*found.values(), strict=True):
+        cells = [f"{row.value:g}" + (f" ({row.wrong} wrong)" if row.wrong else "") for row in rows]
+        first = rows[0]
+        lines.append("| " + " | ".join([first.where, first.what, f"{first.of:g}", *cells]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--kinds", default="brief,net", help="joined by commas")
+    parser.add_argument("--out", type=Path, help="OUT.csv and OUT.table.md are written")
+    asked = parser.parse_args()
+    found: dict[str, list[Row]] = {}
+    for name in asked.kinds.split(","):
+        found[name] = []
+        for row in rows_of(Eyes.of(name), Bars()):
+            found[name].append(row)
+            print(
+                name,
+                row.where,
+                row.what,
+                f"{row.value:g} of {row.of:g}, {row.wrong} wrong",
+                flush=True,
+            )
+    print("\n" + table(found))
+    if asked.out:
+        _write(asked.out, found)
+
+
+def _write(out: Path, found: Mapping[str, Sequence[Row]]) -> None:
+    with write_whole(out.with_suffix(".csv")) as draft, draft.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["kind", "where", "what", "value", "of", "wrong"])
+        for name, rows in found.items():
+            writer.writerows(
+                [name, r.where, r.what, f"{r.value:g}", f"{r.of:g}", r.wrong] for r in rows
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""`engram features`: the kinds of features, and whether each does what it must."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from engram.cli import options
+
+
+class FeaturesAction(StrEnum):
+    """What to do with the kinds."""
+
+    LIST = "list"
+    CHECK = "check"
+
+
+def features(
+    action: Annotated[FeaturesAction, typer.Argument(help="list or check.")] = FeaturesAction.LIST,
+    kinds: Annotated[
+        list[str] | None, typer.Argument(metavar="[KIND]...", help="[default: all].")
+    ] = None,
+    *,
+    as_json: options.Json = False,
+) -> None:
+    """List the kinds of features, or check them.
+
+    A map and a frame log name the kind that made them, and match no other. A kind that is learned
+    names its model, too. An installed package may add kinds; `check` shows whether one does what
+    every kind must.
+
+    \b
+    Examples:
+      engram features list
+      engram features check net
+    """
+    from engram.frontend.contract import check_kind
+    from engram.frontend.features import feature_kind, known_kinds
+
+    asked = [feature_kind(name) for name in kinds] if kinds else known_kinds()
+    if action is FeaturesAction.LIST:
+        listed = [{"kind": one.name, "bits": 8 * one.descriptor_bytes} for one in asked]
+        if as_json:
+            print(json.dumps({"kinds": listed}))
+            return
+        for row in listed:
+            typer.echo(f"{row['kind']:14} {row['bits']} bits")
+        return
+    found = {one.name: check_kind(one) for one in asked}
+    if as_json:
+        rows = {name: [[c.demand, c.met, c.found] for c in part] for name, part in found.items()}
+        print(json.dumps({"checks": rows}))
+    else:
+        for name, part in found.items():
+            for one in part:
+                mark = "ok    " if one.met else "FAILED"
+                typer.echo(f"{name:14} {mark} {one.demand}: {one.found}")
+    if not all(one.met for part in found.values() for one in part):
+        raise typer.Exit(1)
