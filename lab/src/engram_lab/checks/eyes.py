@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.cli.progress import Bars
 from engram.frontend import Frame, Frontend, FrontendConfig, Match, feature_kind, match_frames
@@ -24,6 +25,7 @@ from engram.frontend.frame import BRIEF
 from engram.frontend.matching import MatcherConfig
 from engram.geometry import SE3
 from engram.monitor import Monitor, write_whole
+from engram.places import FabMap, default_vocabulary
 from engram_lab.checks import eyes_real
 from engram_lab.eyes import Scene, judged_scene, training_scene
 from engram_lab.programs import command_line
@@ -115,6 +117,7 @@ def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Ro
                 if match.inliers >= LEAST_INLIERS:
                     right, wrong = right + (off_m < WITHIN_M), wrong + (off_m >= WITHIN_M)
         yield Row(where, f"{a} / {b}", right, places, wrong)
+    yield from place_rows(eyes, where, frames)
     draws = np.random.default_rng(11)
     pairs = [tuple(draws.choice(len(seeds), 2, replace=False)) for _ in range(_RANDOM)]
     falsely = sum(
@@ -122,6 +125,28 @@ def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Ro
         for a, b in pairs
     )
     yield Row(where, "false accepts between the two towns", falsely, _RANDOM)
+
+
+def place_rows(
+    eyes: Eyes, where: str, frames: Sequence[Mapping[tuple[str, int], Frame]]
+) -> Iterator[Row]:
+    """Of single images of a visit, how many the recogniser finds among the morning's places."""
+    vocabulary = default_vocabulary(eyes.kind.name)
+
+    def words(seen: Mapping[tuple[str, int], Frame], name: str) -> list[NDArray[np.int32]]:
+        visit = sorted(key for key in seen if key[0] == name)
+        return [
+            vocabulary.words_of(seen[key].landmarks.descriptors, eyes.kind.name) for key in visit
+        ]
+
+    recogniser = FabMap(vocabulary)
+    for place in [one for seen in frames for one in words(seen, "morning")]:
+        recogniser.add(place)
+    for name in ("late afternoon", "night", "snow", "rain"):
+        queries = [one for seen in frames for one in words(seen, name)]
+        found = [recogniser.recognise(query, 1).places for query in queries]
+        right = sum(len(one) > 0 and one[0] == place for place, one in enumerate(found))
+        yield Row(where, f"recognised at once: {name}, among the morning's", right, len(queries))
 
 
 def _between(scene: Scene, a: tuple[str, int], b: tuple[str, int]) -> SE3:

@@ -123,7 +123,7 @@ def seasons(
         )
         for sign in (1, -1)
     )
-    yield "Stromovka, seasons, % of image pairs", round(100 * best / len(found), 1), 100, 0
+    yield "Stromovka, seasons, % of image pairs", round(float(100 * best / len(found)), 1), 100, 0
 
 
 def _corners(image: NDArray[np.uint8], frontend: Frontend) -> NDArray[np.float32]:

@@ -115,9 +115,10 @@ def judged_scene(seed: int, monitor: Monitor = QUIET) -> Scene:
                  monitor)  # fmt: skip
 
 
-def clip(folder: Path, **how: str) -> list[StereoPair]:
-    """The stereo pairs of a real clip; for `how` see `open_sequence`."""
-    return [pair for pair in open_sequence(folder, **how) if isinstance(pair, StereoPair)]
+def clip(folder: Path, rig: str = "grey", channel: str = "grey") -> list[StereoPair]:
+    """The stereo pairs of a real clip; for the cameras see `open_sequence`."""
+    drive = open_sequence(folder, rig=rig, channel=channel)
+    return [pair for pair in drive if isinstance(pair, StereoPair)]
 
 
 def scenes_folder() -> Path:

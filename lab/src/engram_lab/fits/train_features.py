@@ -68,7 +68,7 @@ class Training:
             torch.tanh, ours, theirs, a, b
         )
         self._optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         self._optimiser.step()
         self.step += 1
         return loss.item(), right_share(ours, theirs, a, b)
@@ -151,7 +151,8 @@ def train(
                 rate_s = (time.monotonic() - began) / (training.step - first)
                 _note(out / f"{seed}.csv", training.step, recent, rate_s)
                 recent = []
-    return training.network.eval()
+    training.network.eval()
+    return training.network
 
 
 def _note(file: Path, step: int, recent: list[tuple[float, float]], rate_s: float) -> None:
