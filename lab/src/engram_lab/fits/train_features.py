@@ -152,7 +152,8 @@ def train(
                 _note(out / f"{seed}.csv", training.step, recent, rate_s)
                 recent = []
     training.network.eval()
-    return training.network
+    network: PatchNetwork = training.network
+    return network
 
 
 def _note(file: Path, step: int, recent: list[tuple[float, float]], rate_s: float) -> None:
