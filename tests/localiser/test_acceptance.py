@@ -7,7 +7,7 @@ from tests.synthetic_world import World, see
 from engram.frontend.matching import Match
 from engram.geometry import SE3
 from engram.localiser import AcceptanceConfig, Prediction, Spread, accept, accept_lost, plausible
-from engram.localiser.acceptance import inlier_spread
+from engram.localiser.spread import inlier_spread
 
 CONFIG = AcceptanceConfig()
 WIDE = Spread(0.5, 0.9, 10.0)

@@ -256,8 +256,8 @@ def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
         localiser.place_at(Position.at(nodes[4].id))  # some four metres too far on
         found = localised(localiser, live)
     where = [k for k, one in enumerate(found) if one.node is not None]
-    # Lost after ten metres; a second witness must be four metres on.
-    assert 20 <= where[0] <= 26
+    # Lost after ten metres; a weak match waits for a second one four metres on.
+    assert 14 <= where[0] <= 26
     assert where == list(range(where[0], 40))
     for k in where:
         node = next(n for n in range(len(nodes)) if nodes[n].id == found[k].node)

@@ -3,7 +3,7 @@
 from engram.localiser.acceptance import (
     AcceptanceConfig,
     Prediction,
-    Spread,
+    Rule,
     accept,
     accept_lost,
     agrees,
@@ -29,6 +29,7 @@ from engram.localiser.relocalisation import (
     spread,
 )
 from engram.localiser.settings import METHOD_VERSION, LocaliserConfig
+from engram.localiser.spread import Spread
 
 __all__ = [
     "KEEPS_NOTHING",
@@ -52,6 +53,7 @@ __all__ = [
     "Position",
     "Prediction",
     "Relocaliser",
+    "Rule",
     "Spread",
     "StageClock",
     "accept",

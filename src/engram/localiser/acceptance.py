@@ -5,15 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engram.errors import ConfigError
-from engram.frontend import Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
 from engram.graph.neighbourhood import Neighbourhood
+from engram.localiser.spread import Spread
+
+
+class Rule(StrEnum):
+    """What decides whether a match is a localisation."""
+
+    CONFIDENCE = "confidence"
+    INLIERS = "inliers"
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +30,16 @@ class AcceptanceConfig:
     Source of the values: SPEC §3, and trials on simulated drives (`lab/reports/constants.md`).
 
     Attributes:
+        rule: `confidence` weighs all evidence (`engram.localiser.confidence`); `inliers` is the
+            published rule, `min_inliers` near the prediction, and the stricter one below for a
+            lost robot.
+        min_confidence: least log-odds that a match is right which the position predicts; 4.6 is one
+            wrong in a hundred at the threshold, far fewer over all.
+        min_confidence_lost: the same of a match that nothing predicts: many such are tried.
+        sure_confidence: log-odds of one fix, without those before it, from which it is believed for
+            good.
+        settle_after_m: distance along which weaker fixes must agree to be believed for good,
+            metres. Until then a contradicting one withdraws them, and no edge rests on them.
         min_inliers: fewest inliers of a match with a prediction.
         min_inliers_lost: fewest inliers of a match without a prediction; above every wrong match
             that passes the other tests.
@@ -37,15 +54,15 @@ class AcceptanceConfig:
             robot found beyond the search radius of the node would be lost again.
         max_sigma_m: largest uncertainty of a match's position (root of the summed variances),
             metres. A match on few or distant landmarks determines the heading at best.
-        max_prediction_sigma_m: largest standard deviation of a prediction that supports a match,
-            metres. A less certain one also agrees with look-alikes: rows of lamps, trees or kerb
-            stones match one period off, consistently along the row.
-        usual_share: share of the usual inliers (median of the last matches) that a match needs if
-            the prediction is less certain; at least `min_inliers`, at most `min_inliers_lost`.
         slack_m, slack_rad: disagreement with the prediction allowed beyond three standard
             deviations. At larger values most additional matches are wrong.
     """
 
+    rule: Rule = Rule.CONFIDENCE
+    min_confidence: float = 4.0
+    min_confidence_lost: float = 6.5
+    sure_confidence: float = 12.0
+    settle_after_m: float = 10.0
     min_inliers: int = 20
     min_inliers_lost: int = 60
     min_inliers_plausible: int = 35
@@ -53,14 +70,14 @@ class AcceptanceConfig:
     min_height_lost: float = 0.4
     reach_m: float = 8.0
     max_sigma_m: float = 0.5
-    max_prediction_sigma_m: float = 1.0
-    usual_share: float = 0.4
     slack_m: float = 0.5
     slack_rad: float = float(np.deg2rad(5.0))
 
     def __post_init__(self) -> None:
         for one in fields(self):
             value = getattr(self, one.name)
+            if isinstance(value, Rule):
+                continue
             if not 0 <= value < np.inf:
                 raise ConfigError(f"acceptance: {one.name} is {value}, must be finite and >= 0")
 
@@ -89,21 +106,6 @@ class Prediction:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Extent of a match's inliers, from their 10th to their 90th percentile.
-
-    Attributes:
-        image: share of the image: geometric mean of the shares of its width and its height.
-        height: extent along the camera's y axis, as a share of that of all landmarks of the frame.
-        depth_m: median depth in front of the camera, metres.
-    """
-
-    image: float
-    height: float
-    depth_m: float
-
-
 def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bool:
     """Whether a match is a localisation: enough inliers, the expected pose, low uncertainty.
 
@@ -114,7 +116,7 @@ def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bo
     """
     if match.reference_from_live is None or match.inliers < config.min_inliers:
         return False
-    return agrees(match.reference_from_live, prediction, config) and _certain(match, config)
+    return agrees(match.reference_from_live, prediction, config) and determined(match, config)
 
 
 def agrees(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig) -> bool:
@@ -128,6 +130,12 @@ def agrees(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig
     cosine = 0.5 * (float(np.vdot(predicted.rotation, node_from_live.rotation)) - 1.0)
     turn_rad = math.acos(min(max(cosine, -1.0), 1.0))
     return turn_rad <= config.slack_rad + 3 * prediction.sigma_yaw_rad
+
+
+def apart(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig) -> float:
+    """Distance of a pose from its prediction over the standard deviation and a share of slack."""
+    apart_m = node_from_live.translation - prediction.node_from_live.translation
+    return float(np.linalg.norm(apart_m)) / math.hypot(prediction.sigma_m, config.slack_m / 3)
 
 
 def accept_lost(match: Match, spread: Callable[[], Spread], config: AcceptanceConfig) -> bool:
@@ -146,37 +154,14 @@ def plausible(match: Match, spread: Callable[[], Spread], config: AcceptanceConf
     pose = match.reference_from_live
     if pose is None or match.inliers < config.min_inliers_plausible:
         return False
-    if pose.distance_m > config.reach_m or not _certain(match, config):
+    if pose.distance_m > config.reach_m or not determined(match, config):
         return False
     over = spread()
     return over.image >= config.min_spread_lost and over.height >= config.min_height_lost
 
 
-def _certain(match: Match, config: AcceptanceConfig) -> bool:
-    """Whether the position of a match that has a pose is certain enough."""
+def determined(match: Match, config: AcceptanceConfig) -> bool:
+    """Whether a match that has a pose determines the position well enough."""
     assert match.covariance is not None
     x, y, z = match.covariance.diagonal()[:3].tolist()
     return bool(x + y + z <= config.max_sigma_m**2)
-
-
-def inlier_spread(match: Match, reference: Frame, live: Frame) -> Spread:
-    """The extent of a match's inliers; of each measure, the smaller of the two frames."""
-    if match.inliers == 0:
-        return Spread(0.0, 0.0, 0.0)
-    spreads = []
-    for frame, rows in ((reference, match.reference_rows), (live, match.live_rows)):
-        size = (frame.camera.width, frame.camera.height)
-        width, height = _extent(frame.landmarks.pixels[rows] / size).tolist()
-        height_m = frame.landmarks.points_in_cam[:, 1]
-        whole_m = max(float(_extent(height_m)), np.finfo(np.float64).tiny)
-        share = float(_extent(height_m[rows])) / whole_m
-        depth_m = float(np.median(frame.landmarks.points_in_cam[rows, 2]))
-        spreads.append((math.sqrt(width * height), share, depth_m))
-    return Spread(*(min(values) for values in zip(*spreads, strict=True)))
-
-
-def _extent(values: NDArray[np.floating]) -> NDArray[np.floating]:
-    """From the 10th to the 90th percentile, along the first axis."""
-    low, high = np.percentile(values, [10, 90], axis=0)
-    extent: NDArray[np.floating] = high - low
-    return extent

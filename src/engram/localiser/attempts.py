@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -17,13 +18,26 @@ from engram.geometry import SE3
 from engram.graph.model import LandmarkSource, NodeId
 from engram.localiser.acceptance import (
     Prediction,
-    Spread,
+    Rule,
     accept,
     accept_lost,
-    inlier_spread,
+    agrees,
+    apart,
+    determined,
     plausible,
 )
+from engram.localiser.confidence import (
+    UNKNOWN,
+    ConfidenceModel,
+    Evidence,
+    Standing,
+    confidence_of,
+)
 from engram.localiser.settings import LocaliserConfig
+from engram.localiser.spread import Spread, inlier_spread
+
+# Matches of fewer inliers are wrong or useless; their spread is not worth computing.
+_LEAST_WEIGHED = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +52,7 @@ class Candidate:
         row: its row in the neighbourhood; None when relocalising.
         doubted: whether the prediction may be wrong: the robot is lost, and has no nodes of its
             own that confirm its position.
-        needed: fewest inliers of a match if the prediction is too uncertain to support it; else 0.
+        standing: how far the robot's position can be relied on.
     """
 
     index: int
@@ -47,7 +61,7 @@ class Candidate:
     guided: bool
     row: int | None
     doubted: bool = False
-    needed: int = 0
+    standing: Standing = UNKNOWN
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,8 +73,10 @@ class Outcome:
         rank: its place in the order, from 0.
         match: its match with the live frame.
         accepted: whether the match is a localisation.
-        plausible: whether it would be one if another frame agreed; only for lost robots.
+        plausible: whether it would be one if another frame agreed.
         damaged: whether the node's landmarks are unreadable, which leaves nothing to match.
+        confidence: log-odds that the match is right.
+        evidence: what these were computed from; None without a pose.
     """
 
     candidate: Candidate
@@ -69,6 +85,8 @@ class Outcome:
     accepted: bool
     plausible: bool = False
     damaged: bool = False
+    confidence: float = -math.inf
+    evidence: Evidence | None = None
 
 
 class Matcher(Protocol):
@@ -181,19 +199,64 @@ class Attempter:
     def _judged(
         self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match
     ) -> Outcome:
-        prediction, acceptance = candidate.prediction, self._acceptance
-        enough = match.inliers >= candidate.needed
-        if prediction is not None and enough and accept(match, prediction, acceptance):
-            return Outcome(candidate, rank, match, accepted=True)
-        if prediction is not None and not candidate.doubted and not candidate.needed:
+        if match.reference_from_live is None:
             return Outcome(candidate, rank, match, accepted=False)
-        spread = partial(self._spread, live, live_id, candidate.node, match)
+        spread = cache(partial(self._spread, live, live_id, candidate.node, match))
+        evidence = self._evidence(live, candidate, match, spread)
+        model = confidence_of(live.descriptor)
+        readings = model.as_predicted(evidence), model.as_anywhere(evidence)
+        if self._acceptance.rule is Rule.CONFIDENCE:
+            accepted, waits = self._weighed(match, readings, model)
+        else:
+            accepted, waits = self._counted(candidate, match, spread)
         return Outcome(
-            candidate,
-            rank,
-            match,
-            accepted=prediction is None and accept_lost(match, spread, acceptance),
-            plausible=plausible(match, spread, acceptance),
+            candidate, rank, match, accepted, waits, confidence=max(readings), evidence=evidence
+        )
+
+    def _evidence(
+        self, live: Frame, candidate: Candidate, match: Match, spread: Callable[[], Spread]
+    ) -> Evidence:
+        assert match.reference_from_live is not None
+        assert match.covariance is not None
+        prediction, acceptance = candidate.prediction, self._acceptance
+        pose = match.reference_from_live
+        in_reach = pose.distance_m <= acceptance.reach_m
+        anywhere = in_reach and (prediction is None or candidate.doubted)
+        return Evidence(
+            match.inliers,
+            match.inliers / len(live.landmarks),
+            pose.distance_m,
+            math.sqrt(float(np.trace(match.covariance[:3, :3]))),
+            candidate.standing,
+            math.inf if prediction is None else prediction.sigma_m,
+            apart(pose, prediction, acceptance)
+            if prediction is not None and agrees(pose, prediction, acceptance)
+            else math.inf,
+            spread() if anywhere and match.inliers >= _LEAST_WEIGHED else None,
+        )
+
+    def _weighed(
+        self, match: Match, readings: tuple[float, float], model: ConfidenceModel
+    ) -> tuple[bool, bool]:
+        """Whether a match is a localisation, and whether it would be one with a second."""
+        acceptance = self._acceptance
+        if match.inliers < acceptance.min_inliers or not determined(match, acceptance):
+            return False, False
+        needed = acceptance.min_confidence, acceptance.min_confidence_lost
+        over = max(found - least for found, least in zip(readings, needed, strict=True))
+        return over >= 0, over >= -model.witness
+
+    def _counted(
+        self, candidate: Candidate, match: Match, spread: Callable[[], Spread]
+    ) -> tuple[bool, bool]:
+        """The same by the published rule, in inliers."""
+        acceptance, prediction = self._acceptance, candidate.prediction
+        if prediction is not None and accept(match, prediction, acceptance):
+            return True, False
+        anywhere = prediction is None or candidate.doubted
+        return (
+            prediction is None and accept_lost(match, spread, acceptance),
+            anywhere and plausible(match, spread, acceptance),
         )
 
     def _spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:

@@ -78,11 +78,12 @@ class Hypotheses:
             nodes += [node for node in near.nodes[order].tolist() if node not in nodes]
         return nodes
 
-    def judge(self, outcomes: list[Outcome]) -> list[Outcome]:
+    def judge(self, outcomes: list[Outcome], witness: float = 0.0) -> list[Outcome]:
         """Accepts plausible matches that agree with an earlier one; the others wait.
 
         Args:
             outcomes: of this frame's attempts; returned unchanged if one is already accepted.
+            witness: what agreement adds to the confidence of a match.
 
         Returns:
             The same outcomes, in their order.
@@ -101,7 +102,9 @@ class Hypotheses:
                 expected.append((new, self._predictions(new.position)))
                 self._waiting = [*self._waiting, new][-_MOST:]
         return [
-            replace(outcome, accepted=True) if outcome in confirmed else outcome
+            replace(outcome, accepted=True, confidence=outcome.confidence + witness)
+            if outcome in confirmed
+            else outcome
             for outcome in outcomes
         ]
 

@@ -19,12 +19,14 @@ class Hint:
             localiser's own count.
         guessed_m: standard deviation of the motion guessed since then, metres; infinite if the
             robot is only roughly known and must be found again.
+        agreed: number of fixes that confirm the position; 0 if it is only said to be.
         found: an earlier result for this frame, which is then not localised again.
     """
 
     position: Position | None = None
     open_loop_m: float | None = 0.0
     guessed_m: float = 0.0
+    agreed: int = 0
     found: Localisation | None = None
 
 

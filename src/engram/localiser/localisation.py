@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 from time import perf_counter
@@ -107,6 +108,8 @@ class Localisation:
         node_from_live: measured pose of the live camera in it; None unless `LOCALISED`.
         covariance: (6, 6) float64 of `node_from_live`, left perturbation, [translation, rotation].
         inliers: landmarks that agree with the pose, 0 unless `LOCALISED`.
+        confidence: log-odds that the match is right; of the best attempt if none was accepted,
+            -inf if none had a pose.
         attempts: match attempts made for this frame.
         proposed: attempts without a prediction, at nodes proposed to a lost robot. They cost a
             quarter of the others (`LocaliserConfig.lost_max_samples`).
@@ -118,6 +121,7 @@ class Localisation:
         looked_up: whether place recognition ran for this frame.
         damaged: candidates whose landmarks cannot be read, each reported once; the localiser skips
             them from then on. ``engram check`` gives details.
+        withdraws: stamps of earlier fixes that this one contradicts and that are withdrawn.
         saved: the node that the frame was saved as, if the robot maps.
         resumed: whether an interrupted run had processed this frame: no attempt was made, only the
             motion counts.
@@ -137,9 +141,11 @@ class Localisation:
     node_from_live: SE3 | None = None
     covariance: NDArray[np.float64] | None = None
     inliers: int = 0
+    confidence: float = -math.inf
     position: Position | None = None
     looked_up: bool = False
     damaged: tuple[NodeId, ...] = ()
+    withdraws: tuple[int, ...] = ()
     saved: NodeId | None = None
     resumed: bool = False
     late: bool = False
@@ -165,9 +171,11 @@ class Localisation:
             "node_stamp_ns": self.node_stamp_ns,
             "node_from_live": None if pose is None else pose.matrix().ravel().tolist(),
             "inliers": self.inliers,
+            "confidence": self.confidence if math.isfinite(self.confidence) else None,
             "attempts": self.attempts,
             "candidates": self.candidates,
             "open_loop_m": self.open_loop_m,
+            "withdraws": list(self.withdraws),
             "damaged": [str(node) for node in self.damaged],
             "ms": self.ms,
         }

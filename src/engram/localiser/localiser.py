@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -31,7 +31,7 @@ from engram.graph.model import (
 )
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.graph.paths import PathMemory
-from engram.localiser.acceptance import Prediction
+from engram.localiser.acceptance import Prediction, Rule, agrees
 from engram.localiser.attempts import (
     Attempter,
     Candidate,
@@ -40,6 +40,8 @@ from engram.localiser.attempts import (
     best_success,
     up_to_first_success,
 )
+from engram.localiser.chain import FixChain
+from engram.localiser.confidence import Record, Standing, confidence_of
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.keeper import KEEPS_NOTHING, Keeper
 from engram.localiser.localisation import (
@@ -62,8 +64,6 @@ from engram.ranking import (
 )
 
 _PREFETCH = 16
-# Number of fixes that show how many inliers are usual.
-_USUAL_OF = 20
 # Nodes near each weak match of a lost robot to try first: they would confirm it.
 _CONFIRMING = 6
 # For a drive without an id: equal input still gives equal results.
@@ -135,7 +135,11 @@ class Localiser:
             if budget.lanes > 1 and (threads if matcher is None else matcher.threads)
             else None
         )
-        self._fix_inliers: deque[int] = deque(maxlen=_USUAL_OF)
+        self._record = Record()
+        accepted = self.config.acceptance
+        self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
+        self._withdraws: tuple[int, ...] = ()
+        self._standing = Standing()
         self._hypotheses = Hypotheses(graph, self._nodes_near, self.config.acceptance)
         self._recent = RecentAttempts(self.config.recent)
         self._run = RunLog()
@@ -209,7 +213,11 @@ class Localiser:
         ]
 
     def place_at(
-        self, position: Position, open_loop_m: float | None = 0.0, guessed_m: float = 0.0
+        self,
+        position: Position,
+        open_loop_m: float | None = 0.0,
+        guessed_m: float = 0.0,
+        agreed: int = 0,
     ) -> None:
         """Sets the position, as an operator or another localiser would.
 
@@ -218,8 +226,11 @@ class Localiser:
             open_loop_m: distance driven since the last match with the map, metres; None keeps
                 the count.
             guessed_m: standard deviation of the motion guessed since then, metres.
+            agreed: number of fixes that confirm it; 0 for a position that is only said to be.
         """
         self.position = position
+        self._record.forget(agreed)
+        self._chain.settle()
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
         self._guessed_m2 = guessed_m**2
@@ -227,6 +238,8 @@ class Localiser:
     def lose(self) -> None:
         """Discards the position: the robot was restarted or carried elsewhere."""
         self.position = None
+        self._record.forget()
+        self._chain.settle()
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
@@ -259,6 +272,7 @@ class Localiser:
     def settle_in(self, node: NodeId) -> None:
         """Sets the position to `node`, as which the live frame was just saved (SPEC §4)."""
         self.position = Position.at(node)
+        self._record.settled()
         self._guessed_m2 = 0.0
 
     def localise(
@@ -281,7 +295,9 @@ class Localiser:
         """
         clock = clock or StageClock()
         self._new_damaged, self._near, self._looked_up = (), None, False
+        self._withdraws = ()
         self._recent.begin_frame(self._driven_m)
+        self._standing = self._record.standing
         outcomes: list[Outcome] = []
         if live.status is FrameStatus.OK:
             self._near = self._neighbourhood()
@@ -300,21 +316,24 @@ class Localiser:
                     break
             if self.config.success is Success.FIRST:
                 outcomes = up_to_first_success(outcomes)
-            outcomes = self._hypotheses.judge(self._without_damaged(outcomes))
+            outcomes = self._judged(live, outcomes)
             clock.lap("attempts")
             self._remember(live, self._near, outcomes)
-        success = self._conclude(outcomes)
+        success = self._conclude(live, outcomes)
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
 
-    def _conclude(self, outcomes: list[Outcome]) -> Outcome | None:
+    def _conclude(self, live: Frame, outcomes: list[Outcome]) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""
         self._outcomes = outcomes
         self._reference = None if self.position is None else self.position.node
         success = best_success(outcomes)
         if success is not None:
-            self._settle(success)
-        elif self._relocaliser is not None:
+            self._settle(live, success)
+            return success
+        if any(one.candidate.row is not None for one in outcomes):
+            self._record.missed()
+        if self._relocaliser is not None:
             self._relocaliser.failed(
                 [
                     one.candidate.index
@@ -322,7 +341,7 @@ class Localiser:
                     if one.candidate.prediction is None and not one.plausible
                 ]
             )
-        return success
+        return None
 
     def move(self, motion: Motion) -> None:
         """Propagates the position by the motion that led to the next frame (SPEC §3).
@@ -345,6 +364,7 @@ class Localiser:
             self._relocaliser.carry_on(None if motion.guessed_m else motion.prev_from_curr)
         if self.position is not None:
             self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
+        self._chain.carry_on(motion.prev_from_curr, motion.covariance)
 
     @property
     def certain(self) -> bool:
@@ -449,7 +469,14 @@ class Localiser:
         budget = self._budget.lost_attempts
         indices = self._hypotheses.nodes_near(_CONFIRMING) + self._proposals(live, budget, keeper)
         proposed = [
-            Candidate(index, self._graph.node(index).id, None, guided=False, row=None)
+            Candidate(
+                index,
+                self._graph.node(index).id,
+                None,
+                guided=False,
+                row=None,
+                standing=self._standing,
+            )
             for index in dict.fromkeys(indices)
             if index not in known | self._damaged
         ]
@@ -488,20 +515,18 @@ class Localiser:
         )
         # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
         doubted = self._lost and not (self.certain and self._own_session is not None)
-        needed = self._needed_inliers(prediction)
         return Candidate(
-            index, self._graph.node(index).id, prediction, guided, row, doubted, needed
+            index, self._graph.node(index).id, prediction, guided, row, doubted, self._standing
         )
 
-    def _needed_inliers(self, prediction: Prediction) -> int:
-        """Fewest inliers of a match if its prediction is too uncertain to support it; else 0."""
-        acceptance = self.config.acceptance
-        if prediction.sigma_m <= acceptance.max_prediction_sigma_m:
-            return 0
-        if not self._fix_inliers:
-            return acceptance.min_inliers_lost
-        usual = acceptance.usual_share * float(np.median(self._fix_inliers))
-        return int(np.clip(usual, acceptance.min_inliers, acceptance.min_inliers_lost))
+    def _judged(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
+        """Outcomes of readable nodes, with those accepted that an earlier match confirms."""
+        confirms = (
+            confidence_of(live.descriptor).witness
+            if self.config.acceptance.rule is Rule.CONFIDENCE
+            else 0.0
+        )
+        return self._hypotheses.judge(self._without_damaged(outcomes), confirms)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes; the others are reported, and not attempted again."""
@@ -540,18 +565,52 @@ class Localiser:
             len(live.landmarks),
         )
 
-    def _settle(self, success: Outcome) -> None:
+    def _settle(self, live: Frame, success: Outcome) -> None:
         """Sets the position to (n, ``T_n_q``) and the open loop to 0 (SPEC §3.3)."""
         node_from_live, covariance = success.match.reference_from_live, success.match.covariance
         assert node_from_live is not None
         assert covariance is not None
-        self.position = Position(success.candidate.node, node_from_live, covariance)
-        self._fix_inliers.append(success.match.inliers)
+        found = Position(success.candidate.node, node_from_live, covariance)
+        self._prove(live, success, found)
+        self.position = found
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
+
+    def _prove(self, live: Frame, success: Outcome, found: Position) -> None:
+        """Checks a fix against those before it; the weaker of two that contradict goes."""
+        evidence = success.evidence
+        assert evidence is not None
+        predicted = math.isfinite(evidence.apart)
+        before = self._chain.position or self.position
+        fits = True if predicted else self._agrees(found, before)
+        alone = confidence_of(live.descriptor).alone(evidence)
+        if fits is False or not self._standing.agreed:
+            withdraws = self._chain.begin(live.stamp_ns, found, alone)
+            self._withdraws = withdraws if fits is False else ()
+        else:
+            self._chain.join(live.stamp_ns, found, alone)
+        self._record.fixed(success.match.inliers, agrees=fits is True)
+
+    def _agrees(self, found: Position, before: Position | None) -> bool | None:
+        """Whether a match that nothing predicted agrees with a position; None if unknown."""
+        if before is None or not self.certain:
+            return None
+        a, b = self._graph.index(before.node), self._graph.index(found.node)
+        known = self._graph.predict(b, a)
+        if known is None:
+            return None
+        there = Position(found.node, *known).carried_on(before.node_from_live, before.covariance)
+        sigma_rad = float(np.sqrt(there.covariance[4, 4]))
+        prediction = Prediction(there.node_from_live, there.sigma_m, sigma_rad)
+        return agrees(found.node_from_live, prediction, self.config.acceptance)
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether the last fixes may still be withdrawn: no edge should rest on them yet."""
+        return self._chain.on_trial
 
     def _result(
         self,
@@ -570,6 +629,8 @@ class Localiser:
             position=self.position,
             looked_up=self._looked_up,
             damaged=self._new_damaged,
+            withdraws=self._withdraws,
+            confidence=max((one.confidence for one in self._outcomes), default=-math.inf),
             stage_ms=stage_ms,
         )
         if success is None:
@@ -583,6 +644,7 @@ class Localiser:
             node_from_live=success.match.reference_from_live,
             covariance=success.match.covariance,
             inliers=success.match.inliers,
+            confidence=success.confidence,
         )
 
     def _status_without_match(self) -> LocalisationStatus:

@@ -20,10 +20,10 @@ from engram.graph.model import (
     path_id,
 )
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
-from engram.localiser import Hint, Localisation, Localiser, Position
+from engram.localiser import Hint, Localisation, LocalisationStatus, Localiser, Position
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch
-from engram.mapper.memory import Memory
+from engram.mapper.memory import Memory, match_of
 from engram.mapper.saver import Records, Saver
 from engram.maps import StoredSession
 from engram.odometry import Motion
@@ -99,6 +99,8 @@ class Mapper(Memory):
         self._experience: list[NodeId] = []
         # Edges of loops closed since the last frame.
         self._closures: list[Edge] = []
+        # Edges that rest on fixes on trial.
+        self._waiting: list[Edge] = []
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
         """See `Keeper`: closes the loops found so far before the frame is localised."""
@@ -129,26 +131,58 @@ class Mapper(Memory):
         """
         if found.resumed:
             return found
-        edges = self._closures
+        edges = self._closures + self._proved(found)
         saved: Node | None = None
+        visit = match_of(found)
         if found.localised:
-            self._joined = True
-            edges += self._end_experience(found)
-            matched = match_edges(
-                self._graph, self._localiser.outcomes, self._localiser.config.acceptance
-            )
-            self._graph.add_edges(matched)
-            edges += matched
+            edges += self._join(found)
         elif self._worth_saving(live, found.motion):
             saved, laid = self._save(live, found.position)
             edges += laid
-        self._visit_match(live, found)
-        self._put(Records(node=saved, frame=live if saved else None, edges=edges))
+            visit = saved.id, PathEntryKind.SAVED
+        self._put(live, Records(node=saved, frame=live if saved else None, edges=edges), visit)
         if saved is None:
             return found
         if self._loops is not None:
             self._loops.ask(saved, live)
         return replace(found, saved=saved.id)
+
+    def withdrawn(self, found: Localisation) -> None:
+        """See `Keeper`: no edge rests on the match."""
+        super().withdrawn(found)
+        self._waiting.clear()
+
+    def _proved(self, found: Localisation) -> list[Edge]:
+        """Edges that waited for their fixes; dropped if the robot is lost before these agree."""
+        waiting, self._waiting = self._waiting, []
+        if self._localiser.on_trial and found.status is not LocalisationStatus.LOST:
+            self._waiting = waiting
+            return []
+        if self._localiser.on_trial or not waiting:
+            return []
+        self._graph.add_edges(waiting)
+        self._joined = True
+        chain = [self._graph.index(node) for node in self._experience]
+        edges = [*waiting, *tighten_chain(self._graph, chain)]
+        for edge in waiting:
+            edges += lay_proximity_edges(self._graph, self._graph.index(edge.b))
+        return edges
+
+    def _join(self, found: Localisation) -> list[Edge]:
+        """Ties the experience to the matched node, and the matched nodes to each other."""
+        matched = match_edges(
+            self._graph, self._localiser.outcomes, self._localiser.config.acceptance
+        )
+        if self._localiser.on_trial:
+            if not self._waiting and self._experience and self._since_saved is not None:
+                assert found.position is not None
+                matched.append(edge_through_live(self._since_saved, found.position, EdgeKind.TIE))
+            self._waiting += matched
+            return []
+        self._joined = True
+        edges = self._end_experience(found)
+        self._graph.add_edges(matched)
+        return edges + matched
 
     def finish(self) -> None:
         """See `Keeper`: waits for the lookups of the last saved nodes.
@@ -156,6 +190,7 @@ class Mapper(Memory):
         Raises:
             MapError: an earlier frame could not be written.
         """
+        super().finish()
         edges = self._close_loops(self._loops.finish()) if self._loops else []
         if edges:
             self._saver.put(Records(edges=edges))
@@ -217,14 +252,15 @@ class Mapper(Memory):
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
         elif not self._experience and position is not None and self._localiser.certain:
-            edges.append(_edge(position, node.id, EdgeKind.TIE))
+            tie = _edge(position, node.id, EdgeKind.TIE)
+            (self._waiting if self._localiser.on_trial else edges).append(tie)
             edges += self._edge_to_last_saved(position, node.id)
         self._graph.add_edges(edges)
         edges += lay_proximity_edges(self._graph, self._graph.index(node.id))
         self._experience.append(node.id)
         self._since_saved = Position.at(node.id)
-        self._localiser.settle_in(node.id)
-        self.walk.visit(node.id, PathEntryKind.SAVED, live.stamp_ns)
+        if not self._waiting:
+            self._localiser.settle_in(node.id)
         return node, edges
 
     def _close_loops(self, closures: list[Edge]) -> list[Edge]:

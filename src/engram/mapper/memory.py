@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,21 @@ from engram.odometry import Motion
 # Uncertainty of a resumed robot's pose in the node it last matched: the match basin is wide.
 _RESUMED_SIGMA_M = 3.0
 _RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
+
+
+@dataclass(slots=True)
+class _Held:
+    """What a frame adds, while the fixes that it rests on may be withdrawn.
+
+    Attributes:
+        stamp_ns: of the frame.
+        records: without path entries.
+        visit: the node that it adds to the path, and how; None if none.
+    """
+
+    stamp_ns: int
+    records: Records
+    visit: tuple[NodeId, PathEntryKind] | None
 
 
 class Walk:
@@ -45,7 +60,8 @@ class Walk:
 class Memory(Keeper):
     """Remembers a drive without saving a node: its path and its attempts.
 
-    The policies `path` and `recall` use them in later drives. Frames that an interrupted run had
+    The policies `path` and `recall` use them in later drives. What fixes on trial add is held back:
+    those that are withdrawn leave no trace. Frames that an interrupted run had
     remembered are only followed; the memory continues after them.
 
     Args:
@@ -61,6 +77,7 @@ class Memory(Keeper):
         self._localiser = localiser
         self._saver = saver
         self._stored = stored
+        self._held: list[_Held] = []
         self.walk = Walk(path)
         if stored is not None and stored.last_entry is not None:
             self.walk = Walk(path, stored.next_sequence, stored.last_entry.node)
@@ -83,23 +100,46 @@ class Memory(Keeper):
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """See `Keeper`."""
         if not found.resumed:
-            self._visit_match(live, found)
-            self._put(Records())
+            self._put(live, Records(), match_of(found))
         return found
+
+    def withdrawn(self, found: Localisation) -> None:
+        """See `Keeper`: the frame was not localised, and its attempts failed."""
+        for one in self._held:
+            if one.stamp_ns == found.stamp_ns:
+                failed = [replace(attempt, accepted=False) for attempt in one.records.attempts]
+                one.records, one.visit = replace(one.records, attempts=failed), None
+
+    def finish(self) -> None:
+        """See `Keeper`: what is still held back is kept."""
+        self._release()
 
     def _is_stored(self, stamp_ns: int) -> bool:
         """Whether an interrupted run processed the frame."""
         last_ns = None if self._stored is None else self._stored.last_stamp_ns
         return last_ns is not None and stamp_ns <= last_ns
 
-    def _visit_match(self, live: Frame, found: Localisation) -> None:
-        if found.node is not None:
-            self.walk.visit(found.node, PathEntryKind.MATCHED, live.stamp_ns)
+    def _put(
+        self, live: Frame, records: Records, visit: tuple[NodeId, PathEntryKind] | None
+    ) -> None:
+        """Adds the frame's attempts and its visit, and hands all to the saver once it is sure."""
+        records = replace(records, attempts=self._localiser.attempts())
+        self._held.append(_Held(live.stamp_ns, records, visit))
+        if not self._localiser.on_trial:
+            self._release()
+        else:
+            self._saver.hold(records)
 
-    def _put(self, records: Records) -> None:
-        """Adds the frame's path entries and attempts, and hands all to the saver."""
-        records = replace(
-            records, path_entries=self.walk.take_new(), attempts=self._localiser.attempts()
-        )
-        if records:
-            self._saver.put(records)
+    def _release(self) -> None:
+        held, self._held = self._held, []
+        for one in held:
+            if one.visit is not None:
+                self.walk.visit(*one.visit, one.stamp_ns)
+            records = replace(one.records, path_entries=self.walk.take_new())
+            if records:
+                self._saver.put(records)
+
+
+def match_of(found: Localisation) -> tuple[NodeId, PathEntryKind] | None:
+    """The visit of a localised frame; None for another."""
+    return None if found.node is None else (found.node, PathEntryKind.MATCHED)

@@ -149,8 +149,7 @@ class Saver:
         Raises:
             MapError: an earlier write failed, or too many wait to be written.
         """
-        if self.nodes is not None:
-            self.nodes.hold(records)
+        self.hold(records)
         self._raise_error()
         try:
             self._queue.put(records, block=self.waits)
@@ -158,6 +157,11 @@ class Saver:
             raise MapError(
                 f"{_QUEUE_LENGTH} frames wait to be saved: the disk is too slow for this drive"
             ) from None
+
+    def hold(self, records: Records) -> None:
+        """Keeps the frame of a node readable until it is put and written."""
+        if self.nodes is not None:
+            self.nodes.hold(records)
 
     def finish(self) -> None:
         """Writes the rest, checkpoints and ends the thread.

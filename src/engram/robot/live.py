@@ -237,6 +237,7 @@ class IntoMemory:
         self._map_path = Path(opened.location)
         self._spool: Spool | None = None
         self._saver: Saver | None = None
+        self._memory: Memory | None = None
 
     def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
         """See `Into`."""
@@ -251,13 +252,16 @@ class IntoMemory:
             mapper.memory_bytes,
         )
         self._saver = Saver(self._spool, checkpoint_every=mapper.checkpoint_every, waits=False)
-        return Memory(self.localiser, self._saver, path_id(session.id))
+        self._memory = Memory(self.localiser, self._saver, path_id(session.id))
+        return self._memory
 
     def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
         """See `Into`; the memory of an unfit drive is dropped."""
-        if self._saver is None or self._spool is None:
+        if self._saver is None or self._spool is None or self._memory is None:
             return
         try:
+            if well:
+                self._memory.finish()
             self._saver.finish()
         except MapError:
             if well:

@@ -161,6 +161,8 @@ class Robot:
         found = self._known(frame, motion)
         if found is None:
             found = self._localiser.localise(frame, deadline, self._keeper, clock)
+        for stamp_ns in found.withdraws:
+            self._withdraw_at(stamp_ns)
         found = self._keeper.keep(frame, found)
         if deadline is not None and time.perf_counter() > deadline:
             found = replace(found, late=True)
@@ -225,13 +227,20 @@ class Robot:
     def withdraw(self, found: Localisation) -> None:
         """Withdraws a result that a later frame disproved: no pose rests on it any more.
 
-        Callers that know better use it; the loop itself does not.
+        The loop calls it for `Localisation.withdraws`, and so may a caller that knows better.
         """
         self._track = deque(
             ((at, replace(one, position=None) if one is found else one) for at, one in self._track),
             _REMEMBERED,
         )
         self._keeper.withdrawn(found)
+
+    def _withdraw_at(self, stamp_ns: int) -> None:
+        """Withdraws the result of an earlier frame."""
+        for at_ns, found in self._track:
+            if at_ns == stamp_ns:
+                self.withdraw(found)
+                return
 
     def pose_at(self, stamp_ns: int) -> Position | None:
         """The position at a time between the robot's last frames, such as that of an image.
@@ -269,7 +278,7 @@ class Robot:
         if hint is None:
             return None
         if hint.position is not None:
-            self._localiser.place_at(hint.position, hint.open_loop_m, hint.guessed_m)
+            self._localiser.place_at(hint.position, hint.open_loop_m, hint.guessed_m, hint.agreed)
         return hint.found
 
     def _in_order(self, arrived: Arrived) -> bool:

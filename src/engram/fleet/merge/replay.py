@@ -60,6 +60,8 @@ _SEED_WITHIN_M = 30.0
 _MEASURED = frozenset({EdgeKind.ODOMETRY, EdgeKind.MATCH, EdgeKind.TIE, EdgeKind.BRIDGE})
 # Iterations between two segments of a session: matches of one are no evidence for the other.
 _ITERATION_GAP = 100
+# Fixes that a position counts for that the robot itself measured on its drive.
+_AGREED = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +202,7 @@ class Replay(Keeper):
         open_loop_m = 0.0
         if self._merge.is_apart(known.node):
             open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
-        return Hint(known, open_loop_m)
+        return Hint(known, open_loop_m, agreed=_AGREED)
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """See `Keeper`: omits or takes the node."""

@@ -1,0 +1,85 @@
+"""Small towns that nothing else is judged on: `confidence` is fitted on some, tried on others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+
+from engram.localiser import METHOD_VERSION
+from engram.monitor import QUIET, Monitor
+from engram.robot import Settings
+from engram_lab.misplaced import Street
+from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
+from engram_lab.town import Campaign, campaign_named
+from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
+
+FITTED_TOWNS = (301, 302, 303)
+HELD_OUT_TOWNS = (401, 402)
+LOOP_M = 200.0
+# Day, hour (UTC), weather and robot of each drive; two by night, one of them in rain.
+_DRIVES = (
+    (0, 8.5, "clear", "wildcat"), (0, 17.0, "clear", "courier"), (1, 11.0, "overcast", "wildcat"),
+    (1, 22.5, "fair", "wildcat"), (2, 10.0, "showers", "courier"), (2, 23.0, "rain", "wildcat"),
+)  # fmt: skip
+
+
+def trial_town(seed: int) -> Campaign:
+    """Six drives around one loop, in all kinds of light, by two kinds of robots."""
+    first = datetime(2025, 7, 14, tzinfo=UTC)
+    hamlet = campaign_named("hamlet", seed)
+    sessions = tuple(
+        replace(plan, start=first + timedelta(days=day, hours=hour), weather=weather, robot=robot)
+        for plan, (day, hour, weather, robot) in zip(hamlet.sessions, _DRIVES, strict=True)
+    )
+    return replace(hamlet, name="trial", home="trial", length_m=LOOP_M, sessions=sessions)
+
+
+# Each map is built from some drives, and localises another.
+_STREETS = (((0, 3), 1), ((2,), 0), ((2,), 4), ((1,), 2))
+
+
+def streets(
+    towns: Sequence[int], settings: Settings, lost_rounds: int, monitor: Monitor = QUIET
+) -> Iterator[tuple[str, Street]]:
+    """The streets of some towns by name; renders and maps what is not there yet.
+
+    Args:
+        towns: seeds.
+        settings: the configuration of maps and robots.
+        lost_rounds: budget of a lost robot.
+        monitor: hears of what is rendered.
+    """
+    for seed in towns:
+        drives = _drives(seed, settings, monitor)
+        for mapped, live in _STREETS:
+            yield _street(seed, drives, mapped, seed, drives[live], settings, lost_rounds)
+
+
+def other_towns(
+    towns: Sequence[int], settings: Settings, lost_rounds: int, monitor: Monitor = QUIET
+) -> Iterator[tuple[str, Street]]:
+    """The same with a drive of the next town in the map of each: nothing can be found there."""
+    for seed, other in zip(towns, [*towns[1:], *towns[:1]], strict=True):
+        if seed != other:
+            drives = _drives(seed, settings, monitor)
+            live = _drives(other, settings, monitor)[0]
+            yield _street(seed, drives, (2,), other, live, settings, lost_rounds)
+
+
+def _drives(seed: int, settings: Settings, monitor: Monitor) -> Sequence[EvaluatedDrive]:
+    folder, town = campaigns_folder(), trial_town(seed)
+    simulate(town, folder, settings=settings, monitor=monitor)
+    return drives_of(campaign_logs(town, folder))
+
+
+def _street(
+    seed: int, drives: Sequence[EvaluatedDrive], mapped: tuple[int, ...],
+    other: int, live: EvaluatedDrive, settings: Settings, lost_rounds: int,
+) -> tuple[str, Street]:  # fmt: skip
+    name = "".join(map(str, mapped))
+    folder = campaign_folder(campaigns_folder(), trial_town(seed))
+    path = folder / f"map{name}-{METHOD_VERSION}.engram"
+    some, same = [drives[k] for k in mapped], seed == other
+    street = Street(path, some, live, settings, lost_rounds, same_town=same)
+    return f"{seed}/{name}/{other}-{live.name[:3]}", street

@@ -1,0 +1,224 @@
+"""Robots that are wrong about where they are: told so, carried there unseen, or past a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.geometry import SE3
+from engram.graph.model import NodeId
+from engram.localiser import Budget, Localisation, Position
+from engram.localiser.attempts import Outcome
+from engram.maps import Map, open_map
+from engram.odometry import OdometryStatus, OdometryStep
+from engram.robot import Robot, Settings
+from engram.robot.front import Front
+from engram.robot.localisers import localiser_in
+from engram.sequences import LoggedFrame
+from engram_lab.studies.building import GENEROUS, build_map, true_nodes
+from engram_lab.studies.drives import EvaluatedDrive
+
+# A fix further from the truth is false.
+FALSE_M = 1.0
+FALSE_RAD = float(np.deg2rad(5.0))
+# A robot is misplaced by at least this much, told so with these standard deviations.
+OFF_M = 15.0
+SIGMAS_M = (0.1, 1.0, 3.0)
+SIGMA_RAD = float(np.deg2rad(2.0))
+# Frames that a robot drives before it is carried elsewhere, and after.
+_BEFORE, FRAMES = 15, 40
+
+
+class Kind(StrEnum):
+    """What happens to a robot."""
+
+    UNDISTURBED = "undisturbed"
+    TOLD = "told a wrong place"
+    CARRIED = "carried elsewhere"
+    GAP = "past a gap"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Try:
+    """One robot.
+
+    Attributes:
+        kind: what happens to it.
+        first: its first frame, or that after a gap or where it was carried to.
+        sigma_m: of a wrong place that it is told; 0 else.
+        seed: of where it is told to be, or was carried from.
+    """
+
+    kind: Kind
+    first: int
+    sigma_m: float = 0.0
+    seed: int = 0
+
+    @property
+    def key(self) -> tuple[str, int, float, int]:
+        """What tells it apart."""
+        return self.kind.value, self.first, self.sigma_m, self.seed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looked:
+    """One frame of such a robot.
+
+    Attributes:
+        found: the result.
+        outcomes: of its attempts.
+        frame: its number in the drive.
+        counts: whether it is one of the `FRAMES` after what happened.
+    """
+
+    found: Localisation
+    outcomes: list[Outcome]
+    frame: int
+    counts: bool
+
+
+class Street:
+    """A map and a drive in the same town, with truth.
+
+    Args:
+        path: where the map is kept; built if it is not there.
+        mapped: the drives that it is built from.
+        live: the drive to be localised.
+        settings: the configuration.
+        lost_rounds: budget of a lost robot.
+        same_town: whether the drive is one of the map's town; else every pose is false.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        mapped: Sequence[EvaluatedDrive],
+        live: EvaluatedDrive,
+        settings: Settings,
+        lost_rounds: int = Budget().lost_rounds,
+        *,
+        same_town: bool = True,
+    ) -> None:
+        self.opened: Map = open_map(build_map(path, mapped, settings, GENEROUS).path)
+        self.live, self.settings = live, settings
+        self._budget = Budget(lost_rounds=lost_rounds)
+        self.nodes = true_nodes(self.opened, mapped)
+        self.frames = live.frames()
+        self._same_town = same_town
+
+    def close(self) -> None:
+        """Closes the map."""
+        self.opened.close()
+
+    @cached_property
+    def truth(self) -> list[SE3]:
+        """world_from_live of each frame."""
+        truth = self.live.truth()
+        assert truth is not None
+        poses = [truth.at(one.frame.stamp_ns) for one in self.frames]
+        return [pose for pose in poses if pose is not None]
+
+    @cached_property
+    def _at_m(self) -> NDArray[np.float64]:
+        return np.array([pose.translation for pose in self.truth])
+
+    def error(self, frame: int, node: NodeId, node_from_live: SE3) -> tuple[float, float] | None:
+        """Error of a pose, metres and rad; None if the node's truth is unknown."""
+        if not self._same_town:
+            return np.inf, np.pi
+        world_from_node = self.nodes.pose(node)
+        if world_from_node is None:
+            return None
+        wrong = self.truth[frame].inverse() @ world_from_node @ node_from_live
+        return wrong.distance_m, wrong.angle_rad
+
+    def is_false(self, frame: int, node: NodeId, node_from_live: SE3) -> bool | None:
+        """Whether a pose is more than 1 m or 5° off; None if that is not known."""
+        error = self.error(frame, node, node_from_live)
+        return None if error is None else error[0] > FALSE_M or error[1] > FALSE_RAD
+
+    def run(self, one: Try, *, relocalises: bool = True) -> Iterator[Looked]:
+        """Drives the robot, frame by frame; `relocalises` if it looks for itself elsewhere."""
+        localiser = localiser_in(
+            self.opened,
+            self.live.camera,
+            self.settings,
+            budget=self._budget,
+            relocaliser="fabmap" if relocalises else None,
+            live=self.live.session.id,
+            threads=False,
+        )
+        with Robot(Front(self.settings), localiser) as robot:
+            shown = self._shown(one)
+            start = self._start(one, shown[0])
+            if start is not None:
+                robot.place_at(start)
+            for number, frame in enumerate(shown):
+                found = robot.step(self._logged(one, shown, number))
+                counts = one.kind is Kind.UNDISTURBED or number >= len(shown) - FRAMES
+                yield Looked(found, robot.outcomes, frame, counts)
+
+    def tries(self, kind: Kind, count: int, seed: int) -> list[Try]:
+        """So many robots, evenly along the drive."""
+        last = len(self.frames) - FRAMES
+        firsts = np.linspace(_BEFORE + 30, last, count).astype(int)
+        sigmas = [SIGMAS_M[k % 3] if kind is Kind.TOLD else 0.0 for k in range(count)]
+        return [
+            Try(kind, int(first), sigma, seed + k)
+            for k, (first, sigma) in enumerate(zip(firsts, sigmas, strict=True))
+        ]
+
+    def _shown(self, one: Try) -> list[int]:
+        """Numbers of the frames that the robot is shown."""
+        after = range(one.first, one.first + FRAMES)
+        if one.kind is Kind.UNDISTURBED:
+            return list(range(len(self.frames)))
+        if one.kind is Kind.CARRIED:
+            elsewhere = self._elsewhere(one)
+            first = max(elsewhere - _BEFORE, 0)
+            return [*range(first, first + _BEFORE), *after]
+        if one.kind is Kind.GAP:
+            gap = int(np.random.default_rng([one.seed, 7]).integers(5, 30))
+            last = max(one.first - gap, 1)
+            return [*range(max(last - _BEFORE, 0), last), *after]
+        return list(after)
+
+    def _start(self, one: Try, first: int) -> Position | None:
+        if one.kind is Kind.LOST:
+            return None
+        if one.kind is not Kind.TOLD:
+            return self.nodes.start(self.truth[first])
+        start = self.nodes.start(self.truth[self._elsewhere(one)])
+        spread = np.diag([one.sigma_m**2] * 3 + [SIGMA_RAD**2] * 3)
+        return None if start is None else replace(start, covariance=spread)
+
+    def _elsewhere(self, one: Try) -> int:
+        """A frame at least `OFF_M` from the first, seen the same way or not."""
+        apart_m = np.linalg.norm(self._at_m - self._at_m[one.first], axis=1)
+        rng = np.random.default_rng([one.seed, one.first])
+        return int(rng.choice(np.flatnonzero(apart_m >= OFF_M)))
+
+    def _logged(self, one: Try, shown: Sequence[int], number: int) -> LoggedFrame:
+        """A frame as the robot meets it.
+
+        Past a gap odometry fails. That of a carried robot reports its usual motion, and its clock
+        runs on: stamps before are moved to where it was carried to.
+        """
+        frame = shown[number]
+        logged, carried = self.frames[frame], one.kind is Kind.CARRIED
+        if number == 0:
+            logged = replace(logged, odometry=OdometryStep(OdometryStatus.FIRST))
+        elif frame != shown[number - 1] + 1 and not carried:
+            logged = replace(logged, odometry=OdometryStep(OdometryStatus.NO_CONSENSUS))
+        if not carried or number >= _BEFORE:
+            return logged
+        stamps = [self.frames[k].frame.stamp_ns for k in (one.first - 1, shown[_BEFORE - 1])]
+        stamp_ns = logged.frame.stamp_ns + stamps[0] - stamps[1]
+        return replace(logged, frame=replace(logged.frame, stamp_ns=stamp_ns))

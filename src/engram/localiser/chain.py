@@ -1,0 +1,75 @@
+"""Fixes are checked by fixes: a run of them is believed for good once it has proved itself.
+
+A street repeats, and matches one period off agree with each other for some metres. So the fixes
+since a robot was lost, or was told its place, are on trial. They settle once one of them is sure by
+itself, or once they have agreed along some way. A match that contradicts them before that withdraws
+them. If it comes later, the robot was rather carried elsewhere.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.geometry import SE3
+from engram.localiser.localisation import Position
+
+# A trial ends this far beyond the distance that settles it: nothing came that could contradict.
+_PATIENCE_M = 20.0
+
+
+class FixChain:
+    """The fixes that agree with each other, on trial until they settle.
+
+    Args:
+        sure_confidence: log-odds of one fix by itself that settle the chain.
+        settle_after_m: distance between agreeing fixes that settles it, metres.
+    """
+
+    def __init__(self, sure_confidence: float, settle_after_m: float) -> None:
+        self._sure = sure_confidence
+        self._after_m = settle_after_m
+        self._on_trial: list[int] = []
+        self._moved_m = 0.0
+        self.position: Position | None = None
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether the newest fixes may still be withdrawn."""
+        return bool(self._on_trial)
+
+    def begin(self, stamp_ns: int, found: Position, alone: float) -> tuple[int, ...]:
+        """A fix that agrees with none before it; returns the stamps of those on trial.
+
+        Args:
+            stamp_ns: stamp of its frame.
+            found: where it is.
+            alone: its confidence without the fixes before it.
+        """
+        before = tuple(self._on_trial)
+        self._on_trial, self._moved_m, self.position = [stamp_ns], 0.0, found
+        if alone >= self._sure:
+            self.settle()
+        return before
+
+    def join(self, stamp_ns: int, found: Position, alone: float) -> None:
+        """A fix that agrees with those before it; see `begin`."""
+        if not self._on_trial:
+            return
+        self._on_trial.append(stamp_ns)
+        self.position = found
+        if alone >= self._sure or self._moved_m >= self._after_m:
+            self.settle()
+
+    def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:
+        """Carries the trial on by the robot's motion."""
+        if self.position is None:
+            return
+        self.position = self.position.carried_on(prev_from_curr, covariance)
+        self._moved_m += prev_from_curr.distance_m
+        if self._moved_m > self._after_m + _PATIENCE_M:
+            self.settle()
+
+    def settle(self) -> None:
+        """The fixes stay, whatever comes."""
+        self._on_trial, self.position = [], None

@@ -1,0 +1,207 @@
+"""How sure a match is: the log-odds that it is right, from all that is known when it is judged.
+
+A street repeats: lamps, trees and kerb stones match one period off with twenty to thirty inliers,
+consistently and with small covariances. So the number of inliers says little by itself. It counts
+against what is usual for this camera, light and distance, and beside how well the robot's position
+was known before: a position that fixes have confirmed again and again supports a weak match, a hint
+that nothing has confirmed yet supports none.
+
+The model is additive. A match has two readings: as what the position predicts, and as that of a
+robot that may be anywhere. `CONFIDENCES` holds the weights for each kind of features, made and
+judged by ``python -m engram_lab.fits.confidence``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from engram.frontend import BRIEF, DescriptorKind
+from engram.localiser.spread import Spread
+
+# Number of fixes that show how many inliers are usual.
+_USUAL_OF = 20
+# Weight of the newest frame in the session's rate of success.
+_NEWEST = 0.05
+# Terms are bounded, so that no single one outweighs all others.
+_MOST_AGREED = 20
+_MOST_MISSED = 10.0
+_LEAST_SIGMA_M, _MOST_SIGMA_M = 0.05, 30.0
+_LEAST_RATIO, _MOST_RATIO = 0.03, 2.0
+_MOST_APART = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How far a robot's position can be relied on, before it looks.
+
+    Attributes:
+        agreed: number of fixes in a row that agreed with the position before them.
+        missed: expected number of fixes since the last one, had the position been right: the sum
+            of the session's rates of success.
+        usual_inliers: median of the session's last fixes; 0 before the first.
+    """
+
+    agreed: int = 0
+    missed: float = 0.0
+    usual_inliers: float = 0.0
+
+
+UNKNOWN = Standing()
+
+
+class Record:
+    """Keeps the standing of a robot up to date, frame by frame."""
+
+    def __init__(self) -> None:
+        self._inliers: deque[int] = deque(maxlen=_USUAL_OF)
+        self._agreed = 0
+        self._missed = 0.0
+        self._rate = 0.5
+
+    @property
+    def standing(self) -> Standing:
+        """The current one."""
+        usual = float(np.median(self._inliers)) if self._inliers else 0.0
+        return Standing(self._agreed, self._missed, usual)
+
+    def fixed(self, inliers: int, *, agrees: bool) -> None:
+        """A match was accepted; `agrees` if the position had predicted it."""
+        self._inliers.append(inliers)
+        self._agreed = self._agreed + 1 if agrees else 1
+        self._missed = 0.0
+        self._rate += _NEWEST * (1.0 - self._rate)
+
+    def missed(self) -> None:
+        """Attempts at the predicted position failed."""
+        self._missed += self._rate
+        self._rate -= _NEWEST * self._rate
+
+    def settled(self) -> None:
+        """The position is that of a node that was just saved."""
+        self._missed = 0.0
+
+    def forget(self, agreed: int = 0) -> None:
+        """The position comes from elsewhere, where so many fixes have confirmed it."""
+        self._agreed, self._missed = agreed, 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What is known of a match when it is judged.
+
+    Attributes:
+        inliers: landmarks that agree on the pose.
+        share: of the landmarks of the poorer frame.
+        distance_m: between live camera and node.
+        match_sigma_m: root of the summed variances of the position.
+        standing: of the robot.
+        sigma_m: standard deviation of the predicted position; infinite without a prediction.
+        apart: distance between measured and predicted position over `sigma_m` and a slack;
+            infinite if they contradict each other, or without a prediction.
+        spread: extent of the inliers; None if it was not needed.
+    """
+
+    inliers: int
+    share: float
+    distance_m: float
+    match_sigma_m: float
+    standing: Standing = UNKNOWN
+    sigma_m: float = math.inf
+    apart: float = math.inf
+    spread: Spread | None = None
+
+    def match_terms(self) -> tuple[float, ...]:
+        """Terms of the match itself; in both readings."""
+        usual = self.standing.usual_inliers
+        ratio = min(max(self.inliers / usual, _LEAST_RATIO), _MOST_RATIO) if usual else 1.0
+        return (
+            1.0,
+            math.log(self.inliers / 20.0),
+            math.log(ratio),
+            0.0 if usual else 1.0,
+            math.log(max(self.share, 1e-3)),
+            min(self.distance_m, 10.0),
+            math.log(min(max(self.match_sigma_m, 0.01), 1.0)),
+        )
+
+    def predicted_terms(self) -> tuple[float, ...]:
+        """Terms of the reading as what the position predicts."""
+        return (
+            *self.match_terms(),
+            math.log1p(min(self.standing.agreed, _MOST_AGREED)),
+            math.log1p(min(self.standing.missed, _MOST_MISSED)),
+            math.log(min(max(self.sigma_m, _LEAST_SIGMA_M), _MOST_SIGMA_M)),
+            min(self.apart, _MOST_APART),
+        )
+
+    def anywhere_terms(self) -> tuple[float, ...]:
+        """Terms of the reading as that of a robot that may be anywhere."""
+        spread = self.spread or Spread(0.0, 0.0, 0.0)
+        return (
+            *self.match_terms(),
+            math.log(max(spread.image, 0.02)),
+            math.log(max(min(spread.height, 1.0), 0.02)),
+        )
+
+
+PREDICTED_TERMS = (
+    "constant", "inliers", "ratio", "no usual", "share", "distance", "match sigma",
+    "agreed", "missed", "sigma", "apart",
+)  # fmt: skip
+ANYWHERE_TERMS = (*PREDICTED_TERMS[:7], "spread", "height")
+
+
+@dataclass(frozen=True, slots=True)
+class ConfidenceModel:
+    """Weights of the terms, one kind of features and one matcher.
+
+    Attributes:
+        predicted: of `Evidence.predicted_terms`.
+        anywhere: of `Evidence.anywhere_terms`.
+        witness: what a second match adds that agrees from some way on.
+    """
+
+    predicted: tuple[float, ...]
+    anywhere: tuple[float, ...]
+    witness: float
+
+    def as_predicted(self, evidence: Evidence) -> float:
+        """Log-odds of a match that agrees with its prediction; -inf if it does not."""
+        if not math.isfinite(evidence.apart):
+            return -math.inf
+        return _sum(self.predicted, evidence.predicted_terms())
+
+    def alone(self, evidence: Evidence) -> float:
+        """Log-odds of a match as if no fix had come before it."""
+        unproved = replace(evidence, standing=replace(evidence.standing, agreed=0))
+        return max(self.as_predicted(unproved), self.as_anywhere(evidence))
+
+    def as_anywhere(self, evidence: Evidence) -> float:
+        """Log-odds of a match whatever was predicted; -inf if the spread is not known."""
+        if evidence.spread is None:
+            return -math.inf
+        return _sum(self.anywhere, evidence.anywhere_terms())
+
+
+def _sum(weights: tuple[float, ...], terms: tuple[float, ...]) -> float:
+    return sum(map(float.__mul__, weights, terms))
+
+
+# Source: python -m engram_lab.fits.confidence
+_BRIEF = ConfidenceModel(
+    # constant, inliers, ratio, no usual, share, distance, match sigma, agreed, missed, sigma, apart
+    predicted=(10.61, 2.898, 1.719, -0.64, 1.928, 0.0, -0.484, 0.0, -0.575, -0.812, -1.485),
+    # constant, inliers, ratio, no usual, share, distance, match sigma, spread, height
+    anywhere=(10.441, 4.533, 1.227, -1.777, 1.848, 0.0, -0.131, 1.786, 0.771),
+    witness=3.0,
+)
+CONFIDENCES: dict[DescriptorKind, ConfidenceModel] = {BRIEF: _BRIEF}
+
+
+def confidence_of(kind: DescriptorKind) -> ConfidenceModel:
+    """The weights for a kind of features; those of BRIEF for a kind without its own."""
+    return CONFIDENCES.get(kind, _BRIEF)

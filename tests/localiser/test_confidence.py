@@ -1,0 +1,129 @@
+"""How sure a match is, and how fixes are checked by fixes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from uuid import UUID
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from engram.frontend import BRIEF
+from engram.geometry import SE3
+from engram.graph.model import NodeId
+from engram.localiser import Position, Spread
+from engram.localiser.chain import FixChain
+from engram.localiser.confidence import (
+    ANYWHERE_TERMS,
+    PREDICTED_TERMS,
+    Evidence,
+    Record,
+    Standing,
+    confidence_of,
+)
+
+MODEL = confidence_of(BRIEF)
+WIDE = Spread(0.5, 0.9, 10.0)
+SURE = 1e-6 * np.eye(6)
+
+
+def evidence(inliers: int = 60, **other: object) -> Evidence:
+    standing = Standing(agreed=5, usual_inliers=100.0)
+    expected = {"standing": standing, "sigma_m": 0.1, "apart": 0.3}
+    return Evidence(inliers, inliers / 500, 2.0, 0.05, **{**expected, **other})
+
+
+def test_there_is_a_weight_for_each_term() -> None:
+    assert len(PREDICTED_TERMS) == len(MODEL.predicted) == len(evidence().predicted_terms())
+    assert len(ANYWHERE_TERMS) == len(MODEL.anywhere) == len(evidence().anywhere_terms())
+
+
+@given(st.integers(12, 500), st.integers(1, 100))
+def test_more_inliers_are_never_less_sure(inliers: int, more: int) -> None:
+    few, many = (evidence(count, spread=WIDE) for count in (inliers, inliers + more))
+    assert MODEL.as_predicted(many) >= MODEL.as_predicted(few)
+    assert MODEL.as_anywhere(many) >= MODEL.as_anywhere(few)
+
+
+@pytest.mark.parametrize(
+    "doubt",
+    [
+        {"sigma_m": 3.0},
+        {"apart": 3.0},
+        {"standing": Standing(agreed=5, missed=8.0, usual_inliers=100.0)},
+        {"standing": Standing(agreed=5, usual_inliers=600.0)},
+    ],
+    ids=["vague position", "off the position", "fixes that did not come", "fewer than usual"],
+)
+def test_what_speaks_against_a_match_lowers_its_confidence(doubt: dict[str, object]) -> None:
+    assert MODEL.as_predicted(evidence(**doubt)) < MODEL.as_predicted(evidence())
+
+
+def test_a_match_has_only_the_readings_that_fit_it() -> None:
+    assert MODEL.as_predicted(evidence(apart=math.inf)) == -math.inf
+    assert MODEL.as_anywhere(evidence()) == -math.inf
+    assert math.isfinite(MODEL.as_anywhere(evidence(spread=WIDE)))
+
+
+def test_by_itself_a_match_is_not_surer_than_with_the_fixes_before_it() -> None:
+    found = evidence(spread=WIDE)
+    proved = max(MODEL.as_predicted(found), MODEL.as_anywhere(found))
+    assert MODEL.alone(found) <= proved
+
+
+def test_a_record_counts_agreeing_fixes_and_expects_as_many_as_usual() -> None:
+    record = Record()
+    for inliers in (80, 100, 120):
+        record.fixed(inliers, agrees=True)
+    assert record.standing == Standing(agreed=3, missed=0.0, usual_inliers=100.0)
+    record.missed()
+    before = record.standing.missed
+    record.missed()
+    assert 0.5 < before < record.standing.missed < 2
+    record.fixed(90, agrees=False)
+    assert replace(record.standing, usual_inliers=0.0) == Standing(agreed=1)
+    record.forget()
+    assert record.standing.agreed == 0
+    assert record.standing.usual_inliers == 95.0
+
+
+def at(metres: float) -> Position:
+    ahead = SE3(np.eye(3), np.array([0.0, 0.0, metres]))
+    return Position(NodeId(UUID(int=1)), ahead, SURE)
+
+
+def drive(chain: FixChain, metres: float) -> None:
+    chain.carry_on(at(metres).node_from_live, SURE)
+
+
+def test_weak_fixes_are_on_trial_until_they_agree_along_some_way() -> None:
+    chain = FixChain(sure_confidence=12.0, settle_after_m=10.0)
+    assert chain.begin(1, at(0.0), 5.0) == ()
+    drive(chain, 6.0)
+    chain.join(2, at(6.0), 6.0)
+    assert chain.on_trial
+    drive(chain, 5.0)
+    chain.join(3, at(11.0), 6.0)
+    assert not chain.on_trial
+    assert chain.begin(4, at(50.0), 5.0) == ()  # the robot was carried: what was proved stays
+
+
+def test_what_contradicts_fixes_on_trial_names_them() -> None:
+    chain = FixChain(sure_confidence=12.0, settle_after_m=10.0)
+    chain.begin(1, at(0.0), 5.0)
+    chain.join(2, at(0.5), 6.0)
+    assert chain.begin(3, at(30.0), 13.0) == (1, 2)
+    assert not chain.on_trial
+
+
+def test_a_trial_ends_where_nothing_comes() -> None:
+    chain = FixChain(sure_confidence=12.0, settle_after_m=10.0)
+    chain.begin(1, at(0.0), 5.0)
+    drive(chain, 5.0)
+    assert chain.position is not None
+    assert chain.position.node_from_live.distance_m == pytest.approx(5.0)
+    drive(chain, 26.0)
+    assert not chain.on_trial
