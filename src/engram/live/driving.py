@@ -151,6 +151,12 @@ class Driving:
             self._robot.lose()
         return "the robot looks for its place in the whole map"
 
+    def place(self, position: Position) -> str:
+        """Takes a position as a hint, such as the last one before a restart: it only proposes."""
+        self._belief = position
+        self._use_belief()
+        return "the hint is taken"
+
     def pause(self) -> str:
         """Closes robot and map, and so commits what was mapped; the next frame opens them again.
 
@@ -207,11 +213,17 @@ class Driving:
             self._map = None
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
             return None
+        self._use_belief()
+        self.trouble = ""
+        return self._robot
+
+    def _use_belief(self) -> None:
+        """Gives the robot the position that was kept, if its map knows the node."""
+        if self._robot is None or self._map is None:
+            return
         belief, self._belief = self._belief, None
         if belief is not None and belief.node in self._map.graph:
             self._robot.place_at(_vague(belief))
-        self.trouble = ""
-        return self._robot
 
     @staticmethod
     def _map_of(options: LiveOptions) -> Map:

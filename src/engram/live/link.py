@@ -15,7 +15,8 @@ The client sends:
   are.
 * ``{"do": "frame", "ticket": N, "stamp_ns": T}`` for a pair that was written to the ring.
 * ``{"do": "map", "on": true}``, ``{"do": "save"}``, ``{"do": "switch", "map": PATH}``,
-  ``{"do": "relocalise"}``, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer
+  ``{"do": "relocalise"}``, ``{"do": "place", "node": …, "node_from_live": …, "covariance": …}``
+  with an older belief as a hint, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer
   ``{"is": "reply", "id": …, "ok": …, "text": …}`` repeats.
 
 The process sends ``{"is": "seen", …}`` for each frame that it took and ``{"is": "alive", …}`` five
@@ -132,7 +133,7 @@ class Ring:
         ticket, self._next = self._next, self._next + 1
         at = self._at(ticket)
         _SLOT.pack_into(self._memory, at, 2 * ticket + 1, stamp_ns)
-        for pixels, image in zip(self._images(ticket), (left, right)):  # noqa: B905  # 3.8
+        for pixels, image in zip(self._images(ticket), (left, right)):  # 3.8
             pixels[...] = image
         _SLOT.pack_into(self._memory, at, 2 * ticket + 2, stamp_ns)
         return ticket

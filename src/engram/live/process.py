@@ -9,15 +9,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import EngramError
+from engram.errors import EngramError, InputError
 from engram.frontend import StereoPair
 from engram.geometry import SE3, propagate_covariance
+from engram.graph.model import NodeId
 from engram.live.driving import Driving, LiveOptions, Step
 from engram.live.transport import Command, FrameEvent, Message, Transport
+from engram.localiser import Position
 
 # Between two messages that the process is alive.
 _HEARTBEAT_S = 0.2
@@ -91,6 +94,7 @@ class LiveProcess:
             "save": lambda _: self._driving.pause() or "nothing was to be saved",
             "switch": lambda given: self._driving.switch(Path(str(given["map"]))),
             "relocalise": lambda _: self._driving.lose(),
+            "place": lambda given: self._driving.place(_position(given)),
         }
 
     def run(self) -> None:
@@ -150,6 +154,8 @@ class LiveProcess:
                 done, text = False, str(error)
             except KeyError as error:
                 done, text = False, f"{command.do} needs {error}"
+            except (TypeError, ValueError) as error:
+                done, text = False, f"{command.do} is not understood: {error}"
         reply = {"is": "reply", "id": command.id, "do": command.do, "ok": done, "text": text}
         self._transport.tell(reply)
         return True
@@ -201,6 +207,15 @@ def _found(step: Step) -> Message:
         said["node_from_live"] = _flat(found.position.node_from_live.matrix())
         said["covariance"] = _flat(found.position.covariance)
     return said
+
+
+def _position(given: Message) -> Position:
+    """The position of a message, as `_found` writes it."""
+    pose = SE3.from_matrix(np.array(given["node_from_live"], np.float64).reshape(4, 4))
+    covariance = np.array(given["covariance"], np.float64).reshape(6, 6)
+    if not np.isfinite(covariance).all():
+        raise InputError("the covariance of a position must be finite")
+    return Position(NodeId(UUID(str(given["node"]))), pose, covariance)
 
 
 def _flat(array: NDArray[np.float64]) -> list[float]:

@@ -1,0 +1,1 @@
+../../../src/engram/live/link.py

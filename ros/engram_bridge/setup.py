@@ -1,0 +1,21 @@
+"""Installs the bridge: colcon build --packages-select engram_msgs engram_bridge."""
+
+from setuptools import setup
+
+NAME = "engram_bridge"
+
+setup(
+    name=NAME,
+    version="0.2.0",
+    packages=[NAME],
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/" + NAME]),
+        ("share/" + NAME, ["package.xml"]),
+        ("share/" + NAME + "/launch", ["launch/engram.launch.py"]),
+        ("share/" + NAME + "/config", ["config/engram.yaml"]),
+    ],
+    install_requires=["setuptools", "numpy"],
+    zip_safe=True,
+    license="Apache-2.0",
+    entry_points={"console_scripts": ["bridge = engram_bridge.node:main"]},
+)

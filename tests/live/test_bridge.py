@@ -1,0 +1,281 @@
+"""The parts of the ROS 2 bridge that need no ROS: images, pairs, frames, and the watchdog."""
+
+from __future__ import annotations
+
+import ast
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import Queue
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import engram.live.link
+from engram.frontend import StereoPair
+from engram.geometry import SE3
+from engram.robot import map_drive, open_drive
+
+PACKAGE = Path(__file__).parents[2] / "ros" / "engram_bridge"
+if not PACKAGE.exists():
+    pytest.skip("the bridge is not part of this checkout", allow_module_level=True)
+sys.path.insert(0, str(PACKAGE))
+
+from engram_bridge import images, rigid  # noqa: E402
+from engram_bridge.belief import Belief  # noqa: E402
+from engram_bridge.pairs import Pairs  # noqa: E402
+from engram_bridge.supervisor import Supervisor  # noqa: E402
+
+TWIST = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6)
+LIVE = [sys.executable, "-c", "from engram.cli import main; main()", "live"]
+
+
+def image(encoding: str, rows: np.ndarray, pad: int = 0) -> Any:
+    """A sensor_msgs/Image, with padding at the end of each row."""
+    height, width = rows.shape[:2]
+    flat = rows.reshape(height, -1).view(np.uint8)
+    padded = np.pad(flat, ((0, 0), (0, pad)))
+    return SimpleNamespace(
+        encoding=encoding,
+        height=height,
+        width=width,
+        step=padded.shape[1],
+        data=padded.tobytes(),
+        is_bigendian=0,
+    )
+
+
+def test_the_link_is_the_same_file() -> None:
+    assert (PACKAGE / "engram_bridge" / "link.py").resolve() == Path(
+        str(engram.live.link.__file__)
+    ).resolve()
+
+
+def test_it_runs_on_python_3_8() -> None:
+    for path in (PACKAGE / "engram_bridge").glob("*.py"):
+        ast.parse(path.read_text(), feature_version=(3, 8))
+
+
+@pytest.mark.parametrize("pad", [0, 3])
+def test_grey_and_coloured_images(pad: int) -> None:
+    colours = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    wanted = cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY)
+    assert np.abs(images.grey(image("rgb8", colours, pad)).astype(int) - wanted).max() <= 1
+    assert (
+        np.abs(
+            images.grey(image("bgr8", colours[..., ::-1].copy(), pad)).astype(int) - wanted
+        ).max()
+        <= 1
+    )
+    np.testing.assert_array_equal(images.grey(image("mono8", wanted, pad)), wanted)
+    ten_bits = wanted.astype(np.uint16) << 2 | 3
+    ten_bits[0, 0] = 1023
+    np.testing.assert_array_equal(images.grey(image("mono16", ten_bits, 2 * pad))[1:], wanted[1:])
+
+
+def test_images_that_cannot_be_used_say_why() -> None:
+    with pytest.raises(images.ImageError, match="'32FC1' of a 7 × 5"):
+        images.grey(image("32FC1", np.zeros((5, 7, 4), np.uint8)))
+    short = image("mono8", np.zeros((5, 7), np.uint8))
+    short.data = short.data[:-1]
+    with pytest.raises(images.ImageError, match="34 bytes"):
+        images.grey(short)
+    with pytest.raises(images.ImageError, match="cannot be decoded"):
+        images.uncompressed(SimpleNamespace(format="png", data=b"none"))
+
+
+def test_compressed_images() -> None:
+    grey = np.random.default_rng(0).integers(0, 256, (5, 7), np.uint8)
+    data = cv2.imencode(".png", grey)[1].tobytes()
+    np.testing.assert_array_equal(
+        images.uncompressed(SimpleNamespace(format="png", data=data)), grey
+    )
+
+
+def test_pairs_are_of_one_instant() -> None:
+    pairs = Pairs(tolerance_ns=2)
+    assert pairs.add(0, 100, "l100") is None
+    assert pairs.add(1, 103, "r103") is None
+    assert pairs.add(1, 101, "r101") == (100, "l100", "r101")
+    assert pairs.add(0, 104, "l104") == (104, "l104", "r103")
+    assert pairs.single == 0
+
+
+def test_images_without_a_partner_do_not_pile_up() -> None:
+    pairs = Pairs(tolerance_ns=2, waiting=3)
+    for stamp in range(0, 1000, 10):
+        assert pairs.add(0, stamp, stamp) is None
+    assert pairs.single == 97
+
+
+@given(TWIST)
+def test_transforms_agree_with_engrams(twist: list[float]) -> None:
+    a_from_b = SE3.exp(twist)
+    matrix = a_from_b.matrix()
+    np.testing.assert_allclose(rigid.inverse(matrix), a_from_b.inverse().matrix(), atol=1e-12)
+    np.testing.assert_allclose(rigid.adjoint(matrix), a_from_b.adjoint(), atol=1e-12)
+    x, y, z, w = rigid.quaternion(matrix)
+    again = SE3.from_quaternion([w, x, y, z], matrix[:3, 3])
+    np.testing.assert_allclose(again.matrix(), matrix, atol=1e-9)
+
+
+def test_roll_pitch_yaw_are_those_of_urdf() -> None:
+    """The usual optical frame: x right, y down, z ahead on a robot whose x is ahead."""
+    optical = rigid.of_xyz_rpy([1.0, 2.0, 3.0, -np.pi / 2, 0.0, -np.pi / 2])
+    np.testing.assert_allclose(optical @ [0, 0, 1, 1], [2.0, 2.0, 3.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(optical @ [1, 0, 0, 1], [1.0, 1.0, 3.0, 1.0], atol=1e-12)
+
+
+@given(TWIST)
+def test_ros_states_covariance_at_the_childs_origin(twist: list[float]) -> None:
+    """Of position and rotation errors around b itself: turning it does not move it."""
+    a_from_b = SE3.exp(twist)
+    only_turns = np.zeros((6, 6))
+    only_turns[3:, 3:] = np.eye(3)
+    shift = SE3(np.eye(3), a_from_b.translation).adjoint()
+    moved = rigid.at_its_own_origin(a_from_b.matrix(), shift @ only_turns @ shift.T)
+    np.testing.assert_allclose(moved, only_turns, atol=1e-9)
+
+
+BASE_FROM_CAMERA = rigid.of_xyz_rpy([0.5, 0.1, 1.2, -np.pi / 2, 0.0, -np.pi / 2])
+
+
+def seen(
+    stamp_ns: int, ahead_m: float, status: str = "lost", map_from_live: SE3 | None = None
+) -> dict[str, Any]:
+    message: dict[str, Any] = {
+        "is": "seen",
+        "stamp_ns": stamp_ns,
+        "status": status,
+        "odom_from_live": SE3(np.eye(3), np.array([0.0, 0.0, ahead_m])).matrix().ravel().tolist(),
+        "odom_covariance": (np.eye(6) * 0.01 * ahead_m).ravel().tolist(),
+    }
+    if map_from_live is not None:
+        message["map_from_live"] = map_from_live.matrix().ravel().tolist()
+        message["map_covariance"] = (np.eye(6) * 0.01).ravel().tolist()
+    return message
+
+
+def test_odometry_does_not_jump_when_the_process_is_started_again() -> None:
+    belief = Belief(BASE_FROM_CAMERA)
+    for metre in range(4):
+        belief.hear(seen(metre, float(metre)), 0.0)
+    np.testing.assert_allclose(belief.odom_from_base[:3, 3], [3.0, 0.0, 0.0], atol=1e-12)
+    spread = np.trace(belief.odom_covariance)
+    belief.began()
+    belief.hear(seen(4, 0.0), 0.0)
+    np.testing.assert_allclose(belief.odom_from_base[:3, 3], [3.0, 0.0, 0.0], atol=1e-12)
+    belief.hear(seen(5, 1.0), 0.0)
+    np.testing.assert_allclose(belief.odom_from_base[:3, 3], [4.0, 0.0, 0.0], atol=1e-12)
+    assert np.trace(belief.odom_covariance) > spread
+
+
+def test_the_map_corrects_and_stays_while_nothing_is_seen() -> None:
+    belief = Belief(BASE_FROM_CAMERA)
+    belief.hear(seen(0, 0.0), 0.0)
+    assert belief.map_from_odom is None
+    assert belief.map_pose is None
+    map_from_base = np.eye(4)
+    map_from_base[:3, 3] = 10.0, 20.0, 0.0
+    map_from_live = SE3.from_matrix(map_from_base @ BASE_FROM_CAMERA)
+    belief.hear(seen(1, 1.0, "localised", map_from_live), 0.0)
+    kept = belief.map_from_odom
+    np.testing.assert_allclose((kept @ belief.odom_from_base)[:3, 3], [10.0, 20.0, 0.0], atol=1e-9)
+    assert belief.map_pose is not None
+    for ahead in range(2, 40):
+        belief.hear(seen(ahead, float(ahead), "lost", map_from_live), 0.0)
+        assert belief.map_pose is None, "no pose of a lost robot"
+    np.testing.assert_array_equal(belief.map_from_odom, kept)
+
+
+def test_the_report_never_pretends() -> None:
+    belief = Belief(BASE_FROM_CAMERA)
+    assert belief.report(0.0)[:2] == (2, "engram live has said nothing yet")
+    belief.hear({"is": "alive", "status": "localised", "trouble": ""}, 1.0)
+    assert belief.report(1.1)[:2] == (0, "localised")
+    assert belief.report(2.5)[0] == 2
+    belief.hear({"is": "alive", "status": "no images", "trouble": ""}, 3.0)
+    assert belief.report(3.1)[:2] == (2, "no images")
+    belief.hear({"is": "alive", "status": "lost", "trouble": ""}, 3.0)
+    assert belief.report(3.1)[:2] == (1, "lost")
+
+
+class Watched:
+    """A supervisor, and what it hears."""
+
+    def __init__(self, command: list[str]) -> None:
+        self.heard: Queue[dict[str, Any]] = Queue()
+        self.said: Queue[str] = Queue()
+        self.supervisor = Supervisor(command, self.heard.put, self.said.put)
+        self.supervisor.start()
+
+    def until(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        for _ in range(2_000):
+            message = self.heard.get(timeout=60)
+            if wanted(message):
+                return message
+        raise AssertionError("it was never said")
+
+    def seen(self, pair: StereoPair) -> dict[str, Any]:
+        assert self.supervisor.show(pair.stamp_ns, pair.left, pair.right)
+        return self.until(lambda one: one["is"] == "seen" and one["stamp_ns"] == pair.stamp_ns)
+
+
+@pytest.fixture(scope="module")
+def pairs(street: Path) -> list[StereoPair]:
+    return list(open_drive(street))[:6]  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def watched(street: Path, tmp_path: Path) -> Iterator[Watched]:
+    path = tmp_path / "street.engram"
+    map_drive(path, open_drive(street, frames="0:12:2"))
+    made = Watched([*LIVE, str(path), "--lanes", "1", "--rounds", "4"])
+    yield made
+    made.supervisor.close()
+
+
+def test_a_killed_process_is_started_again_with_its_last_belief(
+    watched: Watched, pairs: list[StereoPair]
+) -> None:
+    watched.until(lambda one: one["is"] == "alive")
+    camera = pairs[0].camera
+    names = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")
+    said = {name: getattr(camera, name) for name in names}
+    watched.supervisor.see(said, camera.width, camera.height)
+    found = [watched.seen(pair) for pair in pairs[:4]]
+    assert found[-1]["status"] == "localised"
+    os.kill(watched.supervisor.pid, signal.SIGKILL)
+    watched.until(lambda one: one["is"] == "hello")
+    reply = watched.until(lambda one: one["is"] == "reply" and one["do"] == "place")
+    assert reply["ok"], reply
+    assert watched.seen(pairs[4])["status"] == "localised"
+    assert "ended with -9" in watched.said.get(timeout=10)
+    assert watched.supervisor.restarts == 1
+
+
+def test_a_process_that_cannot_start_is_reported_and_tried_again() -> None:
+    watched = Watched([sys.executable, "-c", "import sys; sys.exit('no such map')"])
+    assert "ended with 1. no such map" in watched.said.get(timeout=30)
+    assert "ended with 1" in watched.said.get(timeout=30)
+    watched.supervisor.close()
+
+
+def test_a_process_that_hangs_is_killed() -> None:
+    """It listens and never says anything."""
+    hangs = (
+        "import socket, sys, threading\n"
+        "s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[-1]); s.listen(1)\n"
+        "threading.Event().wait()\n"
+    )
+    watched = Watched([sys.executable, "-c", hangs])
+    assert "said nothing for 1.0 s" in watched.said.get(timeout=60)
+    assert "ended with -9" in watched.said.get(timeout=60)
+    watched.supervisor.close()
