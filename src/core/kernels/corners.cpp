@@ -61,17 +61,13 @@ Corner *keep_maxima(const uint8_t *above, const uint8_t *middle, const uint8_t *
                larger(load<Bytes>(above + x + 1), load<Bytes>(middle + x - 1)));
     const Bytes later = larger(larger(load<Bytes>(below + x - 1), load<Bytes>(below + x)),
                                larger(load<Bytes>(below + x + 1), load<Bytes>(middle + x + 1)));
-    const Bytes kept = (Bytes)((score > floor) & (score >= earlier) & (score > later));
-    uint64_t eights[lanes / 8];
-    store(eights, kept);
-    for (int part = 0; part < lanes / 8; ++part)
-      for (uint64_t left = eights[part]; left != 0;) {
-        const int byte = __builtin_ctzll(left) / 8;
-        left &= ~(uint64_t{0xff} << (8 * byte));
-        const int64_t at = x + 8 * part + byte;
-        if (at < to)
-          *corners++ = {static_cast<int16_t>(at), static_cast<int16_t>(y), middle[at]};
-      }
+    uint64_t kept = bits_of((Bytes)((score > floor) & (score >= earlier) & (score > later)));
+    if (to - x < lanes)
+      kept &= (uint64_t{1} << (to - x)) - 1;
+    for (; kept != 0; kept &= kept - 1) {
+      const int64_t at = x + __builtin_ctzll(kept);
+      *corners++ = {static_cast<int16_t>(at), static_cast<int16_t>(y), middle[at]};
+    }
   }
   return corners;
 }
@@ -123,10 +119,18 @@ void order_corners(const Corner *corners, int64_t count, const Image &image, int
   const int64_t columns = (image.width + cell_px - 1) / cell_px;
   const int64_t cells = columns * ((image.height + cell_px - 1) / cell_px);
   const int64_t most_rounds = most_corners(cell_px, cell_px);
-  int32_t *by_score = scratch.room_for(2 * count + cells + most_rounds + 1);
+  int32_t *by_score =
+      scratch.room_for(2 * count + cells + most_rounds + 1 + image.width + image.height);
   int32_t *round_of = by_score + count;
   int32_t *in_cell = round_of + count;
   int32_t *start_of_round = in_cell + cells;
+  // A division for each pixel of a side, not two for each corner.
+  int32_t *column_of = start_of_round + most_rounds + 1;
+  int32_t *row_of = column_of + image.width;
+  for (int64_t x = 0; x < image.width; ++x)
+    column_of[x] = static_cast<int32_t>(x / cell_px);
+  for (int64_t y = 0; y < image.height; ++y)
+    row_of[y] = static_cast<int32_t>(y / cell_px * columns);
 
   // Best score first: a counting sort, which keeps raster order among equals.
   int32_t starts[257] = {};
@@ -141,7 +145,7 @@ void order_corners(const Corner *corners, int64_t count, const Image &image, int
   std::memset(in_cell, 0, (cells + most_rounds + 1) * sizeof(int32_t));
   for (int64_t i = 0; i < count; ++i) {
     const Corner &corner = corners[by_score[i]];
-    round_of[i] = in_cell[corner.y / cell_px * columns + corner.x / cell_px]++;
+    round_of[i] = in_cell[row_of[corner.y] + column_of[corner.x]]++;
     ++start_of_round[round_of[i] + 1];
   }
   for (int64_t round = 1; round <= most_rounds; ++round)

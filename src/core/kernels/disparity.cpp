@@ -4,6 +4,7 @@
 #include <cmath>
 
 #include "kernels/lanes.hpp"
+#include "kernels/stereo_window.hpp"
 
 namespace engram::ENGRAM_ISA {
 namespace {
@@ -13,42 +14,107 @@ constexpr int coarse_side = 2 * coarse_radius + 1;
 // Differences count up to this: occlusions and highlights cannot outvote the rest, and the sum over
 // a row of the window fits a byte.
 constexpr uint8_t coarse_cap = 255 / coarse_side;
-constexpr int most_candidates = 256;
-constexpr uint16_t impossible = 0xffff;
 
-// costs[k] = truncated SAD between the window whose upper left pixel is `window`, and that at
-// `searched` + k, for k in [0, count); garbage up to the next multiple of `lanes`.
-void scan_row(const uint8_t *window, const uint8_t *searched, int64_t stride, int count,
-              uint16_t *costs) {
-  for (int k = 0; k < count; k += lanes) {
+// Signed: every instruction set compares such; costs stay far below.
+typedef int16_t Costs __attribute__((vector_size(lanes)));
+constexpr int16_t impossible = 32767;
+
+// Costs of disparities k = 0, 1, …, even and odd ones apart, in vectors that hold `lanes` of them.
+template <int vectors> struct CostRow {
+  Costs even[vectors], odd[vectors];
+
+  // Calls work(costs, first, step) of each vector: its lanes are first, first + 2, ….
+  template <class Work> void each(Work work) {
+    for (int v = 0; v < vectors; ++v) {
+      work(even[v], v * lanes);
+      work(odd[v], v * lanes + 1);
+    }
+  }
+
+  // Makes disparities outside [from, to) impossible; drop(), those inside.
+  void keep(int from, int to) {
+    each([&](Costs &costs, int first) {
+      const Costs k = numbers() + static_cast<int16_t>(first);
+      costs = (k >= static_cast<int16_t>(from)) & (k < static_cast<int16_t>(to)) ? costs : none();
+    });
+  }
+  void drop(int from, int to) {
+    each([&](Costs &costs, int first) {
+      const Costs k = numbers() + static_cast<int16_t>(first);
+      costs = (k >= static_cast<int16_t>(from)) & (k < static_cast<int16_t>(to)) ? none() : costs;
+    });
+  }
+
+  int16_t least() {
+    Costs best = none();
+    each([&](const Costs &costs, int) { best = costs < best ? costs : best; });
+    return least_lane(best);
+  }
+
+  // The first disparity of a cost that occurs.
+  int first_of(int16_t cost) {
+    int first = vectors * lanes;
+    each([&](const Costs &costs, int from) {
+      if (const uint64_t bits = bits_of((Bytes)(costs == cost)); bits != 0)
+        first = std::min(first, from + __builtin_ctzll(bits)); // two bytes to a lane
+    });
+    return first;
+  }
+
+private:
+  static Costs none() { return Costs{} + impossible; }
+  static Costs numbers() {
+    Costs k;
+    for (int lane = 0; lane < lanes / 2; ++lane)
+      k[lane] = static_cast<int16_t>(2 * lane);
+    return k;
+  }
+  static int16_t least_lane(Costs costs) {
+    const auto least = [](auto a, auto b) { return a < b ? a : b; };
+#if defined(__AVX512BW__)
+    const auto half = least(
+        __builtin_shufflevector(costs, costs, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15),
+        __builtin_shufflevector(costs, costs, 16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28,
+                                29, 30, 31));
+#else
+    const auto half = costs;
+#endif
+#if defined(__AVX2__)
+    const auto eight = least(__builtin_shufflevector(half, half, 0, 1, 2, 3, 4, 5, 6, 7),
+                             __builtin_shufflevector(half, half, 8, 9, 10, 11, 12, 13, 14, 15));
+    return static_cast<int16_t>(_mm_extract_epi16(_mm_minpos_epu16((__m128i)eight), 0));
+#else
+    const auto four = least(half, __builtin_shufflevector(half, half, 4, 5, 6, 7, 0, 1, 2, 3));
+    const auto two = least(four, __builtin_shufflevector(four, four, 2, 3, 0, 1, 6, 7, 4, 5));
+    return two[0] < two[1] ? two[0] : two[1];
+#endif
+  }
+};
+
+// Truncated SAD between the window whose upper left pixel is `window`, and those at `searched` + k;
+// reads `lanes` · vectors pixels of each row.
+template <int vectors>
+CostRow<vectors> scan(const uint8_t *window, const uint8_t *searched, int64_t stride) {
+  CostRow<vectors> costs;
+  for (int v = 0; v < vectors; ++v) {
     Words even{}, odd{};
     for (int row = 0; row < coarse_side; ++row) {
       Bytes sum{};
       for (int column = 0; column < coarse_side; ++column) {
-        const Bytes there = load<Bytes>(searched + row * stride + column + k);
+        const Bytes there = load<Bytes>(searched + row * stride + column + v * lanes);
         sum += smaller(distance(all(window[row * stride + column]), there), all(coarse_cap));
       }
       even += (Words)sum & 255;
       odd += (Words)sum >> 8;
     }
-    uint16_t evens[lanes / 2], odds[lanes / 2];
-    store(evens, even);
-    store(odds, odd);
-    for (int pair = 0; pair < lanes / 2; ++pair) {
-      costs[k + 2 * pair] = evens[pair];
-      costs[k + 2 * pair + 1] = odds[pair];
-    }
+    costs.even[v] = (Costs)even;
+    costs.odd[v] = (Costs)odd;
   }
-}
-
-uint16_t least(const uint16_t *costs, int count) {
-  uint16_t best = impossible;
-  for (int k = 0; k < count; ++k)
-    best = costs[k] < best ? costs[k] : best;
-  return best;
+  return costs;
 }
 
 // The whole disparity at half resolution, or -1.
+template <int vectors>
 int search_half(const StereoImages &images, int64_t x, int64_t y, const StereoSettings &settings) {
   const int64_t width = images.left_half.width;
   const int most = static_cast<int>(std::min<int64_t>((settings.max_disparity_px + 1) / 2, x));
@@ -57,65 +123,68 @@ int search_half(const StereoImages &images, int64_t x, int64_t y, const StereoSe
   const uint8_t *left = images.left_half.pixels + window_at;
   const uint8_t *right = images.right_half.pixels + window_at;
 
-  uint16_t costs[most_candidates + 64];
-  scan_row(left + x, right + x - most, width, count, costs);
+  auto costs = scan<vectors>(left + x, right + x - most, width);
   // Windows that stick out of the image on the left.
   const int outside = std::max(0, static_cast<int>(most + coarse_radius - x));
-  std::fill(costs, costs + outside, impossible);
-  const uint16_t best = least(costs, count);
-  const int best_at = static_cast<int>(std::find(costs, costs + count, best) - costs);
+  costs.keep(outside, count);
+  const int16_t best = costs.least();
+  const int best_at = costs.first_of(best);
   if (best_at <= outside || best_at >= count - 1)
     return -1;
-  const int from = std::max(0, best_at - 2), to = std::min(count, best_at + 3);
-  std::fill(costs + from, costs + to, impossible);
-  if (static_cast<float>(best) >= settings.uniqueness * least(costs, count))
+  costs.drop(best_at - 2, best_at + 3);
+  const int16_t next = costs.least();
+  constexpr float kNothingElse = 65535;
+  if (static_cast<float>(best) >=
+      settings.uniqueness * (next == impossible ? kNothingElse : static_cast<float>(next)))
     return -1;
 
   // Left-right check: seen from the right image, nothing else fits better.
   const int disparity = most - best_at;
   const int64_t right_x = x - disparity;
   const int inside = static_cast<int>(std::min<int64_t>(count, width - coarse_radius - right_x + 1));
-  scan_row(right + right_x, left + right_x - 1, width, inside, costs); // disparities -1, 0, …
-  const uint16_t mutual = least(costs + disparity, std::min(3, inside - disparity));
-  return mutual == least(costs, inside) ? disparity : -1;
+  auto back = scan<vectors>(right + right_x, left + right_x - 1, width); // disparities -1, 0, …
+  back.keep(0, inside);
+  const int16_t least = back.least();
+  back.keep(disparity, std::min(disparity + 3, inside));
+  return back.least() == least ? disparity : -1;
 }
 
-constexpr int fine_width = 16, fine_height = 9, fine_pixels = fine_width * fine_height;
+int search_half(const StereoImages &images, int64_t x, int64_t y, const StereoSettings &settings) {
+  // As few vectors as hold them all: a scan reads no farther past its row than rows are below it.
+  const int64_t count = std::min<int64_t>((settings.max_disparity_px + 1) / 2, x) + 2;
+  return count <= 64    ? search_half<64 / lanes>(images, x, y, settings)
+         : count <= 128 ? search_half<128 / lanes>(images, x, y, settings)
+                        : search_half<256 / lanes>(images, x, y, settings);
+}
+
 constexpr int fine_left = fine_width / 2, fine_above = fine_height / 2;
-
-int sum_of_differences(const uint8_t *left, const uint8_t *right, int64_t stride) {
-  int sum = 0;
-  for (int row = 0; row < fine_height; ++row, left += stride, right += stride)
-    for (int column = 0; column < fine_width; ++column)
-      sum += std::abs(left[column] - right[column]);
-  return sum;
-}
 
 // The left window: its values and twice their horizontal gradient.
 struct Template {
-  int16_t value[fine_pixels], gradient[fine_pixels];
+  FineWindow value, gradient;
   int32_t gradient_sum;
   int64_t gradient_energy; // fine_pixels · Σ (G − mean G)²
   int64_t value_energy;    // fine_pixels · Σ (L − mean L)²
 };
 
 Template take_template(const uint8_t *left, int64_t stride) {
+  const Pixels ones = Pixels{} + int16_t{1};
   Template window;
-  int32_t sum = 0, squares = 0, value_sum = 0, value_squares = 0;
-  for (int row = 0; row < fine_height; ++row)
-    for (int column = 0; column < fine_width; ++column) {
-      const uint8_t *pixel = left + row * stride + column;
-      const auto gradient = static_cast<int16_t>(pixel[1] - pixel[-1]);
-      window.value[row * fine_width + column] = *pixel;
-      window.gradient[row * fine_width + column] = gradient;
-      sum += gradient;
-      squares += gradient * gradient;
-      value_sum += *pixel;
-      value_squares += *pixel * *pixel;
-    }
+  Totals sums{}, squares{}, value_sums{}, value_squares{};
+  for (int part = 0; part < kWindowParts; ++part) {
+    const Pixels value = window.value[part] = pixels_of(left, stride, part);
+    const Pixels gradient = window.gradient[part] =
+        pixels_of(left + 1, stride, part) - pixels_of(left - 1, stride, part);
+    sums = plus_products(sums, gradient, ones);
+    squares = plus_products(squares, gradient, gradient);
+    value_sums = plus_products(value_sums, value, ones);
+    value_squares = plus_products(value_squares, value, value);
+  }
+  const int32_t sum = total_of(sums), value_sum = total_of(value_sums);
   window.gradient_sum = sum;
-  window.gradient_energy = int64_t{fine_pixels} * squares - int64_t{sum} * sum;
-  window.value_energy = int64_t{fine_pixels} * value_squares - int64_t{value_sum} * value_sum;
+  window.gradient_energy = int64_t{fine_pixels} * total_of(squares) - int64_t{sum} * sum;
+  window.value_energy =
+      int64_t{fine_pixels} * total_of(value_squares) - int64_t{value_sum} * value_sum;
   return window;
 }
 
@@ -125,17 +194,17 @@ struct Residual {
 };
 
 Residual compare(const Template &window, const uint8_t *right, int64_t stride) {
-  int32_t sum = 0, squares = 0, products = 0;
-  for (int row = 0; row < fine_height; ++row, right += stride)
-    for (int column = 0; column < fine_width; ++column) {
-      const int at = row * fine_width + column;
-      const auto residual = static_cast<int16_t>(window.value[at] - right[column]);
-      sum += residual;
-      squares += residual * residual;
-      products += residual * window.gradient[at];
-    }
-  return {int64_t{fine_pixels} * products - int64_t{window.gradient_sum} * sum,
-          int64_t{fine_pixels} * squares - int64_t{sum} * sum};
+  const Pixels ones = Pixels{} + int16_t{1};
+  Totals sums{}, squares{}, products{};
+  for (int part = 0; part < kWindowParts; ++part) {
+    const Pixels residual = window.value[part] - pixels_of(right, stride, part);
+    sums = plus_products(sums, residual, ones);
+    squares = plus_products(squares, residual, residual);
+    products = plus_products(products, residual, window.gradient[part]);
+  }
+  const int32_t sum = total_of(sums);
+  return {int64_t{fine_pixels} * total_of(products) - int64_t{window.gradient_sum} * sum,
+          int64_t{fine_pixels} * total_of(squares) - int64_t{sum} * sum};
 }
 
 // What no shift explains of the residual, times fine_pixels.

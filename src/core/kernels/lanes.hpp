@@ -4,6 +4,12 @@
 
 #include <cstdint>
 
+#ifdef __SSE2__
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
 namespace engram::ENGRAM_ISA {
 
 #if defined(__AVX512BW__)
@@ -33,5 +39,28 @@ inline Bytes larger(Bytes a, Bytes b) { return a > b ? a : b; }
 inline Bytes difference_or_zero(Bytes a, Bytes b) { return larger(a, b) - b; }
 inline Bytes distance(Bytes a, Bytes b) { return larger(a, b) - smaller(a, b); }
 inline Bytes all(uint8_t value) { return Bytes{} + value; }
+
+// Bit k says whether byte k of a mask is set.
+inline uint64_t bits_of(Bytes mask) {
+#if defined(__AVX512BW__)
+  return _mm512_movepi8_mask((__m512i)mask);
+#elif defined(__AVX2__)
+  return static_cast<uint32_t>(_mm256_movemask_epi8((__m256i)mask));
+#elif defined(__SSE2__)
+  return static_cast<uint32_t>(_mm_movemask_epi8((__m128i)mask));
+#else
+  const Bytes bit = {1, 2, 4, 8, 16, 32, 64, 128, 1, 2, 4, 8, 16, 32, 64, 128};
+  const Bytes held = mask & bit;
+#if defined(__aarch64__)
+  return vaddv_u8(vget_low_u8((uint8x16_t)held)) |
+         static_cast<uint64_t>(vaddv_u8(vget_high_u8((uint8x16_t)held))) << 8;
+#else
+  uint64_t bits = 0;
+  for (int lane = 0; lane < lanes; ++lane)
+    bits |= static_cast<uint64_t>(held[lane]) << (lane & 8);
+  return bits;
+#endif
+#endif
+}
 
 } // namespace engram::ENGRAM_ISA
