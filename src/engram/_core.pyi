@@ -30,6 +30,18 @@ def measure_disparities(
     sigma_floor_px: float,
     sigma_scale: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+def quantise_landmarks(
+    pixels: NDArray[np.float32],
+    disparity_px: NDArray[np.float32],
+    sigma_px: NDArray[np.float32],
+    quantum_px: float,
+    sigma_table: NDArray[np.float32],
+    sigma_borders: NDArray[np.float32],
+    camera: tuple[float, float, float, float, float],
+) -> (
+    tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]] | None
+): ...
+def thumbnail(image: NDArray[np.uint8], width_px: int) -> NDArray[np.uint8]: ...
 def extract(
     left: NDArray[np.uint8],
     right: NDArray[np.uint8],

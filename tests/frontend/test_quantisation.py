@@ -14,6 +14,7 @@ from engram.frontend.quantisation import (
     landmarks_from_codes,
     pixel_quantum,
     quantise,
+    quantised_landmarks,
 )
 from engram.geometry import StereoCamera
 
@@ -51,6 +52,26 @@ def test_rounding_errs_by_half_a_quantum_at_most(pixels, disparity, sigma) -> No
     assert np.abs(stored[1] - disparity).max() <= quantum / 2
     # Half a logarithmic step is 2^(1/64): 1.1 %; the rest is the rounding of float32.
     assert np.abs(np.log2(stored[2] / sigma)).max() <= 1 / 64 + 1e-6
+
+
+@given(
+    arrays(np.float32, (9, 2), elements=st.floats(-1, 1100, width=32)),
+    arrays(np.float32, 9, elements=st.floats(-1, 1100, width=32)),
+    arrays(np.float32, 9, elements=st.floats(0, 8, width=32)),
+)
+def test_one_call_gives_the_same_landmarks_to_the_bit(pixels, disparity, sigma) -> None:
+    camera = StereoCamera(301.7, 299.3, 255.1, 190.7, 0.31, 512, 384)
+    descriptors, octaves = np.zeros((9, 32), np.uint8), np.zeros(9, np.uint8)
+    try:
+        codes = quantise(pixels, disparity, sigma, pixel_quantum(512, 384))
+    except InputError:
+        with pytest.raises(InputError):
+            quantised_landmarks(pixels, disparity, sigma, descriptors, octaves, camera)
+        return
+    expected = landmarks_from_codes(codes, descriptors, octaves, camera)
+    found = quantised_landmarks(pixels, disparity, sigma, descriptors, octaves, camera)
+    for name in ("pixels", "disparity_px", "disparity_sigma_px", "points_in_cam"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 @given(sizes, sizes)

@@ -1,5 +1,8 @@
 #include "kernels/extraction.hpp"
 
+#include <nanobind/stl/array.h>
+
+#include <array>
 #include <stdexcept>
 #include <string>
 
@@ -7,6 +10,7 @@
 #include "kernels/brief.hpp"
 #include "kernels/corners.hpp"
 #include "kernels/pyramid.hpp"
+#include "kernels/quantise.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -207,6 +211,58 @@ auto extract(const GreyImage &left_array, const GreyImage &right_array, int land
                         engram::to_numpy(std::move(levels), {count}), counts.corners);
 }
 
+// Of any detector's keypoints, ours or another's.
+nb::object quantise_landmarks(const engram::Input<float, 2> &pixels,
+                              const engram::Input<float, 1> &disparities,
+                              const engram::Input<float, 1> &sigmas, float quantum_px,
+                              const engram::Input<float, 1> &sigma_table,
+                              const engram::Input<float, 1> &sigma_borders,
+                              const std::array<double, 5> &camera) {
+  const size_t count = pixels.shape(0);
+  require(pixels.shape(1) == 2 && disparities.shape(0) == count && sigmas.shape(0) == count,
+          "pixels (N, 2), disparities (N,) and their sigmas (N,) are needed");
+  require(sigma_table.shape(0) == sigma_borders.shape(0) + 1 && sigma_borders.shape(0) > 0,
+          "between two values of sigma lies one border");
+  std::vector<float> seen(pixels.data(), pixels.data() + 2 * count), points(3 * count);
+  std::vector<float> disparity(disparities.data(), disparities.data() + count);
+  std::vector<float> sigma(sigmas.data(), sigmas.data() + count);
+  bool fits;
+  {
+    nb::gil_scoped_release unlocked;
+    fits = ENGRAM_CALL(quantise_landmarks,
+                       {static_cast<int64_t>(count), seen.data(), disparity.data(), sigma.data(),
+                        points.data()},
+                       {quantum_px, sigma_table.data(), sigma_borders.data(),
+                        static_cast<int>(sigma_table.shape(0))},
+                       {camera[0], camera[1], camera[2], camera[3], camera[4]});
+  }
+  if (!fits)
+    return nb::none();
+  return nb::make_tuple(engram::to_numpy(std::move(seen), {count, 2}),
+                        engram::to_numpy(std::move(disparity), {count}),
+                        engram::to_numpy(std::move(sigma), {count}),
+                        engram::to_numpy(std::move(points), {count, 3}));
+}
+
+// The image, halved until it is at most so wide.
+auto thumbnail(const GreyImage &array, int width_px) {
+  Image image = view(array);
+  require(width_px >= 1, "width_px must be at least 1");
+  std::vector<uint8_t> small;
+  {
+    nb::gil_scoped_release unlocked;
+    while (image.width > width_px && image.height > 1) {
+      std::vector<uint8_t> half = half_of(image);
+      small.swap(half);
+      image = {small.data(), image.width / 2, image.height / 2};
+    }
+    if (small.empty())
+      small.assign(image.pixels, image.pixels + image.width * image.height);
+  }
+  return engram::to_numpy(std::move(small), {static_cast<size_t>(image.height),
+                                             static_cast<size_t>(image.width)});
+}
+
 } // namespace
 
 void bind_extraction(nb::module_ &module) {
@@ -223,6 +279,12 @@ void bind_extraction(nb::module_ &module) {
              "max_disparity_px"_a, "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a,
              "sigma_floor_px"_a, "sigma_scale"_a,
              "Disparities and σ (N,) float32 px at corners (N, 2) int16; 0 where there is none.");
+  module.def("quantise_landmarks", &quantise_landmarks, "pixels"_a, "disparity_px"_a, "sigma_px"_a,
+             "quantum_px"_a, "sigma_table"_a, "sigma_borders"_a, "camera"_a,
+             "Pixels (N, 2), disparities (N,) and σ (N,) as their codes have them, and points "
+             "(N, 3), all float32; None where one has no code. Camera: fx, fy, cx, cy, baseline.");
+  module.def("thumbnail", &thumbnail, "image"_a, "width_px"_a,
+             "The image, halved until it is at most width_px wide.");
   module.def("extract", &extract, "left"_a, "right"_a, "landmarks"_a, "octaves"_a,
              "fast_threshold"_a, "cell_px"_a, "with_descriptors"_a, "max_disparity_px"_a,
              "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a, "sigma_floor_px"_a,

@@ -15,7 +15,7 @@ from engram.errors import ConfigError, IncompatibleError, SequenceError
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
 from engram.frontend.masking import clear_of_body, without_body
-from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
+from engram.frontend.quantisation import quantised_landmarks
 
 # Raise it when equal settings give different landmarks.
 FRONTEND_VERSION = 1
@@ -107,15 +107,20 @@ class Frontend:
         descriptors = found.descriptors
         if descriptors is None:
             descriptors = kind.describe(pair.left, found.pixels, found.octaves)
-        quantum_px = pixel_quantum(pair.camera.width, pair.camera.height)
-        codes = quantise(found.pixels, found.disparity_px, found.sigma_px, quantum_px)
         return Frame(
             stamp_ns=pair.stamp_ns,
             camera=pair.camera,
-            landmarks=landmarks_from_codes(codes, descriptors, found.octaves, pair.camera),
+            landmarks=quantised_landmarks(
+                found.pixels,
+                found.disparity_px,
+                found.sigma_px,
+                descriptors,
+                found.octaves,
+                pair.camera,
+            ),
             descriptor=config.descriptor,
             frontend=self.hash,
-            status=self._status(pair, len(codes), found.candidates),
+            status=self._status(pair, len(found.pixels), found.candidates),
             thumbnail=make_thumbnail(pair.left) if config.thumbnails else None,
         )
 
@@ -139,10 +144,7 @@ class Frontend:
 
 def make_thumbnail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The (h, w) uint8 image, halved until it is at most 160 px wide."""
-    small = image
-    while small.shape[1] > _THUMBNAIL_WIDTH_PX and small.shape[0] > 1:
-        small = _core.halve(small)
-    return small if small is not image else image.copy()
+    return _core.thumbnail(image, _THUMBNAIL_WIDTH_PX)
 
 
 def _landmarks_for(image: NDArray[np.uint8], at_512x384: int) -> int:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.errors import InputError
 from engram.frontend.frame import Landmarks
 from engram.geometry import StereoCamera
@@ -103,6 +104,41 @@ def dequantise(
     """
     step = np.float32(quantum_px)
     return codes.pixels * step, codes.disparity * step, SIGMA_TABLE_PX[codes.sigma]
+
+
+def quantised_landmarks(
+    pixels: NDArray[np.float32],
+    disparity_px: NDArray[np.float32],
+    disparity_sigma_px: NDArray[np.float32],
+    descriptors: NDArray[np.uint8],
+    octaves: NDArray[np.uint8],
+    camera: StereoCamera,
+) -> Landmarks:
+    """N landmarks as they will be stored: `quantise`, then `landmarks_from_codes`, in one call.
+
+    Args:
+        pixels, disparity_px, disparity_sigma_px: as for `quantise`, of any detector.
+        descriptors: (N, B) uint8.
+        octaves: (N,) uint8.
+        camera: the camera that saw them.
+
+    Raises:
+        InputError: a pixel or disparity is not finite, negative or too large for 16 bits.
+    """
+    quantum_px = pixel_quantum(camera.width, camera.height)
+    quantised = _core.quantise_landmarks(
+        pixels,
+        disparity_px,
+        disparity_sigma_px,
+        quantum_px,
+        SIGMA_TABLE_PX,
+        _SIGMA_BORDERS_PX,
+        (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m),
+    )
+    if quantised is None:  # it is said which
+        codes = quantise(pixels, disparity_px, disparity_sigma_px, quantum_px)
+        return landmarks_from_codes(codes, descriptors, octaves, camera)
+    return Landmarks(*quantised, descriptors, octaves)
 
 
 def landmarks_from_codes(
