@@ -7,6 +7,7 @@ write-ahead log while the writer still uses it.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import stat
 from collections.abc import Callable, Collection, Iterator
@@ -35,6 +36,8 @@ from engram.errors import (
 
 _OLDEST_SQLITE = (3, 37, 0)  # knows STRICT tables
 _CACHE_KIB = 8192
+# Bytes of one value or row: a vocabulary is the largest.
+_LONGEST_VALUE = 256 * 2**20
 
 _FULL = {
     sqlite3.SQLITE_FULL,
@@ -43,6 +46,16 @@ _FULL = {
     sqlite3.SQLITE_IOERR_FSYNC,
     sqlite3.SQLITE_IOERR_SHMSIZE,
 }
+
+# Definitions of tables and indices that hold names, types and keys, and nothing to evaluate.
+_NAME = r'(?:"\w+"|\w+)'
+_NAMES = rf"\( ?{_NAME}(?:, ?{_NAME})* ?\)"
+_COLUMN = rf"{_NAME} (?:INTEGER|BIGINT|REAL|TEXT|BLOB)(?: NOT NULL)?"
+_PART = rf"\s*(?:{_COLUMN}|PRIMARY KEY {_NAMES}|UNIQUE {_NAMES})\s*"
+_PLAIN = re.compile(
+    rf"CREATE TABLE {_NAME} \({_PART}(?:,{_PART})*\)\s*STRICT\s*"
+    rf"|CREATE INDEX {_NAME} ON {_NAME} {_NAMES}"
+)
 
 # Runs one statement on an open connection, of SQLAlchemy or of SQLite.
 Execute: TypeAlias = Callable[[str], Any]
@@ -141,7 +154,10 @@ class SqliteFile:
         execute(f"PRAGMA user_version={self.kind.format_version}")
 
     def check_tables(self, execute: Execute, missing: Collection[str] = ()) -> None:
-        """Refuses files with other tables or columns, or with views and triggers.
+        """Refuses files with other tables or columns, or with anything that SQLite would evaluate.
+
+        Definitions are compared as text, before any table is touched: defaults, checks, generated
+        columns, partial indices, views, triggers and virtual tables of a stranger never run.
 
         Args:
             execute: `execute` of an open connection; temporary tables may replace missing ones.
@@ -150,6 +166,12 @@ class SqliteFile:
         Raises:
             MapCorruptError: other tables, or other columns.
         """
+        for name, definition in execute("SELECT name, sql FROM sqlite_schema").fetchall():
+            if definition is not None and not _PLAIN.fullmatch(str(definition)):
+                raise MapCorruptError(
+                    f"{self.path}: {str(name)!r:.60} is not a plain table or index; "
+                    f"{self.kind.cure}"
+                )
         expected = self.kind.metadata.tables.keys() - set(missing)
         found = execute("SELECT type, name FROM sqlite_schema WHERE type != 'index'").fetchall()
         here = {(str(kind), str(name)) for kind, name in found}
@@ -188,6 +210,8 @@ class SqliteFile:
         )
         try:
             connection.execute("PRAGMA trusted_schema=OFF")  # call no functions of the file
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+            connection.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
             connection.execute("PRAGMA cell_size_check=ON")
             connection.execute("PRAGMA synchronous=FULL")
             connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")

@@ -13,9 +13,13 @@ from engram.centre.access.enrolment import add_person, new_code
 from engram.centre.access.roles import Role
 from engram.centre.api.app import create_app
 from engram.centre.service import Centre, MapPolicy
+from engram.centre.worker import merging
+from engram.centre.worker.admission import write_checked
 from engram.centre.worker.loop import work_off
 from engram.fleet.merge import MergeOptions
 from engram.maps import Map, open_map
+
+from .faults import FlakyClient
 
 NAME = "fleet"
 # Random descriptors match nothing: what is tested here is who has what, not where.
@@ -37,28 +41,59 @@ class Clock:
 
 
 class Site:
-    """A centre with its HTTP interface and its worker, in one process."""
+    """A centre with its HTTP interface and its worker in one process, and robots.
+
+    `restart` is what a kill leaves: everything is opened again from disk.
+    """
 
     def __init__(self, folder: Path, **options: object) -> None:
         self.folder = folder
         self.clock = Clock()
         self.options = options
-        self.centre = Centre(folder / "centre", clock=self.clock, **options)
+        self.agents: dict[str, Agent] = {}
+        self._open()
         self.centre.add_map(NAME, "tests", POLICY)
+
+    def _open(self) -> None:
+        self.centre = Centre(self.folder / "centre", clock=self.clock, **self.options)
         self.http = TestClient(create_app(self.centre))
+        self.link = FlakyClient(self.http)
+
+    def restart(self) -> None:
+        self.close()
+        self._open()
+        for name in self.agents:
+            self.agents[name] = self._agent(name)
+
+    def close(self) -> None:
+        self.centre.close()
+        for agent in self.agents.values():
+            agent.close()
 
     def token(self, role: Role | str, name: str = NAME) -> dict[str, str]:
         return {"Authorization": f"Bearer {add_person(self.centre, role, name, Role(role))}"}
 
-    def robot(self, name: str, follows: str = "head", **options: object) -> Agent:
-        folder = self.folder / name
-        enrol(
-            folder, "http://centre", new_code(self.centre, NAME, follows, "tests"), name, self.http
-        )
-        return Agent(folder, client=self.http, chance=lambda: 0.0, **options)
+    def robot(self, name: str, follows: str = "head") -> Agent:
+        """A robot that has enrolled."""
+        if name not in self.agents:
+            code = new_code(self.centre, NAME, follows, "tests")
+            enrol(self.folder / name, "http://centre", code, name, self.http)
+            self.agents[name] = self._agent(name)
+        return self.agents[name]
+
+    def _agent(self, name: str) -> Agent:
+        return Agent(self.folder / name, client=self.link, chance=lambda: 0.0)
 
     def work(self) -> int:
         return work_off(self.centre)
+
+    def settle(self) -> None:
+        """Until nobody has anything to do."""
+        for _ in range(20):
+            waits = [agent.step() for agent in self.agents.values()]
+            if not self.work() and min(waits, default=1.0) > 0:
+                return
+        raise AssertionError([agent.status() for agent in self.agents.values()])
 
     def content(self) -> str:
         with Map.open(self.centre.map_path(NAME)) as store:
@@ -78,4 +113,14 @@ def drive(path: Path, robot: str, start_ns: int, nodes: int = 3) -> None:
 def site(tmp_path):
     found = Site(tmp_path)
     yield found
-    found.centre.close()
+    found.close()
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Admission without a process of its own: the same steps, and faults reach them."""
+    monkeypatch.setattr(merging, "admit", admit_here)
+
+
+def admit_here(manifest, parts, path, *limits) -> None:
+    write_checked(manifest, parts, path)

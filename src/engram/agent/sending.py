@@ -124,7 +124,7 @@ class Outbox:
             if body is not None:
                 yield body
                 continue
-            if self._whole is None:
+            if self._whole is None or one not in self._whole:
                 self._whole = split(self._live)
             yield from self._whole.parts([one])
 

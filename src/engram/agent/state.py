@@ -49,6 +49,9 @@ class AgentState:
         except BaseException:
             self._connection.execute("ROLLBACK")
             raise
+        self._commit()
+
+    def _commit(self) -> None:
         self._connection.execute("COMMIT")
 
     def fact(self, name: str, default: Any = None) -> Any:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
 from typing import Any
 
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Request
 from fastapi.responses import PlainTextResponse
 from sqlalchemy import func, select
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from engram import __version__
 from engram.centre.api import maps, robots, transfers
@@ -33,18 +34,33 @@ def create_app(centre: Centre) -> FastAPI:
         app.include_router(part.router, prefix="/v1")
     app.add_api_route("/v1/health", _health, tags=["service"])
     app.add_api_route("/v1/metrics", _metrics, tags=["service"], response_class=PlainTextResponse)
-    app.middleware("http")(_counted)
+    app.add_middleware(_Counting)
     return app
 
 
-async def _counted(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
-    started = time.perf_counter()
-    response = await answer(request)
-    request.app.state.seconds += time.perf_counter() - started
-    request.app.state.answers[response.status_code] += 1
-    response.headers["X-Content-Type-Options"] = "nosniff"
-    response.headers["Cache-Control"] = response.headers.get("Cache-Control", "no-store")
-    return response
+class _Counting:
+    """Counts answers and their time, and adds headers that every answer has."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = time.perf_counter()
+
+        async def answer(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                state = scope["app"].state
+                state.answers[message["status"]] += 1
+                state.seconds += time.perf_counter() - started
+                headers = MutableHeaders(scope=message)
+                headers["X-Content-Type-Options"] = "nosniff"
+                headers.setdefault("Cache-Control", "no-store")
+            await send(message)
+
+        await self._app(scope, receive, answer)
 
 
 def _health(centre: CentreHere) -> dict[str, Any]:

@@ -65,7 +65,7 @@ def diff(
 ) -> Any:
     """What changed between two revisions."""
     with Map.open(centre.map_path(name)) as store:
-        return plain(store.diff(before, after))
+        return store.diff(before, after).to_dict()
 
 
 @router.get("/maps/{name}/blame/{node}", dependencies=PEOPLE)

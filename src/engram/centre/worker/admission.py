@@ -38,7 +38,8 @@ def admit(
         MapCorruptError: the parts make no sound map.
         WorkerError: the limits ended the process.
     """
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
     pipe, theirs = context.Pipe()
     size = sum(map(len, parts.values()))
     limits = (memory_bytes + 3 * size, time_s, 3 * size + 2**26)
@@ -68,14 +69,23 @@ def _admit(pipe: Connection, limits: tuple[int, int, int]) -> None:
     confine(*limits)
     outcome: EngramError | None = None
     try:
-        join(manifest, parts.get, path, thin=True)
-        problems = check_file(path, thin=True).problems
-        if problems:
-            shown = "; ".join(map(str, problems[:_SHOWN_PROBLEMS]))
-            outcome = MapCorruptError(f"{len(problems)} faults: {shown}")
+        write_checked(manifest, parts, path)
     except EngramError as error:
         outcome = MapCorruptError(str(error))
     pipe.send(outcome)
+
+
+def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) -> None:
+    """What the process does: joins the parts, and verifies every record.
+
+    Raises:
+        MapCorruptError: the parts make no sound map.
+    """
+    join(manifest, parts.get, path, thin=True)
+    problems = check_file(path, thin=True).problems
+    if problems:
+        shown = "; ".join(map(str, problems[:_SHOWN_PROBLEMS]))
+        raise MapCorruptError(f"{len(problems)} faults: {shown}")
 
 
 def confine(memory_bytes: int, time_s: int, file_bytes: int) -> None:

@@ -92,20 +92,21 @@ def _settle(centre: Centre, handins: HandIns, row: dict[str, Any], report: Merge
     revision = report.revision
     if revision is None:  # nothing new; or a worker died between the merge and this row
         revision = _revision_of(centre.map_path(row["map"]), row["content_hash"])
+        report.revision = revision
     handins.end(row, HandInState.MERGED, revision=revision, report=told)
     policy: MapPolicy = centre.policy(row["map"])
-    if policy.moves is not None and revision is not None and not row["ungated"]:
+    if policy.moves is not None and revision and not row["ungated"]:
         Refs(centre).move(row["map"], policy.moves, revision, "gate", None)
 
 
-def _revision_of(path: Path, content_hash: str) -> int | None:
-    """The revision that merged a map of this content; None if none did."""
+def _revision_of(path: Path, content_hash: str) -> int:
+    """The revision that holds a map of this content: the one that merged it, or the newest."""
     with Map.open(path) as store:
         for one in store.log():
             merged = one.configuration.get("merge")
             if isinstance(merged, dict) and merged.get("source") == content_hash:
                 return one.number
-    return None
+        return store.revision
 
 
 @contextmanager

@@ -1,0 +1,235 @@
+"""Every route, asked by everybody: what a role may not do is refused, whatever the map."""
+
+from __future__ import annotations
+
+import pytest
+
+from engram.centre.access.enrolment import disable, new_code
+from engram.centre.access.roles import Role
+from engram.centre.serving import Listening
+from engram.centre.store.audit import first_broken
+from engram.centre.store.schema import audit
+from engram.errors import ConfigError
+
+from .conftest import NAME, POLICY, drive
+
+ANYBODY = frozenset({None, "viewer", "robot", "operator", "admin"})
+KNOWN = ANYBODY - {None}
+PEOPLE = frozenset({"viewer", "operator", "admin"})
+OPERATORS = frozenset({"operator", "admin"})
+# Who may ask; `own` is the robot that handed in or asked for the thing.
+ROUTES = {
+    "get /v1/health": ANYBODY,
+    "get /v1/metrics": ANYBODY,
+    "post /v1/robots/enrol": ANYBODY,
+    "post /v1/token/nonce": ANYBODY,
+    "post /v1/token": ANYBODY,
+    "get /v1/me": KNOWN,
+    "get /v1/maps": KNOWN,
+    "get /v1/maps/{name}": KNOWN,
+    "get /v1/maps/{name}/revisions": KNOWN,
+    "get /v1/maps/{name}/refs": KNOWN,
+    "get /v1/maps/{name}/refs/{ref}": KNOWN,
+    "put /v1/maps/{name}/refs/{ref}": OPERATORS,
+    "delete /v1/maps/{name}/refs/{ref}": OPERATORS,
+    "get /v1/maps/{name}/diff": PEOPLE,
+    "get /v1/maps/{name}/blame/{node}": PEOPLE,
+    "get /v1/maps/{name}/events": PEOPLE,
+    "get /v1/maps/{name}/audit": frozenset({"admin"}),
+    "post /v1/maps/{name}/reverts": OPERATORS,
+    "get /v1/maps/{name}/robots": PEOPLE,
+    "get /v1/maps/{name}/robots/me": frozenset({"robot"}),
+    "put /v1/maps/{name}/robots/me/report": frozenset({"robot"}),
+    "put /v1/maps/{name}/robots/{robot}/follows": OPERATORS,
+    "delete /v1/maps/{name}/robots/{robot}": frozenset({"admin"}),
+    "post /v1/maps/{name}/codes": frozenset({"admin"}),
+    "get /v1/maps/{name}/jobs": PEOPLE,
+    "get /v1/maps/{name}/handins": KNOWN,
+    "post /v1/maps/{name}/handins": frozenset({"robot"}),
+    "get /v1/handins/{handin}": PEOPLE | {"own"},
+    "put /v1/handins/{handin}/parts/{part}": frozenset({"own"}),
+    "post /v1/handins/{handin}/parts": frozenset({"own"}),
+    "post /v1/handins/{handin}/complete": frozenset({"own"}),
+    "post /v1/handins/{handin}/cancel": OPERATORS | {"own"},
+    "post /v1/handins/{handin}/merge": OPERATORS,
+    "get /v1/jobs/{job}": PEOPLE | {"own"},
+    "post /v1/maps/{name}/downloads": KNOWN,
+    "get /v1/artifacts/{artifact}": frozenset({"own"}),
+    "get /v1/artifacts/{artifact}/manifest": frozenset({"own"}),
+    "post /v1/artifacts/{artifact}/parts": frozenset({"own"}),
+    "get /v1/artifacts/{artifact}/file": frozenset({"own"}),
+}
+# These look at codes and signatures instead of tokens.
+SIGNED = {"post /v1/robots/enrol", "post /v1/token"}
+BODIES = {
+    "post /v1/robots/enrol": {
+        "code": "x", "name": "x", "public_key": "00" * 32, "signature": "00" * 64,
+    },
+    "post /v1/token/nonce": {"robot": "x"},
+    "post /v1/token": {"robot": "x", "nonce": "x", "signature": "00" * 64},
+    "put /v1/maps/{name}/refs/{ref}": {"revision": 1},
+    "post /v1/maps/{name}/reverts": {"revision": 1, "dry_run": True},
+    "put /v1/maps/{name}/robots/me/report": {},
+    "put /v1/maps/{name}/robots/{robot}/follows": {"follows": "head"},
+    "post /v1/maps/{name}/codes": {},
+    "post /v1/maps/{name}/handins": {
+        "format": "engram-parts-1", "content_hash": "00" * 16, "revision": 0, "tables": {},
+    },
+    "post /v1/maps/{name}/downloads": {"options": {}},
+    "post /v1/artifacts/{artifact}/parts": {"want": []},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def used(tmp_path_factory):
+    """A centre with a map that was handed in and asked for, and everybody's tokens."""
+    from engram.centre.worker import merging
+
+    from .conftest import Site, admit_here
+
+    patch = pytest.MonkeyPatch()
+    patch.setattr(merging, "admit", admit_here)
+    site = Site(tmp_path_factory.mktemp("used"))
+    site.centre.add_map("other", "tests", POLICY)
+    own, robot, foreign = site.robot("r1"), site.robot("r2"), site.robot("r3")
+    drive(own.live, "r1", 1_000)
+    own.hand_in()
+    site.settle()
+    with site.centre.database.writing() as connection:
+        from sqlalchemy import update
+
+        from engram.centre.store.schema import grants
+
+        connection.execute(
+            update(grants)
+            .where(grants.c.subject == foreign.state.fact("robot"))
+            .values(map="other")
+        )
+    tokens = {str(role): site.token(role) for role in Role if role is not Role.ROBOT}
+    tokens |= {f"{role} elsewhere": site.token(role, "other") for role in Role if role != "robot"}
+    tokens |= {None: {}, "own": own.link._headers(), "robot": robot.link._headers()}
+    tokens["robot elsewhere"] = foreign.link._headers()
+    handin = own.state.fact("handin")
+    revision = site.centre.map_path(NAME)
+    assert revision.exists()
+    artifact = site.http.post(
+        f"/v1/maps/{NAME}/downloads",
+        json={"ref": "1", "options": {"thumbnails": False}},
+        headers=tokens["own"],
+    ).json()["id"]
+    site.work()
+    places = {
+        "name": NAME,
+        "handin": next(iter(handin.values())),
+        "job": next(iter(handin.values())),
+        "artifact": artifact,
+        "ref": "head",
+        "robot": own.state.fact("robot"),
+        "node": "0",
+        "part": "00" * 32,
+    }
+    yield site, tokens, places
+    site.close()
+    patch.undo()
+
+
+def ask(used, route: str, who: str | None):
+    site, tokens, places = used
+    method, path = route.split(" ")
+    url = path.format(**places) + ("?follow=false" if path.endswith("events") else "")
+    if "diff" in path:
+        url += "?before=0&after=1"
+    return site.http.request(method, url, headers=tokens[who], json=BODIES.get(route))
+
+
+def test_the_table_names_every_route(used):
+    paths = used[0].http.get("/openapi.json").json()["paths"]
+    assert {f"{method} {path}" for path, methods in paths.items() for method in methods} == set(
+        ROUTES
+    )
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_who_may_not_is_refused_and_who_may_is_not(used, route):
+    if route.startswith("delete /v1/maps/{name}/robots"):
+        pytest.skip("it would take the robot that the others ask as; tested below")
+    for who in ("viewer", "robot", "operator", "admin", None, "own"):
+        allowed = who in ROUTES[route] or (who == "own" and "robot" in ROUTES[route])
+        status = ask(used, route, who).status_code
+        if allowed:
+            assert status not in {403, 500} or route in SIGNED, (route, who)
+            assert (status == 401) is False, (route, who)
+        else:
+            assert status in {401, 403, 404}, (route, who, status)
+
+
+@pytest.mark.parametrize("route", [one for one in ROUTES if "{" in one])
+def test_who_has_another_map_learns_nothing_of_this_one(used, route):
+    for who in ("viewer", "operator", "admin", "robot"):
+        answer = ask(used, route, f"{who} elsewhere")
+        assert answer.status_code in {403, 404}, (route, who)
+        assert NAME not in answer.text.replace(f"'{NAME}'", "") or "no map" in answer.text
+
+
+def test_a_robot_that_is_taken_away_has_no_token_and_gets_none(site):
+    agent = site.robot("r1")
+    agent.step()
+    key = agent.state.fact("robot")
+    answer = site.http.delete(f"/v1/maps/{NAME}/robots/{key}", headers=site.token("admin"))
+    assert answer.status_code == 204
+    assert agent.step() > 0
+    assert "refuses (403)" in agent.status()["trouble"]
+
+
+def test_a_code_enrols_one_robot_once_and_expires(site):
+    agent = site.robot("r1")
+    code = new_code(site.centre, NAME, "head", "tests")
+    signature = agent.link._signer.sign(b"engram enrol " + code.encode()).hex()
+    body = {"code": code, "name": "r1", "public_key": agent.link._signer.public_key.hex()}
+    first = site.http.post("/v1/robots/enrol", json={**body, "signature": signature})
+    again = site.http.post("/v1/robots/enrol", json={**body, "signature": signature})
+    assert first.json() == again.json()
+    forged = site.http.post("/v1/robots/enrol", json={**body, "signature": "00" * 64})
+    assert forged.status_code == 422
+    late = new_code(site.centre, NAME, "head", "tests")
+    site.clock.forward(8 * 86_400)
+    signature = agent.link._signer.sign(b"engram enrol " + late.encode()).hex()
+    expired = site.http.post(
+        "/v1/robots/enrol", json={**body, "code": late, "signature": signature}
+    )
+    assert expired.status_code == 403
+
+
+def test_a_token_ends_and_a_robot_whose_clock_is_wrong_gets_another(site):
+    agent = site.robot("r1")
+    agent.step()
+    site.clock.forward(3_600)
+    assert agent.step() == agent.settings.idle_s
+    assert agent.status()["trouble"] == ""
+
+
+def test_a_cookie_alone_changes_nothing(site):
+    token = site.token("admin")["Authorization"].removeprefix("Bearer ")
+    url = f"/v1/maps/{NAME}/codes"
+    cookies = {"Cookie": f"engram_token={token}"}
+    assert site.http.post(url, json={}, headers=cookies).status_code == 401
+    page = {**cookies, "X-Engram": "page"}
+    assert site.http.post(url, json={}, headers=page).status_code == 200
+
+
+def test_the_audit_log_shows_what_was_changed_in_it(site):
+    site.robot("r1")
+    disable(site.centre, "nobody", "tests")
+    with site.centre.database.writing() as connection:
+        assert first_broken(connection) is None
+        connection.execute(audit.update().where(audit.c.number == 2).values(subject="me"))
+        assert first_broken(connection) == 2
+
+
+def test_it_listens_elsewhere_only_with_tls_or_on_demand(tmp_path):
+    with pytest.raises(ConfigError, match="unencrypted"):
+        Listening("0.0.0.0", 1)
+    Listening("127.0.0.1", 1)
+    Listening("::1", 1)
+    Listening("0.0.0.0", 1, insecure=True)
+    Listening("0.0.0.0", 1, tmp_path / "a", tmp_path / "b")
