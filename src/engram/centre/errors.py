@@ -47,6 +47,13 @@ class ConflictError(CentreError):
     title = "Not in this state"
 
 
+class MalformedError(CentreError):
+    """What was sent makes no map."""
+
+    status = 422
+    title = "No map"
+
+
 class QuotaError(CentreError):
     """More than is granted."""
 

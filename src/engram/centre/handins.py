@@ -14,14 +14,14 @@ from typing import Any
 
 from sqlalchemy import Connection, func, or_, select, update
 
-from engram.centre.errors import ConflictError, QuotaError, UnknownError
+from engram.centre.errors import ConflictError, MalformedError, QuotaError, UnknownError
 from engram.centre.service import Centre
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
 from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.packs import given_by
 from engram.centre.store.schema import artifact_grants, artifacts, handins, usage
-from engram.errors import MapError
+from engram.errors import MapCorruptError, MapError
 from engram.maps import Map
 from engram.maps.schema import frames, nodes, vocabularies
 from engram.transfers import Manifest, PartHash, WireManifest
@@ -193,7 +193,7 @@ class HandIns:
             pages: only blobs that these pages name; None for all.
 
         Raises:
-            MapCorruptError: a page does not hold rows of its table.
+            MalformedError: a page does not hold rows of its table.
         """
         packs = self._centre.packs(row["map"])
 
@@ -201,7 +201,10 @@ class HandIns:
             table = {"nodes": nodes, "frames": frames, "vocabularies": vocabularies}[name]
             wanted = [one for one in manifest.pages.get(name, ()) if some is None or one in some]
             for _, body in packs.read(wanted):
-                yield from decode_page(table, body)
+                try:
+                    yield from decode_page(table, body)
+                except MapCorruptError as error:
+                    raise MalformedError(str(error)) from error
 
         known = self._known_nodes(row["map"])
         held = {one[0] for one in rows("nodes", None) if one[1] in known}
@@ -295,6 +298,13 @@ class HandIns:
         with self._centre.database.writing() as connection:
             connection.execute(
                 update(handins).where(handins.c.id == row["id"]).values(tries=handins.c.tries + 1)
+            )
+
+    def put_off(self, row: dict[str, Any]) -> None:
+        """Takes back a try that found no room or no free lock: it is no fault of the hand-in."""
+        with self._centre.database.writing() as connection:
+            connection.execute(
+                update(handins).where(handins.c.id == row["id"]).values(tries=row["tries"])
             )
 
     def heartbeat(self, key: str, progress: str) -> bool:

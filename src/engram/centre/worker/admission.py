@@ -13,7 +13,7 @@ import resource
 from multiprocessing.connection import Connection
 from pathlib import Path
 
-from engram.errors import EngramError, MapCorruptError, WorkerError
+from engram.errors import EngramError, MapCorruptError, StorageFullError, WorkerError
 from engram.maps import check_file
 from engram.processes import end_with_parent
 from engram.transfers import Manifest, PartHash, join
@@ -36,6 +36,7 @@ def admit(
 
     Raises:
         MapCorruptError: the parts make no sound map.
+        StorageFullError: there is no room for it now.
         WorkerError: the limits ended the process.
     """
     context = multiprocessing.get_context("forkserver")
@@ -70,6 +71,8 @@ def _admit(pipe: Connection, limits: tuple[int, int, int]) -> None:
     outcome: EngramError | None = None
     try:
         write_checked(manifest, parts, path)
+    except StorageFullError as error:
+        outcome = error
     except EngramError as error:
         outcome = MapCorruptError(str(error))
     pipe.send(outcome)

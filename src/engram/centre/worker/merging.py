@@ -47,6 +47,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
     except RefusedError as error:
         handins.end(row, HandInState.REFUSED, error=str(error))
     except (MapLockedError, StorageFullError):
+        handins.put_off(row)
         return False
     except KeyboardInterrupt:
         if not handins.get(row["id"])["cancelled"]:
