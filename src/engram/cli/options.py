@@ -160,6 +160,10 @@ class Drive:
     right: Annotated[
         str | None, typer.Option("--right", metavar="TOPIC", help="Of a bag's right images.")
     ] = None
+    motion: Annotated[
+        list[str] | None,
+        typer.Option("--motion", metavar="TOPIC|FILE", help="Wheels or gyroscope; repeatable."),
+    ] = None
 
     def open(self, path: Path) -> OpenDrive:
         """The drive; see `engram.sequences.open_sequence` for the errors."""
@@ -192,6 +196,7 @@ class Drive:
             "mask": self.mask,
             "left": self.left,
             "right": self.right,
+            "motion": self.motion or (),
         }
 
 

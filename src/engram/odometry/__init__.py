@@ -2,6 +2,7 @@
 
 from engram.odometry.motion import UNMOVED, GapFiller, Motion, driven_steps_m
 from engram.odometry.odometry import Odometry, OdometryConfig
+from engram.odometry.outside import MotionSource, OutsideConfig, OutsideModel, OutsideMotion
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.window import WindowConfig
 
@@ -9,10 +10,14 @@ __all__ = [
     "UNMOVED",
     "GapFiller",
     "Motion",
+    "MotionSource",
     "Odometry",
     "OdometryConfig",
     "OdometryStatus",
     "OdometryStep",
+    "OutsideConfig",
+    "OutsideModel",
+    "OutsideMotion",
     "WindowConfig",
     "driven_steps_m",
 ]

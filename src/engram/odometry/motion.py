@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.geometry import SE3
+from engram.odometry.outside import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
 
 _NS_PER_S = 1e9
@@ -98,14 +99,7 @@ def driven_steps_m(motions: Sequence[Motion], stamps_ns: Sequence[int]) -> NDArr
     return np.diff(driven_m, prepend=driven_m[0]).clip(0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Guess:
-    prev_from_curr: SE3
-    covariance: NDArray[np.float64]
-    sigma_m: float
-
-
-_ANY_MOTION = _Guess(SE3.identity(), np.eye(6) * np.pi**2, np.inf)
+_ANY_MOTION = Guess(SE3.identity(), np.eye(6) * np.pi**2, np.inf)
 
 
 class GapFiller:
@@ -142,12 +136,22 @@ class GapFiller:
         # Time for which the robot has moved at a speed not yet known.
         self._unknown_s = 0.0
 
-    def motion(self, odometry: OdometryStep, stamp_ns: int) -> Motion:
+    def motion(
+        self,
+        odometry: OdometryStep,
+        stamp_ns: int,
+        outside: Guess | None = None,
+        *,
+        doubted: bool = False,
+    ) -> Motion:
         """The motion since the previous usable frame.
 
         Args:
             odometry: the step that ends in this frame.
             stamp_ns: stamp of the frame.
+            outside: the same motion by wheels and gyroscope, which replaces a guess by the last
+                speed; None if unknown.
+            doubted: whether odometry is doubtful and contradicts it, and counts as missing.
         """
         if odometry.status is OdometryStatus.UNUSABLE_FRAME:
             return Motion(odometry)
@@ -156,17 +160,19 @@ class GapFiller:
             return Motion(odometry)
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
-        guess = self._guess(seconds)
+        guess = self._guess(seconds, outside)
         if seconds > 0 and self._knows_speed:
             self._guessed_m_per_s.append(guess.prev_from_curr.distance_m / seconds)
         if (
             measured is None
             or covariance is None
+            or doubted
             or self._too_vague(covariance, guess)
             or self._impossible(measured, covariance, seconds)
         ):
             self._missing.append(True)
-            self._gap_m += guess.prev_from_curr.distance_m
+            if guess is not outside:
+                self._gap_m += guess.prev_from_curr.distance_m
             if guess is _ANY_MOTION:
                 self._unknown_s += max(seconds, 0.0)
             return Motion(odometry, guess.prev_from_curr, guess.covariance, guess.sigma_m)
@@ -222,7 +228,7 @@ class GapFiller:
         variances = np.repeat([step_m**2, (_SIGMA_RAD_PER_M * step_m) ** 2], 3)
         return np.diag(share * variances)
 
-    def _too_vague(self, covariance: NDArray[np.float64], guess: _Guess) -> bool:
+    def _too_vague(self, covariance: NDArray[np.float64], guess: Guess) -> bool:
         vague = _sigma_m(covariance) > guess.sigma_m
         self._vague = self._vague + 1 if vague else 0
         return vague and self._vague <= _STEPS
@@ -245,8 +251,13 @@ class GapFiller:
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * _sigma_m(covariance))
 
-    def _guess(self, seconds: float) -> _Guess:
-        """Motion at the last speed and turn rate; unbounded if these are unknown."""
+    def _guess(self, seconds: float, outside: Guess | None = None) -> Guess:
+        """Motion from outside, or at the last speed and turn rate; unbounded if all is unknown.
+
+        A gyroscope alone replaces the turn.
+        """
+        if outside is not None and outside.has_way:
+            return outside
         if not self._velocities or seconds <= 0:
             return _ANY_MOTION
         velocity = np.median(self._velocities, axis=0)
@@ -256,7 +267,10 @@ class GapFiller:
         sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_M))
         sigma_rad = float(np.hypot(_SIGMA_RAD_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_RAD))
         covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
-        return _Guess(guess, covariance, sigma_m)
+        if outside is not None:
+            guess = SE3(outside.prev_from_curr.rotation, guess.translation)
+            covariance[3:, 3:] = outside.covariance[3:, 3:]
+        return Guess(guess, covariance, sigma_m)
 
 
 def _sigma_m(covariance: NDArray[np.float64]) -> float:

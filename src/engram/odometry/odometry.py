@@ -14,6 +14,7 @@ from engram.config import check_bounds
 from engram.errors import IncompatibleError
 from engram.frontend import Frame, FrameStatus, Match, MatcherConfig, match_frames
 from engram.geometry import SE3, propagate_covariance
+from engram.odometry.outside import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.window import Window, WindowConfig
 
@@ -79,8 +80,13 @@ class Odometry:
         self._inliers: deque[int] = deque(maxlen=_USUAL_OF)
         self._intervals: deque[float] = deque(maxlen=_USUAL_OF)
 
-    def step(self, frame: Frame) -> OdometryStep:
+    def step(self, frame: Frame, expected: Guess | None = None) -> OdometryStep:
         """The motion since the last usable frame; see `OdometryStep` for failures.
+
+        Args:
+            frame: the next frame.
+            expected: the motion by wheels and gyroscope, which guides the match where the last
+                speed says nothing; None if unknown.
 
         Raises:
             IncompatibleError: the camera or the kind of descriptors differs from that of the
@@ -95,7 +101,7 @@ class Odometry:
             return OdometryStep(OdometryStatus.FIRST)
 
         interval_s = (frame.stamp_ns - self._track.stamp_ns) * _S_PER_NS
-        match = self._track.match(frame)
+        match = self._track.match(frame, expected)
         if not self._believes(match, interval_s):
             self._track = _Track(frame, self._config, self._track.offset_px)
             return OdometryStep(_reason(match))
@@ -149,16 +155,16 @@ class _Track:
         changed_m = np.linalg.norm(prev_from_curr.log()[:3] - self._velocity[:3] * interval_s)
         return bool(changed_m <= 0.5 * self._config.acceleration_m_s2 * interval_s**2)
 
-    def match(self, frame: Frame) -> Match:
+    def match(self, frame: Frame, expected: Guess | None = None) -> Match:
         """Match to the keyframe; if that fails, to the previous frame."""
         if frame.camera != self._window.keyframe.camera:
             raise IncompatibleError(
                 "the camera changed within a drive; use a separate odometry for each camera"
             )
-        match = self._match_to_keyframe(frame)
+        match = self._match_to_keyframe(frame, expected)
         if match.inliers < self._config.min_inliers and self._window.has_newest:
             self._keep_previous_as_keyframe()
-            match = self._match_to_keyframe(frame)
+            match = self._match_to_keyframe(frame, expected)
         return match
 
     def place(self, frame: Frame, match: Match) -> tuple[SE3, NDArray[np.float64]]:
@@ -198,21 +204,30 @@ class _Track:
             self._keep_previous_as_keyframe()
         return step
 
-    def _match_to_keyframe(self, frame: Frame) -> Match:
-        """Guided by constant velocity; if that fails, unguided."""
+    def _match_to_keyframe(self, frame: Frame, expected: Guess | None) -> Match:
+        """Guided by constant velocity or what is expected; if that fails, unguided."""
         key, matcher = self._window.keyframe, self._config.matcher
         seed = frame.stamp_ns % 2**64
-        prediction = self._predict(frame)
+        prediction = self._predict(frame, expected)
         if prediction is not None:
             match = match_frames(key, frame, matcher, seed, *prediction)
             if match.inliers >= self._config.min_inliers:
                 return match
         return match_frames(key, frame, matcher, seed)
 
-    def _predict(self, frame: Frame) -> tuple[SE3, NDArray[np.float64]] | None:
+    def _predict(
+        self, frame: Frame, expected: Guess | None
+    ) -> tuple[SE3, NDArray[np.float64]] | None:
         interval_s = (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
         if self._velocity is None or not 0 < interval_s <= self._config.max_prediction_s:
-            return None
+            if expected is None or not expected.has_way:
+                return None
+            return (
+                self._keyframe_from_prev @ expected.prev_from_curr,
+                propagate_covariance(
+                    self._keyframe_from_prev, self._covariance, expected.covariance
+                ),
+            )
         prev_from_curr = SE3.exp(self._velocity * interval_s)
         sigma = np.repeat(
             [self._config.acceleration_m_s2, self._config.angular_acceleration_rad_s2], 3

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 from engram.doctor import Diagnosis, Examination, diagnose
 from engram.frontend import Frame, FrameStatus, Frontend, StereoPair
 from engram.localiser import StageClock
-from engram.odometry import GapFiller, Motion, Odometry
+from engram.odometry import (
+    GapFiller,
+    Motion,
+    Odometry,
+    OdometryStep,
+    OutsideModel,
+    OutsideMotion,
+)
 from engram.robot.settings import Settings
 from engram.sequences import LoggedFrame
 
@@ -51,6 +58,7 @@ class Front:
         """Forgets all motion: what comes next is another drive, or another part of one."""
         self._odometry = Odometry(self._settings.odometry)
         self._gaps = GapFiller()
+        self._outside = OutsideModel(self._settings.outside)
         self._frozen = _FrozenStream()
         self.examination.begin()
 
@@ -68,15 +76,15 @@ class Front:
     def take(
         self,
         arrived: Arrived,
-        motion: Motion | None = None,
+        motion: Motion | OutsideMotion | None = None,
         clock: StageClock | None = None,
     ) -> tuple[Frame, Motion]:
         """The frame and the camera's motion since the previous usable one.
 
         Args:
             arrived: a pair of images, or a frame of a log.
-            motion: an external measurement that replaces odometry; give it for all frames of the
-                drive or for none.
+            motion: what wheels and gyroscope measured since the previous frame, or a `Motion` that
+                replaces odometry; give the latter for all frames of the drive or for none.
             clock: measures the duration of front-end and odometry.
         """
         if self._ahead and isinstance(arrived, LoggedFrame):
@@ -84,24 +92,42 @@ class Front:
         return self._taken(arrived, motion, clock or StageClock())
 
     def _taken(
-        self, arrived: Arrived, motion: Motion | None, clock: StageClock
+        self, arrived: Arrived, motion: Motion | OutsideMotion | None, clock: StageClock
     ) -> tuple[Frame, Motion]:
+        if not isinstance(motion, Motion):
+            self._outside.add(motion)
         if isinstance(arrived, LoggedFrame):
-            if motion is None:
-                motion = self._gaps.motion(arrived.odometry, arrived.frame.stamp_ns)
+            if not isinstance(motion, Motion):
+                motion = self._moved(arrived.odometry, arrived.frame.stamp_ns)
             self.examination.see(arrived, arrived.frame, motion)
             return arrived.frame, motion
         frame = self._frontend.extract(arrived)
         if self._frozen.repeats(arrived):
             frame = replace(frame, status=FrameStatus.FROZEN)
         clock.lap("frontend")
-        if motion is None:
-            motion = self._gaps.motion(self._odometry.step(frame), frame.stamp_ns)
+        if not isinstance(motion, Motion):
+            step = self._odometry.step(frame, self._outside.guess())
+            motion = self._moved(step, frame.stamp_ns)
             clock.lap("odometry")
         self._frozen.note(motion)
         self.examination.see(arrived, frame, motion)
         clock.lap("doctor")
         return frame, motion
+
+    def _moved(self, step: OdometryStep, stamp_ns: int) -> Motion:
+        """Odometry's step, or where it fails or is disproved what wheels and gyroscope say."""
+        outside = self._outside
+        guess = outside.guess()
+        doubted = (
+            guess is not None
+            and step.prev_from_curr is not None
+            and step.covariance is not None
+            and not outside.is_sure(step)
+            and guess.contradicts(step.prev_from_curr, step.covariance, outside.config.gate)
+        )
+        motion = self._gaps.motion(step, stamp_ns, guess, doubted=doubted)
+        outside.compare(step)
+        return motion
 
 
 class _FrozenStream:

@@ -25,9 +25,10 @@ from engram.localiser import (
 )
 from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
-from engram.odometry import Motion, OdometryStatus, OdometryStep
+from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot.front import Arrived, Front, arriving, paced
 from engram.robot.live import LiveKeeper, Saving
+from engram.sequences.motion import MovedSequence
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.
 _REMEMBERED = 200
@@ -123,7 +124,7 @@ class Robot:
         self,
         arrived: Arrived,
         *,
-        motion: Motion | None = None,
+        motion: Motion | OutsideMotion | None = None,
         deadline_ms: float | None = None,
         arrived_s: float | None = None,
     ) -> Localisation:
@@ -137,8 +138,8 @@ class Robot:
         Args:
             arrived: a pair of images, (h, w) uint8 grey, rectified, synchronised; or a frame of
                 a frame log.
-            motion: the camera's motion since the previous usable frame, if measured by something
-                other than visual odometry; give it for all frames or for none.
+            motion: what wheels and gyroscope measured since the previous frame; or a `Motion` since
+                the previous usable frame that replaces odometry, given for all frames or for none.
             deadline_ms: latest start of an attempt after the images arrived; None for the
                 robot's own deadline.
             arrived_s: `time.perf_counter` when they arrived; None for now.
@@ -195,10 +196,14 @@ class Robot:
         """
         if rate_hz is not None and not rate_hz > 0:
             raise ConfigError(f"rate is {rate_hz} Hz, must be > 0")
+        outside = sequence.motion() if isinstance(sequence, MovedSequence) else None
         with closing(arriving(sequence)) as entries, deferred_interrupt() as raise_if_asked:
             for due, arrived in paced(entries, rate_hz):
                 raise_if_asked()
-                found = self.step(arrived, arrived_s=due)
+                motion = None
+                if outside is not None and self._stamp_ns is not None:
+                    motion = outside.between(self._stamp_ns, _stamp_ns(arrived))
+                found = self.step(arrived, motion=motion, arrived_s=due)
                 if rate_hz is not None and self._deadline_ms is None:
                     found = replace(found, late=time.perf_counter() > due + 1 / rate_hz)
                 yield found
@@ -206,7 +211,7 @@ class Robot:
                 monitor.check()
                 raise_if_asked()
 
-    def follow(self, arrived: Arrived, *, motion: Motion | None = None) -> None:
+    def follow(self, arrived: Arrived, *, motion: Motion | OutsideMotion | None = None) -> None:
         """Carries the position on by the motion to this frame, without localising it."""
         if self._in_order(arrived):
             _, motion = self._front.take(arrived, motion)

@@ -14,7 +14,7 @@ from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
 from engram.localiser import Budget, LocaliserConfig
 from engram.mapper import MapperConfig
-from engram.odometry import OdometryConfig
+from engram.odometry import OdometryConfig, OutsideConfig
 from engram.ranking import check_for_robot
 
 # Settings files that ship with the package: the rules of one paper each.
@@ -30,6 +30,7 @@ class Settings:
     localiser: LocaliserConfig = field(default_factory=LocaliserConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     doctor: DoctorConfig = field(default_factory=DoctorConfig)
+    outside: OutsideConfig = field(default_factory=OutsideConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
         """These settings for a map's kind of descriptor; None keeps their own.

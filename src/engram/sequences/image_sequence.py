@@ -16,9 +16,11 @@ from engram.errors import ConfigError, SequenceError
 from engram.frontend import StereoPair
 from engram.geometry.rectification import Rectification, RemapTable
 from engram.graph.model import Clock
+from engram.odometry import MotionSource
 from engram.sequences.calibrating import check_no_view, read_mask
 from engram.sequences.images import read_image
 from engram.sequences.listing import Listing, PairFiles, usable_pairs
+from engram.sequences.motion import motion_of_files
 from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
@@ -65,8 +67,10 @@ class ImageSequence:
         self._drive = drive
         self._options = options
         places = drive.places
+        self._shift_ns = 0
         if options.start_ns is not None:
-            places = _shifted(places, options.start_ns)
+            places, self._shift_ns = _shifted(places, options.start_ns)
+        self.motion()  # so that a file that cannot be used is known at once
         self._pairs, self._listing_faults = usable_pairs(
             places, options.skip_bad, drive.path, partial(_chosen, options)
         )
@@ -77,6 +81,15 @@ class ImageSequence:
     def rectification(self) -> Rectification | None:
         """Rectification of raw images; None for a rectified drive."""
         return self.cameras.rectification
+
+    def motion(self) -> MotionSource | None:
+        """A new pass through the motion of the caller's files; None without one.
+
+        Raises:
+            SequenceError: a file cannot be used.
+        """
+        mounting = self.camera.cam_from_rig
+        return motion_of_files(self._options.motion, mounting, self._shift_ns)
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
@@ -180,11 +193,11 @@ def _chosen(options: OpenOptions, places: Listing) -> Listing:
     return chosen[inside[0] : inside[-1] + 1] if inside else []
 
 
-def _shifted(places: Listing, start_ns: int) -> Listing:
-    """The same places, shifted so that the first good stamp of the drive is `start_ns`."""
+def _shifted(places: Listing, start_ns: int) -> tuple[Listing, int]:
+    """The same places, shifted so that the first good stamp is `start_ns`; and the shift, ns."""
     first_ns = next((place.stamp_ns for place in places if isinstance(place, PairFiles)), 0)
     moved_ns = start_ns - first_ns
     return [
         place if isinstance(place, str) else replace(place, stamp_ns=place.stamp_ns + moved_ns)
         for place in places
-    ]
+    ], moved_ns

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -166,6 +166,7 @@ def options_of(
     mask: str | Path | None = None,
     left: str | None = None,
     right: str | None = None,
+    motion: Sequence[str] = (),
 ) -> OpenOptions:
     """The options of `open_sequence`, from plain values.
 
@@ -187,6 +188,7 @@ def options_of(
         field_of_view_deg: horizontal field of view of rectified images; None for the largest.
         mask: image that is black where the robot sees itself, of the size of the drive's images.
         left, right: topics of a bag's images; None finds them by their names.
+        motion: topics of a bag, or files, with odometry or a gyroscope's rates.
 
     Raises:
         ConfigError: an argument is out of range.
@@ -207,6 +209,7 @@ def options_of(
         mask=None if mask is None else Path(mask),
         left=left,
         right=right,
+        motion=tuple(motion),
     )
 
 

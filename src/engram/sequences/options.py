@@ -192,6 +192,7 @@ class OpenOptions:
         field_of_view_deg: horizontal field of view of rectified images; None for the largest.
         mask: image that is black where the robot sees itself; None for none.
         left, right: topics of a bag's images; None finds them by their names.
+        motion: topics or files of odometry and gyroscope.
 
     Raises:
         ConfigError: the longitude is outside ±180°, the zone is unknown, the tolerance negative.
@@ -212,6 +213,7 @@ class OpenOptions:
     mask: Path | None = None
     left: str | None = None
     right: str | None = None
+    motion: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_longitude(self.longitude_deg)

@@ -13,10 +13,10 @@ from engram.errors import InputError
 from engram.sequences.bags.bag import Bag, files_of
 from engram.sequences.bags.calibrating import read_transforms
 from engram.sequences.bags.messages import Decoder
+from engram.sequences.bags.motion import IMU, ODOMETRY, TWIST
 from engram.sequences.bags.sequence import BagSequence
 from engram.sequences.options import OpenOptions
 
-_ODOMETRY, _IMU = "nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu"
 # A gap is this much longer than the usual interval.
 _GAP_RATIO = 3.0
 
@@ -167,7 +167,9 @@ def _command(
     drive: BagSequence | None,
 ) -> str:
     """`engram map` with every option that this bag needs."""
-    motion = [topic.name for topic in topics if topic.type in {_ODOMETRY, _IMU} and topic.messages]
+    motion = [
+        topic.name for topic in topics if topic.type in {ODOMETRY, TWIST, IMU} and topic.messages
+    ]
     words = ["engram", "map", "MAP.engram", str(path)]
     for option, value in (("--left", options.left), ("--right", options.right)):
         words += [option, value] if value else []

@@ -15,9 +15,11 @@ from engram.errors import CalibrationError, SequenceError
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
 from engram.graph.model import Clock
+from engram.odometry import MotionSource
 from engram.sequences.bags.bag import Bag
-from engram.sequences.bags.calibrating import read_cameras
+from engram.sequences.bags.calibrating import read_cameras, read_transforms
 from engram.sequences.bags.messages import Decoder, stamp_of
+from engram.sequences.bags.motion import BagMotion
 from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
 from engram.sequences.bags.pictures import grey_of, size_of
 from engram.sequences.bags.records import DamageError
@@ -76,7 +78,18 @@ class BagSequence:
         clock = Clock.UTC if self._first_ns >= YEAR_2000_NS else Clock.RELATIVE
         name = path.resolve().name.split(".")[0]
         self.info = with_options(SequenceInfo(name, "bag", clock), options)
+        self._motion = BagMotion(
+            self._bag,
+            self._decoder,
+            options.motion,
+            read_transforms(self._bag, self._decoder),
+            self.camera.cam_from_rig,
+        )
         self._reasons: list[str] = []
+
+    def motion(self) -> MotionSource | None:
+        """A new pass through the motion by wheels or gyroscope; None without one."""
+        return self._motion.source(self._shift_ns)
 
     @property
     def frame(self) -> str:

@@ -14,11 +14,12 @@ from sqlalchemy import Connection, select
 from engram.errors import ConfigError, MapCorruptError, SequenceError
 from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera, propagate_covariance
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import MotionSource, OdometryStatus, OdometryStep
 from engram.sequences.framelog.file import framelog_file, frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
 from engram.sequences.image_sequence import with_options
+from engram.sequences.motion import motion_of_files
 from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
 
@@ -98,6 +99,8 @@ class FrameLog:
         shift_ns = 0 if options.start_ns is None else options.start_ns - int(stamps_ns[0])
         self._shift_ns = shift_ns
         self._stamps_ns = stamps_ns[list(self._numbers)] + shift_ns
+        self._motion_files = options.motion
+        self.motion()  # so that a file that cannot be used is known at once
         self._skip_bad = options.skip_bad
         self._skipped_reasons: list[str] = []
 
@@ -115,6 +118,14 @@ class FrameLog:
     def camera(self) -> StereoCamera:
         """The one camera of the drive."""
         return self._header.camera
+
+    def motion(self) -> MotionSource | None:
+        """A new pass through the motion of the caller's files; None without one.
+
+        Raises:
+            SequenceError: a file cannot be used.
+        """
+        return motion_of_files(self._motion_files, self.camera.cam_from_rig, self._shift_ns)
 
     @property
     def complete(self) -> bool:

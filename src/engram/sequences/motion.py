@@ -1,0 +1,224 @@
+"""Motion from outside for a drive: odometry and gyroscope topics of a bag, TUM and CSV files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import SequenceError
+from engram.geometry import SE3
+from engram.odometry import MotionSource, OutsideMotion
+from engram.sequences.listing import nanoseconds, seconds_as_ns
+from engram.sequences.trajectories import read_tum
+from engram.untrusted import read_text
+
+Vector = NDArray[np.float64]
+
+# Samples hold for half a second: wheels come at 10 Hz and more.
+_HOLDS_NS = 500_000_000
+# How cameras look on most robots: forward, level; x forward, y left, z up (REP 103) in the rig.
+FORWARD = SE3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
+_GYRO = re.compile(r"w_RS_S_[xyz]|gyro_[xyz]|g[xyz]\b|angular_velocity[_.][xyz]")
+_WHEELS = ("forward_m_s", "left_m_s", "turn_rad_s")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """A measurement, which holds from the one before until its stamp.
+
+    Attributes:
+        stamp_ns: its stamp.
+        velocity_m_s: (3,) of the rig in its own axes; None from a gyroscope.
+        rates_rad_s: (3,) turn rates in the axes of rig or gyroscope.
+    """
+
+    stamp_ns: int
+    velocity_m_s: Vector | None
+    rates_rad_s: Vector
+
+
+@runtime_checkable
+class MovedSequence(Protocol):
+    """A drive that may know its motion from outside."""
+
+    def motion(self) -> MotionSource | None:
+        """A new pass through the motion from outside; None without one."""
+        ...
+
+
+class RigMotion:
+    """A `MotionSource` over samples in the order of time.
+
+    Args:
+        wheels: samples of odometry; None for none.
+        gyro: samples of a gyroscope, which replace the turn rates of the wheels.
+        cam_from_rig: mounting of the camera; None for one that looks forward.
+        rig_from_gyro: (3, 3) rotation of the gyroscope's axes to the rig's.
+        shift_ns: what is added to the samples' stamps, ns.
+    """
+
+    def __init__(
+        self,
+        wheels: Iterator[Sample] | None,
+        gyro: Iterator[Sample] | None,
+        cam_from_rig: SE3 | None,
+        rig_from_gyro: NDArray[np.float64] | None = None,
+        shift_ns: int = 0,
+    ) -> None:
+        self._wheels = None if wheels is None else _Held(wheels)
+        self._gyro = None if gyro is None else _Held(gyro)
+        self._cam_from_rig = cam_from_rig or FORWARD
+        self._rig_from_gyro = np.eye(3) if rig_from_gyro is None else rig_from_gyro
+        self._shift_ns = shift_ns
+
+    def between(self, start_ns: int, end_ns: int) -> OutsideMotion | None:
+        """The motion between two stamps; see `MotionSource`."""
+        at_ns, end_ns = start_ns - self._shift_ns, end_ns - self._shift_ns
+        seconds = (end_ns - at_ns) / 1e9
+        if seconds <= 0:
+            return None
+        pose, turned_rad = SE3.identity(), np.zeros(3)
+        while at_ns < end_ns:
+            wheels = None if self._wheels is None else self._wheels.at(at_ns)
+            gyro = None if self._gyro is None else self._gyro.at(at_ns)
+            held = [one for one in (wheels, gyro) if one is not None]
+            if len(held) < (self._wheels is not None) + (self._gyro is not None):
+                return None
+            until_ns = min([end_ns, *(one.stamp_ns for one in held)])
+            step_s, at_ns = (until_ns - at_ns) / 1e9, until_ns
+            velocity = np.zeros(3)
+            if wheels is not None and wheels.velocity_m_s is not None:
+                velocity = wheels.velocity_m_s
+            if gyro is not None:
+                rates = self._rig_from_gyro @ gyro.rates_rad_s
+                turned_rad = turned_rad + rates * step_s
+            else:
+                assert wheels is not None
+                rates = wheels.rates_rad_s
+            pose = pose @ SE3.exp(np.r_[velocity, rates] * step_s)
+        cam = self._cam_from_rig
+        raw = None
+        if self._gyro is not None:
+            raw = cam.rotation @ turned_rad / seconds
+        return OutsideMotion(cam @ pose @ cam.inverse(), seconds, self._wheels is not None, raw)
+
+
+class _Held:
+    """The sample that holds at a time; times rise from call to call."""
+
+    def __init__(self, samples: Iterator[Sample]) -> None:
+        self._samples = samples
+        self._next: Sample | None = next(samples, None)
+
+    def at(self, stamp_ns: int) -> Sample | None:
+        """The first sample later than a stamp; None if it is too far away."""
+        while self._next is not None and self._next.stamp_ns <= stamp_ns:
+            self._next = next(self._samples, None)
+        if self._next is None or self._next.stamp_ns - stamp_ns > _HOLDS_NS:
+            return None
+        return self._next
+
+
+def motion_of_files(
+    names: tuple[str, ...], cam_from_rig: SE3 | None, shift_ns: int = 0
+) -> RigMotion | None:
+    """The motion of files: poses in TUM format (.tum, .txt), or speeds or rates in CSV.
+
+    Args:
+        names: at most one file of odometry and one of a gyroscope.
+        cam_from_rig: mounting of the camera, if known.
+        shift_ns: what is added to the stamps, ns.
+
+    Raises:
+        SequenceError: a file cannot be read, or there are two of a kind.
+    """
+    if not names:
+        return None
+    wheels: list[Sample] | None = None
+    gyro: list[Sample] | None = None
+    for name in names:
+        samples = read_samples(Path(name))
+        is_gyro = samples[0].velocity_m_s is None
+        if (gyro if is_gyro else wheels) is not None:
+            kind = "gyroscope" if is_gyro else "odometry"
+            raise SequenceError(f"--motion {name}: is a second {kind}; give one of each kind")
+        if is_gyro:
+            gyro = samples
+        else:
+            wheels = samples
+    return RigMotion(
+        None if wheels is None else iter(wheels),
+        None if gyro is None else iter(gyro),
+        cam_from_rig,
+        shift_ns=shift_ns,
+    )
+
+
+def read_samples(path: Path) -> list[Sample]:
+    """The samples of a file.
+
+    Raises:
+        SequenceError: it is of no known kind, malformed, or empty.
+    """
+    samples = _csv_samples(path) if path.suffix.lower() == ".csv" else _pose_samples(path)
+    if not samples:
+        raise SequenceError(f"{path}: holds no motion")
+    if any(one.stamp_ns >= then.stamp_ns for one, then in pairwise(samples)):
+        raise SequenceError(f"{path}: its stamps do not rise")
+    return samples
+
+
+def _pose_samples(path: Path) -> list[Sample]:
+    """Speeds between the poses of a TUM file: the rig's, in the frame where it began."""
+    track = read_tum(path)
+    samples = []
+    for at in range(1, len(track)):
+        seconds = float(track.stamps_ns[at] - track.stamps_ns[at - 1]) / 1e9
+        step = track.world_from_cam[at - 1].inverse() @ track.world_from_cam[at]
+        twist = step.log() / seconds
+        samples.append(Sample(int(track.stamps_ns[at]), twist[:3], twist[3:]))
+    return samples
+
+
+def _csv_samples(path: Path) -> list[Sample]:
+    """Speeds or rates of a CSV file, by the names of its columns.
+
+    EuRoC's `imu0/data.csv` (timestamp [ns], w_RS_S_x …), or a stamp (`seconds` or `stamp_ns`) with
+    forward_m_s, and perhaps left_m_s and turn_rad_s, or with gyro_x, gyro_y, gyro_z.
+    """
+    lines = read_text(path).splitlines()
+    names = [name.strip().lstrip("#").strip() for name in lines[0].split(",")] if lines else []
+    gyro = [at for at, name in enumerate(names) if _GYRO.match(name)]
+    wheels = {name: names.index(name) for name in _WHEELS if name in names}
+    if len(gyro) != 3 and "forward_m_s" not in wheels:
+        raise SequenceError(
+            f"{path}: its first line must name the columns: a stamp (seconds or stamp_ns) and "
+            f"forward_m_s, left_m_s, turn_rad_s, or gyro_x, gyro_y, gyro_z; it has {names}"
+        )
+    parse = seconds_as_ns if names[0].startswith("second") else nanoseconds
+    samples = []
+    for number, line in enumerate(lines[1:], start=2):
+        fields = [field.strip() for field in line.split(",")]
+        try:
+            stamp_ns = parse(fields[0])
+            values = [float(field) for field in fields[1:]]
+            if stamp_ns is None or not np.isfinite(values).all():
+                raise ValueError("is not a stamp and finite numbers")
+            if len(gyro) == 3:
+                rates = np.array([values[at - 1] for at in gyro])
+                samples.append(Sample(stamp_ns, None, rates))
+            else:
+                of = {name: values[at - 1] for name, at in wheels.items()}
+                velocity = np.array([of["forward_m_s"], of.get("left_m_s", 0.0), 0.0])
+                turn = np.array([0.0, 0.0, of.get("turn_rad_s", 0.0)])
+                samples.append(Sample(stamp_ns, velocity, turn))
+        except (ValueError, IndexError) as error:
+            raise SequenceError(f"{path}: line {number}: {error}") from error
+    return samples
