@@ -25,6 +25,8 @@ Vector = NDArray[np.float64]
 _HOLDS_NS = 500_000_000
 # How cameras look on most robots: forward, level; x forward, y left, z up (REP 103) in the rig.
 FORWARD = SE3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
+# Mountings turned by less: the rig's axes are a camera's, x right, y down, z forward.
+_LIKE_A_CAMERA_RAD = float(np.deg2rad(45.0))
 _GYRO = re.compile(r"w_RS_S_[xyz]|gyro_[xyz]|g[xyz]\b|angular_velocity[_.][xyz]")
 _WHEELS = ("forward_m_s", "left_m_s", "turn_rad_s")
 
@@ -74,7 +76,7 @@ class RigMotion:
     ) -> None:
         self._wheels = None if wheels is None else _Held(wheels)
         self._gyro = None if gyro is None else _Held(gyro)
-        self._cam_from_rig = cam_from_rig or FORWARD
+        self._cam_from_rig = _mounted(cam_from_rig)
         self._rig_from_gyro = np.eye(3) if rig_from_gyro is None else rig_from_gyro
         self._shift_ns = shift_ns
 
@@ -108,6 +110,13 @@ class RigMotion:
         if self._gyro is not None:
             raw = cam.rotation @ turned_rad / seconds
         return OutsideMotion(cam @ pose @ cam.inverse(), seconds, self._wheels is not None, raw)
+
+
+def _mounted(cam_from_rig: SE3 | None) -> SE3:
+    """cam_from_rig of a rig with x forward; KITTI's rig, for one, has the axes of a camera."""
+    if cam_from_rig is None:
+        return FORWARD
+    return cam_from_rig @ FORWARD if cam_from_rig.angle_rad < _LIKE_A_CAMERA_RAD else cam_from_rig
 
 
 class _Held:
