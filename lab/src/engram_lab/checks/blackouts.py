@@ -2,8 +2,8 @@
 
 A drive of a town is mapped, others are localised in it, each many times, with a blackout at another
 place. Wheels measure 2 % too much and scatter by 1 %; the gyroscope has a bias of 0.01 rad/s, noise
-of 0.002 rad/s, and two seconds of rest at the start. Each is compared with visual odometry alone. Nothing looks
-for a lost robot: what is found is found by dead reckoning.
+of 0.002 rad/s, and two seconds of rest at the start. Each is compared with visual odometry alone.
+Nothing looks for a lost robot: what is found is found by dead reckoning.
 
 python -m engram_lab.checks.blackouts LOGS MAPPED LIVE …     # frame logs with their truth
 """
