@@ -35,6 +35,7 @@ EXAMPLES = {
     DOCS / "study.md": "drives",
     DOCS / "data.md": "mapped",
     DOCS / "doctor.md": "mapped",
+    DOCS / "recorder.md": "mapped",
     DOCS / "trouble.md": "mapped",
     DOCS / "goals.md": "mapped",
     DOCS / "mend.md": "mapped",

@@ -95,6 +95,13 @@ def localise(
         bool,
         typer.Option("--remember", help="Keep the drive's path and attempts in the map."),
     ] = False,
+    recorder: Annotated[
+        Path | None,
+        typer.Option("--recorder", metavar="DIR", help="Write the last 30 s as a file when lost."),
+    ] = None,
+    no_images: Annotated[
+        bool, typer.Option("--no-images", help="Such files hold no images.")
+    ] = False,
     explain: Annotated[
         int | None,
         typer.Option("--explain", metavar="FRAME", min=0, help="Explain this frame's candidates."),
@@ -126,14 +133,14 @@ def localise(
     sequence, resolved, tried = drive.open(path), given.of_robot(), effort.over(given)
     if explain is None:
         asked = RobotOptions(**tried, deadline_ms=deadline, relocaliser=found_by)
-        outputs = Outputs(trajectory, pictures, rate, as_json, remember)
+        outputs = Outputs(trajectory, pictures, rate, as_json, remember, recorder, not no_images)
         with open_map(map_path, at) as opened:
             localise_and_print(opened, sequence, resolved, asked, outputs)
         tell_losses(sequence)
         return
     refused = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
-        "--remember": remember or None,
+        "--remember": remember or None, "--recorder": recorder,
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")

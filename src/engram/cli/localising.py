@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
     from engram.localiser import Localisation
     from engram.maps import Map
-    from engram.robot import RobotOptions, Settings
+    from engram.robot import Recorder, RobotOptions, Settings
     from engram.sequences import Drive
 
 # So many match pictures are spread over a drive: enough to leaf through.
@@ -29,6 +29,8 @@ class Outputs:
         rate_hz: replay in real time; None for as fast as it goes.
         as_json: JSON on stdout, in place of text.
         remember: keep path and attempts in the map.
+        recorder: folder of flight records; None for none.
+        record_images: whether they hold images.
     """
 
     trajectory: Path | None
@@ -36,6 +38,8 @@ class Outputs:
     rate_hz: float | None
     as_json: bool
     remember: bool = False
+    recorder: Path | None = None
+    record_images: bool = True
 
 
 def localise_and_print(
@@ -59,6 +63,7 @@ def localise_and_print(
     results: list[Localisation] = []
     interrupted = False
     with robot_on(opened, sequence, settings, asked, remembers=outputs.remember) as robot:
+        robot.recorder = _recorder(opened, sequence, outputs)
         writer = None
         if outputs.pictures is not None:
             every = max(1, len(sequence) // _PICTURES)
@@ -82,6 +87,7 @@ def localise_and_print(
     }
     if outputs.remember:
         summary["remembered"] = {"state": robot.saving.state, "revision": robot.saving.revision}
+    summary |= _records(robot.recorder)
     frames = [result.to_dict() for result in results]
     if outputs.as_json:
         print(json.dumps({"summary": summary, "frames": frames}))
@@ -93,3 +99,24 @@ def localise_and_print(
             typer.echo(robot.saving.text())
     if interrupted:
         raise typer.Exit(130)
+
+
+def _recorder(opened: Map, sequence: Drive, outputs: Outputs) -> Recorder | None:
+    """The flight recorder, if one was asked for."""
+    from engram.robot import Recorder
+
+    if outputs.recorder is None:
+        return None
+    about = {"map": str(opened.location), "revision": opened.revision}
+    return Recorder(outputs.recorder, sequence.info, about, outputs.record_images)
+
+
+def _records(recorder: Recorder | None) -> dict[str, Any]:
+    """What ``--json`` prints of a recorder; says why a record is missing."""
+    if recorder is None:
+        return {}
+    if recorder.failure:
+        typer.echo(f"warning: not recorded: {recorder.failure}", err=True)
+    for path in recorder.written:
+        typer.echo(f"flight record: {path}", err=True)
+    return {"records": [str(path) for path in recorder.written]}

@@ -99,6 +99,7 @@ CHECKS: tuple[Check, ...] = (
         "frozen_stream", _FATAL, motion.frozen_frames, "frozen_frames", "images in a row",
         "a camera repeats an old image under new stamps",
         "look at the camera's driver and its bandwidth; record again",
+        explains=("repeated_images",),
     ),
     Check(
         "no_odometry", _FATAL, motion.without_odometry, "no_odometry", "of the frames",

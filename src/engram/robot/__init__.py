@@ -5,6 +5,7 @@ from engram.robot.examining import examine_drive
 from engram.robot.front import Front, arriving
 from engram.robot.inspecting import check_map, describe_map, seal_map
 from engram.robot.mapping import MapReport, map_drive
+from engram.robot.recorder import Recorder, RecorderConfig
 from engram.robot.recording import ExtractReport, extract_log
 from engram.robot.results import localise_drive, measure, measured, summarise
 from engram.robot.robot import Robot
@@ -17,6 +18,8 @@ __all__ = [
     "ExtractReport",
     "Front",
     "MapReport",
+    "Recorder",
+    "RecorderConfig",
     "Robot",
     "RobotOptions",
     "Settings",

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 
 import numpy as np
 
-from engram.doctor import Diagnosis, Facts
+from engram.doctor import Diagnosis, Evidence, Facts
 from engram.errors import UnfitDriveError
-from engram.geometry import StereoCamera
+from engram.geometry import SE3, StereoCamera
 from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
 from engram.robot.front import Arrived, Front, arriving
 from engram.robot.session import DriveSequence
@@ -19,6 +19,8 @@ from engram.sequences.listing import StampFault
 
 # A long drive is examined in so many stretches, as it may begin at rest or in the dark.
 _STRETCHES = 4
+# Ways are compared over stretches of this length, metres.
+_WAY_M = 3.0
 
 
 def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
@@ -82,6 +84,27 @@ def stretches(length: int, most: int) -> list[range]:
     each = max(most // _STRETCHES, 1)
     starts = np.linspace(0, length - each, min(_STRETCHES, most)).round().astype(int)
     return [range(int(start), int(start) + each) for start in starts]
+
+
+def ways_of(evidence: Evidence, world_from_cam: Sequence[SE3 | None]) -> list[tuple[float, float]]:
+    """Ways over stretches of a few metres: by motion from outside, and by odometry.
+
+    Args:
+        evidence: of an examination.
+        world_from_cam: pose of each of its frames, measured by something else; None if unknown.
+    """
+    ways: list[tuple[float, float]] = []
+    start: SE3 | None = None
+    moved = SE3.identity()
+    for step, pose in zip(evidence.moved, world_from_cam, strict=True):
+        if step is None or pose is None or start is None:
+            start, moved = pose, SE3.identity()
+            continue
+        moved = moved @ step
+        if moved.distance_m >= _WAY_M:
+            ways.append(((start.inverse() @ pose).distance_m, moved.distance_m))
+            start, moved = pose, SE3.identity()
+    return ways
 
 
 class LookedAhead:

@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Self
 
 from engram.doctor import Diagnosis
-from engram.errors import ConfigError
+from engram.errors import ConfigError, InputError
 from engram.frontend import Frame, StereoPair
 from engram.geometry import SE3
 from engram.localiser import (
@@ -28,6 +29,7 @@ from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot.front import Arrived, Front, arriving, paced
 from engram.robot.live import LiveKeeper, Saving
+from engram.robot.recorder import Recorder
 from engram.sequences.motion import MovedSequence
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.
@@ -85,6 +87,7 @@ class Robot:
         # Rising stamps of the newest frames that came too late.
         self._early_ns: list[int] = []
         self._track: deque[tuple[int, Localisation]] = deque(maxlen=_REMEMBERED)
+        self.recorder: Recorder | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -104,6 +107,8 @@ class Robot:
                 live.close(self.diagnosis.fatal)
         finally:
             self._localiser.close()
+            if self.recorder is not None:
+                self.recorder.close()
 
     @property
     def outcomes(self) -> list[Outcome]:
@@ -168,6 +173,8 @@ class Robot:
         if deadline is not None and time.perf_counter() > deadline:
             found = replace(found, late=True)
         self.last = Seen(arrived, frame, self._localiser.outcomes)
+        if self.recorder is not None:
+            self.recorder.note(arrived, frame, found, self._localiser.outcomes)
         self._track.append((frame.stamp_ns, found))
         return found
 
@@ -217,6 +224,19 @@ class Robot:
             _, motion = self._front.take(arrived, motion)
             self._localiser.move(motion)
 
+    def record(self, reason: str = "asked") -> Path:
+        """Writes the last seconds as a flight record; see `Recorder.record`.
+
+        Args:
+            reason: stored with it.
+
+        Raises:
+            InputError: the robot has no `recorder`.
+        """
+        if self.recorder is None:
+            raise InputError("the robot records nothing: set robot.recorder = Recorder(FOLDER)")
+        return self.recorder.record(reason)
+
     def place_at(self, hint: Position) -> None:
         """Sets the position before the next step, such as an operator's or a stored one.
 
@@ -239,6 +259,8 @@ class Robot:
             _REMEMBERED,
         )
         self._keeper.withdrawn(found)
+        if self.recorder is not None:
+            self.recorder.withdrew()
 
     def _withdraw_at(self, stamp_ns: int) -> None:
         """Withdraws the result of an earlier frame."""

@@ -104,7 +104,7 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             has_topics=True,
         ),
         "framelog": SequenceFormat(
-            "frame log, a file NAME.framelog that `engram record` made",
+            "frame log, NAME.framelog, that `engram record` made; or a flight record, NAME.flight",
             is_framelog,
             open_framelog,
         ),

@@ -1,4 +1,4 @@
-"""The SQLite file of a frame log: its tables and its write-ahead log."""
+"""The SQLite files of frame logs and flight records: their tables and write-ahead log."""
 
 from __future__ import annotations
 
@@ -58,9 +58,55 @@ FRAME_LOG = FileKind(
 )
 
 
+FLIGHT_SUFFIX = ".flight"
+_flight_metadata = MetaData()
+for _table in (log_table, frames_table):
+    _table.to_metadata(_flight_metadata)
+
+# One row: why and where the record was made, JSON.
+report_table = Table(
+    "report",
+    _flight_metadata,
+    Column("key", _INT64, primary_key=True, autoincrement=False),
+    Column("content", Text(), nullable=False),
+    Column("digest", LargeBinary(), nullable=False),
+    sqlite_strict=True,
+)
+# One row a frame: what the robot concluded, JSON.
+decisions_table = Table(
+    "decisions",
+    _flight_metadata,
+    Column("number", _INT64, primary_key=True, autoincrement=False),
+    Column("content", Text(), nullable=False),
+    Column("digest", LargeBinary(), nullable=False),
+    sqlite_strict=True,
+)
+# One row a frame with images, JPEG; none in a record without images.
+images_table = Table(
+    "images",
+    _flight_metadata,
+    Column("number", _INT64, primary_key=True, autoincrement=False),
+    Column("left_image", LargeBinary(), nullable=False),
+    Column("right_image", LargeBinary(), nullable=False),
+    Column("digest", LargeBinary(), nullable=False),
+    sqlite_strict=True,
+)
+
+# A frame log of a robot's last seconds, with images and decisions beside it.
+FLIGHT_RECORD = FileKind(
+    noun="flight record",
+    application_id=0x456E4652,  # "EnFR"
+    format_version=1,
+    metadata=_flight_metadata,
+    strange=SequenceError,
+    cure="restore a copy",
+    busy_s=1.0,
+)
+
+
 def framelog_file(path: Path) -> SqliteFile:
-    """The file of a frame log; it may not exist yet."""
-    return SqliteFile(path, FRAME_LOG)
+    """The file of a frame log, or a flight record by its suffix; it may not exist yet."""
+    return SqliteFile(path, FLIGHT_RECORD if path.suffix == FLIGHT_SUFFIX else FRAME_LOG)
 
 
 def begin_writing(connection: Connection) -> None:

@@ -15,7 +15,7 @@ from engram.errors import ConfigError, MapCorruptError, SequenceError
 from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera, propagate_covariance
 from engram.odometry import MotionSource, OdometryStatus, OdometryStep
-from engram.sequences.framelog.file import framelog_file, frames_table, log_table
+from engram.sequences.framelog.file import FLIGHT_SUFFIX, framelog_file, frames_table, log_table
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
 from engram.sequences.image_sequence import with_options
@@ -27,12 +27,12 @@ SUFFIX = ".framelog"
 
 
 def is_framelog(path: Path) -> bool:
-    """A file named `….framelog`.
+    """A file named `….framelog`, or `….flight`: the log of a robot's last seconds.
 
     Its bytes are not read: opening and closing a file that this process also writes through
     SQLite would drop SQLite's locks.
     """
-    return path.suffix == SUFFIX and path.is_file()
+    return path.suffix in {SUFFIX, FLIGHT_SUFFIX} and path.is_file()
 
 
 def open_framelog(path: Path, options: OpenOptions) -> FrameLog:

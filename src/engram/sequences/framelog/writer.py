@@ -20,7 +20,6 @@ from engram.sequences.framelog.file import (
     frames_table,
     log_table,
     log_while_writing,
-    metadata,
 )
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.reader import read_header
@@ -192,7 +191,7 @@ class FrameLogWriter:
         return int(count), last_ns
 
     def _make(self, connection: Connection) -> None:
-        metadata.create_all(connection)
+        self._file.kind.metadata.create_all(connection)
         self._file.mark(connection.exec_driver_sql)
         header = self._header.to_json()
         connection.execute(

@@ -1,0 +1,119 @@
+"""The flight recorder: what it keeps, when it writes, and that its file is a drive."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive
+
+from engram.errors import EngramError, InputError
+from engram.localiser import LocalisationStatus
+from engram.maps import open_map
+from engram.robot import Recorder, RecorderConfig, Settings, open_drive
+from engram.robot.front import Front
+from engram.robot.results import localise_drive
+from engram.sequences import FrameLog
+from engram.sequences.framelog import read_decisions, read_images, read_report
+from engram_lab.bench.data import synthetic_drive
+
+ROAD = np.arange(0.0, 20.0, 0.7)
+WORLD = World(30.0)
+LIVE = drive(WORLD, ROAD + 0.2, seed=3, start_ns=10**15)
+ELSEWHERE = drive(World(30.0, seed=9), ROAD + 0.2, seed=4, start_ns=10**15 + 4 * 10**9)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recorder") / "town.engram"
+    map_simulated(path, drive(WORLD, ROAD))
+    return path
+
+
+def test_a_lost_robot_writes_what_led_to_it_and_the_file_is_a_drive(
+    town: Path, tmp_path: Path
+) -> None:
+    with open_map(town) as opened:
+        with opened.robot(LIVE[0].frame.camera) as robot:
+            robot.recorder = Recorder(tmp_path / "records", about={"map": "town"})
+            found = [robot.step(one.logged) for one in [*LIVE[:20], *ELSEWHERE]]
+        assert found[19].localised
+        assert found[-1].status is LocalisationStatus.LOST
+        (path,) = robot.recorder.written
+        assert not robot.recorder.failure
+        replayed = localise_drive(opened, open_drive(path))
+    assert read_report(path)["reason"] == "lost"
+    assert read_report(path)["map"] == "town"
+    decisions = read_decisions(path)
+    assert len(decisions) == len(replayed) > 20
+    assert decisions[5]["status"] == "localised"
+    assert sum(one.localised for one in replayed) >= 18
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return list(synthetic_drive(frames=4, step_m=0.8))
+
+
+@pytest.mark.parametrize("images", [True, False])
+def test_images_are_kept_unless_they_are_private(pairs, tmp_path: Path, images: bool) -> None:
+    path = recorded(pairs, tmp_path, images=images)
+    log = FrameLog(path)
+    assert len(log) == len(pairs)
+    logged = log.read(1)
+    kept = read_images(path, 1)
+    assert (kept is not None) is images
+    assert (logged.frame.thumbnail is not None) is images
+    if kept is not None:
+        left = kept[0].astype(float)
+        assert np.abs(left - pairs[1].left).mean() < 4
+
+
+def test_what_is_too_old_or_too_much_is_dropped(pairs, tmp_path: Path) -> None:
+    assert len(FrameLog(recorded(pairs, tmp_path / "a", seconds=0.15))) == 2
+    assert len(FrameLog(recorded(pairs, tmp_path / "b", most_bytes=1_000_000))) < len(pairs)
+
+
+def test_a_robot_without_a_recorder_says_what_to_do(town: Path) -> None:
+    with (
+        open_map(town) as opened,
+        opened.robot(LIVE[0].frame.camera) as robot,
+        pytest.raises(InputError, match="recorder"),
+    ):
+        robot.record()
+
+
+@pytest.mark.parametrize("at", [0, 30, 2000, -2000, -1])
+def test_a_damaged_record_is_a_clear_error_or_reads_as_it_was(
+    pairs, tmp_path: Path, at: int
+) -> None:
+    path = recorded(pairs, tmp_path)
+    content = bytearray(path.read_bytes())
+    content[at] ^= 0x5A
+    path.write_bytes(content)
+    try:
+        list(FrameLog(path))
+        read_report(path)
+        read_decisions(path)
+        for number in range(len(pairs)):
+            read_images(path, number)
+    except EngramError as error:
+        said = str(error)
+        assert path.name in said or "frame log" in said
+
+
+def recorded(pairs, folder: Path, *, images: bool = True, **config: float) -> Path:
+    """The record of a robot that was asked for one."""
+    front = Front(Settings())
+    recorder = Recorder(folder, images=images, config=RecorderConfig(**config))
+    town = folder.with_suffix(".engram")
+    with open_map(town, create=True) as empty, empty.robot(pairs[0].camera) as robot:
+        for pair in pairs:
+            frame, _ = front.take(pair)
+            recorder.note(pair, frame, robot.step(pair), [])
+    path = recorder.record()
+    recorder.close()
+    assert recorder.failure == ""
+    return path
