@@ -135,6 +135,10 @@ def test_it_says_where_the_robot_is(client: Client, pairs: list[StereoPair]) -> 
     assert np.array(last["covariance"]).shape == (36,)
     assert last["odom_from_live"][11] > 0.5  # metres driven ahead
     assert last["node"]
+    first = np.reshape(found[1]["map_from_live"], (4, 4))
+    moved = np.reshape(last["map_from_live"], (4, 4))[:3, 3] - first[:3, 3]
+    assert np.linalg.norm(moved) == pytest.approx(0.8 * (len(pairs) - 2), rel=0.2)
+    assert abs(moved[2]) < 0.3, "z is up in the map frame"
 
 
 def test_it_is_never_silent(client: Client) -> None:

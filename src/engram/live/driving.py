@@ -12,9 +12,11 @@ import numpy as np
 
 from engram.errors import EngramError, InputError
 from engram.frontend import DescriptorKind, StereoPair
-from engram.geometry import StereoCamera
+from engram.geometry import SE3, StereoCamera
+from engram.graph.model import NodeId
 from engram.localiser import Localisation, Position
 from engram.maps import Map, open_map
+from engram.maps.map_frame import MapFrame
 from engram.odometry import Motion
 from engram.robot.front import Arrived, Front
 from engram.robot.live import Saving, SavingState
@@ -82,6 +84,8 @@ class Driving:
         self._camera: StereoCamera | None = None
         self._front: tuple[DescriptorKind, Front] | None = None
         self._map: Map | None = None
+        # Laid out once: what the robot itself saves has no place before it is committed.
+        self._frame: MapFrame | None = None
         self._robot: Robot | None = None
         self._saved = Saving()
         self._belief: Position | None = None
@@ -93,10 +97,13 @@ class Driving:
         """Whether and where the drive is saved; of the last drive while none runs."""
         return self._saved if self._robot is None else self._robot.saving
 
-    @property
-    def opened(self) -> Map | None:
-        """The map that the robot drives in; None while there is none."""
-        return self._map
+    def map_from(self, node: NodeId) -> SE3 | None:
+        """``map_from_node`` in the map frame; None for a node that the opened map does not have."""
+        if self._map is None or node not in self._map.graph:
+            return None
+        if self._frame is None:
+            self._frame = self._map.frame
+        return self._frame.pose(node)
 
     def step(self, arrived: Arrived, arrived_s: float | None = None) -> Step:
         """Takes a frame: opens the map if it is not open, localises, and survives its errors.
@@ -164,7 +171,7 @@ class Driving:
             What became of the drive; "" if none was saved.
         """
         robot, self._robot = self._robot, None
-        opened, self._map = self._map, None
+        opened, self._map, self._frame = self._map, None, None
         self._open_after = -np.inf
         if robot is None or opened is None:
             return ""

@@ -133,7 +133,7 @@ class Ring:
         ticket, self._next = self._next, self._next + 1
         at = self._at(ticket)
         _SLOT.pack_into(self._memory, at, 2 * ticket + 1, stamp_ns)
-        for pixels, image in zip(self._images(ticket), (left, right)):  # 3.8
+        for pixels, image in zip(self._images(ticket), (left, right)):  # noqa: B905  # 3.8
             pixels[...] = image
         _SLOT.pack_into(self._memory, at, 2 * ticket + 2, stamp_ns)
         return ticket

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -139,8 +140,21 @@ class LiveProcess:
                 "odom_covariance": _flat(self._track.covariance),
                 "ms": 1e3 * (time.perf_counter() - event.arrived_s),
                 **_found(step),
+                **self._placed(step),
             }
         )
+
+    def _placed(self, step: Step) -> Message:
+        """The pose in the map frame, where the belief's node has a place in it."""
+        position = None if step.found is None else step.found.position
+        map_from_node = None if position is None else self._driving.map_from(position.node)
+        if position is None or map_from_node is None:
+            return {}
+        adjoint = map_from_node.adjoint()
+        return {
+            "map_from_live": _flat((map_from_node @ position.node_from_live).matrix()),
+            "map_covariance": _flat(adjoint @ position.covariance @ adjoint.T),
+        }
 
     def _obey(self, command: Command) -> bool:
         """Answers a command; False after `stop`."""
@@ -198,6 +212,7 @@ def _found(step: Step) -> Message:
     said: dict[str, Any] = {
         "attempts": found.attempts,
         "inliers": found.inliers,
+        "confidence": found.confidence if math.isfinite(found.confidence) else None,
         "late": found.late,
         "open_loop_m": found.open_loop_m,
         "saved": None if found.saved is None else str(found.saved),
