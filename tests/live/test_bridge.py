@@ -32,6 +32,7 @@ from engram_bridge import images, rigid  # noqa: E402
 from engram_bridge.belief import Belief  # noqa: E402
 from engram_bridge.pairs import Pairs  # noqa: E402
 from engram_bridge.supervisor import Supervisor  # noqa: E402
+from engram_bridge.wheels import Wheels  # noqa: E402
 
 TWIST = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6)
 LIVE = [sys.executable, "-c", "from engram.cli import main; main()", "live"]
@@ -142,6 +143,25 @@ def test_ros_states_covariance_at_the_childs_origin(twist: list[float]) -> None:
     shift = SE3(np.eye(3), a_from_b.translation).adjoint()
     moved = rigid.at_its_own_origin(a_from_b.matrix(), shift @ only_turns @ shift.T)
     np.testing.assert_allclose(moved, only_turns, atol=1e-9)
+
+
+def test_the_wheels_pose_at_the_time_of_an_image() -> None:
+    """A robot that drives a circle with 1 m/s and 0.2 rad/s, reported at 50 Hz."""
+    wheels = Wheels()
+
+    def circle(seconds: float) -> SE3:
+        return SE3.exp(seconds * np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.2]))
+
+    assert wheels.at(0) is None
+    for number in range(50):
+        w, x, y, z = circle(number / 50).quaternion_wxyz()
+        wheels.add(number * 20_000_000, circle(number / 50).translation, [x, y, z, w])
+    for seconds in (0.5, 0.513, 0.995):
+        matrix = wheels.at(int(seconds * 1e9))
+        np.testing.assert_allclose(matrix, circle(seconds).matrix(), atol=1e-4)
+    assert wheels.at(int(1.2e9)) is None
+    wheels.add(0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    assert wheels.at(10) is None, "the clock went back"
 
 
 BASE_FROM_CAMERA = rigid.of_xyz_rpy([0.5, 0.1, 1.2, -np.pi / 2, 0.0, -np.pi / 2])

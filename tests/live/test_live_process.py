@@ -19,6 +19,7 @@ import pytest
 
 from engram.errors import InputError
 from engram.frontend import StereoPair
+from engram.geometry import SE3
 from engram.live import InProcess, LiveOptions, LiveProcess, Played, Served
 from engram.live.link import Link, Ring
 from engram.maps import open_map
@@ -197,6 +198,23 @@ def test_a_missing_map_is_reported_and_odometry_continues(
     assert "does not exist" in found[0]["trouble"]
     assert found[2]["odom_from_live"][11] > found[1]["odom_from_live"][11]
     assert "covariance" not in found[2]
+
+
+def test_wheels_carry_the_robot_where_the_camera_sees_nothing(
+    town: Path, pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    """The drive goes straight ahead, 0.8 m a frame, and three frames are dark."""
+    dark = np.zeros_like(pairs[0].left)
+    with running("in process", tmp_path, LiveOptions(town, robot=OPTIONS)) as one:
+        assert isinstance(one, Caller)
+        for number, pair in enumerate(pairs):
+            blind = number in {4, 5, 6}
+            given = replace(pair, left=dark, right=dark) if blind else pair
+            ahead = SE3(np.eye(3), np.array([0.0, 0.0, 0.8 * number]))
+            one.transport.give(given, ahead)
+            said = until(one, lambda m, at=pair.stamp_ns: m.get("stamp_ns") == at)
+    assert said["status"] == "localised"
+    assert said["odom_from_live"][11] == pytest.approx(0.8 * (len(pairs) - 1), rel=0.05)
 
 
 def test_the_newest_frame_wins(town: Path, pairs: list[StereoPair]) -> None:

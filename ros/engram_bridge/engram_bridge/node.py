@@ -22,6 +22,7 @@ from engram_bridge import images, rigid
 from engram_bridge.belief import Belief
 from engram_bridge.pairs import Pairs
 from engram_bridge.supervisor import Supervisor
+from engram_bridge.wheels import Wheels
 
 try:
     from tf2_msgs.msg import TFMessage
@@ -43,6 +44,7 @@ _PARAMETERS = {
     "right": "right/image_rect",
     "left_info": "left/camera_info",
     "right_info": "right/camera_info",
+    "wheels": "",
     "compressed": False,
     "rectified": True,
     "pair_tolerance_ms": 2.0,
@@ -67,6 +69,8 @@ class Bridge(Node):
             self.declare_parameter(name, value)
         self._belief = Belief(rigid.of_xyz_rpy(self._given("base_from_camera")))
         self._pairs = Pairs(int(1e6 * self._given("pair_tolerance_ms")))
+        self._wheels = Wheels()
+        self._base_from_camera = rigid.of_xyz_rpy(self._given("base_from_camera"))
         self._infos = [None, None]
         self._path = Path()
         self._publish()
@@ -120,6 +124,10 @@ class Bridge(Node):
                 qos_profile_sensor_data,
             )
 
+        if self._given("wheels"):
+            topic = self._given("wheels")
+            self.create_subscription(Odometry, topic, self._turned, qos_profile_sensor_data)
+
     def _serve(self) -> None:
         self.create_service(Trigger, "~/save", self._asked("save"))
         self.create_service(Trigger, "~/relocalise", self._asked("relocalise"))
@@ -167,6 +175,12 @@ class Bridge(Node):
             camera.update(zip(("left", "right"), self._infos))  # Python 3.8
             self._supervisor.see(camera, said["image_width"], said["image_height"])
 
+    def _turned(self, message) -> None:
+        stamp, pose = message.header.stamp, message.pose.pose
+        at, turn = pose.position, pose.orientation
+        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+        self._wheels.add(stamp_ns, [at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w])
+
     def _image(self, side: int, message) -> None:
         stamp = message.header.stamp
         pair = self._pairs.add(side, stamp.sec * 10**9 + stamp.nanosec, message)
@@ -176,7 +190,9 @@ class Bridge(Node):
         try:
             decode = images.uncompressed if self._given("compressed") else images.grey
             left, right = (decode(one) for one in both)
-            self._supervisor.show(stamp_ns, left, right)
+            wheels = self._wheels.at(stamp_ns)
+            wheels = None if wheels is None else wheels @ self._base_from_camera
+            self._supervisor.show(stamp_ns, left, right, wheels)
         except Exception as error:  # whatever a camera sends, the node goes on and says so
             self.get_logger().error(f"images: {error}", throttle_duration_sec=_QUIET_S)
 

@@ -72,3 +72,16 @@ def at_its_own_origin(a_from_b, covariance):
     shift[:3, 3] = -a_from_b[:3, 3]
     moved = adjoint(shift)
     return moved @ covariance @ moved.T
+
+
+def of_quaternion(xyzw, translation):
+    """From a unit quaternion and a translation in metres."""
+    x, y, z, w = np.array(xyzw, np.float64) / np.linalg.norm(xyzw)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = translation
+    return matrix

@@ -17,7 +17,7 @@ from engram.graph.model import NodeId
 from engram.localiser import Localisation, Position
 from engram.maps import Map, open_map
 from engram.maps.map_frame import MapFrame
-from engram.odometry import Motion
+from engram.odometry import Motion, OutsideMotion
 from engram.robot.front import Arrived, Front
 from engram.robot.live import Saving, SavingState
 from engram.robot.robot import Robot
@@ -90,6 +90,7 @@ class Driving:
         self._saved = Saving()
         self._belief: Position | None = None
         self._stamp_ns: int | None = None
+        self._wheels_from_live: SE3 | None = None
         self._open_after = -np.inf
 
     @property
@@ -105,12 +106,18 @@ class Driving:
             self._frame = self._map.frame
         return self._frame.pose(node)
 
-    def step(self, arrived: Arrived, arrived_s: float | None = None) -> Step:
+    def step(
+        self,
+        arrived: Arrived,
+        arrived_s: float | None = None,
+        wheels_from_live: SE3 | None = None,
+    ) -> Step:
         """Takes a frame: opens the map if it is not open, localises, and survives its errors.
 
         Args:
             arrived: the frame.
             arrived_s: `time.perf_counter` when it arrived; None for now.
+            wheels_from_live: pose of the camera by wheel odometry; see `FrameEvent`.
         """
         frame = arrived if isinstance(arrived, StereoPair) else arrived.frame
         if trouble := self._misplaced(frame.stamp_ns):
@@ -120,11 +127,12 @@ class Driving:
             self._front = None
         self._camera = frame.camera
         robot = self._robot or self._begun()
+        motion = self._driven(frame.stamp_ns, wheels_from_live)
         self._stamp_ns = frame.stamp_ns
         if robot is None:
-            return Step(self._front_for(None).take(arrived)[1], trouble=self.trouble)
+            return Step(self._front_for(None).take(arrived, motion)[1], trouble=self.trouble)
         try:
-            found = robot.step(arrived, arrived_s=arrived_s)
+            found = robot.step(arrived, motion=motion, arrived_s=arrived_s)
         except EngramError as error:
             self.pause()
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
@@ -132,6 +140,14 @@ class Driving:
         self._belief = found.position
         self.trouble = robot.saving.reason if robot.saving.state is SavingState.FAILED else ""
         return Step(found.motion, found, self.trouble)
+
+    def _driven(self, stamp_ns: int, wheels_from_live: SE3 | None) -> OutsideMotion | None:
+        """What the wheels measured since the frame before; None if they did not."""
+        before, self._wheels_from_live = self._wheels_from_live, wheels_from_live
+        if before is None or wheels_from_live is None or self._stamp_ns is None:
+            return None
+        seconds = (stamp_ns - self._stamp_ns) / 1e9
+        return OutsideMotion(before.inverse() @ wheels_from_live, seconds)
 
     def map_on(self, on: bool) -> str:
         """Starts or ends mapping; ending commits what was mapped."""
@@ -193,8 +209,7 @@ class Driving:
         if back_ns < _LATE_FRAME_NS:
             return f"a frame is {back_ns / 1e6:.0f} ms older than the one before it; left out"
         self.pause()
-        self._front = None
-        self._stamp_ns = None
+        self._front = self._stamp_ns = self._wheels_from_live = None
         return f"the camera's clock went back by {back_ns / 1e9:.1f} s; the drive begins anew"
 
     def _begun(self) -> Robot | None:

@@ -13,7 +13,8 @@ The client sends:
   A rectified camera is ``fx, fy, cx, cy, baseline_m, width, height``. Or it is ``left, right``,
   each a ROS ``camera_info`` with the names of its YAML file, and ``rectified``: whether the images
   are.
-* ``{"do": "frame", "ticket": N, "stamp_ns": T}`` for a pair that was written to the ring.
+* ``{"do": "frame", "ticket": N, "stamp_ns": T}`` for a pair that was written to the ring; with
+  ``"wheels_from_live"``, 16 numbers, where wheel odometry sees the camera at that time.
 * ``{"do": "map", "on": true}``, ``{"do": "save"}``, ``{"do": "switch", "map": PATH}``,
   ``{"do": "relocalise"}``, ``{"do": "place", "node": …, "node_from_live": …, "covariance": …}``
   with an older belief as a hint, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer

@@ -116,7 +116,7 @@ class LiveProcess:
             self._transport.tell({"is": "ended", "text": said, **self._saving()})
 
     def _take(self, event: FrameEvent) -> None:
-        step = self._driving.step(event.arrived, event.arrived_s)
+        step = self._driving.step(event.arrived, event.arrived_s, event.wheels_from_live)
         self._track = self._track.after(step)
         status = "fault" if step.found is None else step.found.status.value
         before = self._health
@@ -214,6 +214,7 @@ def _found(step: Step) -> Message:
         "inliers": found.inliers,
         "confidence": found.confidence if math.isfinite(found.confidence) else None,
         "late": found.late,
+        "withdraws": list(found.withdraws),
         "open_loop_m": found.open_loop_m,
         "saved": None if found.saved is None else str(found.saved),
     }

@@ -19,7 +19,7 @@ from engram.calibration import Cameras
 from engram.calibration.camera_info import cameras_of_infos, parse_camera_info
 from engram.errors import CalibrationError, InputError
 from engram.frontend import StereoPair
-from engram.geometry import StereoCamera
+from engram.geometry import SE3, StereoCamera
 from engram.live.link import Link, LinkError, Ring
 from engram.live.transport import Command, FrameEvent, Message
 
@@ -117,9 +117,9 @@ class Served:
             if self._images is None:
                 self._refuse(message, "no camera was given yet")
                 return None
-            pair = self._told(message, self._images.pair)
-            if pair is not None:
-                return FrameEvent(pair, now, len(frames) - 1 - older)
+            taken = self._told(message, self._images.taken)
+            if taken is not None:
+                return FrameEvent(taken[0], now, len(frames) - 1 - older, taken[1])
         return None
 
     def _told(self, message: Message, act: Callable[[Message], Any]) -> Any:
@@ -157,8 +157,8 @@ class _Images:
                 f"calibration {size[0]} × {size[1]}"
             )
 
-    def pair(self, message: Mapping[str, Any]) -> StereoPair | None:
-        """The rectified pair of a ticket; None if it was overwritten."""
+    def taken(self, message: Mapping[str, Any]) -> tuple[StereoPair, SE3 | None] | None:
+        """The rectified pair of a ticket, and what the wheels say; None if it was overwritten."""
         images = self._ring.read(int(message["ticket"]))
         if images is None:
             return None
@@ -172,7 +172,11 @@ class _Images:
                 )
                 for image, table in zip((left, right), tables, strict=True)
             )
-        return StereoPair(int(message["stamp_ns"]), left, right, self._cameras.camera)
+        wheels = message.get("wheels_from_live")
+        return (
+            StereoPair(int(message["stamp_ns"]), left, right, self._cameras.camera),
+            None if wheels is None else SE3.from_matrix(np.reshape(wheels, (4, 4))),
+        )
 
     def close(self) -> None:
         """Lets go of the ring."""
