@@ -69,6 +69,9 @@ def extract(
 # --- graph search
 
 def pivoted_error(covariance: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def pivoted_errors(
+    covariances: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]: ...
 
 class GraphArrays:
     def __init__(

@@ -2,6 +2,9 @@
 
 #include "bindings/arrays.hpp"
 
+#include <cmath>
+#include <limits>
+
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
@@ -119,6 +122,21 @@ auto graph_chains(const Graph &arrays, int64_t root, const Input<int32_t, 1> &go
                         engram::to_numpy(std::move(errors_out), {count, 6}));
 }
 
+// By Cholesky's factor; false for what is no number.
+bool is_positive_definite(const double *matrix) {
+  double factor[36];
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j <= i; ++j) {
+      double total = matrix[6 * i + j];
+      for (int k = 0; k < j; ++k)
+        total -= factor[6 * i + k] * factor[6 * j + k];
+      if (i == j && !(total > 0 && total < std::numeric_limits<double>::max()))
+        return false;
+      factor[6 * i + j] = i == j ? std::sqrt(total) : total / factor[7 * j];
+    }
+  return true;
+}
+
 auto pivoted_error(const Input<double, 2> &covariance) {
   if (covariance.shape(0) != 6 || covariance.shape(1) != 6)
     throw std::invalid_argument("pivoted_error: expected a covariance (6, 6)");
@@ -127,11 +145,31 @@ auto pivoted_error(const Input<double, 2> &covariance) {
   return engram::to_numpy(std::move(error), {5});
 }
 
+auto pivoted_errors(const Input<double, 3> &covariances) {
+  const size_t count = covariances.shape(0);
+  if (covariances.shape(1) != 6 || covariances.shape(2) != 6)
+    throw std::invalid_argument("pivoted_errors: expected covariances (E, 6, 6)");
+  std::vector<double> errors(5 * count);
+  std::vector<uint8_t> definite(count);
+  {
+    nb::gil_scoped_release unlocked;
+    for (size_t i = 0; i < count; ++i) {
+      ENGRAM_CALL(pivoted_error, covariances.data() + 36 * i, errors.data() + 5 * i);
+      definite[i] = is_positive_definite(covariances.data() + 36 * i);
+    }
+  }
+  return nb::make_tuple(engram::to_numpy(std::move(errors), {count, 5}),
+                        engram::to_numpy(std::move(definite), {count}));
+}
+
 } // namespace
 
 void bind_graph_search(nb::module_ &module) {
   module.def("pivoted_error", &pivoted_error, "covariance"_a,
              "The error model (5,) tau, v, pivot of a covariance (6, 6).");
+  module.def("pivoted_errors", &pivoted_errors, "covariances"_a,
+             "The error models (E, 5) of covariances (E, 6, 6), and (E,) uint8 whether each is "
+             "surely positive definite.");
   nb::class_<Graph>(module, "GraphArrays", "The arrays of an experience graph, checked for shape.")
       .def(nb::init<Input<int32_t, 1>, Input<int32_t, 1>, Input<int32_t, 1>, Input<double, 2>,
                     Input<double, 2>, Input<int32_t, 1>, Input<double, 1>>(),

@@ -95,20 +95,32 @@ def edge_error_rows(edges: Sequence[tuple[SE3, Array]]) -> Array:
     Raises:
         InputError: a covariance has the wrong shape, is not finite or not positive semi-definite.
     """
-    _check([covariance for _, covariance in edges])
+    stack = _stacked([covariance for _, covariance in edges])
     rows = np.empty((len(edges), 8))
-    for row, (a_from_b, covariance) in zip(rows, edges, strict=True):
-        row[:5] = _core.pivoted_error(np.ascontiguousarray(covariance))
-        row[5:] = a_from_b.inverse() @ row[2:5]
+    rows[:, :5], definite = _core.pivoted_errors(stack)
+    _check(stack[definite == 0])
+    if len(edges):
+        rotations = np.stack([a_from_b.rotation for a_from_b, _ in edges])
+        translations = np.stack([a_from_b.translation for a_from_b, _ in edges])
+        # As a_from_b.inverse() @ pivot has it.
+        transposed = rotations.transpose(0, 2, 1)
+        moved = (transposed @ translations[:, :, None])[:, :, 0]
+        rows[:, 5:] = (rows[:, None, 2:5] @ rotations)[:, 0] - moved
     return rows
 
 
-def _check(covariances: Sequence[Array]) -> None:
-    """Checks all covariances at once: a map has tens of thousands."""
+def _stacked(covariances: Sequence[Array]) -> Array:
+    """(E, 6, 6) float64: a map has tens of thousands."""
     for one in covariances:
         if one.shape != (6, 6):
             raise InputError(f"a covariance must be a finite (6, 6) matrix, not {one.shape}")
-    stack = np.reshape(covariances, (-1, 6, 6))
+    return np.ascontiguousarray(np.reshape(covariances, (-1, 6, 6)), np.float64)
+
+
+def _check(stack: Array) -> None:
+    """Checks (K, 6, 6) covariances that are not surely positive definite."""
+    if not len(stack):
+        return
     if not np.isfinite(stack).all():
         raise InputError("a covariance must be a finite (6, 6) matrix; it has non-finite entries")
     eigenvalues = np.linalg.eigvalsh(stack)

@@ -18,6 +18,9 @@ from engram.graph.growing import Column
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.graph.neighbourhood import Neighbourhood, Search
 
+# From so many edges on they are linked by arrays; a mapper adds a few at a time.
+_BULK = 16
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainTree:
@@ -186,6 +189,10 @@ class ExperienceGraph:
             if a == b:
                 raise InputError(f"an edge joins two nodes; both ends are {edge.a}")
         error_rows = edge_error_rows([(edge.a_from_b, edge.covariance) for edge in edges])
+        keys = [(a, b, edge.kind) for (a, b), edge in zip(ends, edges, strict=True)]
+        if len(edges) >= _BULK and len(set(keys).difference(self._edge_index)) == len(keys):
+            self._link_all(keys, edges, error_rows)
+            return
         for (a, b), edge, error_row in zip(ends, edges, error_rows, strict=True):
             known = self._edge_index.get((a, b, edge.kind))
             if known is None:
@@ -212,6 +219,43 @@ class ExperienceGraph:
         ):
             self._join_experiences(a, b)
         return number
+
+    def _link_all(
+        self,
+        keys: Sequence[tuple[int, int, EdgeKind]],
+        edges: Sequence[Edge],
+        error_rows: NDArray[np.float64],
+    ) -> None:
+        """`_link` for many edges, none of whose keys is known: a map being read."""
+        self._bound = None
+        first = len(self._edges)
+        self._edges += edges
+        self._edge_index.update(zip(keys, range(first, len(self._edges)), strict=True))
+        poses = np.empty((len(edges), 12))
+        poses[:, :9] = np.stack([edge.a_from_b.rotation for edge in edges]).reshape(-1, 9)
+        poses[:, 9:] = np.stack([edge.a_from_b.translation for edge in edges])
+        self._a_from_b.extend(poses)
+        self._errors.extend(error_rows)
+        ends = np.array([(a, b) for a, b, _ in keys], np.int32)
+        sources = ends.ravel()  # of half 2e its a, of half 2e + 1 its b
+        order = np.argsort(sources, kind="stable")
+        halves = (2 * first + order).astype(np.int32)
+        new_source = np.ones(len(order), np.bool_)
+        new_source[1:] = sources[order[1:]] != sources[order[:-1]]
+        before = np.roll(halves, 1)
+        before[new_source] = self._first_half.rows[sources[order[new_source]]]
+        next_half = np.empty_like(halves)
+        next_half[order] = before
+        self._next_half.extend(next_half)
+        self._target.extend(np.ascontiguousarray(ends[:, ::-1]).ravel())
+        last = np.roll(new_source, -1)
+        self._first_half.rows[sources[order[last]]] = halves[last]
+        for a, b, kind in keys:
+            if (
+                kind is EdgeKind.ODOMETRY
+                and self._node_sessions.rows[a] == (self._node_sessions.rows[b])
+            ):
+                self._join_experiences(a, b)
 
     def _join_experiences(self, a: int, b: int) -> None:
         labels, sizes = self._experiences.rows, self._experience_sizes.rows

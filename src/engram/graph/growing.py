@@ -39,3 +39,14 @@ class Column(Generic[Scalar]):
             self._storage = grown
         self._storage[self._count] = row
         self._count += 1
+
+    def extend(self, rows: NDArray[Scalar]) -> None:
+        """Add (M, *row_shape) rows."""
+        count = self._count + len(rows)
+        if count > len(self._storage):
+            room = max(count, 2 * len(self._storage))
+            grown = np.zeros((room, *self._storage.shape[1:]), self._storage.dtype)
+            grown[: self._count] = self.rows
+            self._storage = grown
+        self._storage[self._count : count] = rows
+        self._count = count

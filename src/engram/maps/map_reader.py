@@ -31,6 +31,7 @@ from engram.graph.model import (
 from engram.graph.paths import PathMemory
 from engram.maps import marks, reading
 from engram.maps.checking import check
+from engram.maps.collector import no_collections
 from engram.maps.content import content_hash, record_hashes
 from engram.maps.database import Database
 from engram.maps.difference import STRETCH_M, MapDifference, difference
@@ -456,8 +457,9 @@ class MapReader:
     def _read_contents(self) -> _Contents:
         with self._contents_lock:
             if self._contents is None:
-                found = self.load()
-                self._contents = _Contents.of(found)
+                with no_collections():
+                    found = self.load()
+                    self._contents = _Contents.of(found)
                 # Attempts refer to sessions by position: both must be read together.
                 self.__dict__["sessions"] = {one.id: one for one in found.sessions}
             return self._contents

@@ -131,6 +131,8 @@ def counting(connection: Connection, view: View, rows: list[Row]) -> list[Row]:
     for row in view.rows(connection, removals):
         a_from_b = transform_from_bytes(row["a_from_b"], f"removal {row['key']}")
         removed.setdefault(_edge_key(row), []).append((row["a"], a_from_b))
+    if not removed:
+        return rows
     return [row for row in rows if not _is_removed(row, removed.get(_edge_key(row), []))]
 
 

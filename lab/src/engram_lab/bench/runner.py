@@ -26,6 +26,7 @@ Progress = Callable[[str, int, int], None]
 
 # A quarter of a second or so for one run of either side: fewer runs tell enough.
 _SLOW_STAGES = {
+    "open_map_4000": 10,
     "render_pair_512": 40,
     "render_pair_512_rain": 40,
     "render_pair_512_night": 40,

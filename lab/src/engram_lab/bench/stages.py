@@ -14,6 +14,7 @@ from engram.frontend import Frontend, MatcherConfig, StereoPair, match_frames
 from engram.geometry import StereoCamera
 from engram.odometry import Odometry, OdometryConfig, WindowConfig
 from engram_lab.bench.data import BenchData
+from engram_lab.bench.opening import prepare_opening
 from engram_lab.bench.places import prepare_places_query, prepare_vocabulary_train
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.ranking import prepare_ranking
@@ -101,6 +102,7 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         ),
         "attempt_512": partial(prepare_attempt, size="512"),
         "attempt_full": partial(prepare_attempt, size="full"),
+        "open_map_4000": prepare_opening,
         "render_pair_512": prepare_rendering,
         "render_pair_512_rain": partial(prepare_rendering, session=RAIN),
         "render_pair_512_night": partial(prepare_rendering, session=NIGHT),
