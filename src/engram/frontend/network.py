@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # The first eight hexadecimal digits of the SHA-256 of its weights. Part of the kind's name in maps
 # and frame logs, so that descriptors of two models never meet.
-MODEL = "b32438d4"
+MODEL = "595cbcd3"
 NETWORK_BITS, BRIEF_BITS = 192, 64
 
 _FILE = "net.safetensors"
