@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.frontend import Frame, Frontend, Match, feature_kind
 from engram.geometry import SE3
+from engram.odometry import Odometry, OdometryConfig
+from engram_lab.checks.accuracy import segment_errors
 from engram_lab.eyes import clip
 
 Matching = Callable[[Frame, Frame], Match]
@@ -79,6 +81,21 @@ def kitti(
             for k in range(len(frames) - step)
         ]
         yield _judge(matching, pairs, f"KITTI 06, {what} apart")
+
+
+def odometry(
+    frontend: Frontend, matching: Matching, data: Path
+) -> Iterator[tuple[str, float, float, int]]:
+    """How far odometry drifts, in per cent of the way."""
+    del matching
+    folder, engine = data / "kitti_odometry", Odometry(OdometryConfig())
+    truth = [SE3.from_matrix(row.reshape(3, 4)) for row in np.loadtxt(folder / "poses/06.txt")]
+    poses = [SE3.identity()]
+    for pair in clip(folder / "sequences/06"):
+        step = engine.step(frontend.extract(pair)).prev_from_curr
+        poses.append(poses[-1] @ (step or SE3.identity()))
+    drift, _ = segment_errors(poses[1:], truth)
+    yield "KITTI 06, odometry, % of the way (less is better)", round(100 * drift, 2), 100, 0
 
 
 def rigs(
@@ -152,4 +169,4 @@ def _shift_px(
     return float(np.median(across[np.abs(across - best) < _VOTE_PX]))
 
 
-CLIPS: tuple[Judge, ...] = (euroc, kitti, rigs, seasons)
+CLIPS: tuple[Judge, ...] = (euroc, kitti, odometry, rigs, seasons)
