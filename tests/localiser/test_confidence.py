@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.frontend import BRIEF
+from engram.frontend.features import NET
 from engram.geometry import SE3
 from engram.graph.model import NodeId
 from engram.localiser import Position, Spread
@@ -127,3 +128,13 @@ def test_a_trial_ends_where_nothing_comes() -> None:
     assert chain.position.node_from_live.distance_m == pytest.approx(5.0)
     drive(chain, 26.0)
     assert not chain.on_trial
+
+
+def test_a_kind_that_needs_more_inliers_is_as_sure_with_so_many_more() -> None:
+    net = confidence_of(NET)
+    usual = replace(evidence().standing, usual_inliers=110.0)
+    a, b = evidence(50), evidence(55, standing=usual)
+    assert net.as_predicted(b) == pytest.approx(MODEL.as_predicted(a))
+    assert net.as_predicted(a) < MODEL.as_predicted(a)
+    a, b = replace(a, spread=WIDE), replace(b, spread=WIDE)
+    assert net.as_anywhere(b) == pytest.approx(MODEL.as_anywhere(a))

@@ -84,8 +84,9 @@ class Vocabulary:
         """
         if kind != self.descriptor:
             raise IncompatibleError(
-                f"the descriptors are {kind}, the vocabulary's words {self.descriptor}; train one "
-                f"for {kind} with engram vocabulary train, or use the default one"
+                f"these are {kind} descriptors, the words are of {self.descriptor}: make the drive "
+                "again from its images with engram record DRIVE LOG --features "
+                f"{plain_name(self.descriptor)}, or use a vocabulary of {plain_name(kind)}"
             )
         return np.unique(self.quantise(np.ascontiguousarray(descriptors)))
 

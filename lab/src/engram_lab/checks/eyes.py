@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import os
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.cli.progress import Bars
 from engram.frontend import Frame, Frontend, FrontendConfig, Match, feature_kind, match_frames
 from engram.frontend.features import FeatureKind, fitted_matcher
@@ -139,14 +141,22 @@ def place_rows(
             vocabulary.words_of(seen[key].landmarks.descriptors, eyes.kind.name) for key in visit
         ]
 
-    recogniser = FabMap(vocabulary)
-    for place in [one for seen in frames for one in words(seen, "morning")]:
-        recogniser.add(place)
+    recogniser, at = FabMap(vocabulary), []
+    for town, seen in enumerate(frames):
+        for place, one in enumerate(words(seen, "morning")):
+            recogniser.add(one)
+            at.append((town, place))
     for name in ("late afternoon", "night", "snow", "rain"):
-        queries = [one for seen in frames for one in words(seen, name)]
-        found = [recogniser.recognise(query, 1).places for query in queries]
-        right = sum(len(one) > 0 and one[0] == place for place, one in enumerate(found))
-        yield Row(where, f"recognised at once: {name}, among the morning's", right, len(queries))
+        queries = [
+            (town, place, query)
+            for town, seen in enumerate(frames)
+            for place, query in enumerate(words(seen, name))
+        ]
+        right = 0
+        for town, place, query in queries:
+            best = recogniser.recognise(query, 1).places
+            right += any(at[k][0] == town and abs(at[k][1] - place) <= 1 for k in best)
+        yield Row(where, f"recognised at once within 5 m: {name} / morning", right, len(queries))
 
 
 def _between(scene: Scene, a: tuple[str, int], b: tuple[str, int]) -> SE3:
@@ -184,11 +194,25 @@ def calibration_rows(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
         yield Row(where, f"random visits, ≥ {least} inliers", count, _SAME, wrong)
 
 
+def speed_rows(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
+    """Least time of one core to describe 600 landmarks; ENGRAM_ISA chooses the instructions."""
+    scene = judged_scene(TOWNS[0][0], monitor)
+    marks, image = scene.landmarks[0, 0], np.ascontiguousarray(scene.left[0, 0])
+    rows = np.resize(np.arange(len(marks)), 600)
+    times_s = []
+    for _ in range(60):
+        began = time.thread_time()
+        eyes.kind.describe(image, marks.pixels[rows], marks.octaves[rows])
+        times_s.append(time.thread_time() - began)
+    yield Row(_core.isa, "600 landmarks described, ms", round(1000 * min(times_s), 2))
+
+
 def rows_of(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
     """All figures of a kind."""
     for seeds in TOWNS:
         yield from town_rows(eyes, seeds, monitor)
     yield from calibration_rows(eyes, monitor)
+    yield from speed_rows(eyes, monitor)
     if data := os.environ.get("ENGRAM_DATA"):
         for judge in eyes_real.CLIPS:
             for what, value, of, wrong in judge(eyes.frontend, eyes.match, Path(data)):
