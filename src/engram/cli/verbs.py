@@ -25,6 +25,7 @@ from engram.cli.live import live
 from engram.cli.maps import amend, check, info, plot, vocabulary
 from engram.cli.options import spread
 from engram.cli.showing import settings
+from engram.cli.view import view
 from engram.errors import InputError
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
@@ -38,6 +39,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "Maps": {
         "info": info,
         "plot": plot,
+        "view": view,
         "check": check,
         "amend": amend,
         "vocabulary": vocabulary,
