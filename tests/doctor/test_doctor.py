@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 
 import hypothesis.strategies as st
@@ -14,9 +15,12 @@ from hypothesis import given
 from engram.doctor import CHECKS, Diagnosis, DoctorConfig, Examination, Facts, Severity, diagnose
 from engram.doctor.sides import align, match_sides
 from engram.frontend import StereoPair
+from engram.geometry import SE3
 from engram.graph.model import Clock
+from engram.odometry import OutsideMotion
 from engram.robot import Front, Settings
-from engram.robot.examining import stretches
+from engram.robot.examining import LookedAhead, stretches
+from engram.robot.front import stamp_of
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
     Frozen,
@@ -185,3 +189,46 @@ def test_stretches_are_parts_of_the_drive_without_overlap(length: int, most: int
     assert frames == sorted(set(frames))
     assert 0 <= frames[0] <= frames[-1] < length
     assert len(frames) <= most
+
+
+class Odometer:
+    """Motion from outside that makes every step too long, and is read once, in order."""
+
+    def __init__(self, factor: float) -> None:
+        self.factor = factor
+        self.read_to_ns = 0
+
+    def between(self, start_ns: int, end_ns: int) -> OutsideMotion:
+        assert start_ns >= self.read_to_ns, "read twice"
+        self.read_to_ns = end_ns
+        step = SE3(np.eye(3), np.array([0.0, 0.0, 0.8 * self.factor]))
+        return OutsideMotion(step, (end_ns - start_ns) / 1e9)
+
+
+class Moved(list[StereoPair]):
+    """A drive with motion from outside."""
+
+    factor = 1.0
+
+    def motion(self) -> Odometer:
+        return Odometer(self.factor)
+
+
+@pytest.mark.parametrize(("factor", "found"), [(1.0, set()), (1.12, {"scale_off"})])
+def test_a_wrong_focal_length_shows_against_motion_from_outside(
+    pairs, factor: float, found: set[str]
+) -> None:
+    drive, front = Moved(pairs), Front(Settings())
+    drive.factor = factor
+    with closing(LookedAhead(front, drive)):  # type: ignore[arg-type]
+        assert codes(front.diagnosis) == found
+
+
+def test_motion_from_outside_goes_on_behind_the_frames_that_were_taken_ahead(pairs) -> None:
+    front = Front(Settings(doctor=DoctorConfig(frames=4)))
+    with closing(LookedAhead(front, Moved(pairs))) as ahead:  # type: ignore[arg-type]
+        source, taken = ahead.motion(), list(ahead)
+        assert source is not None
+        assert [stamp_of(one) for one in taken] == [pair.stamp_ns for pair in pairs]
+        assert source.between(pairs[2].stamp_ns, pairs[3].stamp_ns) is None
+        assert source.between(pairs[3].stamp_ns, pairs[4].stamp_ns) is not None

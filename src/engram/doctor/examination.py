@@ -80,8 +80,9 @@ class Evidence:
         matches: left-right matches of every few pairs, and the number of their frame.
         backwards, repeated: frames left out as their stamp is earlier than, or that of, the frame
             before.
-        outside_m: way by motion from outside or a map, and by odometry, over the same stretches.
+        outside: each step as measured by wheels or another source; None where it was not.
         alignments: of some pairs, worked out once at the end; None before.
+        aligned: the matches of those pairs.
     """
 
     config: DoctorConfig
@@ -98,8 +99,9 @@ class Evidence:
     matches: list[tuple[int, SideMatches]] = field(default_factory=list)
     backwards: int = 0
     repeated: int = 0
-    outside_m: list[tuple[float, float]] = field(default_factory=list)
+    outside: list[SE3 | None] = field(default_factory=list)
     alignments: list[Alignment] | None = None
+    aligned: list[SideMatches] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -137,13 +139,20 @@ class Examination:
         """Begins another stretch: nothing is known of the time before its first frame."""
         self._begins, self._last = True, None
 
-    def see(self, arrived: StereoPair | LoggedFrame, frame: Frame, motion: Motion) -> None:
+    def see(
+        self,
+        arrived: StereoPair | LoggedFrame,
+        frame: Frame,
+        motion: Motion,
+        outside: SE3 | None = None,
+    ) -> None:
         """Looks at one frame.
 
         Args:
             arrived: its images, or the logged frame.
             frame: what the front-end made of it.
             motion: the motion that led to it.
+            outside: the same as measured by wheels or another source; None if it was not.
         """
         if self.full:
             return
@@ -155,6 +164,7 @@ class Examination:
         step = motion.odometry
         seen.odometry.append(step.status in {OdometryStatus.OK, OdometryStatus.FIRST})
         seen.moved.append(step.prev_from_curr)
+        seen.outside.append(outside)
         disparity_px = frame.landmarks.disparity_px
         seen.disparity_px.append(float(np.median(disparity_px)) if len(disparity_px) else 0.0)
         self._begins = False
@@ -182,6 +192,7 @@ class Examination:
         if number % self.evidence.config.every == 0:
             self.evidence.sharpness.append(min(_sharpness(pair.left), _sharpness(pair.right)))
             self.evidence.matches.append((number, match_sides(pair)))
+            self.evidence.alignments = None
 
 
 def _equal(

@@ -6,6 +6,7 @@ nothing is demanded, so that what is wrong with a pair shows.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,7 @@ _RATIO = 0.85
 _WRONG_PX = 40.0
 # Fewest matches that must agree on the alignment of a pair, or of a part of the image.
 _LEAST_MATCHES = 20
+_LEAST_SHARE = 0.4
 _LEAST_CELLS = 3
 _AGREE_PX = 1.5
 _LEAST_SCATTER_PX = 0.3
@@ -79,19 +81,28 @@ def _corners(image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.uint8]]:
     return positions[best].astype(np.float64) + offsets[best], described
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
     """How the right image of one pair lies beside the left one.
 
     Attributes:
         offset_px: vertical offset, left minus right, at the principal point.
+        slope_px: (2,) change of that over the width and the height of the image: roll and scale.
         forward_m: way forwards from where the left image was taken to where the right one was.
         sigma_m: standard deviation of that.
+        agree: (M,) bool, which matches agree.
     """
 
     offset_px: float
+    slope_px: tuple[float, float]
     forward_m: float
     sigma_m: float
+    agree: NDArray[np.bool_]
+
+    @property
+    def rms_px(self) -> float:
+        """Root of the mean square of the vertical offset over the image."""
+        return math.sqrt(self.offset_px**2 + sum(one**2 for one in self.slope_px) / 12)
 
 
 def align(matches: SideMatches, camera: StereoCamera, seed: int = 0) -> Alignment | None:
@@ -113,13 +124,17 @@ def align(matches: SideMatches, camera: StereoCamera, seed: int = 0) -> Alignmen
     damping = _DAMPING * np.eye(4)
     for _ in range(_ROUNDS):
         agree = np.abs(offset - rows @ found) < _AGREE_PX
-        if agree.sum() < _LEAST_MATCHES:
+        if agree.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(rows)):
             return None
         normal = rows[agree].T @ rows[agree] + damping
         found = np.linalg.solve(normal, rows[agree].T @ offset[agree])
     scatter = max(float(np.std((offset - rows @ found)[agree])), _LEAST_SCATTER_PX)
     sigma = scatter * float(np.sqrt(np.linalg.inv(normal)[3, 3]))
-    return Alignment(float(found[0]), float(found[3]), sigma)
+    slope_px = (
+        float(found[1]) * camera.width / camera.fx,
+        float(found[2]) * camera.height / camera.fy,
+    )
+    return Alignment(float(found[0]), slope_px, float(found[3]), sigma, agree)
 
 
 def _consensus(rows: Array, values: Array, rng: np.random.Generator) -> Array:

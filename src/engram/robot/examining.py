@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 
 import numpy as np
 
-from engram.doctor import Diagnosis, Evidence, Facts
+from engram.doctor import Diagnosis, Facts
 from engram.errors import UnfitDriveError
-from engram.geometry import SE3, StereoCamera
+from engram.geometry import StereoCamera
 from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
-from engram.robot.front import Arrived, Front, arriving
+from engram.odometry import MotionSource, OutsideMotion
+from engram.robot.front import Arrived, Front, arriving, stamp_of
 from engram.robot.session import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences import Drive, FrameLog, ImageSequence, LoggedFrame, SequenceInfo
 from engram.sequences.listing import StampFault
+from engram.sequences.motion import MovedSequence
 
 # A long drive is examined in so many stretches, as it may begin at rest or in the dark.
 _STRETCHES = 4
-# Ways are compared over stretches of this length, metres.
-_WAY_M = 3.0
 
 
 def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
@@ -56,8 +56,8 @@ def examine_drive(
     evidence = front.examination.evidence
     evidence.facts = facts_of(sequence, by_hour=by_hour)
     with interruptible(monitor) as watched:
-        for arrived in _chosen(sequence, front, evidence.config.frames):
-            front.take(arrived)
+        for arrived, outside in _chosen(sequence, front, evidence.config.frames):
+            front.take(arrived, outside)
             watched.advance("examined")
             watched.check()
     for fault in sequence.skipped_reasons:
@@ -67,14 +67,24 @@ def examine_drive(
     return front.diagnosis
 
 
-def _chosen(sequence: Drive, front: Front, most: int) -> Iterator[Arrived]:
+def _chosen(
+    sequence: Drive, front: Front, most: int
+) -> Iterator[tuple[Arrived, OutsideMotion | None]]:
     """The frames that are examined; the front begins anew with each stretch of them."""
-    if not isinstance(sequence, ImageSequence | FrameLog):
-        yield from islice(sequence, most)
-        return
-    for stretch in stretches(len(sequence), most):
+    source = sequence.motion()
+    runs: Iterable[Iterable[Arrived]] = [islice(sequence, most)]
+    if isinstance(sequence, ImageSequence | FrameLog):
+        runs = (map(sequence.read, stretch) for stretch in stretches(len(sequence), most))
+    for run in runs:
         front.restart()
-        yield from map(sequence.read, stretch)
+        last_ns: int | None = None
+        for arrived in run:
+            stamp_ns = stamp_of(arrived)
+            if source is None or last_ns is None:
+                yield arrived, None
+            else:
+                yield arrived, source.between(last_ns, stamp_ns)
+            last_ns = stamp_ns
 
 
 def stretches(length: int, most: int) -> list[range]:
@@ -84,27 +94,6 @@ def stretches(length: int, most: int) -> list[range]:
     each = max(most // _STRETCHES, 1)
     starts = np.linspace(0, length - each, min(_STRETCHES, most)).round().astype(int)
     return [range(int(start), int(start) + each) for start in starts]
-
-
-def ways_of(evidence: Evidence, world_from_cam: Sequence[SE3 | None]) -> list[tuple[float, float]]:
-    """Ways over stretches of a few metres: by motion from outside, and by odometry.
-
-    Args:
-        evidence: of an examination.
-        world_from_cam: pose of each of its frames, measured by something else; None if unknown.
-    """
-    ways: list[tuple[float, float]] = []
-    start: SE3 | None = None
-    moved = SE3.identity()
-    for step, pose in zip(evidence.moved, world_from_cam, strict=True):
-        if step is None or pose is None or start is None:
-            start, moved = pose, SE3.identity()
-            continue
-        moved = moved @ step
-        if moved.distance_m >= _WAY_M:
-            ways.append(((start.inverse() @ pose).distance_m, moved.distance_m))
-            start, moved = pose, SE3.identity()
-    return ways
 
 
 class LookedAhead:
@@ -123,14 +112,35 @@ class LookedAhead:
         self.sequence = sequence
         self._rest = arriving(sequence)
         self._ahead: list[LoggedFrame] = []
+        self._outside = sequence.motion() if isinstance(sequence, MovedSequence) else None
+        # Stamp of the last frame that was taken ahead.
+        self._until_ns: int | None = None
         with deferred_interrupt() as raise_if_asked:
             while not front.examination.full:
                 arrived = next(self._rest, None)
                 if arrived is None:
                     break
-                self._ahead.append(front.take_ahead(arrived))
+                self._take(front, arrived)
                 monitor.check()
                 raise_if_asked()
+
+    def _take(self, front: Front, arrived: Arrived) -> None:
+        """Takes one frame ahead, with the motion from outside that led to it."""
+        stamp_ns, outside = stamp_of(arrived), None
+        if self._outside is not None and self._until_ns is not None:
+            outside = self._outside.between(self._until_ns, stamp_ns)
+        self._ahead.append(front.take_ahead(arrived, outside))
+        self._until_ns = stamp_ns
+
+    def motion(self) -> MotionSource | None:
+        """The motion from outside that was not used ahead."""
+        return None if self._outside is None else self
+
+    def between(self, start_ns: int, end_ns: int) -> OutsideMotion | None:
+        """See `MotionSource`; None where the frames were taken ahead."""
+        if self._outside is None or (self._until_ns is not None and end_ns <= self._until_ns):
+            return None
+        return self._outside.between(start_ns, end_ns)
 
     @property
     def info(self) -> SequenceInfo:

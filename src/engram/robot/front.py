@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from engram.doctor import Diagnosis, Examination, diagnose
 from engram.frontend import Frame, FrameStatus, Frontend, StereoPair
+from engram.geometry import SE3
 from engram.localiser import StageClock
 from engram.odometry import (
     GapFiller,
@@ -67,9 +68,9 @@ class Front:
         """What the doctor finds in the first frames so far."""
         return diagnose(self.examination.evidence)
 
-    def take_ahead(self, arrived: Arrived) -> LoggedFrame:
+    def take_ahead(self, arrived: Arrived, outside: OutsideMotion | None = None) -> LoggedFrame:
         """Takes a frame before the robot does, which is then given the result."""
-        frame, motion = self._taken(arrived, None, StageClock())
+        frame, motion = self._taken(arrived, outside, StageClock())
         self._ahead.append(motion)
         return LoggedFrame(frame, motion.odometry)
 
@@ -94,12 +95,14 @@ class Front:
     def _taken(
         self, arrived: Arrived, motion: Motion | OutsideMotion | None, clock: StageClock
     ) -> tuple[Frame, Motion]:
+        told: SE3 | None = None
         if not isinstance(motion, Motion):
             self._outside.add(motion)
+            told = motion.prev_from_curr if motion is not None and motion.has_way else None
         if isinstance(arrived, LoggedFrame):
             if not isinstance(motion, Motion):
                 motion = self._moved(arrived.odometry, arrived.frame.stamp_ns)
-            self.examination.see(arrived, arrived.frame, motion)
+            self.examination.see(arrived, arrived.frame, motion, told)
             return arrived.frame, motion
         frame = self._frontend.extract(arrived)
         if self._frozen.repeats(arrived):
@@ -110,7 +113,7 @@ class Front:
             motion = self._moved(step, frame.stamp_ns)
             clock.lap("odometry")
         self._frozen.note(motion)
-        self.examination.see(arrived, frame, motion)
+        self.examination.see(arrived, frame, motion, told)
         clock.lap("doctor")
         return frame, motion
 
@@ -174,6 +177,11 @@ def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]
         if due > now:
             time.sleep(due - now)
         yield due, item
+
+
+def stamp_of(arrived: Arrived) -> int:
+    """Stamp of a pair or logged frame, ns."""
+    return arrived.stamp_ns if isinstance(arrived, StereoPair) else arrived.frame.stamp_ns
 
 
 def arriving(sequence: Iterable[Arrived]) -> Generator[Arrived]:

@@ -13,7 +13,7 @@ from typing import Self
 
 from engram.doctor import Diagnosis
 from engram.errors import ConfigError, InputError
-from engram.frontend import Frame, StereoPair
+from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.localiser import (
     KEEPS_NOTHING,
@@ -27,7 +27,7 @@ from engram.localiser import (
 from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot.front import Arrived, Front, arriving, paced
+from engram.robot.front import Arrived, Front, arriving, paced, stamp_of
 from engram.robot.live import LiveKeeper, Saving
 from engram.robot.recorder import Recorder
 from engram.sequences.motion import MovedSequence
@@ -209,7 +209,7 @@ class Robot:
                 raise_if_asked()
                 motion = None
                 if outside is not None and self._stamp_ns is not None:
-                    motion = outside.between(self._stamp_ns, _stamp_ns(arrived))
+                    motion = outside.between(self._stamp_ns, stamp_of(arrived))
                 found = self.step(arrived, motion=motion, arrived_s=due)
                 if rate_hz is not None and self._deadline_ms is None:
                     found = replace(found, late=time.perf_counter() > due + 1 / rate_hz)
@@ -310,7 +310,7 @@ class Robot:
 
     def _in_order(self, arrived: Arrived) -> bool:
         """Whether the stamp is later than the last one; the first frame begins a live drive."""
-        stamp_ns, last_ns = _stamp_ns(arrived), self._stamp_ns
+        stamp_ns, last_ns = stamp_of(arrived), self._stamp_ns
         if last_ns is not None and stamp_ns <= last_ns:
             self._front.examination.misordered(stamp_ns, last_ns)
             if not self._set_back(stamp_ns):
@@ -336,7 +336,7 @@ class Robot:
     def _left_out(self, arrived: Arrived) -> Localisation:
         """The result for a frame that is not used."""
         return Localisation(
-            stamp_ns=_stamp_ns(arrived),
+            stamp_ns=stamp_of(arrived),
             status=LocalisationStatus.NO_ODOMETRY,
             attempts=0,
             candidates=0,
@@ -344,10 +344,6 @@ class Robot:
             motion=Motion(OdometryStep(OdometryStatus.UNUSABLE_FRAME)),
             position=self._localiser.position,
         )
-
-
-def _stamp_ns(arrived: Arrived) -> int:
-    return arrived.stamp_ns if isinstance(arrived, StereoPair) else arrived.frame.stamp_ns
 
 
 def _word(found: Localisation) -> str:

@@ -10,6 +10,7 @@ stated least one on. Results go to a file as they come; the same command goes on
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import zlib
@@ -28,7 +29,6 @@ from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.graph.model import Clock
 from engram.robot import Front, Settings
-from engram.robot.examining import ways_of
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.faults.clips import JUDGING, read_clip
 from engram_lab.studies.faults.injected import (
@@ -255,7 +255,8 @@ def examined(pairs: Sequence[StereoPair], truth: Sequence[SE3], facts: Facts) ->
         front.take(pair)
     evidence = front.examination.evidence
     if len(truth) == len(evidence):
-        evidence.outside_m = ways_of(evidence, list(truth))
+        steps = [before.inverse() @ after for before, after in itertools.pairwise(truth)]
+        evidence.outside = [None, *steps]
     return front.diagnosis
 
 

@@ -307,3 +307,52 @@ def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -
                 f"--redo {name!r}: is not among the policies of this run ({', '.join(policies)})"
             )
     return again
+
+
+@evaluate.command("faults")
+def faults(
+    *,
+    trials: Annotated[int, typer.Option("--trials", min=1, help="How many in all.")] = 1000,
+    report_only: Annotated[
+        bool, typer.Option("--report-only", help="Run nothing; report what was run.")
+    ] = False,
+    work: Annotated[
+        Path | None,
+        typer.Option("--work", metavar="FILE", help="Results [default: in the user's cache]."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="The matrix, Markdown.")
+    ] = Path("results/faults.md"),
+    as_json: options.Json = False,
+) -> None:
+    """Inject faults into drives; count false fixes.
+
+    Drives of rendered clips (python -m engram_lab.studies.faults.clips) are localised in maps of
+    other days. The same command resumes a run that was stopped.
+
+    \b
+    Examples:
+      engram lab evaluate faults --trials 100
+      engram lab evaluate faults --report-only --out faults.md
+    """
+    from dataclasses import asdict
+
+    from platformdirs import user_cache_path
+
+    from engram.cli.progress import Bars
+    from engram_lab.studies.faults.page import headline, matrix
+    from engram_lab.studies.faults.study import read_trials, run
+
+    file = work or user_cache_path("engram") / "faults" / "trials.jsonl"
+    if not report_only:
+        left = trials - len(read_trials(file))
+        with Bars().stage("faults", max(left, 0)) as monitor:
+            for _ in run(file, trials, monitor=monitor):
+                pass
+    made = read_trials(file)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(f"{headline(made)}\n\n{matrix(made)}\n", encoding="utf-8")
+    if as_json:
+        print(json.dumps([asdict(one) for one in made]))
+    else:
+        typer.echo(f"{headline(made)}\n{out}")

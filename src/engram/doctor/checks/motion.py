@@ -6,13 +6,16 @@ import numpy as np
 
 from engram.doctor.examination import Evidence, Look
 from engram.frontend import FrameStatus
+from engram.geometry import SE3
 
 _MOVING_M = 0.02
 # A repeated image without contrast is darkness, not an old picture.
 _CONTRAST = 4.0
 # So many equal pairs are no robot at rest before a camera without noise.
 _LONG = 30
-_LEAST_WAY_M = 5.0
+# Ways are compared over stretches of this length, metres, and at least so many of them.
+_WAY_M = 3.0
+_LEAST_WAYS = 3
 
 
 def without_odometry(seen: Evidence) -> float | None:
@@ -25,7 +28,8 @@ def without_odometry(seen: Evidence) -> float | None:
 def frozen_frames(seen: Evidence) -> float | None:
     """Most images in a row that repeat the one before.
 
-    Two equal pairs while the robot rests say nothing: a simulated camera may have no noise.
+    Equal pairs while the robot rests, or before it has moved, say nothing: a simulated camera may
+    have no noise. Where odometry last failed, the robot counts as moving.
     """
     if not seen.looks or len(seen.looks) != len(seen):
         return None
@@ -34,8 +38,8 @@ def frozen_frames(seen: Evidence) -> float | None:
     for number, look in enumerate(seen.looks):
         step = seen.moved[number]
         still = all(look.repeats)
-        if step is not None and not any(look.repeats):
-            moving = step.distance_m > _MOVING_M
+        if not any(look.repeats):
+            moving = number > 0 if step is None else step.distance_m > _MOVING_M
         for side in (0, 1):
             run[side] = run[side] + 1 if _repeats(look, side) else 0
             if not still or moving or run[side] >= _LONG or _frozen(seen, number):
@@ -45,10 +49,17 @@ def frozen_frames(seen: Evidence) -> float | None:
 
 def scale_off(seen: Evidence) -> float | None:
     """How far odometry's scale is from that of motion from outside, as a share."""
-    ways = np.array([way for way in seen.outside_m if min(way) > 0.1]).reshape(-1, 2)
-    if len(ways) < 3 or ways[:, 0].sum() < _LEAST_WAY_M:
-        return None
-    return float(abs(np.median(ways[:, 1] / ways[:, 0]) - 1))
+    ratios: list[float] = []
+    measured, outside = SE3.identity(), SE3.identity()
+    for step, told in zip(seen.moved, seen.outside, strict=True):
+        if step is None or told is None:
+            measured, outside = SE3.identity(), SE3.identity()
+            continue
+        measured, outside = measured @ step, outside @ told
+        if outside.distance_m >= _WAY_M:
+            ratios.append(measured.distance_m / outside.distance_m)
+            measured, outside = SE3.identity(), SE3.identity()
+    return float(abs(np.median(ratios) - 1)) if len(ratios) >= _LEAST_WAYS else None
 
 
 def _repeats(look: Look, side: int) -> bool:

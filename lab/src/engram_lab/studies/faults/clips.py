@@ -91,17 +91,21 @@ class Clip:
 def clips_of(towns: tuple[tuple[int, str], ...], count: int) -> list[ClipPlan]:
     """The mapped drive of each town, then some others of other days."""
     plans = []
-    for number, (town, rig) in enumerate(towns):
-        others = [_OTHERS[(number * _LIVE + k) % len(_OTHERS)] for k in range(_LIVE)]
+    for town, rig in towns:
+        first = (town - 1) * _LIVE % (10 * _LIVE)
+        others = [_OTHERS[(first + k) % len(_OTHERS)] for k in range(_LIVE)]
         frames = count // 2 if rig == "kitti" else count  # of three times as many pixels
         plans += [ClipPlan(rig, town, one, count=frames) for one in (MAPPED, *others)]
     return plans
 
 
-SETTING = clips_of(((21, "wildcat"), (22, "courier")), 60)
+SETTING = [
+    *clips_of(((21, "wildcat"), (22, "courier")), 60),
+    *clips_of(((31, "wildcat"), (32, "courier")), 80),
+]
 JUDGING = clips_of(
     (
-        (31, "wildcat"), (32, "courier"), (33, "bicycle"), (34, "kitti"), (35, "shuttle"),
+        (33, "bicycle"), (34, "kitti"), (35, "shuttle"),
         (36, "wildcat"), (37, "courier"), (38, "bicycle"), (39, "kitti"), (40, "shuttle"),
     ),
     80,
