@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from engram.frontend import FrameStatus
 from engram.geometry import SE3
-from engram.localiser import Localisation, LocalisationStatus
+from engram.graph.model import Node
+from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.odometry import OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot import RobotOptions, Settings, map_drive, open_map, robot_on
 from engram.sequences import FrameLog, LoggedFrame, open_sequence
@@ -103,6 +104,7 @@ def trial(
         open_map(map_path) as opened,
         robot_on(opened, log, Settings(), RobotOptions(relocaliser=None)) as robot,
     ):
+        robot.place_at(_start(truths["mapped"], truth[0], opened.graph.nodes))
         for arrived, motion in at_rest(frames[0]):
             robot.step(arrived, motion=motion if aided else None)
         bridged = OutsideMotion(SE3.identity(), 0.1, True, BIAS_RAD_S)
@@ -124,6 +126,18 @@ def _driven_m(truth: Sequence[SE3]) -> NDArray[np.float64]:
     """(F,) way from the start to each frame, metres."""
     steps = [(truth[k - 1].inverse() @ truth[k]).distance_m for k in range(1, len(truth))]
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _start(mapped: Trajectory, live: SE3, nodes: Sequence[Node]) -> Position:
+    """The robot's place at the start, by the truth."""
+    there = [
+        (node.id, world_from_node)
+        for node in nodes
+        if (world_from_node := mapped.at(node.stamp_ns)) is not None
+    ]
+    node, world_from_node = min(there, key=lambda one: (one[1].inverse() @ live).distance_m)
+    node_from_live = world_from_node.inverse() @ live
+    return Position(node, node_from_live, np.diag([0.3**2] * 3 + [0.05**2] * 3))
 
 
 def _off_m(found: Localisation, mapped: Trajectory, live: SE3, nodes: object) -> float:
