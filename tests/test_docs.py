@@ -34,6 +34,8 @@ EXAMPLES = {
     DOCS / "robot-tutorial.md": "drives",
     DOCS / "study.md": "drives",
     DOCS / "data.md": "mapped",
+    DOCS / "bags.md": "bags",
+    DOCS / "calibrations.md": "bags",
     DOCS / "doctor.md": "mapped",
     DOCS / "recorder.md": "mapped",
     DOCS / "trouble.md": "mapped",
@@ -49,7 +51,14 @@ EXAMPLES = {
 }
 # What cannot run here: set-up, the demo (its own tests run it), real drives with two rigs, and what
 # waits for a robot.
-_ELSEWHERE = ("make ", ". .venv", "engram map colour.engram", "engram live town.engram")
+_ELSEWHERE = (
+    "make ",
+    ". .venv",
+    "pip ",
+    "engram map hall.engram",
+    "engram map colour.engram",
+    "engram live town.engram",
+)
 _FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.M | re.S)
 
 
@@ -104,6 +113,9 @@ def folder(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
             place.symlink_to(drive)
         if state == "drives":
             return
+        if state == "bags":
+            _write_bags(drive, tmp_path)
+            return
         engram.map_drive("street.engram", engram.open_drive("street", frames="0::2"))
         if state == "mapped":
             return
@@ -117,6 +129,29 @@ def folder(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
             run_words(f"engram record street {name}.framelog --robot {name} --frames {frames}")
 
     return begin
+
+
+def _write_bags(drive: Path, folder: Path) -> None:
+    """Two bags of the street, its calibration and a mask."""
+    pytest.importorskip("rosbags", reason="the extra `bags` is not installed")
+    from tests.sequences.bag_maker import LEFT, RIGHT, bag, rectified_infos
+
+    for name, kind, frames in (("monday", "ros1", "0::2"), ("tuesday", "mcap", "1::2")):
+        sequence = engram.open_drive(drive, frames=frames)
+        with bag(folder / name, kind) as maker:
+            for pair in sequence:
+                stamp_ns = 10**18 + pair.stamp_ns
+                for side, (topic, image) in enumerate(((LEFT, pair.left), (RIGHT, pair.right))):
+                    maker.image(topic, stamp_ns, image)
+                    info = topic.replace("image_raw", "camera_info")
+                    maker.info(info, stamp_ns, rectified_infos(sequence.camera)[side])
+                maker.odometry("/odom", stamp_ns, 8.0, 0.0)
+                maker.imu("/imu/data", stamp_ns, (0.0, 0.0, 0.0))
+    toml = run_words(["engram", "drive", "calibration", "monday.bag"]).stdout
+    (folder / "monday.toml").write_text(toml)
+    mask = np.full((sequence.camera.height, sequence.camera.width), 255, np.uint8)
+    mask[-30:] = 0
+    cv2.imwrite(str(folder / "mask.png"), mask)
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,8 @@ class DatabaseBag:
                         yield record
                 return
             except sqlite3.Error as error:
-                lost(f"{self.path}: rows after {last} are lost: {error}")
+                if leap == _LEAP:
+                    lost(f"{self.path}: rows after {last} are lost: {error}")
                 last, leap, leaps = last + leap, leap * 4, leaps + 1
 
     def _record(
