@@ -235,7 +235,7 @@ def test_the_examples_of_a_page_run_in_their_order(
                 given = [_first_session(words[2]) if one == "SESSION" else one for one in words]
                 ran = run_words(given)
                 assert ran.returncode == 0, f"{page.name}: {shlex.join(words)}\n{ran.stderr}"
-                printed += ran.stdout
+                printed += ran.stdout + ran.stderr
                 if words[1] == "localise" and "--explain" not in words and "--json" not in words:
                     share = re.search(r"([\d.]+)% localised", ran.stdout)
                     assert share is not None

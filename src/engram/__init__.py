@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from engram.geometry import SE3, StereoCamera
     from engram.localiser import Budget, Localisation, LocalisationStatus, Position
     from engram.maps import Map, open_map
+    from engram.odometry import OutsideMotion
     from engram.robot import Robot, Settings, map_drive, open_drive
 
 __version__ = "0.1.0"
