@@ -23,9 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from engram.config import check_bounds
 from engram.geometry import SE3
-from engram.graph.model import Edge
+from engram.graph.model import Edge, EdgeKind
 
 Array = NDArray[np.float64]
+
+# Prior odds: odometry joins frames a moment apart, a tie was made by a robot that was localised; a
+# match alone may join look-alikes.
+_TRUST = {EdgeKind.ODOMETRY: 4.0, EdgeKind.TIE: 2.0, EdgeKind.BRIDGE: 2.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +130,8 @@ class Measured:
         rotations: (E, 3, 3) float64.
         translations: (E, 3) float64, metres.
         whitening: (E, 6, 6) float64: a residual times this has unit covariance.
+        trust: (E,) float64: how much wider than others its kernel is. Where a cycle does not
+            close, what is trusted less gives way.
     """
 
     a: NDArray[np.int64]
@@ -133,6 +139,7 @@ class Measured:
     rotations: Array
     translations: Array
     whitening: Array
+    trust: Array
 
     @staticmethod
     def of(edges: Sequence[Edge], ends: NDArray[np.integer], config: AdjustConfig) -> Measured:
@@ -157,13 +164,14 @@ class Measured:
         return Measured(
             ends[:, 0].astype(np.int64), ends[:, 1].astype(np.int64),
             rotations, translations, whitening,
+            np.array([_TRUST.get(edge.kind, 1.0) for edge in edges]),
         )  # fmt: skip
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.integer]) -> Measured:
         """Some of them."""
         return Measured(
             self.a[rows], self.b[rows], self.rotations[rows],
-            self.translations[rows], self.whitening[rows],
+            self.translations[rows], self.whitening[rows], self.trust[rows],
         )  # fmt: skip
 
     def residuals(self, poses: Poses) -> Array:
@@ -265,17 +273,17 @@ def adjust(
     largest = 2 * float(used.chi2(poses).max(initial=0.0)) / config.kernel_chi2
     width, left = float(np.clip(largest, 1.0, config.widest)), config.steps
     while free.any() and left and (len(used.a) or len(priors.at)):
-        weights = kernel(used.chi2(poses), config.kernel_chi2 * width)
+        weights = kernel(used.chi2(poses), config.kernel_chi2 * width * used.trust)
         step = _step(poses, used, weights, column, priors)
         poses = poses.moved(step)
         if width == 1.0:
             left = 0 if np.abs(step).max() < config.still_m else left - 1
         width = max(1.0, width / config.narrowing)
     chi2 = measured.chi2(poses)
-    return Adjusted(poses, chi2, kernel(chi2, config.kernel_chi2))
+    return Adjusted(poses, chi2, kernel(chi2, config.kernel_chi2 * measured.trust))
 
 
-def kernel(chi2: Array, width: float) -> Array:
+def kernel(chi2: Array, width: float | Array) -> Array:
     """(E,) weights of Geman and McClure, of squared residuals."""
     return np.asarray((width / (width + chi2)) ** 2)
 

@@ -64,13 +64,28 @@ class RepairConfig:
     agree_inliers: Annotated[
         int, Meta(ge=0, description="fewest inliers of a match that confirms an edge")
     ] = 10
+    odometry_inliers: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="inliers of a match of its own ends from which a step of odometry is right "
+            "whatever contradicts it: more than look-alikes reach",
+        ),
+    ] = 60
     contradicted_surety: Annotated[
         float,
         Meta(description="surety that an edge is wrong which the rest of the map contradicts"),
     ] = 1.8
     alone_surety: Annotated[
         float, Meta(description="surety that an edge is wrong which nothing confirms")
-    ] = 0.6
+    ] = 0.75
+    tie_surety: Annotated[
+        float,
+        Meta(description="surety less for a tie: a robot that was localised made it, and drove on"),
+    ] = 0.4
+    doubtful: Annotated[
+        float, Meta(description="surety from which an edge is listed as doubtful")
+    ] = 0.7
     per_failing_look: Annotated[
         float, Meta(ge=0, description="surety that a second look adds which does not agree")
     ] = 0.1

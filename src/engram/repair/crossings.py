@@ -11,6 +11,10 @@ from numpy.typing import NDArray
 from engram.graph.graph import ExperienceGraph
 from engram.graph.paths import PathMemory
 
+# Entries of a path between its last on one side and its first on the other, at most, and entries
+# that count on each side.
+_PAUSE, _LOOK = 8, 8
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Crossings:
@@ -40,8 +44,8 @@ class Crossings:
             count: number of nodes of the graph.
 
         Returns:
-            The number of different nodes by which it was localised before and after, of the two
-            the smaller; 0 if no drive crossed.
+            The number of different nodes by which it was localised, or that it saved, just before
+            and just after; of the two the smaller. 0 if no drive crossed.
         """
         on = np.zeros((2, count), np.bool_)
         for side, nodes in enumerate((side_a, side_b)):
@@ -50,19 +54,19 @@ class Crossings:
         best = 0
         for walk in self.walks:
             here = on[:, walk]
-            for first, then in ((here[0], here[1]), (here[1], here[0])):
-                for at in np.flatnonzero(first[:-1] & then[1:]).tolist():
-                    before = _run(walk, first, range(at, -1, -1))
-                    after = _run(walk, then, range(at + 1, len(walk)))
-                    best = max(best, min(before, after))
+            sides = np.flatnonzero(here.any(axis=0))
+            second = here[1, sides]
+            changes = np.flatnonzero(second[1:] != second[:-1])
+            for at in changes.tolist():
+                last, first = int(sides[at]), int(sides[at + 1])
+                if first - last > _PAUSE:
+                    continue
+                before = walk[max(last - _LOOK, 0) : last + 1]
+                after = walk[first : first + _LOOK + 1]
+                side = int(second[at])
+                counts = (
+                    len(np.unique(before[on[side, before]])),
+                    len(np.unique(after[on[1 - side, after]])),
+                )
+                best = max(best, min(counts))
         return best
-
-
-def _run(walk: NDArray[np.int64], on: NDArray[np.bool_], places: range) -> int:
-    """Different nodes of a walk from a place on, as long as it stays on one side."""
-    nodes = set()
-    for at in places:
-        if not on[at]:
-            break
-        nodes.add(int(walk[at]))
-    return len(nodes)

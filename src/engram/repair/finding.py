@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,10 @@ from engram.repair.config import RepairConfig
 from engram.repair.crossings import Crossings
 from engram.repair.second_looks import Look, SecondLooks
 from engram.repair.surroundings import Surroundings
-from engram.repair.suspects import Suspicion, part_labels, suspect
+from engram.repair.suspects import suspect
+
+# Way from the ends of a wrong edge within which edges were predicted through it, metres.
+_BESIDE_M = 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,37 +126,41 @@ def find_wrong_edges(
         matcher: settings of the matcher; None for the defaults.
         monitor: receives progress, and may stop the search.
     """
-    search = _Search(graph, paths, frames, config or RepairConfig(), matcher or MatcherConfig())
-    return search.findings(monitor)
+    config, matcher = config or RepairConfig(), matcher or MatcherConfig()
+    crossings = Crossings.of(graph, paths)
+    gone: dict[int, Finding] = {}
+    while True:
+        search = _Search(graph, crossings, frames, config, matcher, gone)
+        found = search.findings(monitor)
+        alone = [one for one in found if one.surety >= 1 and one.why == "alone"]
+        if not alone:
+            return search.report(found)
+        # In a single cycle any edge may be to blame: without the edges that nothing confirms
+        # others may no longer be contradicted.
+        gone |= {one.row: one for one in alone}
 
 
 class _Search:
+    """One round of the search, without the edges that earlier rounds found wrong."""
+
     def __init__(
         self,
         graph: ExperienceGraph,
-        paths: PathMemory,
+        crossings: Crossings,
         frames: LandmarkSource,
         config: RepairConfig,
         matcher: MatcherConfig,
+        gone: Mapping[int, Finding],
     ) -> None:
-        self._graph, self._paths, self._frames = graph, paths, frames
-        self._config, self._matcher = config, matcher
+        self._graph, self._crossings, self._frames = graph, crossings, frames
+        self._config, self._matcher, self._gone = config, matcher, gone
+        self._suspicion = suspect(graph, config, gone)
+        trusted = self._suspicion.measured & ~self._suspicion.contradicted
+        trusted[list(gone)] = False
+        self._trusted = Surroundings(graph, trusted)
 
-    @cached_property
-    def _suspicion(self) -> Suspicion:
-        return suspect(self._graph, self._config)
-
-    @cached_property
-    def _trusted(self) -> Surroundings:
-        suspicion = self._suspicion
-        return Surroundings(self._graph, suspicion.measured & ~suspicion.contradicted)
-
-    @cached_property
-    def _crossings(self) -> Crossings:
-        return Crossings.of(self._graph, self._paths)
-
-    def findings(self, monitor: Monitor) -> Findings:
-        """The search, step by step."""
+    def findings(self, monitor: Monitor) -> list[Finding]:
+        """The suspected edges, judged."""
         suspicion = self._suspicion
         monitor.check()
         odometry = np.array(
@@ -166,13 +172,19 @@ class _Search:
         found = []
         with monitor.stage("second looks", len(rows)) as stage:
             for row in rows:
-                found.append(self._finding(row, looks.at(row)))
+                if row not in self._gone:
+                    found.append(self._finding(row, looks.at(row)))
                 stage.advance()
                 stage.check()
-        wrong = [one for one in found if one.surety >= 1]
-        wrong += self._derived({one.row for one in wrong})
-        doubtful = [one for one in found if 0.5 <= one.surety < 1]
-        return Findings(_ranked(wrong), _ranked(doubtful), len(rows), len(self._graph.edges))
+        return found
+
+    def report(self, found: Sequence[Finding]) -> Findings:
+        """What the rounds came to; `found` is of this, the last one."""
+        wrong = [*self._gone.values(), *(one for one in found if one.surety >= 1)]
+        wrong += self._derived(wrong)
+        doubtful = [one for one in found if self._config.doubtful <= one.surety < 1]
+        examined = len(self._gone) + len(found)
+        return Findings(_ranked(wrong), _ranked(doubtful), examined, len(self._graph.edges))
 
     def _finding(self, row: int, looks: Sequence[Look]) -> Finding:
         suspicion, edge = self._suspicion, self._graph.edges[row]
@@ -184,21 +196,32 @@ class _Search:
         return self._finding_of(
             row,
             "contradicted" if contradicted else "alone",
-            self._surety(contradicted, confirming, len(others), witnessed),
+            self._surety(edge.kind, contradicted, confirming, len(others), witnessed)
+            - self._sure_odometry(edge, own),
             confirming=confirming,
             looks=len(others),
             inliers=0 if own is None else own.inliers,
             witnessed=witnessed,
         )
 
-    def _surety(self, contradicted: bool, confirming: int, looks: int, witnessed: int) -> float:
+    def _surety(
+        self, kind: EdgeKind, contradicted: bool, confirming: int, looks: int, witnessed: int
+    ) -> float:
         """How surely an edge is wrong, from what speaks for and against it."""
         config = self._config
         if contradicted:
             return config.contradicted_surety - config.per_look * confirming
-        failing = config.per_failing_look * (looks - confirming)
-        known = min(failing, config.most_by_looks) - config.per_look * confirming
-        return config.alone_surety + known - config.per_fix * min(witnessed, 5)
+        failing = min(config.per_failing_look * (looks - confirming), config.most_by_looks)
+        tied = config.tie_surety * (kind is EdgeKind.TIE)
+        for_it = config.per_look * confirming + config.per_fix * min(witnessed, 5) + tied
+        return config.alone_surety + failing - for_it
+
+    def _sure_odometry(self, edge: Edge, own: Look | None) -> float:
+        """Surety that a step of odometry loses whose two frames match well as it says."""
+        config = self._config
+        odometry = edge.kind is EdgeKind.ODOMETRY and own is not None and self._confirms(own)
+        strong = own is not None and own.inliers >= config.odometry_inliers
+        return config.contradicted_surety * (odometry and strong)
 
     def _confirms(self, look: Look) -> bool:
         config = self._config
@@ -216,20 +239,28 @@ class _Search:
         ]
         return self._crossings.witnessed(sides[0], sides[1], len(self._graph))
 
-    def _derived(self, wrong: set[int]) -> list[Finding]:
-        """Predicted edges that contradict the map without the wrong ones."""
-        suspicion, config, edges = self._suspicion, self._config, self._graph.edges
-        kept = suspicion.measured & ~suspicion.contradicted
-        kept[sorted(wrong)] = False
-        ends = self._graph.edge_ends
-        parts = part_labels(ends[kept], len(self._graph))
-        gross = (suspicion.off_m > config.gross_m) & (suspicion.chi2 > config.gross_chi2)
-        together = parts[ends[:, 0]] == parts[ends[:, 1]]
-        return [
-            self._finding_of(row, "derived", surety=1.0)
-            for row in np.flatnonzero(~suspicion.measured & gross & together).tolist()
-            if edges[row].kind is EdgeKind.PROXIMITY
-        ]
+    def _derived(self, wrong: Sequence[Finding]) -> list[Finding]:
+        """Predicted edges beside wrong ones that say the same as these."""
+        graph, config = self._graph, self._config
+        found: dict[int, Finding] = {}
+        for one in wrong:
+            sides = [
+                {near.node: near.root_from_node for near in self._trusted.around(end, _BESIDE_M)}
+                for end in map(graph.index, (one.edge.a, one.edge.b))
+            ]
+            for node, a_from_node in sides[0].items():
+                for edge, row in graph.numbered_edges_of(node):
+                    ahead = graph.index(edge.a) == node
+                    other = graph.index(edge.b if ahead else edge.a)
+                    if edge.kind is not EdgeKind.PROXIMITY or other not in sides[1]:
+                        continue
+                    said = a_from_node.inverse() @ one.edge.a_from_b @ sides[1][other]
+                    measured = edge.a_from_b if ahead else edge.a_from_b.inverse()
+                    apart_m = (measured.inverse() @ said).distance_m
+                    off_m = float(self._suspicion.off_m[row])
+                    if apart_m <= config.gross_m < off_m:
+                        found[row] = self._finding_of(row, "derived", surety=1.0)
+        return list(found.values())
 
     def _finding_of(self, row: int, why: str, surety: float, **evidence: int) -> Finding:
         suspicion, edge = self._suspicion, self._graph.edges[row]

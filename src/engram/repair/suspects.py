@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,11 +40,18 @@ class Suspicion:
     poses: Poses
 
 
-def suspect(graph: ExperienceGraph, config: RepairConfig) -> Suspicion:
-    """Adjusts the whole map robustly, and tells which edges it contradicts or does not confirm."""
+def suspect(graph: ExperienceGraph, config: RepairConfig, gone: Collection[int] = ()) -> Suspicion:
+    """Adjusts the whole map robustly, and tells which edges it contradicts or does not confirm.
+
+    Args:
+        graph: the graph.
+        config: settings.
+        gone: indices of edges that are left out.
+    """
     edges = graph.edges
     ends = graph.edge_ends.astype(np.int64)[:, ::-1]
     measured = np.array([is_measured(edge.kind) for edge in edges], np.bool_)
+    measured[list(gone)] = False
     used = measured | np.array([edge.kind is EdgeKind.BRIDGE for edge in edges], np.bool_)
     rows = np.flatnonzero(used)
     adjusted = _adjusted(graph, rows, ends, config)
