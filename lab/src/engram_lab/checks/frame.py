@@ -87,7 +87,7 @@ def truth_of_frame(path: Path, drives: list[EvaluatedDrive]) -> np.ndarray:
         known = [at for at, pose in zip(inside, poses, strict=True) if pose is not None]
         places = np.array([pose.translation for pose in poses if pose is not None])
         laid = store.frame.positions[known]
-    return np.linalg.norm((fit_level(laid, places) @ laid - places)[:, :2], axis=1)
+    return np.asarray(np.linalg.norm((fit_level(laid, places) @ laid - places)[:, :2], axis=1))
 
 
 def main() -> None:
