@@ -72,6 +72,7 @@ class RepairConfig:
             "whatever contradicts it: more than look-alikes reach",
         ),
     ] = 60
+    match_inliers: Annotated[int, Meta(ge=0, description="the same of a match or a tie")] = 100
     contradicted_surety: Annotated[
         float,
         Meta(description="surety that an edge is wrong which the rest of the map contradicts"),

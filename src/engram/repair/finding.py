@@ -197,7 +197,7 @@ class _Search:
             row,
             "contradicted" if contradicted else "alone",
             self._surety(edge.kind, contradicted, confirming, len(others), witnessed)
-            - self._sure_odometry(edge, own),
+            - self._by_own_match(edge, own),
             confirming=confirming,
             looks=len(others),
             inliers=0 if own is None else own.inliers,
@@ -216,12 +216,13 @@ class _Search:
         for_it = config.per_look * confirming + config.per_fix * min(witnessed, 5) + tied
         return config.alone_surety + failing - for_it
 
-    def _sure_odometry(self, edge: Edge, own: Look | None) -> float:
-        """Surety that a step of odometry loses whose two frames match well as it says."""
+    def _by_own_match(self, edge: Edge, own: Look | None) -> float:
+        """Surety that an edge loses whose two frames match as it says, better than look-alikes."""
         config = self._config
-        odometry = edge.kind is EdgeKind.ODOMETRY and own is not None and self._confirms(own)
-        strong = own is not None and own.inliers >= config.odometry_inliers
-        return config.contradicted_surety * (odometry and strong)
+        odometry = edge.kind is EdgeKind.ODOMETRY
+        needed = config.odometry_inliers if odometry else config.match_inliers
+        strong = own is not None and own.inliers >= needed and self._confirms(own)
+        return config.contradicted_surety * strong
 
     def _confirms(self, look: Look) -> bool:
         config = self._config
