@@ -43,6 +43,7 @@ EXAMPLES = {
     DOCS / "mend.md": "mapped",
     DOCS / "budget.md": "mapped",
     DOCS / "ranking.md": "mapped",
+    DOCS / "eyes.md": "drives",
     DOCS / "operate.md": "fleet",
     DOCS / "live.md": "mapped",
     DOCS / "commands.md": "drives",
