@@ -13,9 +13,8 @@
 namespace engram::ENGRAM_ISA {
 namespace {
 
-// Sixteen patches side by side, one per 32-bit lane; each lane holds kGroup neighbouring values:
+// Patches stand side by side, one per 32-bit lane; each lane holds kGroup neighbouring values:
 // four bytes where the machine adds four products at once, else two 16-bit numbers.
-constexpr int kPatches = 16;
 #if defined(__AVX512VNNI__)
 constexpr int kGroup = 4;
 #else
@@ -24,11 +23,11 @@ constexpr int kGroup = 2;
 constexpr int kValueBits = 32 / kGroup;
 
 #if defined(__AVX512BW__)
-constexpr int kNative = 16, kBlock = 16; // outputs that share a pass over the inputs
+constexpr int kNative = 16, kPatches = 32, kBlock = 8; // outputs that share a pass
 #elif defined(__AVX2__)
-constexpr int kNative = 8, kBlock = 4;
+constexpr int kNative = 8, kPatches = 16, kBlock = 4;
 #else
-constexpr int kNative = 4, kBlock = 2;
+constexpr int kNative = 4, kPatches = 16, kBlock = 2;
 #endif
 typedef int32_t Native __attribute__((vector_size(4 * kNative)));
 constexpr int kParts = kPatches / kNative;
@@ -263,25 +262,24 @@ void convolution(const Lanes *input, const int32_t *weights, const PatchScaling 
 void signs(const Lanes *input, const int32_t *weights, const PatchWeights &net, int64_t count,
            uint8_t *descriptors) {
   const int64_t bytes = net.bits / 8;
-  Lanes word{};
-  for (int64_t block = 0; block < net.bits; block += kBlock) {
-    Sums sums{};
-    for (int tap = 0; tap < kTaps[3]; ++tap, weights += kBlock)
-      add_group(sums, input[tap], weights);
-    for (int output = 0; output < kBlock; ++output) {
-      const int64_t bit = block + output;
-      for (int part = 0; part < kParts; ++part) {
-        const Native set = sums.of[output].part[part] > Native{} + net.thresholds[bit];
-        word.part[part] |= set & (Native{} + (128 >> (bit & 7)));
-      }
-      if ((bit & 7) != 7)
-        continue;
-      int32_t values[kPatches];
-      std::memcpy(values, &word, sizeof values);
-      for (int64_t patch = 0; patch < count; ++patch)
-        descriptors[patch * bytes + bit / 8] = static_cast<uint8_t>(values[patch]);
-      word = Lanes{};
+  for (int64_t byte = 0; byte < bytes; ++byte) {
+    Lanes word{};
+    for (int first = 0; first < 8; first += kBlock) {
+      Sums sums{};
+      for (int tap = 0; tap < kTaps[3]; ++tap, weights += kBlock)
+        add_group(sums, input[tap], weights);
+#pragma GCC unroll 8
+      for (int output = 0; output < kBlock; ++output)
+        for (int part = 0; part < kParts; ++part) {
+          const Native least = Native{} + net.thresholds[8 * byte + first + output];
+          word.part[part] |=
+              (sums.of[output].part[part] > least) & (Native{} + (128 >> (first + output)));
+        }
     }
+    int32_t values[kPatches];
+    std::memcpy(values, &word, sizeof values);
+    for (int64_t patch = 0; patch < count; ++patch)
+      descriptors[patch * bytes + byte] = static_cast<uint8_t>(values[patch]);
   }
 }
 
