@@ -16,6 +16,7 @@ from engram import __version__
 from engram.centre.api import maps, robots, transfers
 from engram.centre.api.context import CentreHere
 from engram.centre.api.problems import add_problems
+from engram.centre.pages import routes as pages
 from engram.centre.service import Centre
 from engram.centre.store.schema import artifacts, handins
 
@@ -32,6 +33,7 @@ def create_app(centre: Centre) -> FastAPI:
     add_problems(app)
     for part in (robots, maps, transfers):
         app.include_router(part.router, prefix="/v1")
+    app.include_router(pages.router)
     app.add_api_route("/v1/health", _health, tags=["service"])
     app.add_api_route("/v1/metrics", _metrics, tags=["service"], response_class=PlainTextResponse)
     app.add_middleware(_Counting)

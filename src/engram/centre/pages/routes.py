@@ -1,0 +1,203 @@
+"""Routes of the pages. They take the token of ``engram centre token`` as a cookie."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from importlib.resources import files
+from typing import Annotated, Any
+from urllib.parse import parse_qs
+
+from fastapi import APIRouter, Path, Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse
+from jinja2 import Environment, PackageLoader
+
+from engram.centre.access.enrolment import subject_of
+from engram.centre.access.roles import Role, Subject
+from engram.centre.api.context import COOKIE, Asking, CentreHere, takes, who_asks
+from engram.centre.downloads import Downloads
+from engram.centre.errors import CentreError, UnknownError
+from engram.centre.fleet import Fleet
+from engram.centre.handins import HandIns
+from engram.centre.pages.positions import drawn, thumbnail
+from engram.centre.refs import Refs
+from engram.centre.service import Centre
+from engram.centre.store.audit import events_after, first_broken
+from engram.maps import map_log
+
+router = APIRouter(include_in_schema=False)
+VIEWERS = [takes(Role.VIEWER)]
+_SHOWN = 200
+_LONGEST_LOGIN = 4096
+_STATIC = {"page.js": "text/javascript", "page.css": "text/css"}
+# Nothing comes from elsewhere, and nobody frames the pages.
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+_templates = Environment(loader=PackageLoader("engram.centre.pages"), autoescape=True)
+
+
+def _when(stamp_ns: int | None) -> str:
+    if stamp_ns is None:
+        return "never"
+    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+_templates.filters["when"] = _when
+
+
+def _page(name: str, who: Subject | None, status: int = 200, **values: Any) -> HTMLResponse:
+    body = _templates.get_template(f"{name}.html").render(page=name, who=who, **values)
+    return HTMLResponse(body, status, {"Content-Security-Policy": _POLICY})
+
+
+@router.get("/static/{name}")
+def static(name: str) -> Response:
+    """The script and the style sheet."""
+    if name not in _STATIC:
+        raise UnknownError(f"there is no file {name!r:.40}")
+    body = (files(__package__) / "static" / name).read_bytes()
+    return Response(body, media_type=_STATIC[name], headers={"Cache-Control": "max-age=3600"})
+
+
+@router.get("/")
+def front(request: Request, centre: CentreHere) -> Response:
+    """The first map of the one who asks, or the form for the token."""
+    try:
+        who = who_asks(request)
+    except CentreError:
+        return _page("login", None, map=None, wrong=False)
+    names = _maps(centre, who)
+    if not names:
+        return _page("login", None, 403, map=None, wrong=True)
+    return RedirectResponse(f"/maps/{names[0]}/map", 303)
+
+
+@router.post("/login")
+async def login(request: Request, centre: CentreHere) -> Response:
+    """Takes a token into a cookie that scripts cannot read and other sites cannot send."""
+    body = b""
+    async for piece in request.stream():
+        body += piece
+        if len(body) > _LONGEST_LOGIN:
+            return _page("login", None, 413, map=None, wrong=True)
+    token = parse_qs(body.decode(errors="replace")).get("token", [""])[0].strip()
+    try:
+        subject_of(centre, token)
+    except CentreError:
+        return _page("login", None, 401, map=None, wrong=True)
+    answer = RedirectResponse("/", 303)
+    secure = request.url.scheme == "https"
+    answer.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=secure)
+    return answer
+
+
+@router.get("/maps/{name}/map", dependencies=VIEWERS)
+def map_page(name: str, centre: CentreHere, who: Asking) -> Response:
+    """The map from above."""
+    log = map_log(centre.map_path(name))
+    return _page("map", who, map=name, maps=_maps(centre, who), head=len(log))
+
+
+@router.get("/maps/{name}/nodes", dependencies=VIEWERS)
+def nodes(name: str, centre: CentreHere, at: int | None = None) -> Response:
+    """What the map page draws."""
+    refs = Refs(centre)
+    revision = refs.revision(name, "head" if at is None else str(max(at, 0)))
+    body = drawn(centre.map_path(name), refs.version(name, revision), revision)
+    return Response(body, media_type="application/json")
+
+
+@router.get("/maps/{name}/nodes/{node}/picture", dependencies=VIEWERS)
+def picture(
+    name: str,
+    node: Annotated[str, Path(pattern=r"^[0-9a-fA-F-]{4,36}$")],
+    centre: CentreHere,
+) -> Response:
+    """The small picture of a node."""
+    body = thumbnail(centre.map_path(name), node)
+    if body is None:
+        raise UnknownError("the node has no picture")
+    return Response(body, media_type="image/jpeg")
+
+
+@router.get("/maps/{name}/history", dependencies=VIEWERS)
+def history(name: str, centre: CentreHere, who: Asking) -> Response:
+    """Revisions, what merged them, refs."""
+    rows = HandIns(centre).listed(name, None, None, 2**62, _SHOWN)
+    reports = {row["revision"]: _report(row) for row in rows if row["report"] is not None}
+    return _page(
+        "history",
+        who,
+        map=name,
+        maps=_maps(centre, who),
+        log=map_log(centre.map_path(name))[:_SHOWN],
+        refs=Refs(centre).all(name),
+        reports=reports,
+        may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
+    )
+
+
+@router.get("/maps/{name}/fleet", dependencies=VIEWERS)
+def robots(name: str, centre: CentreHere, who: Asking) -> Response:
+    """What every robot runs, and wants."""
+    rows = []
+    for row in Fleet(centre).all(name):
+        try:
+            revision = Refs(centre).revision(name, row["follows"])
+            wanted = Refs(centre).version(name, revision)
+        except UnknownError:
+            revision, wanted = None, None
+        rows.append({**row, "wanted": revision, "up_to_date": row["report"].get("runs") == wanted})
+    refs = [one["name"] for one in Refs(centre).all(name)]
+    return _page("robots", who, map=name, maps=_maps(centre, who), robots=rows, refs=refs)
+
+
+@router.get("/maps/{name}/queue", dependencies=VIEWERS)
+def queue(name: str, centre: CentreHere, who: Asking) -> Response:
+    """Hand-ins and downloads, and what became of them."""
+    rows = HandIns(centre).listed(name, None, None, 2**62, _SHOWN)
+    asked = [row for row in Downloads(centre).asked() if row["map"] == name]
+    jobs = [{**row, "report": _report(row)} for row in rows]
+    return _page(
+        "queue",
+        who,
+        map=name,
+        maps=_maps(centre, who),
+        jobs=jobs,
+        downloads=asked,
+        robots={row["robot"]: row["name"] for row in Fleet(centre).all(name)},
+        may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
+    )
+
+
+@router.get("/maps/{name}/health", dependencies=VIEWERS)
+def health(name: str, centre: CentreHere, who: Asking) -> Response:
+    """Whether all is well, and the last changes of state."""
+    with centre.database.reading() as connection:
+        broken = first_broken(connection)
+        events = events_after(connection, 0, name, 10**6)[-_SHOWN:]
+    waiting = HandIns(centre).waiting(name)
+    path = centre.map_path(name)
+    return _page(
+        "health",
+        who,
+        map=name,
+        maps=_maps(centre, who),
+        broken=broken,
+        events=list(reversed(events)),
+        waiting=waiting,
+        size_bytes=path.stat().st_size,
+        row=centre.map_row(name),
+        silent=[one for one in Fleet(centre).all(name) if one["reported_ns"] is None],
+    )
+
+
+def _maps(centre: Centre, who: Subject) -> list[str]:
+    allowed = {Role.VIEWER, Role.OPERATOR, Role.ADMIN}
+    return [name for name in centre.map_names() if who.role_on(name) in allowed]
+
+
+def _report(row: dict[str, Any]) -> dict[str, Any] | None:
+    return None if row["report"] is None else json.loads(row["report"])

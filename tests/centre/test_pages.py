@@ -1,0 +1,65 @@
+"""Pages: who may see them, and that what robots say is text."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from .conftest import NAME, drive
+
+PAGES = ["map", "history", "fleet", "queue", "health"]
+
+
+@pytest.fixture
+def visited(site, in_process):
+    evil = site.robot("<script>x</script>")
+    drive(evil.live, "<img src=x>", 1_000)
+    evil.hand_in()
+    site.settle()
+    return site
+
+
+def cookie(site, role="viewer"):
+    token = site.token(role)["Authorization"].removeprefix("Bearer ")
+    return {"Cookie": f"engram_token={token}"}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_needs_a_token_and_takes_names_as_text(visited, page):
+    url = f"/maps/{NAME}/{page}"
+    assert visited.http.get(url).status_code == 401
+    answer = visited.http.get(url, headers=cookie(visited))
+    assert answer.status_code == 200
+    assert "<script>x" not in answer.text
+    assert "<img src=x>" not in answer.text
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert re.findall(r'(?:src|href)="(?!/|#)', answer.text) == []
+
+
+def test_the_map_page_gets_every_node_with_its_revision(visited):
+    found = visited.http.get(f"/maps/{NAME}/nodes", headers=cookie(visited)).json()
+    assert len(found["nodes"]) == 3
+    assert {node[4] for node in found["nodes"]} == {1}
+    empty = visited.http.get(f"/maps/{NAME}/nodes?at=0", headers=cookie(visited)).json()
+    assert empty["nodes"] == []
+    node = found["nodes"][0][0]
+    picture = visited.http.get(f"/maps/{NAME}/nodes/{node}/picture", headers=cookie(visited))
+    assert picture.content[:2] == b"\xff\xd8"
+    assert visited.http.get(f"/maps/{NAME}/nodes/{node}/picture").status_code == 401
+
+
+def test_logging_in_sets_a_cookie_that_only_the_server_reads(visited):
+    token = visited.token("viewer")["Authorization"].removeprefix("Bearer ")
+    answer = visited.http.post("/login", data={"token": token}, follow_redirects=False)
+    assert answer.status_code == 303
+    said = answer.headers["set-cookie"].lower()
+    assert "httponly" in said
+    assert "samesite=strict" in said
+    assert visited.http.post("/login", data={"token": "x"}).status_code == 401
+
+
+def test_what_a_viewer_may_not_do_is_not_offered(visited):
+    url = f"/maps/{NAME}/history"
+    assert "Revert…" not in visited.http.get(url, headers=cookie(visited)).text
+    assert "Revert…" in visited.http.get(url, headers=cookie(visited, "operator")).text
