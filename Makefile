@@ -13,7 +13,7 @@ export ENGRAM_DATA := $(abspath ../shared/data)
 endif
 endif
 
-.PHONY: setup demo test test-long test-ros goldens check format clean
+.PHONY: setup demo centre-demo test test-services test-long test-ros goldens check format clean
 
 setup: $(STAMP)
 
@@ -29,6 +29,9 @@ $(STAMP): pyproject.toml lab/pyproject.toml constraints.txt $(CORE_SOURCES) $(PA
 demo: setup
 	$(BIN)/engram demo --out demo
 
+centre-demo: setup
+	$(BIN)/engram lab fleet-day --out centre-demo
+
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not long'
 
@@ -41,6 +44,10 @@ test-ros: setup
 	test -x $(ROS)/bin/python || $(PYTHON) -m venv $(ROS)
 	$(ROS)/bin/python -m pip install --quiet -r ros/test-requirements.txt
 	ENGRAM_ROS_PYTHON=$(abspath $(ROS))/bin/python $(BIN)/python -m pytest tests/live/test_ros.py
+
+# PostgreSQL of this machine, in a folder of its own, for the length of the run.
+test-services: setup
+	tests/with_postgres $(BIN)/python -m pytest -q tests/centre tests/maps -m 'not long'
 
 goldens: setup
 	$(BIN)/python -m tests.goldens check --all

@@ -2,6 +2,7 @@
 
 import typer
 
+from engram_lab.cli.fleet_day import fleet_day
 from engram_lab.cli.maps import places, relocalise, try_
 from engram_lab.cli.studies import evaluate
 from engram_lab.cli.town import bench, demo, simulate
@@ -16,6 +17,7 @@ lab.command("relocalise")(relocalise)
 lab.command("places")(places)
 lab.command("try")(try_)
 lab.command("bench")(bench)
+lab.command("fleet-day")(fleet_day)
 lab.add_typer(evaluate)
 
 __all__ = ["demo", "lab"]
