@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import uuid
 from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
+from sqlalchemy import create_engine, make_url, text
 from tests.maps.maps import begin, session, write_drive
 
 from engram.agent import Agent, enrol
@@ -109,11 +112,42 @@ def drive(path: Path, robot: str, start_ns: int, nodes: int = 3) -> None:
         writer.commit()
 
 
-@pytest.fixture
-def site(tmp_path):
-    found = Site(tmp_path)
+KINDS = ["embedded", *(["services"] if os.environ.get("ENGRAM_TEST_POSTGRES") else [])]
+
+
+@pytest.fixture(params=KINDS)
+def site(request, tmp_path):
+    """A centre in a folder; and one on PostgreSQL and a bucket where ENGRAM_TEST_POSTGRES says."""
+    options = {}
+    if request.param == "services":
+        bucket = os.environ.get("ENGRAM_TEST_BUCKET")
+        (tmp_path / "bucket").mkdir()
+        options["objects"] = bucket or (tmp_path / "bucket").as_uri()
+        options["database"] = new_database()
+    found = Site(tmp_path, **options)
     yield found
     found.close()
+    if request.param == "services":
+        drop_database(options["database"])
+
+
+def new_database() -> str:
+    """Address of an empty database of its own."""
+    url = make_url(os.environ["ENGRAM_TEST_POSTGRES"])
+    name = f"centre_{uuid.uuid4().hex}"
+    _run(url, f'CREATE DATABASE "{name}"')
+    return url.set(database=name).render_as_string(hide_password=False)
+
+
+def drop_database(address: str) -> None:
+    _run(os.environ["ENGRAM_TEST_POSTGRES"], f'DROP DATABASE "{make_url(address).database}"')
+
+
+def _run(url, statement: str) -> None:
+    engine = create_engine(url, isolation_level="AUTOCOMMIT")
+    with engine.connect() as connection:
+        connection.execute(text(statement))
+    engine.dispose()
 
 
 @pytest.fixture

@@ -212,6 +212,24 @@ def test_what_the_gate_refuses_stays_and_a_person_may_merge_it(site, robot, monk
     assert [one["name"] for one in refs] == ["head"]  # what a person forced moves no ref
 
 
+def test_what_stays_incomplete_or_unused_goes(site, robot):
+    manifest, _ = taken_apart(robot)
+    assert send(site, robot, manifest, {}).status_code == 409
+    viewer = site.token("viewer")
+    robot.hand_in()
+    site.settle()
+    asked = {"ref": "1", "options": {}}
+    url = f"/v1/maps/{NAME}/downloads"
+    key = site.http.post(url, json=asked, headers=viewer).json()["id"]
+    site.work()
+    site.clock.forward(31 * 86_400)
+    site.work()
+    assert not HandIns(site.centre).listed(NAME, None, "open", 2**62, 10)
+    assert site.http.get(f"/v1/artifacts/{key}", headers=viewer).status_code == 404
+    assert list(site.centre.objects.keys("artifacts")) == []
+    assert site.http.post(url, json=asked, headers=viewer).json()["state"] == "asked"
+
+
 def test_a_job_can_be_cancelled_before_and_within(site, robot):
     robot.hand_in()
     robot.step()

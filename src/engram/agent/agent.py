@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from engram.agent.fetching import Fetch
 from engram.agent.link import CentreRefusedError, Link, Unreachable, new_client
-from engram.agent.sending import FAILED, Outbox
+from engram.agent.sending import FAILED, QUEUED, SENT, Outbox
 from engram.agent.settings import AgentSettings
 from engram.agent.state import AgentState
 from engram.errors import InputError, MapError, StorageFullError
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import httpx
 
 MAP = "map.engram"
+_PARTS = ("live", "base", "next")
 
 
 def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | None = None) -> str:
@@ -48,7 +49,8 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
         CentreRefusedError: the code is not valid.
         Unreachable: the centre does not answer.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    for part in _PARTS:
+        (folder / part).mkdir(parents=True, exist_ok=True)
     key = folder / "key"
     if not key.exists():
         with write_whole(key) as draft:
@@ -101,7 +103,7 @@ class Agent:
         self.state = AgentState(folder / "agent.sqlite")
         self._chance = chance
         self.live = folder / "live" / MAP
-        for part in ("live", "base", "next"):
+        for part in _PARTS:
             (folder / part).mkdir(exist_ok=True)
         signer = Signer((folder / "key").read_bytes())
         self._map = self.state.fact("map")
@@ -267,6 +269,14 @@ class Agent:
         self.state.remember(
             rejected=rejected, runs=self.state.fact("runs_before"), share=None, driven_m=0.0
         )
+
+    @property
+    def waits(self) -> bool:
+        """Whether the centre still owes something: a version, or the outcome of a hand-in."""
+        fact = self.state.fact
+        known = {fact("runs"), fact("staged"), fact("rejected"), None, "0"}
+        open_states = {row["state"] for row in self.state.outbox()} & {QUEUED, SENT}
+        return bool(open_states) or fact("wanted") not in known
 
     def status(self) -> dict[str, Any]:
         """The state, as ``engram agent status --json`` prints it."""

@@ -59,19 +59,17 @@ class Outbox:
         return key
 
     def send(self, link: Link, durable_revision: int) -> bool:
-        """Sends what is queued, oldest first; whether anything changed.
+        """Sends what is queued, oldest first; whether something was handed in.
+
+        What the centre does not know, as after a restored backup, is sent again.
 
         Raises:
             Unreachable: the link broke. What arrived need not be sent again.
         """
         changed = False
         for row in self._state.outbox():
-            was = row["state"]
-            if row["state"] != QUEUED and not self._look(link, row, durable_revision):
-                row["state"] = QUEUED  # a centre of yesterday's backup does not know it
-            if row["state"] == QUEUED:
-                self._send(link, row)
-            changed = changed or was == QUEUED
+            if row["state"] == QUEUED or not self._look(link, row, durable_revision):
+                changed = self._send(link, row) or changed
         return changed
 
     def _queued(self) -> set[PartHash]:
@@ -79,7 +77,8 @@ class Outbox:
             one for row in self._state.outbox() for one in self._state.waiting_hashes(row["id"])
         }
 
-    def _send(self, link: Link, row: dict[str, Any]) -> None:
+    def _send(self, link: Link, row: dict[str, Any]) -> bool:
+        """Sends one hand-in; whether it is complete."""
         manifest = decode_manifest(row["manifest"])
         answer = self._begin(link, manifest)
         key = answer["id"]
@@ -90,13 +89,14 @@ class Outbox:
             if answer["wanted"] and set(answer["wanted"]) == set(before):
                 error = f"{len(wanted)} parts are not on this robot any more"
                 self._state.set_outbox(row["id"], FAILED, None, error)
-                return
+                return False
         link.ask("POST", f"/v1/handins/{key}/complete")
         self._state.share([*manifest.hashes(), *self._state.waiting_hashes(row["id"])])
         self._state.remember(
             base=row["manifest"].decode(), handin={**self._handins(), row["id"]: key}
         )
         self._state.set_outbox(row["id"], SENT, None, None)
+        return True
 
     def _begin(self, link: Link, manifest: Manifest) -> dict[str, Any]:
         """Announces a hand-in: as what it adds to a manifest that the centre has, if it does."""

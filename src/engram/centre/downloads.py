@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from typing import Any, TypedDict, get_type_hints
 
 import msgspec
-from sqlalchemy import select, update
+from sqlalchemy import delete, select, update
 
 from engram.centre.errors import ConflictError, UnknownError
 from engram.centre.refs import Refs
 from engram.centre.service import Centre
+from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
 from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.packs import PACK_BYTES
@@ -129,6 +130,21 @@ class Downloads:
         query = select(artifacts).where(artifacts.c.state == ASKED).order_by(artifacts.c.asked_ns)
         with self._centre.database.reading() as connection:
             return rows_of(connection, query)
+
+    def expire(self) -> None:
+        """Forgets artifacts that nobody used for long; asked for again they are made again."""
+        limit_ns = self._centre.now_ns() - self._centre.settings.artifact_days * DAY_NS
+        query = select(artifacts).where(artifacts.c.used_ns < limit_ns, artifacts.c.state != ASKED)
+        with self._centre.database.reading() as connection:
+            old = rows_of(connection, query)
+        for row in old:
+            with self._centre.database.writing() as connection:
+                for table in (artifact_grants, artifacts):
+                    column = table.c.artifact if table is artifact_grants else table.c.id
+                    connection.execute(delete(table).where(column == row["id"]))
+                now = self._centre.now_ns()
+                note(connection, now, "worker", "expired", row["map"], artifact=row["id"])
+            self._centre.objects.delete(f"artifacts/{row['map']}/{row['id']}.engram")
 
     def make(self, row: dict[str, Any]) -> None:
         """Makes an artifact; done twice, or half done before, it is the same."""

@@ -314,6 +314,17 @@ class HandIns:
             asked = connection.execute(select(handins.c.cancelled).where(handins.c.id == key))
             return bool(asked.scalar())
 
+    def expire(self) -> None:
+        """Ends hand-ins that stayed incomplete too long."""
+        limit_ns = self._centre.now_ns() - self._centre.settings.handin_days * DAY_NS
+        query = select(handins).where(
+            handins.c.state == str(HandInState.OPEN), handins.c.begun_ns < limit_ns
+        )
+        with self._centre.database.reading() as connection:
+            old = rows_of(connection, query)
+        for row in old:
+            self.end(row, HandInState.CANCELLED, error="incomplete for too long")
+
     def waiting(self, name: str) -> list[dict[str, Any]]:
         """Jobs of a map, in the order of their completion."""
         query = (

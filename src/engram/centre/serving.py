@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from engram.centre.service import Centre
 from engram.centre.worker.loop import work
@@ -66,12 +67,27 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
         log_level="warning",
         server_header=False,
     )
-    server = uvicorn.Server(config)
+    server = _telling(uvicorn.Server)(config)
     if not worker:
         server.run()
         return
     with _supervised_worker(centre):
         server.run()
+
+
+def _telling(kind: type[Any]) -> type[Any]:
+    """A server that prints its address as soon as it answers."""
+
+    class Telling(kind):  # type: ignore[misc]
+        async def startup(self, sockets: Any = None) -> None:
+            await super().startup(sockets=sockets)
+            if self.started:
+                scheme = "https" if self.config.is_ssl else "http"
+                print(
+                    f"engram centre at {scheme}://{self.config.host}:{self.config.port}", flush=True
+                )
+
+    return Telling
 
 
 def run_worker(folder: Path, database: str | None, objects: str | None) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -22,7 +23,7 @@ Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The a
 Config: TypeAlias = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Limits and download, in TOML.")
 ]
-_ROUNDS = 1000
+_LOOK_S = 0.5
 
 
 def _open(folder: Path, config: Path | None = None) -> Agent:
@@ -57,12 +58,21 @@ def run(folder: Folder, *, config: Config = None) -> None:
 
 
 @agent_group.command()
-def sync(folder: Folder, *, config: Config = None, as_json: options.Json = False) -> None:
-    """Send and fetch once, as far as the link allows."""
+def sync(
+    folder: Folder,
+    *,
+    wait_s: Annotated[
+        float, typer.Option("--wait", metavar="S", min=0, help="For what the centre still makes.")
+    ] = 0.0,
+    config: Config = None,
+    as_json: options.Json = False,
+) -> None:
+    """Send and fetch, as far as the link allows."""
+    waiting = threading.Event()
     with _open(folder, config) as agent:
-        for _ in range(_ROUNDS):
-            if agent.step() > 0:
-                break
+        until_s = time.monotonic() + wait_s
+        while (pause_s := agent.step()) == 0 or (agent.waits and time.monotonic() < until_s):
+            waiting.wait(min(pause_s, _LOOK_S))
         _print(agent, as_json=as_json)
 
 

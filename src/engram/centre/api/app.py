@@ -26,7 +26,13 @@ next mission needs. Errors are problem details (RFC 9457). Whatever is sent twic
 
 def create_app(centre: Centre) -> FastAPI:
     """The HTTP interface of a centre."""
-    app = FastAPI(title="Engram centre", version=__version__, description=_ABOUT, docs_url=None)
+    app = FastAPI(
+        title="Engram centre",
+        version=__version__,
+        description=_ABOUT,
+        docs_url=None,
+        redoc_url=None,
+    )
     app.state.centre = centre
     app.state.answers = Counter[int]()
     app.state.seconds = 0.0

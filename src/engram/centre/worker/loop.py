@@ -14,6 +14,8 @@ def work_off(centre: Centre) -> int:
     """Does what there is to do; returns the number of settled jobs."""
     downloads, handins = Downloads(centre), HandIns(centre)
     settled = 0
+    handins.expire()
+    downloads.expire()
     for name in centre.map_names():
         if not handins.waiting(name):
             continue

@@ -1,0 +1,109 @@
+"""The agent: offline first, patient, careful with maps."""
+
+from __future__ import annotations
+
+import pytest
+from tests.centre.conftest import Site, admit_here, drive
+
+from engram.agent import Agent, AgentSettings
+from engram.centre.backup import back_up
+from engram.centre.worker import merging
+from engram.errors import InputError, StorageFullError
+from engram.maps import Map
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    monkeypatch.setattr(merging, "admit", admit_here)
+    found = Site(tmp_path)
+    yield found
+    found.close()
+
+
+def test_pauses_grow_while_the_link_is_down_and_end_with_it(site):
+    agent = site.robot("r1")
+    site.link.fates = ["lost"] * 12
+    pauses = [agent.step() for _ in range(12)]
+    assert pauses[:4] == [1.0, 2.0, 4.0, 8.0]  # half of each: the jitter of this test is none
+    assert max(pauses) == agent.settings.longest_retry_s / 2
+    assert agent.step() == agent.settings.idle_s
+    assert agent.status()["failures"] == 0
+
+
+def test_a_full_outbox_keeps_the_map_and_says_so(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    with Agent(agent.folder, AgentSettings(outbox_bytes=1_000), client=site.link) as small:
+        with pytest.raises(StorageFullError, match="outbox"):
+            small.hand_in()
+        assert small.status()["outbox"] == []
+    assert agent.hand_in() is not None
+
+
+def test_the_cap_of_the_link_is_kept_by_waiting(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000, 20)
+    waited = []
+    options = AgentSettings(bytes_per_s=10_000.0)
+    with Agent(agent.folder, options, client=site.http, wait=waited.append) as capped:
+        capped.hand_in()
+        capped.step()
+        assert sum(waited) == pytest.approx(capped.link.sent_bytes / 10_000, rel=0.4)
+
+
+def test_a_hand_in_is_kept_until_a_backup_holds_it(site, tmp_path):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    site.settle()
+    assert [row["state"] for row in agent.status()["outbox"]] == ["settled"]
+    back_up(site.centre, tmp_path / "backup")
+    site.settle()
+    assert agent.status()["outbox"] == []
+
+
+def test_a_new_map_that_does_not_localise_gives_way_to_the_last_one(site):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    drive(second.live, "r2", 2_000)
+    first.hand_in()
+    second.hand_in()
+    site.settle()
+    with Map.open(second.live) as store:
+        before = store.content_hash()
+    assert second.switch()
+    assert not second.drove(0.05, 10.0)  # too early to say
+    assert second.drove(0.05, 100.0)
+    with Map.open(second.live) as store:
+        assert store.content_hash() == before
+    site.settle()
+    assert second.status()["staged"] is None  # the version that did not serve is not fetched again
+
+
+def test_a_map_that_serves_stays(site):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    first.hand_in()
+    site.settle()
+    second.switch()
+    assert not second.drove(0.9, 100.0)
+    assert not second.drove(0.0, 100.0)  # later it is the weather
+
+
+def test_a_drive_between_fetching_and_parking_is_not_lost(site):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    drive(second.live, "r2", 2_000)
+    first.hand_in()
+    site.settle()
+    drive(second.live, "r2", 3_000)
+    assert not second.switch()
+    site.settle()
+    assert second.switch()
+    with Map.open(second.live) as store:
+        assert {one.start_ns for one in store.sessions.values()} == {1_000, 2_000, 3_000}
+
+
+def test_a_folder_that_is_not_enrolled_is_named(tmp_path):
+    with pytest.raises(InputError, match="engram agent enrol"):
+        Agent(tmp_path)

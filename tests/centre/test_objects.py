@@ -1,0 +1,42 @@
+"""Objects in a folder and in a bucket answer alike."""
+
+from __future__ import annotations
+
+import pytest
+
+from engram.centre.store.objects import BucketObjects, FolderObjects
+from engram.errors import MapError
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def objects(request, tmp_path):
+    if request.param == "folder":
+        return FolderObjects(tmp_path / "objects")
+    (tmp_path / "bucket").mkdir()
+    return BucketObjects((tmp_path / "bucket").as_uri())
+
+
+def test_what_is_put_is_got_whole_and_in_ranges(objects, tmp_path):
+    body = bytes(range(256)) * 40
+    objects.put("packs/fleet/a", body)
+    assert objects.get("packs/fleet/a") == body
+    assert objects.get("packs/fleet/a", 100, 7) == body[100:107]
+    assert objects.size("packs/fleet/a") == len(body)
+    objects.put("packs/fleet/a", body)
+    (tmp_path / "file").write_bytes(body[::-1])
+    objects.put_file("packs/town/b", tmp_path / "file")
+    assert objects.get("packs/town/b") == body[::-1]
+    assert list(objects.keys("packs/fleet")) == ["packs/fleet/a"]
+    assert sorted(objects.keys("packs")) == ["packs/fleet/a", "packs/town/b"]
+
+
+def test_what_is_missing_is_named(objects):
+    for ask in (objects.get, objects.size):
+        with pytest.raises(MapError, match="packs/x is missing"):
+            ask("packs/x")
+
+
+def test_what_is_deleted_is_gone(objects):
+    objects.put("a/b", b"x")
+    objects.delete("a/b")
+    assert list(objects.keys("a")) == []
