@@ -31,6 +31,8 @@ EXAMPLES = {
     README: "drives",
     DOCS / "first-map.md": "drives",
     DOCS / "fleet-tutorial.md": "drives",
+    DOCS / "afternoon.md": "drives",
+    DOCS / "centre.md": "drives",
     DOCS / "robot-tutorial.md": "drives",
     DOCS / "study.md": "drives",
     DOCS / "data.md": "mapped",
@@ -155,6 +157,23 @@ def _write_bags(drive: Path, folder: Path) -> None:
     cv2.imwrite(str(folder / "mask.png"), mask)
 
 
+@pytest.fixture
+def served() -> Iterator[Callable[[list[str]], None]]:
+    """Runs a centre beside the page's other commands, until the page ends."""
+    running: list[subprocess.Popen[str]] = []
+
+    def serve(words: list[str]) -> None:
+        program = [sys.executable, "-c", "from engram.cli import main; main()", *words[1:]]
+        running.append(subprocess.Popen(program, stdout=subprocess.PIPE, text=True))
+        assert running[-1].stdout is not None
+        assert "engram centre at" in running[-1].stdout.readline()
+
+    yield serve
+    for one in running:
+        one.terminate()
+        one.communicate()
+
+
 @dataclass(frozen=True)
 class Ran:
     """How a command ended, and what it printed."""
@@ -211,9 +230,13 @@ def test_every_page_with_examples_is_run() -> None:
 
 @pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.name)
 def test_the_examples_of_a_page_run_in_their_order(
-    folder: Callable[[str], None], page: Path, capsys: pytest.CaptureFixture[str]
+    folder: Callable[[str], None],
+    page: Path,
+    capsys: pytest.CaptureFixture[str],
+    request: pytest.FixtureRequest,
 ) -> None:
     folder(EXAMPLES[page])
+    last = ""
     names: dict[str, object] = {"my_camera": _my_camera}
     printed = ""
     for block in blocks(page):
@@ -234,7 +257,12 @@ def test_the_examples_of_a_page_run_in_their_order(
                     continue
                 # A person copies the id from `engram info --sessions`.
                 given = [_first_session(words[2]) if one == "SESSION" else one for one in words]
+                given = [last if one == "CODE" else one for one in given]
+                if words[1:3] == ["centre", "serve"]:
+                    request.getfixturevalue("served")(given)
+                    continue
                 ran = run_words(given)
+                last = (ran.stdout.split() or [""])[-1]
                 assert ran.returncode == 0, f"{page.name}: {shlex.join(words)}\n{ran.stderr}"
                 printed += ran.stdout + ran.stderr
                 if words[1] == "localise" and "--explain" not in words and "--json" not in words:
