@@ -8,11 +8,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from engram.errors import InputError
+
+
+class Estimator(StrEnum):
+    """What P(X >= x), the chance of a long way without a match, is taken over."""
+
+    ROUTE = "route"
+    GAP = "gap"
+    LOST = "lost"
+    REACQUIRED = "reacquired"
+
+
+# What is shown beside every figure; g is the distance between two successive matches, d the
+# distance from the first frame without a match to the next one with. Source: SPEC §8; `reacquired`
+# is the measure of [G16] §VI-B: "after becoming lost, before reacquiring".
+FORMULAS = {
+    Estimator.ROUTE: "(1/L) Σ max(0, g − x)",
+    Estimator.GAP: "#{g ≥ x} / #{g}",
+    Estimator.LOST: "#{g ≥ x} / #{g}, gaps with a failed frame",
+    Estimator.REACQUIRED: "#{d ≥ x} / #{d}, from becoming lost to reacquiring",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,16 +85,20 @@ class Gaps:
     Attributes:
         length_m: (G,) float64, metres.
         failed: (G,) bool, whether at least one frame within the gap was not matched.
+        lost_m: (G,) float64, distance from its first unmatched frame to its end, metres; 0
+            without one.
     """
 
     length_m: NDArray[np.float64]
     failed: NDArray[np.bool_]
+    lost_m: NDArray[np.float64]
 
 
 def gaps(drives: Sequence[Drive]) -> Gaps:
     """All gaps of the given sessions. Source: SPEC §8."""
     lengths: list[float] = []
     failed: list[bool] = []
+    lost_m: list[float] = []
     for drive in drives:
         if not len(drive.step_m):
             continue
@@ -87,38 +112,52 @@ def gaps(drives: Sequence[Drive]) -> Gaps:
         real[[0, -1]] = (length_m[[0, -1]] > 0) | without[[0, -1]]
         lengths.extend(length_m[real])
         failed.extend(without[real])
-    return Gaps(np.array(lengths, dtype=np.float64), np.array(failed, dtype=bool))
+        first = np.minimum(np.concatenate([[0], ends + 1]), len(positions) - 1)
+        lost_m.extend(np.where(without, marks[1:] - positions[first], 0.0)[real])
+    return Gaps(
+        np.array(lengths, dtype=np.float64),
+        np.array(failed, dtype=bool),
+        np.array(lost_m, dtype=np.float64),
+    )
 
 
-def failure_curve(drives: Sequence[Drive], at_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """P(X >= x) from a uniformly random point of the route, for many distances x.
+def failure(
+    drives: Sequence[Drive], at_m: ArrayLike, estimator: Estimator = Estimator.ROUTE
+) -> NDArray[np.float64]:
+    """P(X >= x): the one function for all failure estimators; see `FORMULAS`.
 
     Args:
         drives: the localised sessions.
-        at_m: (X,) float64, the distances, metres.
+        at_m: distances x, metres; a number or an array.
+        estimator: what a failure is counted over.
 
     Returns:
-        (X,) float64; 0 for a route of length 0.
-
-    Source: SPEC §8, estimator *route*.
+        float64 of the shape of `at_m`; 0 where nothing was driven or never failed.
     """
-    above, below = np.zeros(len(at_m)), 0.0
+    at = np.asarray(at_m, np.float64)
+    above, below = np.zeros(at.size), 0.0
     for drive in drives:
-        beyond = gaps([drive]).length_m[None, :] - at_m[:, None]
-        above = above + np.maximum(beyond, 0.0).sum(axis=1)
-        below = below + float(drive.step_m.sum())
-    return above / below if below else above
+        part, count = failure_sums(drive, at.reshape(-1), estimator)
+        above, below = above + part, below + count
+    return np.asarray((above / below if below else above).reshape(at.shape))
 
 
-def failure_route(drives: Sequence[Drive], at_m: float) -> float:
-    """P(X >= x) from a uniformly random point of the route: (1/L) Σ max(0, g − x).
+def failure_sums(
+    drive: Drive, at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
+) -> tuple[NDArray[np.float64], float]:
+    """One session's part of `failure`: numerators (X,) at distances (X,), and denominator.
 
-    0 for a route of length 0. Source: SPEC §8, estimator *route*.
+    The curve over several sessions is the sum of the numerators ÷ the sum of the denominators.
     """
-    length_m = route_m(drives)
-    if length_m == 0.0:
-        return 0.0
-    return float(np.maximum(gaps(drives).length_m - at_m, 0.0).sum() / length_m)
+    found = gaps([drive])
+    lengths = found.length_m
+    if estimator is Estimator.ROUTE:
+        beyond = np.maximum(lengths[None, :] - at_m[:, None], 0.0)
+        return beyond.sum(axis=1), float(drive.step_m.sum())
+    if estimator is not Estimator.GAP:
+        lengths = found.lost_m if estimator is Estimator.REACQUIRED else lengths
+        lengths = lengths[found.failed]
+    return (lengths[None, :] >= at_m[:, None]).sum(axis=1).astype(np.float64), float(len(lengths))
 
 
 def route_m(drives: Sequence[Drive]) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from engram.errors import InputError
-from engram.measures import Drive, failure_route, gaps, longest_gap_m, route_m, route_not_localised
+from engram.measures import Drive, failure, gaps, longest_gap_m, route_m, route_not_localised
 
 
 def drive(steps: list[float], matched: str) -> Drive:
@@ -23,7 +23,7 @@ def test_gaps_are_closed_by_start_and_end() -> None:
 
 def test_failures_of_the_worked_case() -> None:
     # At 1.5 m: (0.5 + 3.5 + 0.5) / 10.
-    assert failure_route([WORKED], 1.5) == pytest.approx(0.45)
+    assert failure([WORKED], 1.5) == pytest.approx(0.45)
 
 
 def test_route_not_localised_counts_the_steps_that_end_unmatched() -> None:
@@ -66,12 +66,12 @@ def test_what_is_neither_true_nor_false_is_refused(matched) -> None:
 def test_a_session_without_a_match_is_one_gap() -> None:
     never = drive([2, 3], "..")
     np.testing.assert_allclose(gaps([never]).length_m, [5])
-    assert failure_route([never], 1.0) == pytest.approx(0.8)
+    assert failure([never], 1.0) == pytest.approx(0.8)
 
 
 def test_a_robot_at_rest_has_no_route() -> None:
     rest = drive([0, 0], "x.")
-    assert failure_route([rest], 10) == 0
+    assert failure([rest], 10) == 0
     assert route_not_localised([rest]) == 0
 
 
@@ -84,7 +84,7 @@ def test_route_estimator_agrees_with_drawing_points_at_random() -> None:
     points = rng.uniform(0, steps.sum(), 200_000)
     ahead = ends[np.searchsorted(ends, points)] - points
     # 200,000 draws: standard error below 0.0012, four of them.
-    assert failure_route([sample], 5.0) == pytest.approx(np.mean(ahead >= 5.0), abs=0.005)
+    assert failure([sample], 5.0) == pytest.approx(np.mean(ahead >= 5.0), abs=0.005)
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.measures import Drive, failure_curve, gaps, longest_gap_m
+from engram.measures import Drive, failure, longest_gap_m
 
 Array = NDArray[np.float64]
 # (N, S) weights of the sessions → (N,) values.
@@ -151,37 +150,6 @@ def excess_ratio(a: SessionSums, b: SessionSums, bound: SessionSums) -> Statisti
     return statistic
 
 
-class Estimator(StrEnum):
-    """How P(X >= x) is taken from the gaps g. Source: SPEC §8; the formulas stand in `FORMULAS`."""
-
-    ROUTE = "route"
-    GAP = "gap"
-    LOST = "lost"
-
-
-# What is printed beside every figure.
-FORMULAS = {
-    Estimator.ROUTE: "(1/L) Σ max(0, g − x)",
-    Estimator.GAP: "#{g ≥ x} / #{g}",
-    Estimator.LOST: "#{g ≥ x} / #{g}, gaps with a failed frame",
-}
-
-
-def failure_sums(
-    drive: Drive, at_m: NDArray[np.float64], estimator: Estimator = Estimator.ROUTE
-) -> tuple[NDArray[np.float64], float]:
-    """One session's part of a failure curve: numerators (X,) at distances (X,), and denominator.
-
-    The curve over several sessions is the sum of the numerators ÷ the sum of the denominators.
-    """
-    found = gaps([drive])
-    lengths = found.length_m[found.failed] if estimator is Estimator.LOST else found.length_m
-    beyond = lengths[None, :] - at_m[:, None]
-    if estimator is Estimator.ROUTE:
-        return np.maximum(beyond, 0.0).sum(axis=1), float(drive.step_m.sum())
-    return (beyond >= 0).sum(axis=1).astype(np.float64), float(len(lengths))
-
-
 def not_localised_sums(drives: Sequence[Drive]) -> SessionSums:
     """`route_not_localised` by its parts: metres without a match and metres driven, by session."""
     missed_m = [float(one.step_m[~one.matched].sum()) for one in drives]
@@ -196,7 +164,7 @@ def beats(a: Sequence[Drive], b: Sequence[Drive]) -> bool:
     """
     at_m = np.arange(0.0, _UP_TO_M + _STEP_M / 2, _STEP_M)
     # Sums of the same gaps in another order differ in the last bits.
-    below = failure_curve(a, at_m) <= failure_curve(b, at_m) + 1e-12
+    below = failure(a, at_m) <= failure(b, at_m) + 1e-12
     return bool(below.all()) and longest_gap_m(a) <= _LONGEST_GAP_RATIO * longest_gap_m(b)
 
 

@@ -23,7 +23,7 @@ from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, Session
 from engram.localiser import Localisation, Position
 from engram.maps import Map, open_map
-from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.robot import (
     DriveSequence,
@@ -260,7 +260,7 @@ def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:
                 size_bytes=float(np.mean([trial.report.size_bytes for trial in own])),
                 expected_missed=float(promised @ lengths / total_m) if total_m else 0.0,
                 missed=route_not_localised(steps),
-                p_no_match_10m=failure_route(steps, 10.0),
+                p_no_match_10m=float(failure(steps, 10.0)),
                 longest_gap_m=longest_gap_m(steps),
                 ms_per_frame=float(np.mean([trial.ms_per_frame for trial in own])),
             )

@@ -5,9 +5,9 @@ import pytest
 
 from engram.errors import InputError
 from engram.geometry import SE3
-from engram.measures import Drive, failure_curve, failure_route
+from engram.measures import FORMULAS, Drive, Estimator, failure, failure_sums, gaps
 from engram_lab.accuracy import pose_errors
-from engram_lab.intervals import Estimator, beats, failure_sums
+from engram_lab.intervals import beats
 
 
 def drive(marks: str, step_m: float = 1.0) -> Drive:
@@ -19,7 +19,7 @@ def curve_at(drives, x: float, estimator: Estimator) -> float:
     return sum(part[0][0] for part in parts) / sum(part[1] for part in parts)
 
 
-def test_three_estimators_of_a_worked_case() -> None:
+def test_four_estimators_of_a_worked_case() -> None:
     # Gaps of 2, 1, 5 and 2 m, that of 1 m without a failure. Route at 1.5 m:
     # (0.5 + 3.5 + 0.5) / 10; gap: three of four; lost: three of three.
     worked = drive(".xx....x..")
@@ -27,19 +27,24 @@ def test_three_estimators_of_a_worked_case() -> None:
     assert curve_at([worked], 1.5, Estimator.GAP) == pytest.approx(0.75)
     assert curve_at([worked], 1.5, Estimator.LOST) == pytest.approx(1.0)
     assert curve_at([worked], 2.5, Estimator.LOST) == pytest.approx(1 / 3)
+    # From the first failed frame on: 1, 4 and 1 m.
+    assert gaps([worked]).lost_m.tolist() == [1.0, 0.0, 4.0, 1.0]
+    assert curve_at([worked], 1.5, Estimator.REACQUIRED) == pytest.approx(1 / 3)
+    assert curve_at([worked], 1.0, Estimator.REACQUIRED) == pytest.approx(1.0)
+    assert set(FORMULAS) == set(Estimator)
 
 
 def test_a_curve_is_its_points() -> None:
     drives = [drive(".xx....x.."), drive("x....x", 1.7), drive("......")]
     at_m = np.array([0.0, 0.5, 1.0, 1.7, 2.0, 5.0, 8.5, 50.0])
-    found = failure_curve(drives, at_m)
-    np.testing.assert_allclose(found, [failure_route(drives, float(x)) for x in at_m], atol=1e-12)
+    found = failure(drives, at_m)
+    np.testing.assert_allclose(found, [failure(drives, float(x)) for x in at_m], atol=1e-12)
     by_session = [curve_at(drives, float(x), Estimator.ROUTE) for x in at_m]
     np.testing.assert_allclose(found, by_session, atol=1e-12)
 
 
 def test_route_curve_begins_at_one_and_falls() -> None:
-    curve = failure_curve([drive("..x...x")], np.arange(0.0, 10.0, 0.5))
+    curve = failure([drive("..x...x")], np.arange(0.0, 10.0, 0.5))
     assert curve[0] == 1.0
     assert (np.diff(curve) <= 0).all()
     assert curve[-1] == 0.0
@@ -47,8 +52,8 @@ def test_route_curve_begins_at_one_and_falls() -> None:
 
 def test_nothing_driven_has_no_failures() -> None:
     nothing = Drive(np.zeros(0), np.zeros(0, bool))
-    assert failure_curve([], np.array([1.0]))[0] == 0
-    assert failure_curve([nothing], np.array([1.0]))[0] == 0
+    assert failure([], np.array([1.0]))[0] == 0
+    assert failure([nothing], np.array([1.0]))[0] == 0
 
 
 def test_beats_needs_the_curve_below_and_no_much_longer_gap() -> None:

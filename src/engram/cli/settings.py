@@ -19,6 +19,7 @@ from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import ConfigError
 from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.frontend import DescriptorKind
+from engram.measures import Estimator
 from engram.robot.settings import Settings, settings_text
 
 
@@ -76,6 +77,10 @@ class BuildSettings:
         float,
         Meta(ge=0, description="m; the best order has the fewest longer gaps. Source: [G16] §VI"),
     ] = 10.0
+    estimator: Annotated[
+        Estimator,
+        Meta(description="what failures are counted over: route, gap, lost, reacquired ([G16])"),
+    ] = Estimator.ROUTE
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -97,6 +102,10 @@ class DownloadSettings:
     buffer_min: Annotated[
         float, Meta(ge=0, le=720, description="paths: minutes added before and after the mission")
     ] = 0.0
+    widen_min: Annotated[
+        float,
+        Meta(gt=0, le=720, description="step by which an hour without data is widened, minutes"),
+    ] = 60.0
     latitude_deg: (
         Annotated[
             float,

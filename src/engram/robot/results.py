@@ -10,7 +10,7 @@ import numpy as np
 
 from engram.localiser import Localisation, LocalisationStatus
 from engram.maps import Map
-from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.odometry.motion import driven_steps_m
 from engram.robot.session import DriveSequence
@@ -67,7 +67,7 @@ def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
         "unusable_frames": sum(not result.motion.usable for result in results),
         "attempts_per_frame": sum(r.attempts for r in results) / count,
         "driven_m": route_m([drive]),
-        "p_no_match_10m": failure_route([drive], 10.0),
+        "p_no_match_10m": float(failure([drive], 10.0)),
         "route_not_localised": route_not_localised([drive]),
         "longest_gap_m": longest_gap_m([drive]),
         "late_frames": sum(result.late for result in results),

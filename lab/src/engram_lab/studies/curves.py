@@ -7,14 +7,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.measures import Drive
+from engram.measures import Drive, Estimator, failure_sums
 from engram_lab.charts import Line
 from engram_lab.intervals import (
-    Estimator,
     Interval,
     Resamples,
     SessionSums,
-    failure_sums,
     not_localised_sums,
     product,
 )

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.measures import FORMULAS, Estimator
 from engram_lab.charts import Line, Panel, draw_bars, draw_curves
-from engram_lab.intervals import FORMULAS, Estimator
 from engram_lab.studies.configurations import UNLIMITED, Configuration, PathKinds, lanes_text
 from engram_lab.studies.curves import failure_line, row_line
 from engram_lab.studies.pages import Row, chosen

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from engram_lab.intervals import Estimator, Resamples, beats, difference
+from engram.measures import Estimator
+from engram_lab.intervals import Resamples, beats, difference
 from engram_lab.studies.configurations import (
     UNLIMITED,
     Configuration,

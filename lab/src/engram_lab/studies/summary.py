@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.measures import Drive, longest_gap_m
+from engram.measures import Drive, Estimator, failure_sums, longest_gap_m
 from engram_lab.accuracy import PoseErrors
 from engram_lab.intervals import (
-    Estimator,
     Resamples,
     SessionSums,
-    failure_sums,
     not_localised_sums,
 )
 from engram_lab.policies import STUDIED

@@ -30,7 +30,7 @@ from engram.fleet.merge.merging import merge
 from engram.fleet.merge.replay import MergeOptions
 from engram.graph.model import Session
 from engram.maps import Map, copy_map
-from engram.measures import failure_curve, failure_route, route_not_localised
+from engram.measures import failure, route_not_localised
 from engram.monitor import Monitor
 from engram.robot import Settings, measure, open_drive
 
@@ -111,7 +111,9 @@ class _Search:
         judge: JudgeOptions,
         root: Path | None,
     ) -> None:
-        self.found = BestOrder([], judge.judge_at_m, judge.orders, root is not None)
+        self.found = BestOrder(
+            [], judge.judge_at_m, judge.orders, root is not None, estimator=judge.estimator
+        )
         self._maps = maps
         self._folder = folder
         self._settings = settings
@@ -202,15 +204,16 @@ class _Search:
             )
             nodes, content_hash = len(opened.graph), opened.content_hash()
         steps = np.arange(0.0, _AREA_TO_M, _AREA_STEP_M) + _AREA_STEP_M / 2
-        area_m = sum(failure_route(drives, float(at)) for at in steps) * _AREA_STEP_M
+        estimator = self._judge.estimator
+        area_m = float(failure(drives, steps, estimator).sum()) * _AREA_STEP_M
         return OrderResult(
             order,
-            failure_route(drives, self._judge.judge_at_m),
-            float(area_m),
-            {f"{at:g}": failure_route(drives, at) for at in _SPREAD_AT_M},
+            float(failure(drives, self._judge.judge_at_m, estimator)),
+            area_m,
+            {f"{at:g}": float(failure(drives, at, estimator)) for at in _SPREAD_AT_M},
             nodes,
             content_hash,
-            failure_curve(reported, _REPORTED_AT_M).tolist() if reported else [],
+            failure(reported, _REPORTED_AT_M).tolist() if reported else [],
             route_not_localised(reported),
         )
 

@@ -19,7 +19,7 @@ from engram.errors import ConfigError
 from engram.fleet.merge.gate import held_as
 from engram.graph.model import Session
 from engram.maps import Map
-from engram.measures import Drive
+from engram.measures import Drive, Estimator
 from engram.robot import DriveSequence, RobotOptions, Settings, open_drive, session_of_drive
 
 # 7 groups have 5,040 orders, which take days.
@@ -59,6 +59,7 @@ class JudgeOptions:
         localise: how a drive is localised in a map; None for `measure`. Stored results are
             assumed to come from the same function.
         orders: which are tried.
+        estimator: what P is taken over.
     """
 
     drives: Sequence[Path]
@@ -67,6 +68,7 @@ class JudgeOptions:
     reported: Sequence[Path] = ()
     localise: Localise | None = None
     orders: Orders = Orders.ALL
+    estimator: Estimator = Estimator.ROUTE
 
     def __post_init__(self) -> None:
         if not self.drives:
@@ -88,7 +90,10 @@ class JudgeOptions:
             [str(session_of_drive(open_drive(path)).id) for path in paths]
             for paths in (self.drives, self.reported)
         ]
-        return config_hash([*sessions, self.judge_at_m, to_dict(self.localising)])
+        judged = [self.judge_at_m, to_dict(self.localising)]
+        if self.estimator is not Estimator.ROUTE:  # older judgements are of the route
+            judged.append(self.estimator)
+        return config_hash([*sessions, *judged])
 
 
 def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -> None:
@@ -197,6 +202,7 @@ class BestOrder:
         tried: which orders of the groups.
         rooted: whether every order began with an existing fleet map, not with its first group.
         spent: cost of this search over all its runs; work undone by an interruption counts once.
+        estimator: what P was taken over.
     """
 
     results: list[OrderResult] = field(default_factory=list)
@@ -204,6 +210,7 @@ class BestOrder:
     tried: Orders = Orders.ALL
     rooted: bool = False
     spent: Spent = field(default_factory=Spent)
+    estimator: Estimator = Estimator.ROUTE
 
     @property
     def order(self) -> tuple[int, ...]:
@@ -228,6 +235,7 @@ class BestOrder:
         return {
             "order": list(self.order),
             "judge_at_m": self.judge_at_m,
+            "estimator": self.estimator,
             "tried": self.tried.value,
             "rooted": self.rooted,
             "orders": plain(self.results),
@@ -240,13 +248,13 @@ class BestOrder:
         told = " ".join(map(str, self.order))
         lines = [
             f"best of {len(self.results)} orders: {told}, P(no match within "
-            f"{self.judge_at_m:g} m) {self.results[0].judged:.2%}; {self.spent.merges} "
-            f"merges in {self.spent.merge_s:.1f} s, {self.spent.copies} copies in "
-            f"{self.spent.copy_s:.1f} s, judging {self.spent.judge_s:.1f} s"
+            f"{self.judge_at_m:g} m, {self.estimator}) {self.results[0].judged:.2%}; "
+            f"{self.spent.merges} merges in {self.spent.merge_s:.1f} s, {self.spent.copies} copies "
+            f"in {self.spent.copy_s:.1f} s, judging {self.spent.judge_s:.1f} s"
         ]
         lines += [
-            f"  P(X >= {at} m): least {one['least']:.2%}, median {one['median']:.2%}, most "
-            f"{one['most']:.2%}, best order {one['best']:.2%}"
+            f"  P(X >= {at} m, {self.estimator}): least {one['least']:.2%}, "
+            f"median {one['median']:.2%}, most {one['most']:.2%}, best order {one['best']:.2%}"
             for at, one in self.spread().items()
         ]
         return "\n".join(lines)

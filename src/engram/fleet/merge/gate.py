@@ -12,7 +12,7 @@ from engram.errors import ConfigError, RefusedError
 from engram.fleet.merge.report import HeldOutFigures, HeldOutReport
 from engram.graph.model import Session, session_id
 from engram.maps import Map
-from engram.measures import Drive, failure_route, longest_gap_m, route_not_localised
+from engram.measures import Drive, Estimator, failure, longest_gap_m, route_not_localised
 from engram.monitor import Monitor
 from engram.robot import RobotOptions, Settings, measure, open_drive, session_of_drive
 from engram.robot.session import DriveSequence
@@ -21,6 +21,8 @@ from engram.sequences import FrameLog, first_pair_hash
 # SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
 _JUDGED_M = np.arange(0.0, 20.5, 0.5)
 _LONGEST_GAP_RATIO = 1.5
+# From a random point of the route: long gaps count by their length.
+ESTIMATOR = Estimator.ROUTE
 # Distances at which reports give the failure curve, metres (SPEC §8).
 _TOLD_M = (5, 10, 20)
 # Rounding of sums of the same gaps in another order.
@@ -165,7 +167,8 @@ def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
     at = int(np.argmax(excess))
     if excess[at] > _ROUNDING:
         facts.append(
-            f"P(no match within {_JUDGED_M[at]:.1f} m) {curves[0][at]:.2%}, was {curves[1][at]:.2%}"
+            f"P(no match within {_JUDGED_M[at]:.1f} m, {ESTIMATOR}) {curves[0][at]:.2%}, was "
+            f"{curves[1][at]:.2%}"
         )
     longest = [longest_gap_m(drives) for drives in (after, before)]
     if longest[0] > _LONGEST_GAP_RATIO * longest[1] + _ROUNDING:
@@ -180,9 +183,10 @@ def _figures(drives: Sequence[Drive]) -> HeldOutFigures:
     return HeldOutFigures(
         route_not_localised(drives),
         longest_gap_m(drives),
-        {within_m: failure_route(drives, float(within_m)) for within_m in _TOLD_M},
+        ESTIMATOR,
+        {within_m: float(failure(drives, float(within_m))) for within_m in _TOLD_M},
     )
 
 
 def _curve(drives: Sequence[Drive]) -> NDArray[np.float64]:
-    return np.array([failure_route(drives, float(at)) for at in _JUDGED_M])
+    return failure(drives, _JUDGED_M)

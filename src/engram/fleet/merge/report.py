@@ -158,11 +158,13 @@ class HeldOutFigures:
     Attributes:
         route_not_localised: share of their route without a match.
         longest_gap_m: longest stretch without a match, metres.
+        estimator: key of `engram.measures.FORMULAS`, what P is taken over.
         p_no_match: P(no match within x metres), by x.
     """
 
     route_not_localised: float
     longest_gap_m: float
+    estimator: str
     p_no_match: Mapping[int, float]
 
 
@@ -183,7 +185,8 @@ class HeldOutReport:
         """The report as one line of text."""
         was, now = self.before, self.after
         curve = ", ".join(
-            f"P(no match within {within_m} m) {was.p_no_match[within_m]:.2%} → {p:.2%}"
+            f"P(no match within {within_m} m, {now.estimator}) {was.p_no_match[within_m]:.2%} → "
+            f"{p:.2%}"
             for within_m, p in now.p_no_match.items()
         )
         return (

@@ -7,7 +7,7 @@ from itertools import chain
 
 import numpy as np
 
-from engram.measures import Drive, failure_route, longest_gap_m, route_m, route_not_localised
+from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_localised
 from engram_lab.studies.building import BuiltSession
 from engram_lab.studies.fleet.experiments import SHARED, SINGLE, merged_name, pair_merges
 from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS
@@ -278,6 +278,6 @@ def _failure(drives: Sequence[Drive]) -> Row:
         "sessions": len(drives),
         "driven_m": route_m(drives),
         "share_not_localised": route_not_localised(drives),
-        **{f"p_gt_{at:g}m": failure_route(drives, at) for at in _AT_M},
+        **{f"p_gt_{at:g}m": float(failure(drives, at)) for at in _AT_M},
         "longest_gap_m": longest_gap_m(drives),
     }

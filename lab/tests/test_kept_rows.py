@@ -1,0 +1,47 @@
+"""The intervals of the fleet study's report follow from the session rows beside it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram_lab.checks.paper_figures import read, sessions_of
+from engram_lab.intervals import Resamples, SessionSums, difference
+
+REPORTS = Path(__file__).parents[1] / "reports"
+# "+0.72 (−0.32 … +2.30) points"
+POINTS = re.compile(r"([+−][\d.]+) \(([+−][\d.]+) … ([+−][\d.]+)\) points; \d+ drives")
+PAIRS = {
+    "`tod` against `copy`": ("held out in tod", "held out in copy"),
+    "`tod+paths` against `copy`": ("held out in tod+paths", "held out in copy"),
+    "`budget 1/4` against `copy`": ("held out in budget 1/4", "held out in copy"),
+    "`budget 1/10` against `copy`": ("held out in budget 1/10", "held out in copy"),
+    "`budget` of the bytes of `tod` against it": ("held out in budget as tod", "held out in tod"),
+}
+
+
+def sums(rows, drives) -> SessionSums:
+    found = {(one["fold"], one["drive"]): one for one in rows}
+    driven_m = np.array([float(found[one]["driven_m"]) for one in drives])
+    share = np.array([float(found[one]["share_not_localised"]) for one in drives])
+    return SessionSums(share * driven_m, driven_m)
+
+
+@pytest.mark.parametrize("what", PAIRS)
+def test_printed_intervals_are_those_of_the_kept_rows(what):
+    text = (REPORTS / "fleet.md").read_text(encoding="utf-8")
+    (line,) = [one for one in text.splitlines() if one.startswith(f"| {what}, route not localised")]
+    printed = [tuple(float(x.replace("−", "-")) for x in one) for one in POINTS.findall(line)]
+    assert len(printed) == 2
+    rows = read(REPORTS / "fleet_sessions.csv")
+    for arm, told in zip("AB", printed, strict=True):
+        ours, theirs = (sessions_of(rows, arm, "9", name) for name in PAIRS[what])
+        there = {(one["fold"], one["drive"]) for one in theirs}
+        drives = [key for one in ours if (key := (one["fold"], one["drive"])) in there]
+        paired = difference(sums(ours, drives), sums(theirs, drives))
+        found = Resamples.of(len(drives), seed=0).interval(paired)
+        again = [100 * value for value in (found.estimate, found.low, found.high)]
+        assert again == pytest.approx(told, abs=0.0051)
