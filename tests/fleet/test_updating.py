@@ -293,6 +293,10 @@ def test_updated_equals_fresh_united_with_own(tmp_path, first):
         run_history(tmp_path / str(seed), seed, rounds=1 + (seed % 5 == 0))
 
 
+def test_own_nodes_are_tied_to_equivalents_that_an_earlier_update_brought(tmp_path):
+    run_history(tmp_path, 1047, rounds=2)
+
+
 @pytest.mark.long
 def test_updated_equals_fresh_united_with_own_in_a_thousand_histories(tmp_path):
     for seed in range(1000, 2000):

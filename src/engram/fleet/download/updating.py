@@ -231,10 +231,11 @@ class _Update:
     def _lacking_ties(self, copied: set[tuple[NodeId, NodeId, EdgeKind]]) -> Iterator[Edge]:
         """Matches of own nodes with the nodes by which the fleet map replaced them."""
         known = copied | {_key(edge) for edge in self._own.edges}
-        own = {node.id for node in self._own.nodes} - self._stock.index.keys()
+        own = {node.id for node in self._own.nodes}
         here = own | set(self._part.node_ids)
         for omitted, omission in sorted(self._stock.store.omissions.items()):
-            if omitted in own and omission.node in here:
+            only_ours = omitted in own and omitted not in self._stock.index
+            if only_ours and omission.node in here:
                 at = position_of(omission)
                 tie = Edge(at.node, omitted, EdgeKind.MATCH, at.node_from_live, at.covariance)
                 if _key(tie) not in known:
