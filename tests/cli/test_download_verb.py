@@ -11,7 +11,7 @@ from engram.robot import RobotOptions, Settings, map_drive, open_drive
 KEYS = {
     "out", "policy", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",
     "partial_paths", "edges", "bridges", "components", "size_bytes", "of_bytes", "why",
-    "expected_missed", "copy_missed",
+    "expected_missed", "copy_missed", "forecast",
 }  # fmt: skip
 
 
@@ -57,6 +57,14 @@ def test_a_robot_keeps_its_map_and_takes_the_download_into_it(
     assert "exists already" in refused.err
 
 
+def test_an_hour_without_data_is_widened_and_says_so(engram, centre: Path, tmp_path: Path) -> None:
+    asked = ("--select", "tod", "--depart", "21:00")
+    text = engram("download", centre, tmp_path / "r1.engram", *asked).out
+    assert "nothing was saved within 180 minutes of 21:00: widened to 720 minutes" in text
+    told = engram("download", centre, tmp_path / "r2.engram", *asked, "--json").json
+    assert told["nodes"] == told["of_nodes"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -64,8 +72,12 @@ def test_a_robot_keeps_its_map_and_takes_the_download_into_it(
         (("--select", "tod"), "needs --depart"),
         (("--select", "tod", "--depart", "25:00"), "depart is '25:00'"),
         (("--select", "tod", "--depart", "9h"), "depart is '9h'"),
-        (("--select", "tod", "--depart", "21:00"), "window_min"),
-        (("--select", "paths", "--depart", "3:00", "--arrive", "4:00"), "there is some from 9:00"),
+        (("--select", "tod", "--depart", "21:00", "--strict"), "window_min"),
+        (
+            ("--select", "paths", "--depart", "3:00", "--arrive", "4:00", "--strict"),
+            "there is some from 9:00",
+        ),
+        (("--strict",), "does not use --strict"),
         (("--select", "budget", "--budget", "much"), "budget is 'much'"),
         (("--select", "budget", "--budget", "0%"), "budget_percent is 0.0"),
         (("--select", "budget", "--budget", "1e2%"), "budget is '1e2%'"),

@@ -388,8 +388,14 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "says"),
         [
-            ({"policy": "tod", "start_h": 13.0, "window_min": 30.0}, "no node was saved within 30"),
-            ({"policy": "paths", "start_h": 12.0, "end_h": 13.0}, "no epoch from 12:00 to 13:00"),
+            (
+                {"policy": "tod", "start_h": 13.0, "window_min": 30.0, "strict": True},
+                "no node was saved within 30",
+            ),
+            (
+                {"policy": "paths", "start_h": 12.0, "end_h": 13.0, "strict": True},
+                "no epoch from 12:00 to 13:00",
+            ),
             ({"policy": "region", "near": ("zz",)}, "is not a UUID"),
             ({"policy": "region", "near": ("00000000",)}, "begins with"),
             ({"policy": "route", "route": "00000000"}, "0 sessions begin with"),
@@ -407,7 +413,7 @@ class TestMistakes:
             ({"policy": "copy", "route": "zzzz"}, "copy does not use --route"),
             ({"policy": "copy", "near": ("ffff",)}, "does not use --near"),
             ({"policy": "tod", "start_h": 9.0, "budget_bytes": 10_000}, "choose --select budget"),
-            ({"policy": "tod", "start_h": 9.0, "route": "0"}, "choose --select route or budget"),
+            ({"policy": "copy", "route": "0"}, "choose --select tod or paths"),
             ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "use --budget"),
             ({"policy": "region", "near": ("0",), "budget_percent": 50.0}, "use --budget"),
             ({"policy": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "only one of"),
@@ -423,7 +429,14 @@ class TestMistakes:
     def test_every_option_has_a_policy_that_goes_by_it(self):
         assert UNDERSTOOD.keys() == SELECTIONS.keys()
         mission = {"start_h", "end_h", "day", "latitude_deg"}
-        settings = {"window_min", "epoch_min", "best_percent", "buffer_min", "radius_m"}
+        settings = {
+            "window_min",
+            "epoch_min",
+            "best_percent",
+            "buffer_min",
+            "radius_m",
+            "widen_min",
+        }
         fields = {one.name for one in dataclasses.fields(DownloadOptions)}
         assert frozenset().union(*UNDERSTOOD.values()) == fields - mission - settings - {
             "policy",

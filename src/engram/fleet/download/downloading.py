@@ -7,6 +7,7 @@ and no host, and the file is compacted at the end.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,11 +21,13 @@ from engram.errors import InputError
 from engram.files import check_parent, draft_folder
 from engram.fleet.download.bridges import components
 from engram.fleet.download.coverage import Coverage, expected_missed
+from engram.fleet.download.forecast import Forecast
 from engram.fleet.download.marks import write_marks
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Part
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.download.stock import Stock
+from engram.graph.clock import hour_of_day
 from engram.maps import Map, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
@@ -56,6 +59,7 @@ class DownloadReport:
         why: facts of the policy, as plain data.
         expected_missed, copy_missed: expected share of the mission's route without a match,
             with the nodes sent and with all nodes.
+        forecast: interval of the first, by missions in other towns.
     """
 
     out: Path
@@ -75,6 +79,7 @@ class DownloadReport:
     why: dict[str, Any]
     expected_missed: float
     copy_missed: float
+    forecast: Forecast
 
     def to_dict(self) -> dict[str, Any]:
         """What ``download --json`` prints."""
@@ -91,9 +96,12 @@ class DownloadReport:
             f"of revision {self.revision}",
             f"{self.sessions} sessions, {self.edges} edges ({self.bridges} bridges), "
             f"{self.components} components, {self.partial_paths} partial paths",
+            self.forecast.text(),
             f"expected share of the route without a match: {self.expected_missed:.1%} "
             f"({self.copy_missed:.1%} with all nodes: {lost:+.1%} from nodes left out)",
         ]
+        if self.why.get("widened"):
+            lines.append(self.why["widened"])
         if self.why.get("epochs"):
             lines.append(
                 f"epochs {self.why['epochs'][0]} to {self.why['epochs'][-1]}, "
@@ -287,6 +295,15 @@ def revision_of(stock: Stock, options: DownloadOptions) -> dict[str, Any]:
     }
 
 
+def hours_from(stock: Stock, start_h: float | None) -> float:
+    """Hours from a mission's start to the time of day of the nearest drive; infinite if unknown."""
+    starts = [hour_of_day(one, one.start_ns) for one in stock.sessions]
+    known = [one for one in starts if one is not None]
+    if start_h is None or not known:
+        return math.inf
+    return min(abs((start_h - one + 12) % 24 - 12) for one in known)
+
+
 def _report(
     part: Part,
     why: Mapping[str, Any],
@@ -297,6 +314,7 @@ def _report(
 ) -> DownloadReport:
     """The report of a file that will be named `out`."""
     stock, sent = part.stock, part.sent
+    missed = expected_missed(coverage, sent)
     with Map.open(file) as written:
         info = written.info()
         content_hash = written.content_hash()
@@ -319,6 +337,7 @@ def _report(
         size_bytes=file.stat().st_size,
         of_bytes=stock.store.info().size_bytes,
         why=dict(why),
-        expected_missed=expected_missed(coverage, sent),
+        expected_missed=missed,
         copy_missed=expected_missed(coverage, stock.everything()),
+        forecast=Forecast.of(missed, len(stock.sessions), hours_from(stock, options.start_h)),
     )

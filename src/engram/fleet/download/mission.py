@@ -40,10 +40,12 @@ class DownloadOptions:
         buffer_min: widens the mission at both ends, minutes.
         budget_bytes: `budget`: largest size of the file.
         budget_percent: `budget`: the same, in per cent of a file with all nodes.
-        near: `region`: beginnings of UUIDs of nodes.
-        route: `route`, and optionally `budget`: beginning of the UUID of a session that
-            drove it.
+        near: `region`, and any policy but `copy` and `route`: beginnings of UUIDs of nodes.
+        route: `route`, and any policy but `copy` and `region`: beginning of the UUID of a session
+            that drove it.
         radius_m: of regions and routes, along the edges, metres.
+        widen_min: `tod`, `paths`: step by which an hour without data is widened, minutes.
+        strict: whether an hour without data is refused instead.
         thumbnails: whether thumbnails are sent; None for all policies but `budget`.
     """
 
@@ -61,6 +63,8 @@ class DownloadOptions:
     near: tuple[str, ...] = ()
     route: str | None = None
     radius_m: Annotated[float, Meta(ge=0, le=1e6)] = 20.0
+    widen_min: Annotated[float, Meta(gt=0, le=720)] = 60.0
+    strict: bool = False
     thumbnails: bool | None = None
 
     def __post_init__(self) -> None:

@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from engram.errors import ConfigError, InputError
+from engram.fleet.download.by_time import best_paths, near_start
 from engram.fleet.download.coverage import Coverage, Demand, greedy_order
 from engram.fleet.download.mission import DownloadOptions
-from engram.fleet.download.path_weights import count_paths, mission_epochs
 from engram.fleet.download.stock import Mask, Stock
 from engram.graph.model import PathId, path_id
 from engram.maps.difference import edge_lengths
 
 _HOURS = 24.0
-# Stamps are exact to the nanosecond; this covers rounding, hours.
-_ROUNDING_H = 1e-9
 _DEFAULTS = asdict(DownloadOptions())
 
 
@@ -54,22 +52,22 @@ def select_tod(stock: Stock, options: DownloadOptions) -> Selection:
 
     Source: [G16] (4); SPEC §7.
     """
-    sent, unknown = _near_start(stock, options)
-    return Selection(sent, {"nodes_without_hour": unknown})
+    return Selection(*near_start(stock, options, mission_area(stock, options)))
 
 
 def select_paths(stock: Stock, options: DownloadOptions) -> Selection:
     """All nodes of the best paths of each of the mission's epochs. [G16] Algorithms 2 and 3."""
     stock.known_hours()
-    chosen, why = _best_paths(stock, options, None)
-    return Selection(_nodes_on(stock, chosen), why)
+    where = mission_area(stock, options)
+    chosen, why = best_paths(stock, options, where)
+    return Selection(where & _nodes_on(stock, chosen), why)
 
 
 def select_tod_and_paths(stock: Stock, options: DownloadOptions) -> Selection:
     """Nodes that pass `tod` and lie on a path chosen by counts over those nodes (SPEC §7)."""
-    near, unknown = _near_start(stock, options)
-    chosen, why = _best_paths(stock, options, near)
-    return Selection(near & _nodes_on(stock, chosen), {**why, "nodes_without_hour": unknown})
+    near, facts = near_start(stock, options, mission_area(stock, options))
+    chosen, why = best_paths(stock, options, near)
+    return Selection(near & _nodes_on(stock, chosen), {**why, **facts})
 
 
 def select_region(stock: Stock, options: DownloadOptions) -> Selection:
@@ -116,9 +114,9 @@ SELECTIONS: dict[str, Policy] = {
 # The options that each policy uses. All use the mission's time (for the forecast) and `thumbnails`.
 UNDERSTOOD: dict[str, frozenset[str]] = {
     "copy": frozenset(),
-    "tod": frozenset(),
-    "paths": frozenset(),
-    "tod+paths": frozenset(),
+    "tod": frozenset({"near", "route", "strict"}),
+    "paths": frozenset({"near", "route", "strict"}),
+    "tod+paths": frozenset({"near", "route", "strict"}),
     "region": frozenset({"near"}),
     "route": frozenset({"route"}),
     "budget": frozenset({"budget_bytes", "budget_percent", "near", "route"}),
@@ -128,6 +126,7 @@ _FLAGS = {
     "budget_percent": "--budget",
     "near": "--near",
     "route": "--route",
+    "strict": "--strict",
 }
 # Policies whose mission may have an end and no start: it starts with the first epoch with data.
 _OPEN_START = frozenset({"paths", "tod+paths"})
@@ -151,8 +150,7 @@ def check_options(options: DownloadOptions) -> None:
             f"selection {policy} does not use {flag}; leave it out, or choose --select "
             f"{' or '.join(takers)}"
         )
-    if policy == "budget":
-        _check_where(options)
+    _check_where(options)
     if options.start_h is None:
         _check_no_mission(options)
 
@@ -172,12 +170,18 @@ def _check_no_mission(options: DownloadOptions) -> None:
 
 def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
     """The forecast for a mission: its expected needs, and the gain of each node."""
-    where = None
-    if options.route is not None:
-        where = along_route(stock, options.route, options.radius_m)
-    elif options.near:
-        where = select_region(stock, options).sent
+    has_area = options.route is not None or options.near
+    where = mission_area(stock, options) if has_area else None
     return Coverage(stock, Demand.of(stock, options, where))
+
+
+def mission_area(stock: Stock, options: DownloadOptions) -> Mask:
+    """(N,) bool, the nodes of the mission's route or region; all without one."""
+    if options.route is not None:
+        return along_route(stock, options.route, options.radius_m)
+    if options.near:
+        return select_region(stock, options).sent
+    return stock.everything()
 
 
 def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
@@ -199,33 +203,6 @@ def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
     if seeds is None:
         raise InputError(f"session {found.id} of {found.robot} has no node on its path")
     return within(stock, np.unique(seeds), radius_m)
-
-
-def _near_start(stock: Stock, options: DownloadOptions) -> tuple[Mask, int]:
-    if options.start_h is None:
-        raise ConfigError(f"selection {options.policy} needs --depart, the mission's time of day")
-    hours = stock.known_hours()
-    apart = np.abs(hours - options.start_h)
-    apart = np.minimum(apart, _HOURS - apart)
-    allowed_h = options.window_min / 60
-    sent = np.nan_to_num(apart, nan=np.inf) <= allowed_h + _ROUNDING_H
-    if not sent.any():
-        minutes = round(60 * options.start_h) % (24 * 60)
-        raise InputError(
-            f"no node was saved within {allowed_h * 60:.0f} minutes of "
-            f"{minutes // 60}:{minutes % 60:02d}; widen it with --set download.window_min=MINUTES"
-        )
-    return sent, int(np.isnan(hours).sum())
-
-
-def _best_paths(
-    stock: Stock, options: DownloadOptions, counted: Mask | None
-) -> tuple[list[PathId], dict[str, Any]]:
-    counts = count_paths(stock.on_path, stock.hours, options.epoch_min, counted)
-    epochs = mission_epochs(counts, options.start_h, options.end_h, options.buffer_min)
-    rows = sorted({row for epoch in epochs for row in counts.best(epoch, options.best_percent)})
-    chosen = [counts.paths[row] for row in rows]
-    return chosen, {"epochs": epochs, "paths": [str(path) for path in chosen]}
 
 
 def _nodes_on(stock: Stock, paths: list[PathId]) -> Mask:

@@ -90,6 +90,7 @@ def update(
     *,
     at: int | str | None = None,
     monitor: Monitor = QUIET,
+    message: str | None = None,
 ) -> UpdateReport:
     """Takes a download into a robot's map, which keeps its own nodes and history.
 
@@ -99,6 +100,7 @@ def update(
         options: which part of the fleet map; None for all of it.
         at: revision of the fleet map; None for the newest.
         monitor: receives progress per copied node.
+        message: of the revision; None names the download.
 
     Raises:
         ConfigError: an option is missing, out of range, or not used by the policy.
@@ -122,7 +124,8 @@ def update(
         with draft_folder(robot) as folder:
             part, why = choose_part(stock, selection, options, folder, monitor)
         taking = _Update(part, own)
-        revision = taking.write(revision_of(stock, options), monitor)
+        about = revision_of(stock, options)
+        revision = taking.write({**about, "message": message or about["message"]}, monitor)
         return taking.report(robot, options.policy, revision, dict(why))
 
 
