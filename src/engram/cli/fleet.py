@@ -15,7 +15,7 @@ from engram.cli.history import AUTHOR
 from engram.errors import ConfigError, EngramError
 
 if TYPE_CHECKING:
-    from engram.cli.settings import AllSettings
+    from engram.cli.settings import AllSettings, BuildSettings
     from engram.fleet.build import JudgeOptions
     from engram.fleet.download import DownloadReport, UpdateReport
     from engram.fleet.merge import MergeOptions, MergeReport
@@ -41,6 +41,10 @@ def merge(
             help="Refuse a merge after which this held-out drive localises worse; repeatable.",
         ),
     ] = None,
+    keep: Annotated[
+        bool,
+        typer.Option("--keep", help="Keep the robots' maps in FLEET.handed, for engram dream."),
+    ] = False,
     picture: Annotated[
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw the fleet map before and after."),
@@ -68,6 +72,7 @@ def merge(
       engram merge fleet.engram r1.engram --require-better held-out.framelog
     """
     from engram.cli.progress import Bars
+    from engram.fleet.dream import keep_hand_in
     from engram.fleet.merge import GeometryGate
     from engram.fleet.merge import merge as merge_maps
 
@@ -94,6 +99,9 @@ def merge(
             if geometry or require_geometry
             else None,
         )
+        for robot, report in zip(robots, reports, strict=False):
+            if keep and not (dry_run or report.interrupted):
+                keep_hand_in(centre, robot)
     except EngramError as error:
         raise PartlyDoneError(error, _merges(reports)) from error
     except KeyboardInterrupt:
@@ -169,11 +177,13 @@ def download(
     ] = None,
     near: Annotated[
         list[str] | None,
-        typer.Option("--near", metavar="NODE", help="region, budget: around a node; repeatable."),
+        typer.Option(
+            "--near", "--region", metavar="NODE", help="Only around a node; repeatable. Not copy."
+        ),
     ] = None,
     route: Annotated[
         str | None,
-        typer.Option("--route", metavar="SESSION", help="route, budget: along this session."),
+        typer.Option("--route", metavar="SESSION", help="Only along this session. Not copy."),
     ] = None,
     thumbnails: Annotated[
         bool | None,
@@ -181,6 +191,10 @@ def download(
             "--thumbnails/--no-thumbnails", help="Pictures for people [default: not with budget]."
         ),
     ] = None,
+    strict: Annotated[
+        bool,
+        typer.Option("--strict", help="Refuse an hour without data instead of widening it."),
+    ] = False,
     at: options.At = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
@@ -197,6 +211,7 @@ def download(
       engram download fleet.engram r1.engram --update
       engram download fleet.engram r1.engram --select tod --depart 9:30
       engram download fleet.engram r1.engram --select tod+paths --depart 9:30 --arrive 11:00
+      engram download fleet.engram r1.engram --select tod --depart 3:00 --route 5f3a
       engram download fleet.engram r1.engram --select budget --budget 25% --depart 17:00
     """
     from engram.cli.progress import Bars
@@ -222,6 +237,8 @@ def download(
         near=tuple(near or ()),
         route=route,
         radius_m=given.radius_m,
+        widen_min=given.widen_min,
+        strict=strict,
         thumbnails=thumbnails,
     )
     report: DownloadReport | UpdateReport
@@ -310,7 +327,7 @@ def build(
         ),
         merging=merging,
         scheduler=scheduler,
-        judge=_judge(order, validate or [], resolved.build.max_gap_m),
+        judge=_judge(order, validate or [], resolved.build),
     )
     report = build_map(centre, drives, resolved.of_robot(), asked, keep=keep, monitor=Bars())
     looked = None
@@ -341,7 +358,7 @@ def _grouping(text: str) -> tuple[str, int]:
     return how, int(seed)
 
 
-def _judge(order: str | None, drives: list[Path], max_gap_m: float) -> JudgeOptions | None:
+def _judge(order: str | None, drives: list[Path], given: BuildSettings) -> JudgeOptions | None:
     """How orders are compared; None if the groups are merged as they come.
 
     Raises:
@@ -356,4 +373,6 @@ def _judge(order: str | None, drives: list[Path], max_gap_m: float) -> JudgeOpti
         return None
     if order not in known:
         raise ConfigError(f"--order {order!r} is unknown; known: {', '.join(known)}")
-    return JudgeOptions(drives, judge_at_m=max_gap_m, orders=known[order])
+    return JudgeOptions(
+        drives, judge_at_m=given.max_gap_m, orders=known[order], estimator=given.estimator
+    )

@@ -14,6 +14,7 @@ from engram.cli import moved
 from engram.cli.agent import agent_group
 from engram.cli.centre import centre_group
 from engram.cli.doctor import doctor
+from engram.cli.dreaming import dream
 from engram.cli.drive import drive_group
 from engram.cli.drives import localise, map_, record
 from engram.cli.endings import VerbInterruptedError
@@ -48,7 +49,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "export": export,
     },
     "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
-    "Fleet": {"merge": merge, "download": download, "build": build},
+    "Fleet": {"merge": merge, "download": download, "build": build, "dream": dream},
     "Settings": {"settings": settings, "features": features},
 }
 VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}

@@ -85,6 +85,19 @@ def find_best_order(
     return search.found
 
 
+def results_in(folder: Path) -> list[OrderResult]:
+    """What earlier searches in a folder found, best first; all must be of the same inputs."""
+    found = []
+    for path in sorted(folder.glob("order-*.json")):
+        try:
+            step = read_kept(path, _Step)
+        except ConfigError:  # partial, after a power cut
+            continue
+        if step.result is not None:
+            found.append(step.result)
+    return sorted(found, key=lambda one: one.rank)
+
+
 @dataclass(frozen=True, slots=True)
 class _Step:
     """One node of the prefix tree: its map was made, and judged if it has all groups.
@@ -147,6 +160,7 @@ class _Search:
                 for step in known:
                     self._count(step, monitor)
                 continue
+            monitor.check()
             with _Intermediate(self._folder, order) as place:
                 step = self._step(order, place, merged)
                 write_kept(self._path(step.order), step)

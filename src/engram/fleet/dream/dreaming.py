@@ -1,0 +1,307 @@
+"""Tries orders and behaviours of merging, and adds what the best of them has ([G16] §IV and §V).
+
+The hand-ins are merged anew, in other orders and with other behaviours, and each result is judged
+by validation drives. The best one may improve the fleet map: what it has and the fleet map lacks
+is added as one revision, if the drives then miss less of their route, beyond the interval of that
+difference. Nothing is removed, so that all nodes that robots refer to stay.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+
+from engram.config import check_bounds, config_hash, plain, to_dict
+from engram.errors import ConfigError, InputError
+from engram.files import draft_folder
+from engram.fleet.build.best_order import find_best_order, results_in
+from engram.fleet.build.orders import JudgeOptions, OrderResult, Orders
+from engram.fleet.download.updating import UpdateReport, update
+from engram.fleet.merge.gate import check_held_out
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.replay import MergeOptions
+from engram.fleet.merge.whole_segments import SeedFrom, Unit
+from engram.maps import Map, copy_map
+from engram.measures import Drive, Estimator, route_not_localised
+from engram.monitor import QUIET, Monitor
+from engram.robot import RobotOptions, Settings, measure, open_drive
+
+# What a dream changes of the way in which robots' maps are merged.
+BEHAVIOURS: dict[str, dict[str, Any]] = {
+    "as usual": {},
+    "surer matches": {"sure_inliers": 80},
+    "any match": {"sure_inliers": 0},
+    "whole segments": {"unit": Unit.SEGMENT, "segment_share": 0.9},
+    "by place": {"seed": SeedFrom.PLACES},
+}
+# More hand-ins are tried with each of them first only.
+_ALL_ORDERS = 4
+_FEWEST_DRIVES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class DreamOptions:
+    """How a fleet map dreams.
+
+    Attributes:
+        minutes, judge_at_m, resamples, level, seed: see their descriptions.
+        merging: how robots' maps are merged usually.
+        localising: policy and budget of the validation.
+        estimator: what orders are judged over.
+    """
+
+    minutes: Annotated[
+        float | None, Meta(gt=0, description="time for trying, minutes; none: until all is tried")
+    ] = None
+    merging: MergeOptions = field(default_factory=MergeOptions)
+    localising: RobotOptions = field(default_factory=RobotOptions)
+    judge_at_m: Annotated[
+        float, Meta(ge=0, description="m; the best order has the fewest longer gaps")
+    ] = 10.0
+    estimator: Estimator = Estimator.ROUTE
+    resamples: Annotated[int, Meta(ge=1, description="draws of the drives")] = 2000
+    level: Annotated[
+        float, Meta(gt=0, lt=1, description="share of the draws within the interval")
+    ] = 0.9
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(slots=True, eq=False)
+class DreamReport:
+    """What came of a dream.
+
+    Attributes:
+        centre: the fleet map.
+        tried: results by behaviour; best order first.
+        complete: whether everything was tried; the same command goes on otherwise.
+        behaviour, order: of the best result; order by numbers of the hand-ins.
+        missed_before, missed_after: share of the validation drives' route without a match, in the
+            fleet map and with what the best result adds.
+        better_by: the difference with its interval (estimate, low, high).
+        added: what was added; None if nothing was better.
+        seconds: of this run.
+    """
+
+    centre: str
+    tried: dict[str, list[OrderResult]] = field(default_factory=dict)
+    complete: bool = False
+    behaviour: str = ""
+    order: tuple[int, ...] = ()
+    missed_before: float = 0.0
+    missed_after: float = 0.0
+    better_by: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    added: UpdateReport | None = None
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``dream --json`` prints."""
+        values: dict[str, Any] = plain(self)
+        return values
+
+    def text(self) -> str:
+        """The report as text."""
+        count = sum(map(len, self.tried.values()))
+        head = f"{count} maps tried" + ("" if self.complete else "; the same command tries more")
+        if not count:
+            return head
+        estimate, low, high = (100 * one for one in self.better_by)
+        lines = [
+            head,
+            f"best: {self.behaviour}, order {' '.join(map(str, self.order))}; route not localised "
+            f"{self.missed_before:.2%} → {self.missed_after:.2%}, better by {estimate:.2f} points "
+            f"({low:.2f} … {high:.2f})",
+        ]
+        if self.added is None:
+            lines.append("not better beyond its interval: the fleet map is unchanged")
+        else:
+            lines.append(f"revision {self.added.revision}: {self.added.nodes} nodes added")
+        return "\n".join(lines)
+
+
+class _Deadline(Monitor):
+    """Stops work after some time."""
+
+    def __init__(self, monitor: Monitor, minutes: float | None) -> None:
+        self._monitor = monitor
+        self._end_s = np.inf if minutes is None else time.monotonic() + 60 * minutes
+        self.over = False
+
+    def advance(self, word: str = "") -> None:
+        self._monitor.advance(word)
+
+    def check(self) -> None:
+        self._monitor.check()
+        if time.monotonic() >= self._end_s:
+            self.over = True
+            raise KeyboardInterrupt
+
+
+def dream(
+    centre: Path,
+    handed: Sequence[Path],
+    drives: Sequence[Path],
+    settings: Settings | None = None,
+    options: DreamOptions | None = None,
+    monitor: Monitor = QUIET,
+) -> DreamReport:
+    """Looks for a better map in what robots handed in; adds it to the fleet map if it is better.
+
+    Results are kept in FLEET.dream: a dream that was stopped or killed goes on, and comes to the
+    same result. They are removed once everything has been tried.
+
+    Args:
+        centre: the fleet map.
+        handed: robots' maps as they were handed in, oldest first (`hand_ins_of`).
+        drives: validation drives, in none of the maps.
+        settings: of the localiser; None for the defaults.
+        options: time, behaviours' base, judgement.
+        monitor: receives progress; its `check` is called between two merges.
+
+    Raises:
+        ConfigError: there are too few drives, or one is not held out.
+        InputError: nothing was handed in.
+        MapError: a map cannot be read or written. The fleet map is unchanged.
+        KeyboardInterrupt: it was interrupted; what was tried is kept.
+    """
+    options, settings = options or DreamOptions(), settings or Settings()
+    _check(centre, handed, drives)
+    started, report = time.perf_counter(), DreamReport(str(centre))
+    judge = JudgeOptions(
+        list(drives),
+        judge_at_m=options.judge_at_m,
+        localising=options.localising,
+        orders=Orders.ALL if len(handed) <= _ALL_ORDERS else Orders.FIRST,
+        estimator=options.estimator,
+    )
+    folder = _folder(centre, handed, judge, settings, options)
+    folder.mkdir(parents=True, exist_ok=True)
+    report.complete = _try(report, folder, handed, judge, settings, options, monitor)
+    results = [(one.rank, name, one) for name, found in report.tried.items() for one in found]
+    if results:
+        _, report.behaviour, best = min(results, key=lambda one: one[:2])
+        report.order = best.order
+        _add(report, centre, [handed[at] for at in best.order], drives, settings, options, monitor)
+    if report.complete:
+        shutil.rmtree(folder.parent, ignore_errors=True)
+    report.seconds = time.perf_counter() - started
+    return report
+
+
+def _check(centre: Path, handed: Sequence[Path], drives: Sequence[Path]) -> None:
+    if not handed:
+        raise InputError(f"{centre}: nothing was handed in; merge with --keep, or name maps")
+    if len(drives) < _FEWEST_DRIVES:
+        raise ConfigError(
+            f"{len(drives)} validation drives tell nothing about chance: give at least "
+            f"{_FEWEST_DRIVES} with --validate"
+        )
+    with Map.open(centre) as store:
+        named = [(path, open_drive(path)) for path in drives]
+        check_held_out(named, store.sessions.values(), centre, "--validate")
+
+
+def _folder(
+    centre: Path,
+    handed: Sequence[Path],
+    judge: JudgeOptions,
+    settings: Settings,
+    options: DreamOptions,
+) -> Path:
+    """Where results of exactly these inputs are kept."""
+    hashes = []
+    for path in handed:
+        with Map.open(path) as store:
+            hashes.append(store.content_hash())
+    inputs = config_hash([hashes, judge.hash(), to_dict(settings), to_dict(options.merging)])
+    return centre.with_name(f"{centre.name}.dream") / inputs
+
+
+def _try(
+    report: DreamReport,
+    folder: Path,
+    handed: Sequence[Path],
+    judge: JudgeOptions,
+    settings: Settings,
+    options: DreamOptions,
+    monitor: Monitor,
+) -> bool:
+    """Tries behaviours one after another, until the time is over; whether all were tried."""
+    deadline = _Deadline(monitor, options.minutes)
+    for name, changes in BEHAVIOURS.items():
+        place = folder / name.replace(" ", "-")
+        try:
+            deadline.check()
+            find_best_order(
+                handed, place, settings, replace(options.merging, **changes), judge, deadline
+            )
+        except KeyboardInterrupt:
+            if not deadline.over:
+                raise
+        if found := results_in(place):
+            report.tried[name] = found
+        if deadline.over:
+            return False
+    return True
+
+
+def _add(
+    report: DreamReport,
+    centre: Path,
+    handed: Sequence[Path],
+    drives: Sequence[Path],
+    settings: Settings,
+    options: DreamOptions,
+    monitor: Monitor,
+) -> None:
+    """Makes the best map again, and adds what it has if that is better."""
+    merging = replace(options.merging, **BEHAVIOURS[report.behaviour])
+    with draft_folder(centre) as folder:
+        dreamt, joined = folder / "dreamt.engram", folder / "joined.engram"
+        copy_map(handed[0], dreamt)
+        for robot in handed[1:]:
+            (merged,) = merge(dreamt, [robot], merging, monitor, settings=settings)
+            if merged.interrupted:
+                raise KeyboardInterrupt
+        copy_map(centre, joined)
+        about = f"dream: {report.behaviour}, order {' '.join(map(str, report.order))}"
+        update(dreamt, joined, monitor=monitor, message=about)
+        before, after = (_localised(one, drives, settings, options) for one in (centre, joined))
+        report.missed_before, report.missed_after = map(route_not_localised, (before, after))
+        report.better_by = gain(before, after, options)
+        if report.better_by[1] > 0:
+            report.added = update(dreamt, centre, monitor=monitor, message=about)
+
+
+def _localised(
+    path: Path, drives: Sequence[Path], settings: Settings, options: DreamOptions
+) -> list[Drive]:
+    with Map.open(path) as store:
+        return [measure(store, open_drive(one), settings, options.localising) for one in drives]
+
+
+def gain(
+    before: Sequence[Drive], after: Sequence[Drive], options: DreamOptions
+) -> tuple[float, float, float]:
+    """By how much less of the route is missed, and the ends of its interval, paired over drives."""
+    missed_m = np.array(
+        [[float(one.step_m[~one.matched].sum()) for one in drives] for drives in (before, after)]
+    )
+    driven_m = np.array([float(one.step_m.sum()) for one in before])
+    spared_m = missed_m[0] - missed_m[1]
+    rng = np.random.default_rng(options.seed)
+    count = len(driven_m)
+    draws = rng.multinomial(count, np.full(count, 1 / count), options.resamples)
+    values = draws @ spared_m / (draws @ driven_m)
+    tail = 50 * (1 - options.level)
+    low, high = np.percentile(values, [tail, 100 - tail])
+    return float(spared_m.sum() / driven_m.sum()), float(low), float(high)

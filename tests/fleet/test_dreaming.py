@@ -1,0 +1,182 @@
+"""Dreaming finds a better order where there is one, resumes, and never loses anything."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive
+
+from engram.errors import ConfigError, InputError
+from engram.fleet.dream import DreamOptions, dream, hand_ins_of, keep_hand_in
+from engram.fleet.dream.dreaming import BEHAVIOURS, gain
+from engram.graph.model import Clock
+from engram.maps import Map, check_file
+from engram.measures import Drive
+from engram.monitor import Monitor
+from engram.robot import RobotOptions
+from engram.sequences import FrameLogHeader, FrameLogWriter, SequenceInfo
+
+from .robots import DAY_NS, OPTIONS, merged
+
+ROAD = np.arange(0.0, 16.0, 0.7)
+MORNING, NIGHT, DUSK = 0, 1, 2
+
+
+class Twilight(World):
+    """Every second point looks at dusk as in the morning, the others as at night."""
+
+    def descriptors(self, appearance: int) -> np.ndarray:
+        if appearance != DUSK:
+            return super().descriptors(appearance)
+        mixed = super().descriptors(MORNING).copy()
+        mixed[::2] = super().descriptors(NIGHT)[::2]
+        return mixed
+
+
+TOWN = Twilight(20.0, seed=5)
+ASKED = DreamOptions(
+    merging=OPTIONS,
+    localising=RobotOptions(relocaliser="exhaustive", policy="distance"),
+    judge_at_m=3.0,
+)
+
+
+def steps_of(appearance: int, day: int):
+    return drive(TOWN, ROAD, appearance, aside_m=0.05 * day, start_ns=day * DAY_NS, seed=day)
+
+
+def log_of(path: Path, appearance: int, day: int) -> Path:
+    steps = steps_of(appearance, day)
+    first = steps[0].frame
+    info = SequenceInfo(path.stem, "synthetic", Clock.UTC, path.stem, longitude_deg=0.0)
+    header = FrameLogHeader(info, first.camera, first.descriptor, first.frontend)
+    with FrameLogWriter(path, header) as writer:
+        for number, seen in enumerate(steps):
+            writer.append(seen.logged, hashlib.sha256(f"{path.stem} {number}".encode()).hexdigest())
+        writer.close(complete=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    """Morning was handed in first: dusk, which matches it, was omitted. The drives are at night."""
+    folder = tmp_path_factory.mktemp("town")
+    robots = []
+    for day, (name, appearance) in enumerate((("r1", MORNING), ("r2", DUSK)), start=1):
+        robots.append(folder / f"{name}.engram")
+        map_simulated(robots[-1], steps_of(appearance, day), name)
+    centre = folder / "centre.engram"
+    merged(centre, *robots)
+    drives = [log_of(folder / f"v{day}.framelog", NIGHT, day) for day in (4, 5, 6)]
+    return centre, robots, drives
+
+
+def copy_of(centre: Path, folder: Path) -> Path:
+    return Path(shutil.copy(centre, folder / "centre.engram"))
+
+
+def nodes_of(path: Path) -> set:
+    with Map.open(path) as store:
+        return {node.id for node in store.load().nodes}
+
+
+def test_a_better_order_is_found_and_what_it_has_is_added(town, tmp_path):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    before = nodes_of(centre)
+    with Map.open(centre) as store:
+        revision, omitted = store.revision, set(store.omissions)
+    report = dream(centre, robots, drives, options=ASKED)
+    assert report.complete
+    assert report.order == (1, 0)
+    assert report.missed_before > 0.9
+    assert report.missed_after < 0.1
+    assert report.better_by[1] > 0
+    assert report.added is not None
+    assert "revision" in report.text()
+    with Map.open(centre) as store:
+        assert store.revision == revision + 1
+        assert store.log()[-1].message == f"dream: {report.behaviour}, order 1 0"
+        assert omitted <= set(store.omissions)
+    assert before < nodes_of(centre)
+    for robot in robots:  # what robots out there hold is known, and handing it in adds nothing
+        (again,) = merged(centre, robot)
+        assert again.taken == 0
+    assert check_file(centre).problems == ()
+    assert not list(tmp_path.glob("*.dream/*"))
+
+
+def test_where_nothing_is_better_the_fleet_map_stays_as_it_is(town, tmp_path):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    dream(centre, robots, drives, options=ASKED)
+    with Map.open(centre) as store:
+        content = store.content_hash()
+    report = dream(centre, robots, drives, options=ASKED)
+    assert report.added is None
+    assert "unchanged" in report.text()
+    with Map.open(centre) as store:
+        assert store.content_hash() == content
+
+
+class Stops(Monitor):
+    def __init__(self, checks: int) -> None:
+        self.left = checks
+
+    def check(self) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("checks", [1, 4, 9])
+def test_a_stopped_dream_goes_on_to_the_same_result(town, tmp_path, checks):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    with pytest.raises(KeyboardInterrupt):
+        dream(centre, robots, drives, options=ASKED, monitor=Stops(checks))
+    assert nodes_of(centre) == nodes_of(town[0])
+    report = dream(centre, robots, drives, options=ASKED)
+    fresh = Path(shutil.copy(town[0], tmp_path / "fresh.engram"))
+    whole = dream(fresh, robots, drives, options=ASKED)
+    assert (report.behaviour, report.order) == (whole.behaviour, whole.order)
+    assert report.better_by == whole.better_by
+    assert nodes_of(centre) == nodes_of(fresh)
+
+
+def test_a_time_budget_ends_the_trying_and_the_best_so_far_counts(town, tmp_path):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    short = DreamOptions(
+        minutes=1e-9, merging=ASKED.merging, localising=ASKED.localising, judge_at_m=3.0
+    )
+    report = dream(centre, robots, drives, options=short)
+    assert not report.complete
+    assert report.tried == {}
+    assert "the same command tries more" in report.text()
+    assert dream(centre, robots, drives, options=ASKED).tried.keys() == BEHAVIOURS.keys()
+
+
+def test_hand_ins_are_kept_once_in_the_order_in_which_they_came(town, tmp_path):
+    centre, robots, _ = copy_of(town[0], tmp_path), town[1], town[2]
+    kept = [keep_hand_in(centre, robot) for robot in (*reversed(robots), robots[0])]
+    assert hand_ins_of(centre) == kept[:2]
+    assert kept[2] == kept[1]
+    assert nodes_of(kept[0]) == nodes_of(robots[1])
+
+
+def test_what_would_tell_nothing_is_refused(town, tmp_path):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    with pytest.raises(ConfigError, match="tell nothing about chance"):
+        dream(centre, robots, drives[:2], options=ASKED)
+    with pytest.raises(InputError, match="nothing was handed in"):
+        dream(centre, [], drives, options=ASKED)
+
+
+def test_the_gain_is_paired_over_drives():
+    before = [Drive(np.ones(10), np.arange(10) < n) for n in (2, 5, 8)]
+    after = [Drive(np.ones(10), np.arange(10) < n) for n in (4, 7, 10)]
+    estimate, low, high = gain(before, after, ASKED)
+    assert estimate == pytest.approx(0.2)
+    assert (low, high) == (pytest.approx(0.2), pytest.approx(0.2))
