@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError
-from engram.geometry import SE3, propagate_covariance
+from engram.geometry import SE3, StereoCamera, propagate_covariance
 from engram.graph.model import NodeId
 from engram.odometry.motion import UNMOVED, Motion
 
@@ -81,6 +81,28 @@ class Position:
     def at(node: NodeId) -> Position:
         """The position of the frame that was saved as `node`."""
         return Position(node, SE3.identity(), np.zeros((6, 6)))
+
+    @staticmethod
+    def mounted(
+        node: NodeId,
+        node_camera: StereoCamera,
+        live_camera: StereoCamera,
+        covariance: NDArray[np.float64],
+    ) -> Position:
+        """The position of a robot that stands where the robot of a node stood.
+
+        The cameras of the two may be mounted at other heights, sides and angles. Without known
+        mountings both cameras count as mounted alike.
+
+        Args:
+            node: the reference node.
+            node_camera, live_camera: of the node's frame and of the robot.
+            covariance: (6, 6) float64 of the pose, left perturbation, [translation, rotation].
+        """
+        mountings = node_camera.cam_from_rig, live_camera.cam_from_rig
+        if mountings[0] is None or mountings[1] is None:
+            return Position(node, SE3.identity(), covariance)
+        return Position(node, mountings[0] @ mountings[1].inverse(), covariance)
 
     def carried_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> Position:
         """The position after one more step of odometry with its (6, 6) covariance."""

@@ -44,6 +44,7 @@ from engram.localiser.chain import FixChain
 from engram.localiser.confidence import Record, Standing, confidence_of
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.keeper import KEEPS_NOTHING, Keeper
+from engram.localiser.lenses import Lenses
 from engram.localiser.localisation import (
     Budget,
     Localisation,
@@ -153,6 +154,7 @@ class Localiser:
         # Reference node and neighbourhood of the last frame's attempts.
         self._reference: NodeId | None = None
         self._near: Neighbourhood | None = None
+        self._lenses = self._lenses_of_map()
         self._looked_up = False
         self._damaged: set[int] = set()
         self._new_damaged: tuple[NodeId, ...] = ()
@@ -375,6 +377,16 @@ class Localiser:
     def _lost(self) -> bool:
         return not self.certain or self._open_loop_m > self.config.lost_after_m
 
+    def _lenses_of_map(self) -> Lenses:
+        told = self._background
+        return Lenses(
+            self._graph,
+            told.sessions,
+            told.cameras,
+            self._basin.focal_px,
+            self.config.lens_depth_m,
+        )
+
     def _own_search(self) -> Callable[..., Neighbourhood]:
         if self.config.neighbourhood is NeighbourhoodSearch.BREADTH_FIRST:
             return partial(breadth_first, self._graph)
@@ -418,6 +430,7 @@ class Localiser:
             hour=None if self._clock is None else hour_of_day(self._clock, live.stamp_ns),
             day=None if self._clock is None else day_of(self._clock, live.stamp_ns),
             background=self._background,
+            seen=self._lenses.as_seen(neighbourhood),
             live_words=self._words_of(live),
         )
         return self._policy.rank(context)
@@ -546,15 +559,16 @@ class Localiser:
         rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
         if neighbourhood is not None and (known := rows >= 0).any():
             near = rows[known]
-            distance_m[known] = neighbourhood.rms_distance_m[near]
+            seen = self._lenses.as_seen(neighbourhood)
+            shifts_m = self._lenses.shifts_m(neighbourhood.nodes)
+            distance_m[known] = seen.rms_distance_m[near]
             accepted = known & np.array([one.accepted for one in outcomes])
             for at in np.flatnonzero(accepted).tolist():
                 found = outcomes[at].match.reference_from_live
                 assert found is not None
-                distance_m[at] = found.distance_m
-            rates[known] = self._basin.success_rate(
-                neighbourhood.along_m[near], neighbourhood.across_m[near]
-            )
+                ahead_m = np.array([0.0, 0.0, shifts_m[rows[at]]])
+                distance_m[at] = np.linalg.norm(found.translation - ahead_m)
+            rates[known] = self._basin.success_rate(seen.along_m[near], seen.across_m[near])
         self._run.add(
             self._driven_m,
             [one.candidate.index for one in outcomes],

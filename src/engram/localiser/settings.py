@@ -60,7 +60,7 @@ class LocaliserConfig:
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They make a failed attempt four times cheaper and keep 98.8 % of the matches it would
             accept. Source: `lab/reports/constants.md`.
-        neighbourhood, path_entries, success: see their descriptions.
+        neighbourhood, path_entries, success, lens_depth_m: see their descriptions.
         recent: how the ranking weights this session's recent attempts.
         matcher, acceptance: settings of the two halves of an attempt.
     """
@@ -96,6 +96,15 @@ class LocaliserConfig:
             "the frame with the highest ranked, as [L15] §III-C does"
         ),
     ] = Success.MOST_INLIERS
+    lens_depth_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="usual depth of what matches, m: a node of another focal length is most "
+            "alike this far times 1 - f_live / f_node ahead; 0: lenses count as equal. Source: "
+            "best offsets of two cameras in one street",
+        ),
+    ] = 7.0
     recent: RecentConfig = field(default_factory=RecentConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)

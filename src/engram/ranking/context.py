@@ -54,6 +54,7 @@ class RankingContext:
         hour: hour of day of the live frame in [0, 24); None if unknown.
         day: its date, days since 1970; None if its clock is not UTC.
         background: data about the map's sessions and nodes.
+        seen: the candidates as seen by one lens; None if the lenses are equal.
         live_words: computes the distinct words of the live frame, (n,) int32, increasing; None
             without a vocabulary.
     """
@@ -72,7 +73,13 @@ class RankingContext:
     hour: float | None = None
     day: float | None = None
     background: Background = field(default_factory=Background)
+    seen: Neighbourhood | None = None
     live_words: Callable[[], NDArray[np.int32]] | None = None
+
+    @property
+    def as_seen(self) -> Neighbourhood:
+        """The candidates with offsets that compare over lenses."""
+        return self.seen or self.neighbourhood
 
     @property
     def sessions(self) -> NDArray[np.int32]:

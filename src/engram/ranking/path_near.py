@@ -37,7 +37,7 @@ class PathNearPolicy:
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
         """See `RankingPolicy`."""
         return context.path_memory.order(
-            context.neighbourhood,
+            context.as_seen,
             evidence_of(context, self._alpha, self._gamma),
             context.basin,
             BASIN_LEVEL,

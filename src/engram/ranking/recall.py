@@ -265,7 +265,7 @@ class RecallPolicy:
         c, near = self._constants, context.neighbourhood
         base = context.background.lessons.of(near.nodes[canonical])
         likeness = self._likeness(context, canonical)
-        costs = self._per_m(context) * near.rms_distance_m[canonical] - likeness
+        costs = self._per_m(context) * context.as_seen.rms_distance_m[canonical] - likeness
         return costs, c.level + c.lessons * np.log(base / (1 - base)), likeness
 
     def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:

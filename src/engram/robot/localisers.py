@@ -73,7 +73,12 @@ def localiser_in(
     ranking = policy_named(policy) if isinstance(policy, str) else policy
     descriptor = settings.frontend.descriptor
     words = opened.derived(words_of, descriptor)
-    background = Background(opened.derived(drives_of), opened.derived(lessons_of, camera.fx), words)
+    background = Background(
+        opened.derived(drives_of),
+        opened.derived(lessons_of, camera.fx),
+        words,
+        opened.cameras,
+    )
     if uses_words(ranking):
         words.prepare()
     return Localiser(
