@@ -24,7 +24,8 @@ FARTHEST_H = 3.0
 # (low, high) of each bin, for maps of few and of many drives; None where fewer than five missions
 # were met. Source: `engram_lab.fits.forecasts fit`, lab/reports/forecasts.md.
 INTERVALS: dict[bool, tuple[tuple[float, float] | None, ...]] = {
-    True: (None, None, None, None, (0.0, 0.05), (0.0, 0.15), None, None, None, None),
+    # Three bins together: there were twelve such missions.
+    True: (None, None, None, *((0.0, 0.01),) * 3, None, None, None, None),
     False: (
         (0.0, 0.01),
         (0.0, 0.01),
