@@ -36,8 +36,8 @@ def test_path_near_ranks_by_paths_only_where_six_in_ten_would_match():
     rates = basin.success_rate(offsets, np.zeros_like(offsets))
     doubtful = float(offsets[np.flatnonzero((rates < 0.55) & (rates > 0.32))[0]])
     context = make_context(
-        candidates=[1, 2], paths=[[0, 2]] * 5, along_m=np.array([0.2, doubtful]), reference=0, observed=(0,),
-        outcomes=(True,),
+        candidates=[1, 2], paths=[[0, 2]] * 5, along_m=np.array([0.2, doubtful]), reference=0,
+        observed=(0,), outcomes=(True,),
     )  # fmt: skip
     assert BASIN_LEVEL == 0.6
     assert POLICIES["path"]().rank(context).tolist() == [1, 0]
