@@ -47,6 +47,7 @@ EXAMPLES = {
     DOCS / "ranking.md": "mapped",
     DOCS / "eyes.md": "drives",
     DOCS / "operate.md": "fleet",
+    DOCS / "papers.md": "fleet",
     DOCS / "live.md": "mapped",
     DOCS / "commands.md": "drives",
     DOCS / "settings.md": "drives",
@@ -320,7 +321,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
 
 def test_the_documents_stay_within_their_length() -> None:
     words = sum(len(page.read_text().split()) for page in [README, *DOCS.glob("*.md")])
-    assert words <= 20_000
+    assert words <= 22_000
 
 
 def test_no_text_names_somebody_elses_package() -> None:
