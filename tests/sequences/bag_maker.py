@@ -230,3 +230,20 @@ def split(folder: Path, files: Iterable[Path]) -> Path:
     for number, file in enumerate(files):
         shutil.copy(file, folder / f"drive_{number}{file.suffix}")
     return folder
+
+
+def kalibr_chain(raw: Any, topics: tuple[str, str]) -> str:
+    """Kalibr's camchain of a raw calibration with radtan lenses."""
+    parts = []
+    for number, (lens, topic) in enumerate(zip((raw.left, raw.right), topics, strict=True)):
+        name, pose = (
+            ("T_cam_imu", raw.left_from_rig) if number == 0 else ("T_cn_cnm1", raw.right_from_left)
+        )
+        parts.append(
+            f"cam{number}:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+            f"  distortion_coeffs: {list(lens.coefficients)}\n"
+            f"  intrinsics: {[lens.fx, lens.fy, lens.cx, lens.cy]}\n"
+            f"  resolution: {[lens.width, lens.height]}\n"
+            f"  {name}: {pose.matrix().tolist()}\n  rostopic: {topic}\n"
+        )
+    return "".join(parts)

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from engram.errors import CalibrationError, ConfigError, EngramError, SequenceError
+from engram.errors import (
+    CalibrationError,
+    ConfigError,
+    EngramError,
+    MissingExtraError,
+    SequenceError,
+)
 from engram.graph.model import Clock
 from engram.sequences import BagSequence, open_sequence
-from engram.sequences.bags import Bag
+from engram.sequences.bags import Bag, messages
 from engram.sequences.bags.pairing import learnt_tolerance
 
 from .bag_maker import (
@@ -403,3 +410,17 @@ class TestCalibration:
         path = WHOLE.write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match="are left and right swapped"):
             open_sequence(path, left=RIGHT, right=LEFT)
+
+    def test_one_of_other_images_is_refused(self, tmp_path) -> None:
+        infos = tuple({**info, "width": 640, "height": 480} for info in WHOLE.infos)
+        path = StereoBag(PICTURES, infos).write(tmp_path / "b", "mcap")
+        with pytest.raises(CalibrationError, match=r"640×480 px, the images of .* are 48×32"):
+            open_sequence(path)
+
+    def test_without_the_extra_the_command_is_named(self, tmp_path, monkeypatch) -> None:
+        path = WHOLE.write(tmp_path / "b", "mcap")
+        messages._store.cache_clear()
+        monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+        with pytest.raises(MissingExtraError, match=r"pip install 'engram-localisation\[bags\]'"):
+            open_sequence(path)
+        messages._store.cache_clear()

@@ -20,6 +20,8 @@ from engram.sequences import (
     session_of,
 )
 
+from .bag_maker import StereoBag, kalibr_chain, rectified_infos
+
 pytestmark = pytest.mark.data
 
 RAW_DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
@@ -144,3 +146,47 @@ def test_the_same_drive_has_the_same_first_pair(data_dir: Path, frames: str | No
     assert first_pair_hash(once) == first_pair_hash(again)
     other = open_sequence(path).read(7)
     assert first_pair_hash(other) != first_pair_hash(once)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+@pytest.mark.parametrize("png", [False, True])
+def test_a_bag_of_kitti_06_holds_the_folders_frames(data_dir, tmp_path, kind, png) -> None:
+    drive = open_sequence(data_dir / "kitti_odometry/sequences/06", frames="::10")
+    pairs = [(pair.stamp_ns, pair.left, pair.right) for pair in drive]
+    made = StereoBag(pairs, rectified_infos(drive.camera), png=png).write(tmp_path / "b", kind)
+    bag = open_sequence(made)
+    assert bag.camera.fx == drive.camera.fx
+    assert bag.camera.baseline_m == drive.camera.baseline_m
+    for found, (stamp_ns, left, right) in zip(bag, pairs, strict=True):
+        assert found.stamp_ns == stamp_ns
+        np.testing.assert_array_equal(found.left, left)
+        np.testing.assert_array_equal(found.right, right)
+
+
+def test_a_raw_bag_of_euroc_with_a_kalibr_chain_is_rectified_as_the_folder(
+    data_dir: Path, tmp_path: Path
+) -> None:
+    folder = data_dir / "euroc/V1_01_easy_sparse"
+    drive = open_sequence(folder, frames="::9")
+    raw = drive.cameras.raw
+    topics = ("/cam0/image_raw", "/cam1/image_raw")
+    wanted = list(drive)
+    pairs = [
+        (
+            pair.stamp_ns,
+            *(
+                cv2.imread(str(folder / f"mav0/cam{side}/data/{pair.stamp_ns}.jpg"), 0)
+                for side in range(2)
+            ),
+        )
+        for pair in wanted
+    ]
+    made = StereoBag(pairs, None, topics=topics).write(tmp_path / "b", "ros1")
+    chain = tmp_path / "camchain.yaml"
+    chain.write_text(kalibr_chain(raw, topics))
+    bag = open_sequence(made, calibration=chain)
+    assert bag.camera.fx == pytest.approx(drive.camera.fx, abs=1e-6)
+    assert bag.camera.cam_from_rig is not None
+    for found, pair in zip(bag, wanted, strict=True):
+        for one, other in ((found.left, pair.left), (found.right, pair.right)):
+            np.testing.assert_array_equal(one, other)

@@ -30,6 +30,7 @@ _WIDEST_FISHEYE_DEG = 100.0
 
 # Larger images are refused: the four tables of a pair take 12 bytes a pixel.
 _MAX_SIDE_PX = 16_384
+_MAX_PIXELS = 64_000_000
 
 
 class DistortionModel(StrEnum):
@@ -84,6 +85,11 @@ class RawCamera:
                 raise CalibrationError(
                     f"raw camera: image size is {self.width}×{self.height}, "
                     f"each side must be 1 to {_MAX_SIDE_PX} px"
+                )
+            if self.width * self.height > _MAX_PIXELS:
+                raise CalibrationError(
+                    f"raw camera: image size is {self.width}×{self.height}, at most "
+                    f"{_MAX_PIXELS:,} px are rectified"
                 )
             value = getattr(self, name)
             if not (np.isfinite(value) and -size <= value <= 2 * size):

@@ -103,9 +103,20 @@ def read_infos(
 
 
 def read_cameras(
-    bag: Bag, decoder: Decoder, stereo: StereoTopics, field_of_view_deg: float | None
+    bag: Bag,
+    decoder: Decoder,
+    stereo: StereoTopics,
+    size: tuple[int, int],
+    field_of_view_deg: float | None,
 ) -> Cameras:
     """The stereo pair as the bag describes it.
+
+    Args:
+        bag: the bag.
+        decoder: decodes its messages.
+        stereo: the image topics.
+        size: of the images, px.
+        field_of_view_deg: of rectified images; None for the largest.
 
     Raises:
         CalibrationError: it does not, or what it says is not of a stereo pair.
@@ -118,6 +129,12 @@ def read_cameras(
             "right.yaml, OpenCV's, or calibration.toml)"
         )
     left, right = infos
+    if (left.width, left.height) != size:
+        raise CalibrationError(
+            f"{bag.path}: {info_topic(stereo.left, bag.topics)} is of {left.width}×{left.height} "
+            f"px, the images of {stereo.left} are {size[0]}×{size[1]}: give the calibration of "
+            "these images with --calibration FILE"
+        )
     transforms = read_transforms(bag, decoder)
     base = transforms.base_of(left.frame)
     try:

@@ -237,15 +237,26 @@ class BagSequence:
         return given
 
     def _calibrated(self, options: OpenOptions) -> Cameras:
-        return read_cameras(self._bag, self._decoder, self.topics, options.field_of_view_deg)
+        view = options.field_of_view_deg
+        return read_cameras(self._bag, self._decoder, self.topics, self._size(), view)
 
     def _size(self) -> tuple[int, int]:
-        """Size of the first left image, px."""
-        topics = self._stereo_topics(None)
-        first = next(self._shots(topics.left), None)
-        if first is None or isinstance(first.content, str):
-            raise SequenceError(f"{self._bag.path}: {topics.left}: no image can be read")
-        return size_of(first.content, topics.left)
+        """Size of the first left image that can be read, px.
+
+        Raises:
+            SequenceError: there is none.
+        """
+        left = self._stereo_topics(None).left
+        fault = "no image can be read"
+        for shot in islice(self._shots(left), _LEARNT_FROM):
+            if isinstance(shot.content, str):
+                fault = shot.content
+                continue
+            try:
+                return size_of(shot.content, left)
+            except SequenceError as error:
+                fault = str(error)
+        raise SequenceError(f"{self._bag.path}: {left}: {fault}")
 
 
 def _frame(message: Any) -> str:
