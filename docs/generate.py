@@ -11,7 +11,7 @@ import typer
 import engram
 from engram.cli.app import app
 from engram.cli.settings import AllSettings, every_setting
-from engram.cli.verbs import GROUPS
+from engram.cli.verbs import GROUPS, NESTED
 from engram.doctor import CHECKS, DoctorConfig
 
 
@@ -31,14 +31,24 @@ def commands() -> str:
     """The help of every verb, by group."""
     program: Any = typer.main.get_command(app)
     parts = []
-    for title, verbs in GROUPS.items():
+    for title in dict.fromkeys([*GROUPS, *NESTED]):
         parts.append(f"### {title}")
-        for name in verbs:
-            with program.make_context("engram", [name], resilient_parsing=True) as context:
-                verb = program.commands[name]
-                with verb.make_context(name, [], parent=context, resilient_parsing=True) as inner:
-                    parts += [f"#### {name}", f"```text\n{verb.get_help(inner)}\n```"]
+        with program.make_context("engram", [], resilient_parsing=True) as context:
+            for name in GROUPS.get(title, {}):
+                parts += _help(name, program.commands[name], context)
+            for name in NESTED.get(title, {}):
+                group = program.commands[name]
+                with group.make_context(name, [], parent=context, resilient_parsing=True) as outer:
+                    for inner, verb in group.commands.items():
+                        parts += _help(inner, verb, outer)
     return "\n\n".join(parts) + "\n"
+
+
+def _help(name: str, verb: Any, context: Any) -> list[str]:
+    """Heading and help of a verb, with the words before its name."""
+    with verb.make_context(name, [], parent=context, resilient_parsing=True) as inner:
+        words = inner.command_path.partition(" ")[2]
+        return [f"#### {words}", f"```text\n{verb.get_help(inner)}\n```"]
 
 
 def settings() -> str:
