@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from engram.maps import open_map
@@ -27,6 +29,24 @@ def test_a_healthy_drive_passes(engram, street: Path) -> None:
     assert ran.status == 0
     assert "12 frames examined: nothing wrong" in ran.out
     assert "cannot be told: scale_off" in ran.out
+
+
+def test_pairs_are_drawn(engram, street: Path, tmp_path: Path) -> None:
+    assert engram("doctor", street, "--pictures", tmp_path / "looks").status == 0
+    drawn = sorted((tmp_path / "looks").glob("pair-*.png"))
+    assert len(drawn) == 4
+    first = cv2.imread(str(drawn[0]))
+    assert (first[..., 0] != first[..., 1]).any(), "lines are coloured"
+
+
+def test_ten_bits_in_sixteen_are_found(engram, street: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "deep"
+    shutil.copytree(street, folder)
+    for file in folder.glob("*/*.png"):
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(file), image.astype(np.uint16) * 4)
+    found = {one["code"] for one in engram("doctor", folder, "--json").json["findings"]}
+    assert "few_grey_levels" in found
 
 
 def test_a_fatal_finding_has_an_exit_status_of_its_own(engram, swapped: Path) -> None:

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from engram.cli import options
 from engram.cli.endings import EXIT_UNFIT_DRIVE
+
+if TYPE_CHECKING:
+    from engram.frontend import StereoPair
+    from engram.robot.front import Arrived
+
+_PICTURES = 4
 
 
 def doctor(
@@ -19,6 +26,10 @@ def doctor(
     hours: Annotated[
         bool, typer.Option("--hours", help="Missions by hour need the drive's clock: check it.")
     ] = False,
+    pictures: Annotated[
+        Path | None,
+        typer.Option("--pictures", metavar="DIR", help="Draw four pairs and what both sides show."),
+    ] = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -31,19 +42,42 @@ def doctor(
     \b
     Examples:
       engram doctor drives/monday
-      engram doctor drives/monday --json
+      engram doctor drives/monday --json --pictures looks
       engram doctor drives/monday --hours --zone Europe/London
     """
     from engram.cli.losses import tell_losses
     from engram.cli.progress import Bars
     from engram.robot import examine_drive
+    from engram.sequences import LoggedFrame
 
     sequence = dataclasses.replace(drive, skip_bad=True).open(path)
     resolved = settings.read().of_robot()
     most = min(len(sequence), resolved.doctor.frames)
     with Bars().stage("doctor", most) as monitor:
-        diagnosis = examine_drive(sequence, resolved, monitor, by_hour=hours)
+        pairs: list[StereoPair] = []
+
+        def keep(number: int, arrived: Arrived) -> None:
+            wanted = number * _PICTURES // max(most, 1) == len(pairs)
+            if pictures is not None and wanted and not isinstance(arrived, LoggedFrame):
+                pairs.append(arrived)
+
+        diagnosis = examine_drive(sequence, resolved, monitor, by_hour=hours, seen=keep)
+    if pictures is not None:
+        _draw(pictures, pairs)
     print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
     if diagnosis.fatal:
         raise typer.Exit(EXIT_UNFIT_DRIVE)
     tell_losses(sequence)
+
+
+def _draw(folder: Path, pairs: list[StereoPair]) -> None:
+    """Writes a picture of each pair."""
+    import cv2
+
+    from engram.monitor import write_whole
+    from engram.viewing.sides import side_picture
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, pair in enumerate(pairs, start=1):
+        with write_whole(folder / f"pair-{number}.png") as draft:
+            draft.write_bytes(cv2.imencode(".png", side_picture(pair))[1].tobytes())

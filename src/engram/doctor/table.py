@@ -122,7 +122,7 @@ CHECKS: tuple[Check, ...] = (
         "scale_off", _WARNING, motion.scale_off, "scale", "of the way",
         "focal length or baseline is wrong: odometry's way differs from the one measured outside",
         "calibrate again; check the baseline with a ruler",
-        needs="motion from outside (--motion FILE) or a map of the place (--map MAP)",
+        needs="motion from outside: --motion TOPIC or FILE",
     ),
     Check(
         "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, islice
 
 import numpy as np
@@ -27,7 +27,8 @@ def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
     """What is known of a drive beside its frames."""
     info = sequence.info
     step = sequence.frames.step if isinstance(sequence, ImageSequence) else 1
-    return Facts(info.clock, info.zone, info.longitude_deg, by_hour, step)
+    bits = sequence.bits() if isinstance(sequence, ImageSequence) else None
+    return Facts(info.clock, info.zone, info.longitude_deg, by_hour, step, bits)
 
 
 def examine_drive(
@@ -36,6 +37,7 @@ def examine_drive(
     monitor: Monitor = QUIET,
     *,
     by_hour: bool = False,
+    seen: Callable[[int, Arrived], None] = lambda *_: None,
 ) -> Diagnosis:
     """Examines up to `DoctorConfig.frames` frames of a drive, in stretches spread over it.
 
@@ -48,6 +50,7 @@ def examine_drive(
         settings: the resolved configuration; None for the defaults.
         monitor: receives each frame, and may stop the examination.
         by_hour: whether missions by hour need the drive's clock.
+        seen: called with the number and the images of each frame that is examined.
 
     Raises:
         SequenceError: an image cannot be used.
@@ -56,8 +59,10 @@ def examine_drive(
     evidence = front.examination.evidence
     evidence.facts = facts_of(sequence, by_hour=by_hour)
     with interruptible(monitor) as watched:
-        for arrived, outside in _chosen(sequence, front, evidence.config.frames):
+        chosen = _chosen(sequence, front, evidence.config.frames)
+        for number, (arrived, outside) in enumerate(chosen):
             front.take(arrived, outside)
+            seen(number, arrived)
             watched.advance("examined")
             watched.check()
     for fault in sequence.skipped_reasons:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from engram.geometry.rectification import Rectification, RemapTable
 from engram.graph.model import Clock
 from engram.odometry import MotionSource
 from engram.sequences.calibrating import check_no_view, read_mask
-from engram.sequences.images import read_image
+from engram.sequences.images import image_bits, read_image
 from engram.sequences.listing import Listing, PairFiles, usable_pairs
 from engram.sequences.motion import motion_of_files
 from engram.sequences.options import Channel, OpenOptions
@@ -126,6 +127,18 @@ class ImageSequence:
                 self._reading_faults.append(str(error))
                 continue
             yield pair
+
+    def bits(self) -> int | None:
+        """Bits of the brightest pixel of a few left images of 16 bits; None for 8-bit ones.
+
+        Images that cannot be read are left out.
+        """
+        found: list[int] = []
+        for index in {0, len(self) // 2, len(self) - 1}:
+            with suppress(SequenceError):
+                bits = image_bits(self._pairs[index].left)
+                found += [] if bits is None else [bits]
+        return max(found, default=None)
 
     def read(self, index: int) -> StereoPair:
         """Decode pair `index` of `len(self)`, whatever `skip_bad` says.

@@ -98,6 +98,20 @@ def image_size(path: Path) -> tuple[int, int]:
     return size
 
 
+def image_bits(path: Path) -> int | None:
+    """Bits of the brightest pixel of a 16-bit image; None for one of 8 bits.
+
+    Raises:
+        SequenceError: the file is missing or not an image.
+    """
+    content = _read_bytes(path)
+    size = header_size(content)
+    if size is not None:
+        check_not_huge(path, size)
+    image = _decoded(path, content)
+    return int(image.max()).bit_length() if image.dtype == np.uint16 else None
+
+
 def header_size(content: bytes) -> tuple[int, int] | None:
     """Width and height that a PNG, JPEG, BMP or PNM header claims, px; None for other kinds."""
     try:
