@@ -61,6 +61,12 @@ def static(name: str) -> Response:
     return Response(body, media_type=_STATIC[name], headers={"Cache-Control": "max-age=3600"})
 
 
+@router.get("/favicon.ico")
+def no_icon() -> Response:
+    """Browsers ask for it."""
+    return Response(status_code=204)
+
+
 @router.get("/")
 def front(request: Request, centre: CentreHere) -> Response:
     """The first map of the one who asks, or the form for the token."""

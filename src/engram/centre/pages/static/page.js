@@ -61,6 +61,7 @@ if (canvas) {
   let view = null; // metres at the middle, and pixels a metre
   let chosen = -1;
   let asked = 0;
+  let fitted = false;
 
   const hue = (n, of) => `hsl(${Math.round((360 * n * 0.618) % 360)} 65% ${of > 8 ? 38 + (n % 3) * 9 : 42}%)`;
   const KEYS = {
@@ -153,7 +154,7 @@ if (canvas) {
     if (mine !== asked || !answer.ok) return;
     shown = found;
     chosen = -1;
-    if (!view) fit();
+    if (!fitted && shown.nodes.length) { fit(); fitted = true; }
     draw();
   }
 
