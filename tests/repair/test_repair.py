@@ -145,7 +145,9 @@ def test_a_removal_is_of_one_measurement_in_either_direction():
 )
 def test_a_drive_that_crossed_is_a_witness(walk, expected):
     crossings = Crossings((np.array(walk),))
-    assert crossings.witnessed({0, 1, 2}, {7, 8, 9}, 10) == expected
+    assert crossings.witnessed({0, 1, 2}, {7, 8, 9}, 10, pause=8) == expected
+    adjacent = crossings.witnessed({0, 1, 2}, {7, 8, 9}, 10, pause=1)
+    assert adjacent == (0 if 5 in walk else expected)
 
 
 def test_an_empty_map_has_no_wrong_edges(tmp_path):

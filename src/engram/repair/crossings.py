@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from engram.graph.graph import ExperienceGraph
 from engram.graph.paths import PathMemory
 
-# Entries of a path between its last on one side and its first on the other, at most, and entries
-# that count on each side.
-_PAUSE, _LOOK = 8, 8
+# Entries of a path that count on each side.
+_LOOK = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,12 +35,15 @@ class Crossings:
             )
         )
 
-    def witnessed(self, side_a: Collection[int], side_b: Collection[int], count: int) -> int:
+    def witnessed(
+        self, side_a: Collection[int], side_b: Collection[int], count: int, pause: int
+    ) -> int:
         """How well the best drive that crossed from one side to the other was at home on both.
 
         Args:
             side_a, side_b: nodes near one end of an edge, and near the other.
             count: number of nodes of the graph.
+            pause: entries of a path from its last on one side to its first on the other, at most.
 
         Returns:
             The number of different nodes by which it was localised, or that it saved, just before
@@ -59,7 +61,7 @@ class Crossings:
             changes = np.flatnonzero(second[1:] != second[:-1])
             for at in changes.tolist():
                 last, first = int(sides[at]), int(sides[at + 1])
-                if first - last > _PAUSE:
+                if first - last > pause:
                     continue
                 before = walk[max(last - _LOOK, 0) : last + 1]
                 after = walk[first : first + _LOOK + 1]

@@ -21,6 +21,10 @@ from engram.repair.suspects import suspect
 
 # Way from the ends of a wrong edge within which edges were predicted through it, metres.
 _BESIDE_M = 12.0
+# Entries of a path within which a drive crosses an edge: a tie leads from a match to a node saved
+# some frames later; both ends of a match were seen at once, and over more entries a drive goes from
+# one look-alike to the next without it.
+_PAUSES = {EdgeKind.TIE: 8}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,7 +242,8 @@ class _Search:
             [near.node for near in self._trusted.around(index(end), reach_m, without=row)]
             for end in (edge.a, edge.b)
         ]
-        return self._crossings.witnessed(sides[0], sides[1], len(self._graph))
+        pause = _PAUSES.get(edge.kind, 1)
+        return self._crossings.witnessed(sides[0], sides[1], len(self._graph), pause)
 
     def _derived(self, wrong: Sequence[Finding]) -> list[Finding]:
         """Predicted edges beside wrong ones that say the same as these."""
