@@ -5,7 +5,7 @@ place. Wheels measure 2 % too much and scatter by 1 %; the gyroscope has a bias 
 of 0.002 rad/s, and two seconds of rest at the start. Each is compared with visual odometry alone.
 Nothing looks for a lost robot: what is found is found by dead reckoning.
 
-python -m engram_lab.checks.blackouts LOGS MAPPED LIVE …     # frame logs with their truth
+python -m engram_lab.checks.blackouts MAPPED LIVE …     # frame logs with their truth
 """
 
 from __future__ import annotations
