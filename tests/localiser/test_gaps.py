@@ -285,3 +285,28 @@ def test_a_robot_that_seems_to_stop_among_missing_steps_is_doubted_by_its_speed(
     # Four of ten steps are missing, and each of them was half a metre.
     sigma_m = [np.sqrt(one.covariance[2, 2]) for one in stood]
     np.testing.assert_allclose(sigma_m, 0.5 * np.sqrt(0.4), rtol=1e-3)
+
+
+def test_while_the_camera_is_dark_the_guess_goes_on_and_grows_less_certain() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    for k in range(1, 6):
+        gaps.motion(ahead(0.5), k * 100 * MS)
+    dark = [gaps.motion(DARK, (500 + later) * MS) for later in (100, 500, 2000)]
+    assert all(one.prev_from_curr is None for one in dark)
+    guesses = [one.ahead for one in dark if one.ahead is not None]
+    assert [pose.distance_m for pose, _ in guesses] == pytest.approx([0.5, 2.5, 10.0])
+    sigmas_m = [float(np.sqrt(covariance[2, 2])) for _, covariance in guesses]
+    assert sigmas_m == sorted(sigmas_m)
+    assert 5.0 < sigmas_m[-1] < 6.0
+
+
+def test_a_robot_at_rest_may_have_driven_off_while_nothing_was_seen() -> None:
+    gaps = GapFiller()
+    gaps.motion(FIRST, 0)
+    for k in range(1, 6):
+        gaps.motion(ahead(0.0), k * 100 * MS)
+    motion = gaps.motion(DARK, 5000 * MS)
+    assert motion.ahead is not None
+    # 1 m/s² for 4 s.
+    assert np.sqrt(motion.ahead[1][2, 2]) == pytest.approx(8.0, rel=0.01)

@@ -640,7 +640,7 @@ class Localiser:
             candidates=0 if self._near is None else len(self._near),
             motion=self._motion,
             open_loop_m=self._open_loop_m,
-            position=self.position,
+            position=self._position_now(),
             looked_up=self._looked_up,
             damaged=self._new_damaged,
             withdraws=self._withdraws,
@@ -660,6 +660,13 @@ class Localiser:
             inliers=success.match.inliers,
             confidence=success.confidence,
         )
+
+    def _position_now(self) -> Position | None:
+        """The position; at an unusable frame carried on by a guess, whose uncertainty grows."""
+        ahead = self._motion.ahead
+        if self.position is None or ahead is None:
+            return self.position
+        return self.position.carried_on(*ahead)
 
     def _status_without_match(self) -> LocalisationStatus:
         if self._motion.odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:

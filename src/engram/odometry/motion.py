@@ -42,6 +42,10 @@ _NEWEST_STEPS = 10
 # Least standard deviation of a guess, also for a robot that stood still.
 _LEAST_SIGMA_M = 0.05
 _LEAST_SIGMA_RAD = float(np.deg2rad(0.5))
+# Standard deviation of the mean acceleration over a gap: a car pulls away with 1 to 2 m/s².
+_SIGMA_ACCELERATION_M_S2 = 1.0
+# Within this time no robot sets off unnoticed: the terms above allow for it.
+_STEADY_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +59,15 @@ class Motion:
         covariance: (6, 6) float64 of `prev_from_curr`, left perturbation, [translation,
             rotation]; None if that is.
         guessed_m: standard deviation of a guess, metres; 0 if odometry measured the motion.
+        ahead: at an unusable frame, the guess of the motion since the last usable one, with its
+            covariance; it is not part of the motion that the next usable frame brings.
     """
 
     odometry: OdometryStep
     prev_from_curr: SE3 | None = None
     covariance: NDArray[np.float64] | None = None
     guessed_m: float = 0.0
+    ahead: tuple[SE3, NDArray[np.float64]] | None = None
 
     @property
     def moved_m(self) -> float:
@@ -154,13 +161,13 @@ class GapFiller:
             doubted: whether odometry is doubtful and contradicts it, and counts as missing.
         """
         if odometry.status is OdometryStatus.UNUSABLE_FRAME:
-            return Motion(odometry)
+            return Motion(odometry, ahead=self._ahead(stamp_ns))
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         if odometry.status is OdometryStatus.FIRST:
             return Motion(odometry)
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
-        guess = self._guess(seconds, outside)
+        guess = self._guess(seconds, stamp_ns, outside)
         if seconds > 0 and self._knows_speed:
             self._guessed_m_per_s.append(guess.prev_from_curr.distance_m / seconds)
         if (
@@ -251,7 +258,14 @@ class GapFiller:
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * _sigma_m(covariance))
 
-    def _guess(self, seconds: float, outside: Guess | None = None) -> Guess:
+    def _ahead(self, stamp_ns: int) -> tuple[SE3, NDArray[np.float64]] | None:
+        """Guess of the motion since the last usable frame; None before the first."""
+        if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
+            return None
+        guess = self._guess((stamp_ns - self._stamp_ns) / _NS_PER_S, stamp_ns)
+        return guess.prev_from_curr, guess.covariance
+
+    def _guess(self, seconds: float, stamp_ns: int, outside: Guess | None = None) -> Guess:
         """Motion from outside, or at the last speed and turn rate; unbounded if all is unknown.
 
         A gyroscope alone replaces the turn.
@@ -264,13 +278,20 @@ class GapFiller:
         guess = SE3.exp(np.r_[velocity, self._turn_per_s] * seconds)
         # Errors of the steps of one gap are correlated: they add up, not their variances.
         growth_m2 = (self._gap_m + guess.distance_m) ** 2 - self._gap_m**2
-        sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_M))
+        started_m = self._started_m(seconds, stamp_ns)
+        sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), max(_LEAST_SIGMA_M, started_m)))
         sigma_rad = float(np.hypot(_SIGMA_RAD_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_RAD))
         covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
         if outside is not None:
             guess = SE3(outside.prev_from_curr.rotation, guess.translation)
             covariance[3:, 3:] = outside.covariance[3:, 3:]
         return Guess(guess, covariance, sigma_m)
+
+    def _started_m(self, seconds: float, stamp_ns: int) -> float:
+        """How far a robot that stood, or held its speed, may have got by speeding up, metres."""
+        gap_s = seconds if self._believed_ns is None else (stamp_ns - self._believed_ns) / _NS_PER_S
+        until_s, since_s = (max(one - _STEADY_S, 0.0) for one in (gap_s, gap_s - seconds))
+        return 0.5 * _SIGMA_ACCELERATION_M_S2 * float(np.sqrt(max(until_s**4 - since_s**4, 0.0)))
 
 
 def _sigma_m(covariance: NDArray[np.float64]) -> float:

@@ -14,8 +14,8 @@ from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
 from engram_lab.town import Campaign, campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 
-FITTED_TOWNS = (301, 302, 303)
-HELD_OUT_TOWNS = (401, 402)
+FITTED_TOWNS = (301, 302)
+HELD_OUT_TOWNS = (401,)
 LOOP_M = 200.0
 # Day, hour (UTC), weather and robot of each drive; two by night, one of them in rain.
 _DRIVES = (

@@ -1,0 +1,149 @@
+"""A fix that a later one contradicts leaves no trace; a doubtful one joins nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated, session_for
+from tests.synthetic_world import Seen, World, drive
+
+from engram.frontend import Frame, Match
+from engram.frontend.matching import NO_MATCH
+from engram.geometry import SE3
+from engram.graph.model import Attempt, NodeId, PathEntry, Session, path_id
+from engram.localiser import FrameMatcher, Localiser, Position, Prediction, Spread
+from engram.mapper import Mapper, Memory, NodeSaver, Saver
+from engram.maps import Map, RevisionWriter
+from engram.robot import Front, Robot, Settings
+from engram.robot.localisers import localiser_in
+
+ROAD = World(length_m=120.0, seed=11)
+ELSEWHERE = World(length_m=60.0, seed=12)
+MIRAGE = 10
+
+
+class Mirage:
+    """Matches as usual, but for some frames only a look-alike, with few inliers."""
+
+    threads = False
+
+    def __init__(self, opened: Map, node: NodeId, stamps_ns: set[int]) -> None:
+        self._usual = FrameMatcher(opened.frames, Settings().localiser.matcher, threads=False)
+        self._node, self._stamps_ns = node, stamps_ns
+
+    def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
+        if live.stamp_ns not in self._stamps_ns:
+            return self._usual.match(live, live_id, node, guide)
+        if node != self._node:
+            return NO_MATCH
+        rows = np.arange(24, dtype=np.int32)
+        return Match(SE3.identity(), 1e-3 * np.eye(6), 24, rows, rows)
+
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
+        return self._usual.spread(live, live_id, node, match)
+
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        self._usual.prefetch(nodes)
+
+
+class Notes:
+    """What a saver writes."""
+
+    def __init__(self) -> None:
+        self.entries: list[PathEntry] = []
+        self.attempts: list[Attempt] = []
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        self.entries.append(entry)
+
+    def add_attempts(self, attempts: list[Attempt]) -> None:
+        self.attempts += attempts
+
+    def checkpoint(self) -> None:
+        """Nothing to do."""
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "road.engram"
+    map_simulated(path, drive(ROAD, np.arange(0, 100, 1.0)))
+    return path
+
+
+@contextmanager
+def misled(
+    path: Path, live: list[Seen], *, saves: bool
+) -> Iterator[tuple[Map, Localiser, RevisionWriter | None]]:
+    """A robot that is told a wrong node, and that sees a look-alike there at first."""
+    with Map.open(path, writes=saves) as opened, opened.writing() if saves else nullcontext():
+        node = sorted(opened.graph.nodes, key=lambda one: one.stamp_ns)[MIRAGE].id
+        session = session_for(live, "misled")
+        writer = _begun(opened, session, live[0].frame) if saves else None
+        matcher = Mirage(opened, node, {live[0].frame.stamp_ns})
+        with localiser_in(
+            opened,
+            live[0].frame.camera,
+            Settings(),
+            policy="distance",
+            live=session.id,
+            saves=saves,
+            matcher=matcher,
+        ) as localiser:
+            localiser.place_at(Position(node, SE3.identity(), 1e-2 * np.eye(6)))
+            yield opened, localiser, writer
+
+
+def _begun(opened: Map, session: Session, first: Frame) -> RevisionWriter:
+    return opened.begin_session(
+        session,
+        first.camera,
+        descriptor=first.descriptor,
+        frontend=first.frontend,
+        author="misled",
+        configuration={},
+    )
+
+
+def test_a_fix_that_a_later_one_contradicts_is_withdrawn_and_forgotten(town: Path) -> None:
+    live = drive(ROAD, np.arange(50, 75, 1.0), start_ns=3_000_000_000_000, seed=2)
+    notes = Notes()
+    with misled(town, live, saves=False) as (_, localiser, _):
+        memory = Memory(localiser, Saver(notes), path_id(localiser.live))
+        robot = Robot(Front(Settings()), localiser, memory)
+        found = [robot.step(seen.logged) for seen in live]
+        memory.finish()
+        memory._saver.finish()
+        false = found[0].node
+    assert found[0].localised
+    assert found[0].inliers == 24
+    again = next(one for one in found[1:] if one.localised)
+    assert again.withdraws == (found[0].stamp_ns,)
+    assert robot.pose_at(found[0].stamp_ns) is None
+    assert notes.entries
+    assert false not in {entry.node for entry in notes.entries}
+    assert [entry.sequence for entry in notes.entries] == list(range(len(notes.entries)))
+    assert not any(one.accepted and one.node == false for one in notes.attempts)
+
+
+def test_a_mapping_robot_joins_nothing_by_a_fix_that_nothing_confirms(town: Path) -> None:
+    live = drive(ELSEWHERE, np.arange(0, 30, 1.0), start_ns=4_000_000_000_000, seed=2)
+    with misled(town, live, saves=True) as (opened, localiser, writer):
+        assert writer is not None
+        session = writer.session
+        saver = Saver(writer, NodeSaver(writer, opened.frames))
+        mapper = Mapper(opened.graph, localiser, saver, session)
+        robot = Robot(Front(Settings()), localiser, mapper)
+        found = [robot.step(seen.logged) for seen in live]
+        mapper.finish()
+        saver.finish()
+        graph = localiser.graph
+        own = graph.sessions == graph.session_number(session.id)
+        labels = graph.components()
+    assert found[0].localised
+    assert sum(one.saved is not None for one in found) > 15
+    assert not set(labels[own]) & set(labels[~own])
+    assert len(set(labels[own])) == 1
