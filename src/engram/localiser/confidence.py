@@ -209,10 +209,10 @@ def _sum(weights: tuple[float, ...], terms: tuple[float, ...]) -> float:
 # Source: python -m engram_lab.fits.confidence
 _BRIEF = ConfidenceModel(
     # constant, inliers, ratio, no usual, share, distance, match sigma, agreed, missed, sigma, apart
-    predicted=(10.61, 2.898, 1.719, -0.64, 1.928, 0.0, -0.484, 0.0, -0.575, -0.812, -1.485),
+    predicted=(13.166, 2.09, 0.513, -0.07, 2.88, 0.0, -0.532, 0.036, -0.89, -0.814, -1.426),
     # constant, inliers, ratio, no usual, share, distance, match sigma, spread, height
-    anywhere=(10.441, 4.533, 1.227, -1.777, 1.848, 0.0, -0.131, 1.786, 0.771),
-    witness=3.0,
+    anywhere=(13.06, 2.575, 0.0, 0.0, 3.933, 0.0, -0.563, 0.568, 1.255),
+    witness=4.0,
 )
 # At 22 inliers `net` has as many false accepts as BRIEF at 20 (`lab/reports/eyes.md`).
 _NET = _BRIEF.needing(1.1)
