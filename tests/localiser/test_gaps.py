@@ -308,5 +308,5 @@ def test_a_robot_at_rest_may_have_driven_off_while_nothing_was_seen() -> None:
         gaps.motion(ahead(0.0), k * 100 * MS)
     motion = gaps.motion(DARK, 5000 * MS)
     assert motion.ahead is not None
-    # 1 m/s² for 4 s.
-    assert np.sqrt(motion.ahead[1][2, 2]) == pytest.approx(8.0, rel=0.01)
+    # 0.5 m/s² for 4 s.
+    assert np.sqrt(motion.ahead[1][2, 2]) == pytest.approx(4.0, rel=0.01)

@@ -42,8 +42,8 @@ _NEWEST_STEPS = 10
 # Least standard deviation of a guess, also for a robot that stood still.
 _LEAST_SIGMA_M = 0.05
 _LEAST_SIGMA_RAD = float(np.deg2rad(0.5))
-# Standard deviation of the mean acceleration over a gap: a car pulls away with 1 to 2 m/s².
-_SIGMA_ACCELERATION_M_S2 = 1.0
+# Standard deviation of the mean acceleration over a gap: a car pulls away with 1 m/s².
+_SIGMA_ACCELERATION_M_S2 = 0.5
 # Within this time no robot sets off unnoticed: the terms above allow for it.
 _STEADY_S = 0.5
 
