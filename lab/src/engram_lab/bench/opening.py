@@ -14,7 +14,7 @@ from engram.maps import Map, RevisionWriter
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared
-from engram_lab.checks.synthetic_places import (
+from engram_lab.synthetic_places import (
     CAMERA,
     DESCRIPTOR,
     FRONTEND,

@@ -20,10 +20,10 @@ import numpy as np
 
 from engram.monitor import QUIET
 from engram.robot import Settings
-from engram_lab.fits.trial_towns import HELD_OUT_TOWNS, streets
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.simulating import campaigns_folder
+from engram_lab.trial_towns import HELD_OUT_TOWNS, streets
 
 KINDS = {"told": Kind.TOLD, "carried": Kind.CARRIED, "gap": Kind.GAP, "lost": Kind.LOST}
 

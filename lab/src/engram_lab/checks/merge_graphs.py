@@ -55,7 +55,8 @@ from engram.graph.model import (
     path_id,
 )
 from engram.maps import Map, check_file
-from engram_lab.checks.synthetic_places import (
+from engram_lab.programs import command_line
+from engram_lab.synthetic_places import (
     CAMERA,
     DESCRIPTOR,
     FRONTEND,
@@ -64,7 +65,6 @@ from engram_lab.checks.synthetic_places import (
     node_of,
     stored,
 )
-from engram_lab.programs import command_line
 
 Item = TypeVar("Item")
 OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")

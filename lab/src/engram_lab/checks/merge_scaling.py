@@ -26,7 +26,8 @@ from engram.fleet.merge import merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
 from engram.maps import Map, RevisionWriter, copy_map
-from engram_lab.checks.synthetic_places import (
+from engram_lab.programs import command_line
+from engram_lab.synthetic_places import (
     CAMERA,
     DESCRIPTOR,
     FRONTEND,
@@ -35,7 +36,6 @@ from engram_lab.checks.synthetic_places import (
     node_of,
     stored,
 )
-from engram_lab.programs import command_line
 
 SESSION_NODES = 500
 LANDMARKS = 100

@@ -30,10 +30,10 @@ from engram.localiser.confidence import (
 )
 from engram.monitor import Monitor, write_whole
 from engram.robot import Settings
-from engram_lab.fits.trial_towns import FITTED_TOWNS, HELD_OUT_TOWNS, other_towns, streets
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Looked, Street
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.simulating import campaigns_folder
+from engram_lab.trial_towns import FITTED_TOWNS, HELD_OUT_TOWNS, other_towns, streets
 
 Array = NDArray[np.float64]
 
