@@ -104,8 +104,11 @@ struct FloatPose {
   }
 };
 
-// Everything about sixteen matches that the score and the normal equations share.
-struct Block {
+// Everything about sixteen matches, or about four, that the score and the normal equations share.
+template <int lanes> struct Block {
+  typedef Pack<float, lanes> Floats;
+  typedef Pack<int32_t, lanes> Ints;
+
   Floats x, y, z;                                  // in the reference, its offset taken off
   Floats by_offset;                                // relative depth by the reference's offset
   Floats along_u, along_v, u_by_z, v_by_z, d_by_z; // non-zero entries of ∂π/∂(live point)
@@ -119,6 +122,7 @@ struct Block {
   Ints usable;                                     // −1 where in front and valid, else 0
 
   Block(const Correspondences &matches, int64_t i, const FloatPose &pose) {
+    const auto load = [](const float *values) { return Floats::load(values); };
     const float *m = pose.m, *t = pose.t;
     const Floats inverse_disparity = load(&matches.inverse_disparity[i]);
     const Floats stretch = 1.0f / (1.0f - pose.reference_offset * inverse_disparity);

@@ -45,13 +45,17 @@ ENGRAM_INLINE FourFloats sum_to_four(const Floats &lanes) {
 #endif
 }
 
+// Of sixteen lanes of which all but these are zero.
+ENGRAM_INLINE FourFloats sum_to_four(const Pack<float, 4> &lanes) { return lanes.part[0]; }
+
 inline float sum(const Floats &lanes) {
   const FourFloats four = sum_to_four(lanes);
   return (four[0] + four[2]) + (four[1] + four[3]);
 }
 
 // The sums of four vectors, each in the order of sum().
-ENGRAM_INLINE FourFloats sums(const Floats &a, const Floats &b, const Floats &c, const Floats &d) {
+template <class Lanes>
+ENGRAM_INLINE FourFloats sums(const Lanes &a, const Lanes &b, const Lanes &c, const Lanes &d) {
   const FourFloats fa = sum_to_four(a), fb = sum_to_four(b), fc = sum_to_four(c),
                    fd = sum_to_four(d);
   const FourFloats ab = __builtin_shufflevector(fa, fb, 0, 4, 1, 5) +
@@ -67,9 +71,10 @@ inline int32_t sum(const Ints &lanes) {
   return (four[0] + four[2]) + (four[1] + four[3]);
 }
 
-typedef std::array<Floats, 3> Vec3Floats;
+template <int lanes> using Vec3Floats = std::array<Pack<float, lanes>, 3>;
 
-inline Vec3Floats cross(const Vec3Floats &a, const Vec3Floats &b) {
+template <int lanes>
+ENGRAM_INLINE Vec3Floats<lanes> cross(const Vec3Floats<lanes> &a, const Vec3Floats<lanes> &b) {
   return {a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]};
 }
 

@@ -49,9 +49,11 @@ using MaskOf = std::conditional_t<
   }
 
 template <class T, int lanes> struct Pack {
-  typedef T Part __attribute__((vector_size(kRegisterBytes)));
+  static constexpr int kBytes = lanes * static_cast<int>(sizeof(T));
+  static constexpr int kPartBytes = kBytes < kRegisterBytes ? kBytes : kRegisterBytes;
+  static constexpr int kParts = kBytes / kPartBytes;
+  typedef T Part __attribute__((vector_size(kPartBytes)));
   typedef Pack<MaskOf<T>, lanes> Mask;
-  static constexpr int kParts = lanes * static_cast<int>(sizeof(T)) / kRegisterBytes;
   static_assert(kParts == 1 || kParts == 2 || kParts == 4);
 
   Part part[kParts];

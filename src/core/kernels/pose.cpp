@@ -104,7 +104,7 @@ Score score(const Correspondences &matches, const Pose &pose, float chi2, float 
     Ints inliers(0);
     const int64_t end = std::min(start + kBetweenChecks, matches.padded);
     for (int64_t i = start; i < end; i += kLanes) {
-      const Block block(matches, i, live_from_reference);
+      const Block<kLanes> block(matches, i, live_from_reference);
       const Ints inlier = block.usable & (block.chi2 < chi2);
       cost += select(inlier, block.chi2, chi2) * load(&matches.valid[i]);
       inliers -= inlier;
@@ -150,7 +150,10 @@ template <int size> struct NormalEquations {
 // translation, x the point in the reference. So the three residuals of a match, whose information
 // is C⁻¹ = D⁻¹ − κ hhᵀ, come down to a symmetric 3×3 matrix M and a vector m:
 //     H = (M, ([x]× M)ᵀ; [x]× M, −[x]× M [x]×),  g = (m, x × m).
-template <int size> struct Sums {
+template <int size, int lanes> struct Sums {
+  typedef Pack<float, lanes> Floats;
+  typedef Vec3Floats<lanes> Vector;
+
   // Where they stand: M (xx, yx, yy, zx, zy, zz); [x]× M, row-major; −[x]× M [x]×;
   // g; the cost; rows of the reference's and the live camera's offset; the offsets' own block.
   static constexpr int kMoving = 0, kMixed = 6, kTurning = 15, kGradient = 21,
@@ -160,12 +163,12 @@ template <int size> struct Sums {
 
   Floats all[kPadded];
 
-  void add(const Block &b, const FloatPose &pose, Floats valid, float scale) {
+  void add(const Block<lanes> &b, const FloatPose &pose, Floats valid, float scale) {
     const float *r = pose.m;
     const Floats robust = 1.0f / (1.0f + b.chi2 / scale);
     const Floats weight = select(b.usable, robust * robust, 0.0f);
     all[kCost] += select(b.usable, b.chi2 * robust, valid * scale);
-    Vec3Floats u, v, d, along; // a of each residual, and hᵀA
+    Vector u, v, d, along; // a of each residual, and hᵀA
     for (int k = 0; k < 3; ++k) {
       u[k] = -(b.along_u * r[k] + b.u_by_z * r[6 + k]);
       v[k] = -(b.along_v * r[3 + k] + b.v_by_z * r[6 + k]);
@@ -174,7 +177,7 @@ template <int size> struct Sums {
     }
     const Floats wp = weight * b.wp, wd = weight * b.wd, wk = weight * b.kappa;
     Floats matrix[6];
-    Vec3Floats vector;
+    Vector vector;
     int entry = 0;
     for (int row = 0; row < 3; ++row) {
       const Floats pu = wp * u[row], pv = wp * v[row], pd = wd * d[row], pk = wk * along[row];
@@ -221,19 +224,19 @@ template <int size> struct Sums {
   }
 
 private:
-  static void add_pose(const Vec3Floats &x, const Floats matrix[6], const Vec3Floats &vector,
+  static void add_pose(const Vector &x, const Floats matrix[6], const Vector &vector,
                        Floats *all) {
-    const Vec3Floats turned = cross(x, vector);
-    const Vec3Floats columns[3] = {cross(x, {matrix[0], matrix[1], matrix[3]}),
-                                   cross(x, {matrix[1], matrix[2], matrix[4]}),
-                                   cross(x, {matrix[3], matrix[4], matrix[5]})};
+    const Vector turned = cross<lanes>(x, vector);
+    const Vector columns[3] = {cross<lanes>(x, {matrix[0], matrix[1], matrix[3]}),
+                                   cross<lanes>(x, {matrix[1], matrix[2], matrix[4]}),
+                                   cross<lanes>(x, {matrix[3], matrix[4], matrix[5]})};
     int entry = 0;
     for (int row = 0; row < 3; ++row) {
       all[kGradient + row] += vector[row];
       all[kGradient + 3 + row] += turned[row];
       for (int column = 0; column < 3; ++column)
         all[kMixed + 3 * row + column] += columns[column][row];
-      const Vec3Floats both = cross(x, {columns[0][row], columns[1][row], columns[2][row]});
+      const Vector both = cross<lanes>(x, {columns[0][row], columns[1][row], columns[2][row]});
       for (int column = 0; column <= row; ++column, ++entry) {
         all[kMoving + entry] += matrix[entry];
         all[kTurning + entry] += both[column];
@@ -242,16 +245,16 @@ private:
   }
 
   // The reference's offset moves the residuals as depth does, the live one's the disparity alone.
-  void add_offsets(const Block &b, Floats weight, const Vec3Floats &d, const Vec3Floats &along) {
-    const Vec3Floats x = {b.x, b.y, b.z};
+  void add_offsets(const Block<lanes> &b, Floats weight, const Vector &d, const Vector &along) {
+    const Vector x = {b.x, b.y, b.z};
     const Floats reference = weight * b.by_offset * b.kept;
     const Floats wd = weight * b.wd, hd = b.wd * b.jd, pk = weight * b.kappa * hd;
-    Vec3Floats by_reference, by_live;
+    Vector by_reference, by_live;
     for (int k = 0; k < 3; ++k) {
       by_reference[k] = reference * along[k];
       by_live[k] = wd * d[k] - pk * along[k];
     }
-    const Vec3Floats turned_reference = cross(x, by_reference), turned_live = cross(x, by_live);
+    const Vector turned_reference = cross<lanes>(x, by_reference), turned_live = cross<lanes>(x, by_live);
     for (int k = 0; k < 3; ++k) {
       all[kByOffset + k] += by_reference[k];
       all[kByOffset + 3 + k] += turned_reference[k];
@@ -267,14 +270,15 @@ private:
 };
 
 // Geman–McClure's ρ(χ²) = χ² / (1 + χ²/c²), c² = `scale`.
-template <int size>
+template <int size, int lanes>
 NormalEquations<size> normal_equations(const Correspondences &matches, const Estimate &estimate,
                                        float scale) {
   const FloatPose live_from_reference(estimate.pose, estimate.offsets);
-  Sums<size> sums{};
-  for (int64_t i = 0; i < matches.padded; i += kLanes)
-    sums.add(Block(matches, i, live_from_reference), live_from_reference, load(&matches.valid[i]),
-             scale);
+  Sums<size, lanes> sums{};
+  const int64_t end = lanes == kLanes ? matches.padded : matches.count;
+  for (int64_t i = 0; i < end; i += lanes)
+    sums.add(Block<lanes>(matches, i, live_from_reference), live_from_reference,
+             Pack<float, lanes>::load(&matches.valid[i]), scale);
   return sums.equations();
 }
 
@@ -289,21 +293,22 @@ void add_prior(const OffsetPrior &prior, const Offsets &offsets,
   equations.cost += offsets.reference * reference + offsets.live * live;
 }
 
-template <int size>
+template <int size, int lanes>
 NormalEquations<size> equations_at(const Correspondences &matches, const Estimate &estimate,
                                    float scale, [[maybe_unused]] const OffsetPrior &prior) {
-  auto equations = normal_equations<size>(matches, estimate, scale);
+  auto equations = normal_equations<size, lanes>(matches, estimate, scale);
   if constexpr (size == kPoseAndOffsets)
     add_prior(prior, estimate.offsets, equations);
   return equations;
 }
 
-// Levenberg–Marquardt. Returns the normal equations at the estimate reached.
-template <int size>
+// Levenberg–Marquardt. Returns the normal equations at the estimate reached. Four lanes are enough
+// for the three matches of a hypothesis; the other twelve would add zeros.
+template <int size, int lanes = kLanes>
 NormalEquations<size> refine(const Correspondences &matches, Estimate &estimate, float scale,
                              int iterations, const OffsetPrior &prior) {
   constexpr double kConverged = 1e-5; // relative fall of the cost that is no longer worth a step
-  auto equations = equations_at<size>(matches, estimate, scale, prior);
+  auto equations = equations_at<size, lanes>(matches, estimate, scale, prior);
   double damping = 1e-4;
   for (int i = 0; i < iterations; ++i) {
     double factor[size * size], step[size];
@@ -320,7 +325,7 @@ NormalEquations<size> refine(const Correspondences &matches, Estimate &estimate,
       moved.offsets.reference += step[6];
       moved.offsets.live += step[7];
     }
-    const auto there = equations_at<size>(matches, moved, scale, prior);
+    const auto there = equations_at<size, lanes>(matches, moved, scale, prior);
     if (there.cost < equations.cost) {
       const bool converged = equations.cost - there.cost < kConverged * equations.cost;
       estimate = moved;
@@ -492,7 +497,7 @@ std::vector<uint8_t> inliers(const Correspondences &matches, const Estimate &est
   const FloatPose live_from_reference(estimate.pose, estimate.offsets);
   std::vector<uint8_t> result(matches.padded);
   for (int64_t i = 0; i < matches.padded; i += kLanes) {
-    const Block block(matches, i, live_from_reference);
+    const Block<kLanes> block(matches, i, live_from_reference);
     const Ints inlier = block.usable & (block.chi2 < static_cast<float>(chi2));
     for (int lane = 0; lane < kLanes; ++lane)
       result[i + lane] = inlier[lane] != 0;
@@ -652,7 +657,7 @@ private:
     sample_.pad();
     constexpr float kNoShrinking = 1e6;
     Estimate estimate{pose, {}};
-    refine<kPose>(sample_, estimate, kNoShrinking, 2, prior_);
+    refine<kPose, 4>(sample_, estimate, kNoShrinking, 2, prior_);
     pose = estimate.pose;
     return true;
   }
