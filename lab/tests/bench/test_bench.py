@@ -184,3 +184,15 @@ def test_without_real_images_the_drive_is_synthetic(monkeypatch) -> None:
     data = load_bench_data()
     assert data.name == "synthetic street"
     assert len(data.full) == 24
+
+
+@pytest.mark.long
+def test_a_checkout_beside_itself_is_as_fast() -> None:
+    from engram_lab.bench.against import HERE, compare
+
+    (found,) = compare(HERE, ["rank_recall_150"], blocks=2, runs=10)
+    assert found.ours_ms > 0
+    assert found.theirs_ms > 0
+    assert found.low <= found.ratio <= found.high
+    with pytest.raises(ConfigError, match="does its checkout have this stage"):
+        list(compare(HERE, ["no_such_stage"], blocks=2, runs=1))

@@ -134,18 +134,28 @@ def bench(
         str | None, typer.Option("--only", metavar="STAGES", help="Stages, joined by commas.")
     ] = None,
     repeats: Annotated[int, typer.Option("--repeats", min=1, help="Runs of each stage.")] = 200,
+    against: Annotated[
+        Path | None,
+        typer.Option("--against", metavar="CHECKOUT", help="Another checkout, built in place."),
+    ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Time each stage beside plain OpenCV.
+    """Time each stage beside plain OpenCV, or beside another checkout.
 
-    Everything runs on one core, in memory, each stage interleaved with its reference.
+    Everything runs on one core, in memory, each stage interleaved with its reference. With
+    --against both checkouts run in blocks that alternate between two processes.
 
     \b
     Examples:
       engram lab bench
       engram lab bench --only frontend_odometry_512,attempt_512 --json
+      engram lab bench --only attempt_512 --against ../engram-before
     """
     from rich.console import Console
+
+    if against is not None:
+        _bench_against(against, only, as_json=as_json)
+        return
 
     from engram_lab.bench import run_bench
 
@@ -159,3 +169,20 @@ def bench(
         print(json.dumps(report.to_dict()))
     else:
         Console().print(report.table())
+
+
+def _bench_against(other: Path, only: str | None, *, as_json: bool) -> None:
+    from dataclasses import asdict
+
+    from engram_lab.bench import STAGES
+    from engram_lab.bench.against import compare
+
+    for one in compare(other, only.split(",") if only else list(STAGES)):
+        if as_json:
+            print(json.dumps(asdict(one)), flush=True)
+        else:
+            print(
+                f"{one.name}: {one.ours_ms:.3f} ms, there {one.theirs_ms:.3f} ms, ratio "
+                f"{one.ratio:.3f} ({one.low:.3f} to {one.high:.3f})",
+                flush=True,
+            )
