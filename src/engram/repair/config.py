@@ -73,17 +73,28 @@ class RepairConfig:
         ),
     ] = 60
     match_inliers: Annotated[int, Meta(ge=0, description="the same of a match or a tie")] = 100
+    least_failing_looks: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="second looks that must disagree with a tie or a step of odometry that the "
+            "rest of the map contradicts, before it is wrong",
+        ),
+    ] = 3
+    most_unseen: Annotated[
+        float, Meta(description="surety of such an edge with fewer of them, at most")
+    ] = 0.95
     contradicted_surety: Annotated[
         float,
         Meta(description="surety that an edge is wrong which the rest of the map contradicts"),
     ] = 1.8
     alone_surety: Annotated[
         float, Meta(description="surety that an edge is wrong which nothing confirms")
-    ] = 0.75
+    ] = 0.85
     tie_surety: Annotated[
         float,
         Meta(description="surety less for a tie: a robot that was localised made it, and drove on"),
-    ] = 0.4
+    ] = 0.5
     doubtful: Annotated[
         float, Meta(description="surety from which an edge is listed as doubtful")
     ] = 0.7

@@ -214,7 +214,10 @@ class _Search:
         """How surely an edge is wrong, from what speaks for and against it."""
         config = self._config
         if contradicted:
-            return config.contradicted_surety - config.per_look * confirming
+            against = config.contradicted_surety - config.per_look * confirming
+            # Where a map is bent, ties and steps of odometry are off that nothing else disproves.
+            seen = kind is EdgeKind.MATCH or looks - confirming >= config.least_failing_looks
+            return against if seen else min(against, config.most_unseen)
         failing = min(config.per_failing_look * (looks - confirming), config.most_by_looks)
         tied = config.tie_surety * (kind is EdgeKind.TIE)
         for_it = config.per_look * confirming + config.per_fix * min(witnessed, 5) + tied
