@@ -187,6 +187,8 @@ def choose_part(
     if options.budget_percent is not None:
         why["everything_bytes"] = everything_bytes = measure(len(selection.order))
         budget_bytes = int(everything_bytes * options.budget_percent / 100)
+        if budget_bytes >= everything_bytes:
+            return parts[len(selection.order)], why
     assert budget_bytes is not None
     count = most_that_fit(measure, np.cumsum(pages[selection.order]), budget_bytes)
     return parts[count], why
