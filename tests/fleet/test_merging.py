@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive, see
 from tests.worlds import attempts_of
 
 from engram.fleet.download import DownloadOptions, download
@@ -39,6 +41,27 @@ def test_an_empty_centre_takes_everything_to_the_byte(tmp_path, fleet):
     assert (report.taken, report.omitted, report.revision) == (len(given.nodes), 0, 1)
     assert report.segments[0].seed is Seed.NONE
     assert_sound(centre)
+
+
+def test_a_drive_through_streets_that_look_alike_is_not_folded_onto_itself(tmp_path):
+    road, centre = World(100.0, seed=6), tmp_path / "centre.engram"
+    seen_again = [
+        replace(seen, frame=see(road, road.pose_at(s - 50.0), seen.frame.stamp_ns))
+        if 70.0 <= (s := float(seen.world_from_live.translation[2])) < 82.0
+        else seen
+        for seen in drive(road, np.arange(0.0, 100.0, 0.8))
+    ]
+    mapped = map_simulated(tmp_path / "robot.engram", seen_again, closes_loops=True)
+    (report,) = merged(centre, tmp_path / "robot.engram")
+    assert (report.taken, report.omitted) == (len(mapped.saved), 0)
+    with Map.open(centre) as store:
+        frame, edges = store.frame, store.graph.edges
+    truth = truth_of(mapped)
+    for edge in edges:
+        true = truth[edge.a].inverse() @ truth[edge.b]
+        assert (true.inverse() @ edge.a_from_b).distance_m < 5.0
+    for node, true in truth.items():
+        assert abs(frame.pose(node).translation[0] - true.translation[2]) < 5.0
 
 
 def test_what_localises_is_omitted_and_remembered_where_it_lies(tmp_path, fleet):
