@@ -11,6 +11,7 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.attempts import FrameMatcher, Matcher
 from engram.localiser.belief import BeliefConfig, PlaceBelief
+from engram.localiser.given import UNNAMED_LIVE_SESSION, LiveDrive, MapParts
 from engram.localiser.keeper import KEEPS_NOTHING, Hint, Keeper
 from engram.localiser.localisation import (
     Budget,
@@ -19,7 +20,7 @@ from engram.localiser.localisation import (
     Position,
     StageClock,
 )
-from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
+from engram.localiser.localiser import Localiser
 from engram.localiser.relocalisation import (
     RELOCALISERS,
     ByAppearance,
@@ -44,10 +45,12 @@ __all__ = [
     "FrameMatcher",
     "Hint",
     "Keeper",
+    "LiveDrive",
     "Localisation",
     "LocalisationStatus",
     "Localiser",
     "LocaliserConfig",
+    "MapParts",
     "Matcher",
     "PlaceBelief",
     "Position",

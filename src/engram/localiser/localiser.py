@@ -9,29 +9,17 @@ from dataclasses import replace
 from functools import partial
 from time import perf_counter
 from typing import Self
-from uuid import uuid5
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import Frame, FrameStatus
-from engram.graph.basin import MatchBasin
 from engram.graph.breadth_first import breadth_first
-from engram.graph.clock import Clocked, day_of, hour_of_day
+from engram.graph.clock import day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import (
-    ENGRAM_NAMESPACE,
-    Attempt,
-    LandmarkSource,
-    NodeId,
-    Session,
-    SessionId,
-    node_id,
-    path_id,
-)
+from engram.graph.model import Attempt, NodeId, Session, node_id, path_id
 from engram.graph.neighbourhood import Neighbourhood, Search
-from engram.graph.paths import PathMemory
-from engram.localiser.acceptance import Prediction, Rule, agrees
+from engram.localiser.acceptance import Prediction, Rule
 from engram.localiser.attempts import (
     Attempter,
     Candidate,
@@ -40,8 +28,8 @@ from engram.localiser.attempts import (
     best_success,
     up_to_first_success,
 )
-from engram.localiser.chain import FixChain
-from engram.localiser.confidence import Record, Standing, confidence_of
+from engram.localiser.confidence import confidence_of
+from engram.localiser.given import LiveDrive, MapParts
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.keeper import KEEPS_NOTHING, Keeper
 from engram.localiser.lenses import Lenses
@@ -52,23 +40,20 @@ from engram.localiser.localisation import (
     Position,
     StageClock,
 )
+from engram.localiser.proving import Prover
 from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, Success
+from engram.localiser.tried import Tried
 from engram.odometry import UNMOVED, Motion, OdometryStatus
 from engram.ranking import (
-    Background,
     Foreseen,
     RankingContext,
     RankingPolicy,
-    RecentAttempts,
-    RunLog,
 )
 
 _PREFETCH = 16
 # Nodes near each weak match of a lost robot to try first: they would confirm it.
 _CONFIRMING = 6
-# For a drive without an id: equal input still gives equal results.
-UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
 
 
 class Localiser:
@@ -78,72 +63,55 @@ class Localiser:
     between calls.
 
     Args:
-        graph: the experience graph.
-        paths: the path memory.
-        frames: where the landmarks of nodes come from.
+        known: the map.
+        drive: the session.
         policy: orders the candidates.
         budget: how many attempts a frame may make.
         relocaliser: proposes nodes to a lost robot; with None it tries the nodes near its dead
             reckoning, within a growing radius.
-        basin: the match basin of this session's camera.
-        live: the live session; its UUID seeds the matcher, so that the same drive gives the same
-            results.
-        saves: whether the session is being mapped: then its own recent nodes are not candidates.
         config: settings.
-        matcher: the first half of an attempt; None matches with the landmarks of `frames`.
+        matcher: the first half of an attempt; None matches with the landmarks of `known`.
         threads: whether lanes run on threads; a given `matcher` decides this itself.
         search: finds the candidates; None for the graph's own `neighbourhood`. Localisers of one
             drive on a fixed graph may share a search with a cache.
-        background: what policies may know about the map beyond its graph and paths.
-        clock: time zone and location of the live frames' stamps; None if unknown.
     """
 
     def __init__(
         self,
-        graph: ExperienceGraph,
-        paths: PathMemory,
-        frames: LandmarkSource,
+        known: MapParts,
+        drive: LiveDrive,
         *,
         policy: RankingPolicy,
         budget: Budget,
         relocaliser: Relocaliser | None,
-        basin: MatchBasin,
-        live: SessionId = UNNAMED_LIVE_SESSION,
-        saves: bool = False,
         config: LocaliserConfig | None = None,
         matcher: Matcher | None = None,
         threads: bool = True,
         search: Callable[..., Neighbourhood] | None = None,
-        background: Background | None = None,
-        clock: Clocked | None = None,
     ) -> None:
         self.config = config or LocaliserConfig()
-        self.live = live
-        self._background = background or Background()
-        self._clock = clock
-        self._own_session = live if saves else None
-        self._own_path = path_id(live)
-        self._graph = graph
-        self._paths = paths
+        self.live = drive.live
+        self._clock = drive.clock
+        self._own_session = drive.live if drive.saves else None
+        self._own_path = path_id(drive.live)
+        self._basin = drive.basin
+        self._graph = known.graph
+        self._paths = known.paths
+        self._background = known.background
         self._policy = policy
         self._budget = budget
         self._relocaliser = relocaliser
-        self._basin = basin
         self._search = search or self._own_search()
-        self._attempter = Attempter(frames, self.config, matcher)
+        self._attempter = Attempter(known.frames, self.config, matcher)
         self._pool = (
             ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")
             if budget.lanes > 1 and (threads if matcher is None else matcher.threads)
             else None
         )
-        self._record = Record()
-        accepted = self.config.acceptance
-        self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
-        self._withdraws: tuple[int, ...] = ()
-        self._standing = Standing()
-        self._hypotheses = Hypotheses(graph, self._nodes_near, self.config.acceptance)
-        self._recent = RecentAttempts(self.config.recent)
-        self._run = RunLog()
+        self._prover = Prover(known.graph, self.config.acceptance)
+        self._hypotheses = Hypotheses(known.graph, self._nodes_near, self.config.acceptance)
+        self._lenses = self._lenses_of_map()
+        self._tried = Tried(self.config.recent, drive.basin, self._lenses)
         self.position: Position | None = None
         self._open_loop_m = 0.0
         self._driven_m = 0.0
@@ -154,7 +122,6 @@ class Localiser:
         # Reference node and neighbourhood of the last frame's attempts.
         self._reference: NodeId | None = None
         self._near: Neighbourhood | None = None
-        self._lenses = self._lenses_of_map()
         self._looked_up = False
         self._damaged: set[int] = set()
         self._new_damaged: tuple[NodeId, ...] = ()
@@ -197,7 +164,7 @@ class Localiser:
             return []
         return [
             Attempt(
-                iteration=self._recent.iteration,
+                iteration=self._tried.iteration,
                 reference=reference,
                 node=outcome.candidate.node,
                 along_m=float(near.along_m[row]),
@@ -231,8 +198,7 @@ class Localiser:
             agreed: number of fixes that confirm it; 0 for a position that is only said to be.
         """
         self.position = position
-        self._record.forget(agreed)
-        self._chain.settle()
+        self._prover.forget(agreed)
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
         self._guessed_m2 = guessed_m**2
@@ -240,8 +206,7 @@ class Localiser:
     def lose(self) -> None:
         """Discards the position: the robot was restarted or carried elsewhere."""
         self.position = None
-        self._record.forget()
-        self._chain.settle()
+        self._prover.forget()
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
@@ -264,17 +229,17 @@ class Localiser:
             next_iteration: number of the first iteration.
         """
         self._driven_m = driven_m
-        self._recent = RecentAttempts(self.config.recent, next_iteration)
+        self._tried.resume(next_iteration)
 
     @property
     def iteration(self) -> int:
         """Number of the current iteration."""
-        return self._recent.iteration
+        return self._tried.iteration
 
     def settle_in(self, node: NodeId) -> None:
         """Sets the position to `node`, as which the live frame was just saved (SPEC §4)."""
         self.position = Position.at(node)
-        self._record.settled()
+        self._prover.settled()
         self._guessed_m2 = 0.0
 
     def localise(
@@ -297,9 +262,8 @@ class Localiser:
         """
         clock = clock or StageClock()
         self._new_damaged, self._near, self._looked_up = (), None, False
-        self._withdraws = ()
-        self._recent.begin_frame(self._driven_m)
-        self._standing = self._record.standing
+        self._tried.begin_frame(self._driven_m)
+        self._prover.begin_frame()
         outcomes: list[Outcome] = []
         if live.status is FrameStatus.OK:
             self._near = self._neighbourhood()
@@ -320,7 +284,7 @@ class Localiser:
                 outcomes = up_to_first_success(outcomes)
             outcomes = self._judged(live, outcomes)
             clock.lap("attempts")
-            self._remember(live, self._near, outcomes)
+            self._tried.add(live, self._driven_m, self._near, outcomes)
         success = self._conclude(live, outcomes)
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
@@ -334,7 +298,7 @@ class Localiser:
             self._settle(live, success)
             return success
         if any(one.candidate.row is not None for one in outcomes):
-            self._record.missed()
+            self._prover.missed()
         if self._relocaliser is not None:
             self._relocaliser.failed(
                 [
@@ -366,7 +330,7 @@ class Localiser:
             self._relocaliser.carry_on(None if motion.guessed_m else motion.prev_from_curr)
         if self.position is not None:
             self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
-        self._chain.carry_on(motion.prev_from_curr, motion.covariance)
+        self._prover.carry_on(motion.prev_from_curr, motion.covariance)
 
     @property
     def certain(self) -> bool:
@@ -420,13 +384,13 @@ class Localiser:
             graph=self._graph,
             path_memory=self._paths,
             basin=self._basin,
-            observations=self._recent.observations,
+            observations=self._tried.observations,
             reference=self._graph.index(self.position.node),
             own_path=self._own_path,
             stamp_ns=live.stamp_ns,
             seed=live.stamp_ns,
             foresee=lambda: self._foresee(live, neighbourhood),
-            run=self._run.attempts(self._driven_m),
+            run=self._tried.run(self._driven_m),
             hour=None if self._clock is None else hour_of_day(self._clock, live.stamp_ns),
             day=None if self._clock is None else day_of(self._clock, live.stamp_ns),
             background=self._background,
@@ -488,7 +452,7 @@ class Localiser:
                 None,
                 guided=False,
                 row=None,
-                standing=self._standing,
+                standing=self._prover.standing,
             )
             for index in dict.fromkeys(indices)
             if index not in known | self._damaged
@@ -528,9 +492,8 @@ class Localiser:
         )
         # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
         doubted = self._lost and not (self.certain and self._own_session is not None)
-        return Candidate(
-            index, self._graph.node(index).id, prediction, guided, row, doubted, self._standing
-        )
+        node, standing = self._graph.node(index).id, self._prover.standing
+        return Candidate(index, node, prediction, guided, row, doubted, standing)
 
     def _judged(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes, with those accepted that an earlier match confirms."""
@@ -548,44 +511,13 @@ class Localiser:
         self._damaged.update(candidate.index for candidate in damaged)
         return [outcome for outcome in outcomes if not outcome.damaged]
 
-    def _remember(
-        self, live: Frame, neighbourhood: Neighbourhood | None, outcomes: list[Outcome]
-    ) -> None:
-        """Records what policies learn from during the drive."""
-        # A lost robot's failed proposals tell nothing of the appearance here: they are elsewhere.
-        here = [one for one in outcomes if one.candidate.row is not None or one.accepted]
-        self._recent.add([one.candidate.index for one in here], [one.accepted for one in here])
-        distance_m, rates = np.full((2, len(outcomes)), np.nan)
-        rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
-        if neighbourhood is not None and (known := rows >= 0).any():
-            near = rows[known]
-            seen = self._lenses.as_seen(neighbourhood)
-            shifts_m = self._lenses.shifts_m(neighbourhood.nodes)
-            distance_m[known] = seen.rms_distance_m[near]
-            accepted = known & np.array([one.accepted for one in outcomes])
-            for at in np.flatnonzero(accepted).tolist():
-                found = outcomes[at].match.reference_from_live
-                assert found is not None
-                ahead_m = np.array([0.0, 0.0, shifts_m[rows[at]]])
-                distance_m[at] = np.linalg.norm(found.translation - ahead_m)
-            rates[known] = self._basin.success_rate(seen.along_m[near], seen.across_m[near])
-        self._run.add(
-            self._driven_m,
-            [one.candidate.index for one in outcomes],
-            distance_m,
-            rates,
-            [one.accepted for one in outcomes],
-            [one.match.inliers for one in outcomes],
-            len(live.landmarks),
-        )
-
     def _settle(self, live: Frame, success: Outcome) -> None:
         """Sets the position to (n, ``T_n_q``) and the open loop to 0 (SPEC §3.3)."""
         node_from_live, covariance = success.match.reference_from_live, success.match.covariance
         assert node_from_live is not None
         assert covariance is not None
         found = Position(success.candidate.node, node_from_live, covariance)
-        self._prove(live, success, found)
+        self._prover.prove(live, success, found, self.position, certain=self.certain)
         self.position = found
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0
@@ -593,38 +525,10 @@ class Localiser:
         if self._relocaliser is not None:
             self._relocaliser.forget()
 
-    def _prove(self, live: Frame, success: Outcome, found: Position) -> None:
-        """Checks a fix against those before it; the weaker of two that contradict goes."""
-        evidence = success.evidence
-        assert evidence is not None
-        predicted = math.isfinite(evidence.apart)
-        before = self._chain.position or self.position
-        fits = True if predicted else self._agrees(found, before)
-        alone = confidence_of(live.descriptor).alone(evidence)
-        if fits is False or not self._standing.agreed:
-            withdraws = self._chain.begin(live.stamp_ns, found, alone)
-            self._withdraws = withdraws if fits is False else ()
-        else:
-            self._chain.join(live.stamp_ns, found, alone)
-        self._record.fixed(success.match.inliers, agrees=fits is True)
-
-    def _agrees(self, found: Position, before: Position | None) -> bool | None:
-        """Whether a match that nothing predicted agrees with a position; None if unknown."""
-        if before is None or not self.certain:
-            return None
-        a, b = self._graph.index(before.node), self._graph.index(found.node)
-        known = self._graph.predict(b, a)
-        if known is None:
-            return None
-        there = Position(found.node, *known).carried_on(before.node_from_live, before.covariance)
-        sigma_rad = float(np.sqrt(there.covariance[4, 4]))
-        prediction = Prediction(there.node_from_live, there.sigma_m, sigma_rad)
-        return agrees(found.node_from_live, prediction, self.config.acceptance)
-
     @property
     def on_trial(self) -> bool:
         """Whether the last fixes may still be withdrawn: no edge should rest on them yet."""
-        return self._chain.on_trial
+        return self._prover.on_trial
 
     def _result(
         self,
@@ -643,7 +547,7 @@ class Localiser:
             position=self._position_now(),
             looked_up=self._looked_up,
             damaged=self._new_damaged,
-            withdraws=self._withdraws,
+            withdraws=self._prover.withdraws,
             confidence=max((one.confidence for one in self._outcomes), default=-math.inf),
             stage_ms=stage_ms,
         )

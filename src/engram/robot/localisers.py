@@ -18,7 +18,9 @@ from engram.localiser import (
     RELOCALISERS,
     UNNAMED_LIVE_SESSION,
     Budget,
+    LiveDrive,
     Localiser,
+    MapParts,
     Matcher,
     Relocaliser,
 )
@@ -81,24 +83,19 @@ def localiser_in(
     )
     if uses_words(ranking):
         words.prepare()
+    paths = path_memory or _counted_paths(opened, settings)
     return Localiser(
-        opened.graph,
-        path_memory or _counted_paths(opened, settings),
-        opened.frames,
+        MapParts(opened.graph, paths, opened.frames, background),
+        LiveDrive(MatchBasin.of(camera.fx, opened.basin_counts), live, saves, clock),
         policy=ranking,
         budget=budget or Budget(),
         relocaliser=relocaliser_in(opened, relocaliser, descriptor)
         if isinstance(relocaliser, str)
         else relocaliser,
-        basin=MatchBasin.of(camera.fx, opened.basin_counts),
-        live=live,
-        saves=saves,
         config=settings.localiser,
         matcher=matcher,
         threads=threads,
         search=search,
-        background=background,
-        clock=clock,
     )
 
 

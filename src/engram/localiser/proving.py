@@ -1,0 +1,108 @@
+"""Proves each fix by those before it: how well the position stands, and which fixes go."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import Frame
+from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
+from engram.localiser.attempts import Outcome
+from engram.localiser.chain import FixChain
+from engram.localiser.confidence import Record, Standing, confidence_of
+from engram.localiser.localisation import Position
+
+
+class Prover:
+    """The standing of a robot's position, and its fixes on trial.
+
+    Args:
+        graph: the experience graph; it may grow.
+        accepted: limits of agreement, and when fixes settle.
+
+    Attributes:
+        standing: of the position, when the frame began.
+        withdraws: stamps of the fixes that the frame's fix contradicts, ns.
+    """
+
+    def __init__(self, graph: ExperienceGraph, accepted: AcceptanceConfig) -> None:
+        self._graph = graph
+        self._accepted = accepted
+        self._record = Record()
+        self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
+        self.standing = Standing()
+        self.withdraws: tuple[int, ...] = ()
+
+    @property
+    def on_trial(self) -> bool:
+        """Whether the last fixes may still be withdrawn."""
+        return self._chain.on_trial
+
+    def begin_frame(self) -> None:
+        """Begins a frame: nothing is withdrawn yet."""
+        self.standing, self.withdraws = self._record.standing, ()
+
+    def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:
+        """Carries the fixes on trial on by the robot's motion."""
+        self._chain.carry_on(prev_from_curr, covariance)
+
+    def forget(self, agreed: int = 0) -> None:
+        """The position is another, confirmed by so many fixes; those before it stay."""
+        self._record.forget(agreed)
+        self._chain.settle()
+
+    def settled(self) -> None:
+        """The live frame was saved as a node, which is the position from now on."""
+        self._record.settled()
+
+    def missed(self) -> None:
+        """A frame with predicted candidates had no match."""
+        self._record.missed()
+
+    def prove(
+        self,
+        live: Frame,
+        success: Outcome,
+        found: Position,
+        before: Position | None,
+        *,
+        certain: bool,
+    ) -> None:
+        """Checks a fix against those before it; the weaker of two that contradict goes.
+
+        Args:
+            live: the live frame.
+            success: the accepted match.
+            found: the position by it.
+            before: the position before it; None if unknown.
+            certain: whether odometry since the last match had only short gaps.
+        """
+        evidence = success.evidence
+        assert evidence is not None
+        predicted = math.isfinite(evidence.apart)
+        before = self._chain.position or before
+        fits = True if predicted else self._agrees(found, before if certain else None)
+        alone = confidence_of(live.descriptor).alone(evidence)
+        if fits is False or not self.standing.agreed:
+            withdraws = self._chain.begin(live.stamp_ns, found, alone)
+            self.withdraws = withdraws if fits is False else ()
+        else:
+            self._chain.join(live.stamp_ns, found, alone)
+        self._record.fixed(success.match.inliers, agrees=fits is True)
+
+    def _agrees(self, found: Position, before: Position | None) -> bool | None:
+        """Whether a match that nothing predicted agrees with a position; None if unknown."""
+        if before is None:
+            return None
+        a, b = self._graph.index(before.node), self._graph.index(found.node)
+        known = self._graph.predict(b, a)
+        if known is None:
+            return None
+        there = Position(found.node, *known).carried_on(before.node_from_live, before.covariance)
+        sigma_rad = float(np.sqrt(there.covariance[4, 4]))
+        prediction = Prediction(there.node_from_live, there.sigma_m, sigma_rad)
+        return agrees(found.node_from_live, prediction, self._accepted)

@@ -1,0 +1,104 @@
+"""What a drive has tried so far, from which policies learn as it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.frontend import Frame
+from engram.graph.basin import MatchBasin
+from engram.graph.neighbourhood import Neighbourhood
+from engram.localiser.attempts import Outcome
+from engram.localiser.lenses import Lenses
+from engram.ranking import Observations, RecentAttempts, RecentConfig, RunAttempts, RunLog
+
+
+class Tried:
+    """The attempts of the last iterations, and those of the drive with where they were made.
+
+    Args:
+        config: how far back the last iterations reach.
+        basin: of the live camera.
+        lenses: of the map's drives.
+    """
+
+    def __init__(self, config: RecentConfig, basin: MatchBasin, lenses: Lenses) -> None:
+        self._config = config
+        self._basin = basin
+        self._lenses = lenses
+        self._recent = RecentAttempts(config)
+        self._run = RunLog()
+
+    @property
+    def iteration(self) -> int:
+        """Number of the current iteration."""
+        return self._recent.iteration
+
+    @property
+    def observations(self) -> Observations:
+        """The attempts of the last iterations."""
+        return self._recent.observations
+
+    def run(self, driven_m: float) -> RunAttempts:
+        """The attempts of the drive that are remembered after `driven_m` metres."""
+        return self._run.attempts(driven_m)
+
+    def resume(self, next_iteration: int) -> None:
+        """Goes on with this iteration, without the last ones."""
+        self._recent = RecentAttempts(self._config, next_iteration)
+
+    def begin_frame(self, driven_m: float) -> None:
+        """Begins a frame at this distance driven, metres."""
+        self._recent.begin_frame(driven_m)
+
+    def add(
+        self,
+        live: Frame,
+        driven_m: float,
+        near: Neighbourhood | None,
+        outcomes: Sequence[Outcome],
+    ) -> None:
+        """Adds the outcomes of one frame.
+
+        Args:
+            live: the frame.
+            driven_m: odometry distance from the session's start, metres.
+            near: the neighbourhood of its predicted candidates.
+            outcomes: of all its attempts.
+        """
+        # A lost robot's failed proposals tell nothing of the appearance here: they are elsewhere.
+        here = [one for one in outcomes if one.candidate.row is not None or one.accepted]
+        self._recent.add([one.candidate.index for one in here], [one.accepted for one in here])
+        distance_m, rates = self._expected(near, outcomes)
+        self._run.add(
+            driven_m,
+            [one.candidate.index for one in outcomes],
+            distance_m,
+            rates,
+            [one.accepted for one in outcomes],
+            [one.match.inliers for one in outcomes],
+            len(live.landmarks),
+        )
+
+    def _expected(
+        self, near: Neighbourhood | None, outcomes: Sequence[Outcome]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(R,) distances, metres, and rates of success of attempts; NaN without a prediction."""
+        distance_m, rates = np.full((2, len(outcomes)), np.nan)
+        rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
+        if near is None or not (known := rows >= 0).any():
+            return distance_m, rates
+        seen, shifts_m = self._lenses.as_seen(near), self._lenses.shifts_m(near.nodes)
+        distance_m[known] = seen.rms_distance_m[rows[known]]
+        accepted = known & np.array([one.accepted for one in outcomes])
+        for at in np.flatnonzero(accepted).tolist():
+            found = outcomes[at].match.reference_from_live
+            assert found is not None
+            ahead_m = np.array([0.0, 0.0, shifts_m[rows[at]]])
+            distance_m[at] = np.linalg.norm(found.translation - ahead_m)
+        rates[known] = self._basin.success_rate(
+            seen.along_m[rows[known]], seen.across_m[rows[known]]
+        )
+        return distance_m, rates
