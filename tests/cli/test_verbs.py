@@ -15,6 +15,7 @@ from engram.localiser import Localiser
 
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
+    "confidence", "withdraws",
     "candidates", "open_loop_m", "ms", "damaged",
 }  # fmt: skip
 STATUSES = {"localised", "dead_reckoning", "lost", "no_odometry"}

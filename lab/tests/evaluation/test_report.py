@@ -172,6 +172,7 @@ def test_every_figure_is_drawn(out: Path) -> None:
         "fig12_curves_gap.png",
         "fig12_curves_lost.png",
         "fig12_curves_lost_scaled.png",
+        "fig12_curves_reacquired.png",
         "fig13_T.png",
         "costs_made-up.png",
     }

@@ -512,6 +512,7 @@ class Map(MapReader):
         """The writer of a revision; until it ends, this map includes its rows."""
         if session is not None:
             self.forget()  # later reads include the session
+            self._keys.forget_nodes()  # so do later searches for its nodes
         self._see(own)
         self._writing = RevisionWriter(
             self._database,

@@ -111,8 +111,8 @@ def _rerun() -> Any:
         import rerun
     except ImportError as error:
         raise MissingExtraError(
-            "the viewer needs Rerun: pip install 'engram-localisation[view]'; engram plot and "
-            "engram localise --pictures draw without it"
+            "the viewer needs Rerun: pip install 'engram-localisation[view]'. Without it, plot and "
+            "localise --pictures draw"
         ) from error
     return rerun
 

@@ -153,6 +153,7 @@ def try_(
 
     budget_bytes, budget_percent = budget_from_text(budget)
     asked = DownloadOptions(
+        strict="tod" in policy or policy == "paths",  # an hour without data is a row of its own
         policy=policy,
         start_h=hour_from_text(start, "start"),
         end_h=hour_from_text(end, "end"),

@@ -175,7 +175,7 @@ def download_for_foray(
 def _downloaded(whole: Path, draft: Path, policy: str, hour: float | None) -> DownloadReport:
     """What a robot gets: where nothing was driven at such an hour it asks for more."""
     try:
-        options = DownloadOptions(policy, start_h=hour, end_h=hour)
+        options = DownloadOptions(policy, start_h=hour, end_h=hour, strict=policy in _ASKS_FOR_MORE)
         return download(whole, draft, options)
     except InputError:
         if policy not in _ASKS_FOR_MORE:
