@@ -45,6 +45,7 @@ def test_groups_are_mapped_and_merged_into_one_map(built, logs):
     assert report.to_dict()["parallel_s"] == pytest.approx(report.parallel_s)
 
 
+@pytest.mark.long
 def test_a_worker_that_dies_is_replaced_and_the_map_is_the_same(tmp_path, logs, built):
     killed = []
 
@@ -114,6 +115,7 @@ def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, 
     assert again.content_hash == built[1].content_hash
 
 
+@pytest.mark.long
 def test_a_centre_that_exists_takes_in_all_groups(tmp_path, logs):
     centre = tmp_path / "centre.engram"
     build(centre, logs, names="a", groups=1)
@@ -138,6 +140,7 @@ def test_drives_that_the_centre_has_are_not_mapped_again(tmp_path, logs):
         assert len(store.load().sessions) == 3
 
 
+@pytest.mark.long
 def test_what_a_build_leaves_out_does_not_change_when_it_goes_on(tmp_path, logs):
     centre = tmp_path / "centre.engram"
     build(centre, logs, names="a", groups=1)

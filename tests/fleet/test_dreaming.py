@@ -110,6 +110,7 @@ def test_a_better_order_is_found_and_what_it_has_is_added(town, tmp_path):
     assert not list(tmp_path.glob("*.dream/*"))
 
 
+@pytest.mark.long
 def test_where_nothing_is_better_the_fleet_map_stays_as_it_is(town, tmp_path):
     centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
     dream(centre, robots, drives, options=ASKED)
@@ -132,7 +133,9 @@ class Stops(Monitor):
             raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("checks", [1, 4, 9])
+@pytest.mark.parametrize(
+    "checks", [4, *(pytest.param(checks, marks=pytest.mark.long) for checks in (1, 9))]
+)
 def test_a_stopped_dream_goes_on_to_the_same_result(town, tmp_path, checks):
     centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
     with pytest.raises(KeyboardInterrupt):
@@ -146,6 +149,7 @@ def test_a_stopped_dream_goes_on_to_the_same_result(town, tmp_path, checks):
     assert nodes_of(centre) == nodes_of(fresh)
 
 
+@pytest.mark.long
 def test_a_time_budget_ends_the_trying_and_the_best_so_far_counts(town, tmp_path):
     centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
     short = DreamOptions(

@@ -286,7 +286,9 @@ def run_history(folder: Path, seed: int, rounds: int) -> None:
             check_update(world, world.options(), again=rounds > 1)
 
 
-@pytest.mark.parametrize("first", range(0, 30, 10))
+@pytest.mark.parametrize(
+    "first", [0, *(pytest.param(first, marks=pytest.mark.long) for first in (10, 20))]
+)
 def test_updated_equals_fresh_united_with_own(tmp_path, first):
     for seed in range(first, first + 10):
         (tmp_path / str(seed)).mkdir()
@@ -340,7 +342,7 @@ def killed_at(statement: int, centre: Path, robot: Path) -> bool:
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
-@pytest.mark.parametrize("every", [15, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("every", [40, pytest.param(1, marks=pytest.mark.long)])
 def test_killed_anywhere_the_map_is_the_one_before_or_the_one_after(tmp_path, every):
     world = World(tmp_path, 1)
     for _ in range(3):

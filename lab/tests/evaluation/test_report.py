@@ -238,6 +238,7 @@ def test_runs_as_on_a_robot_stand_beside_the_unguided_ones_of_the_same_sessions(
         assert float(row["share_b"]) == pytest.approx(memo)
 
 
+@pytest.mark.long
 def test_several_campaigns_are_pooled(plan: Plan, out: Path, tmp_path: Path) -> None:
     assert "pooled\n" not in (out / "report.md").read_text()
     other = replace(plan, drives=replace(plan.drives, name="made-up again"))
@@ -283,6 +284,7 @@ def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path) -> None:
     assert not {"fig09_map_size.png", "fig10_candidates.png", "fig13_T.png"} & files
 
 
+@pytest.mark.long
 def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / "work"
     shutil.copytree(plan.work, work)

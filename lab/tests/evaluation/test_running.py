@@ -66,6 +66,7 @@ def test_every_session_is_localised_with_every_configuration(plan: Plan) -> None
     assert np.nanmax(runs.offset_m) < 0.5
 
 
+@pytest.mark.long
 def test_two_workers_and_one_give_the_same(campaign, plan: Plan, tmp_path: Path) -> None:
     other = make_plan(campaign, Settings(), few_options(), tmp_path)
     run(other, workers=2)
@@ -211,6 +212,7 @@ def test_policies_are_run_again_in_the_folds_that_are_run(plan: Plan, tmp_path: 
     assert results(one_fold) == results(plan)
 
 
+@pytest.mark.long
 def test_folds_may_be_run_one_after_another(campaign, plan: Plan, tmp_path: Path) -> None:
     first = make_plan(campaign, Settings(), few_options(only_folds=(1,)), tmp_path)
     run(first)

@@ -34,6 +34,7 @@ def test_a_worker_that_dies_is_said_in_one_line(tmp_path: Path) -> None:
     assert first.read_text() == "done"
 
 
+@pytest.mark.long
 def test_workers_end_with_a_run_that_is_killed() -> None:
     """Left behind, they would write where the run that goes on writes."""
     program = "from lab.tests.evaluation.test_tasks import wait_for_ever; wait_for_ever()"

@@ -44,6 +44,7 @@ def test_two_drives_read_in_turns_do_not_mix(hamlet: Campaign) -> None:
     np.testing.assert_array_equal(alone, taken)
 
 
+@pytest.mark.long
 def test_threads_do_not_change_the_picture(hamlet: Campaign) -> None:
     one = next(iter(small(SimulatedDrive(hamlet, 0, threads=1))))
     three = next(iter(small(SimulatedDrive(hamlet, 0, threads=3))))
@@ -60,6 +61,7 @@ def test_a_covered_lens_shows_nothing_and_what_was_seen_comes_back(hamlet: Campa
     assert min(contrast[5:]) > 0.15 * min(contrast[:3])
 
 
+@pytest.mark.long
 def test_another_seed_is_another_town(drive: SimulatedDrive) -> None:
     other = small(SimulatedDrive(campaign_named("hamlet", seed=4), 0))
     assert (next(iter(drive)).left != next(iter(other)).left).mean() > 0.5
@@ -74,7 +76,7 @@ np.save(sys.argv[2], next(drive.frames(20, 21)).left)
 """
 
 
-@pytest.mark.parametrize("session", [0, 3])
+@pytest.mark.parametrize("session", [pytest.param(0, marks=pytest.mark.long), 3])
 def test_every_instruction_set_gives_the_same_picture(
     session: int, hamlet: Campaign, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -79,6 +79,7 @@ def test_what_another_front_end_made_is_not_taken_for_this_ones(
         simulate(short, tmp_path, sessions=[1], settings=other)
 
 
+@pytest.mark.long
 def test_odometry_that_has_changed_is_run_over_what_was_rendered(
     short: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +137,7 @@ def test_a_killed_run_is_taken_up_again(short: Campaign, tmp_path: Path) -> None
     log.close()
 
 
+@pytest.mark.long
 def test_a_worker_that_dies_is_told_and_the_same_call_goes_on(
     short: Campaign, tmp_path: Path
 ) -> None:
