@@ -37,6 +37,7 @@ from engram.maps.hiding import check_same_node, check_same_session, hidden_row, 
 from engram.maps.keys import KeyBook
 from engram.maps.marks import mark_row
 from engram.maps.records import Revision, RevisionStatus, StoredNode, StoredSession
+from engram.maps.references import References
 from engram.maps.revisions import (
     change_revision,
     changes_layout,
@@ -46,7 +47,6 @@ from engram.maps.revisions import (
 )
 from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import (
-    camera_row,
     check_edge,
     checked_int,
     session_row,
@@ -125,6 +125,7 @@ class RevisionWriter:
         self._database = database
         self._keys = keys
         self._rows = RowBuffer(database, keys, view.own)
+        self._known = References(database, keys, view, self._rows)
         self._frames = frame_reader
         self._view = view
         self._revision_key = view.own
@@ -135,22 +136,10 @@ class RevisionWriter:
         self._ended = False
         with database.reading() as connection:
             self._descriptor = reading.descriptor_of(connection, view)
-            self._frontend_keys = {
-                content: key for key, content in reading.load_frontends(connection).items()
-            }
-            self._camera_keys = {
-                camera.id: key for key, camera in reading.load_cameras(connection).items()
-            }
-            self._sessions = {
-                row["uuid"]: (row["key"], row["camera"], row["frontend"])
-                for row in view.rows(connection, sessions)
-            }
-            self._path_keys = {row["uuid"]: row["key"] for row in view.rows(connection, paths)}
             self._hidden = {
                 table: hidden_rows(connection, view, table) for table in (sessions, nodes, paths)
             }
             self._interrupted = open_sessions(connection)
-        self._sequences: dict[int, set[int]] = {}
         self._omitted: set[bytes] = set()
         self._amended: set[Amendment] | None = None  # read on first use
         self._shows_again = False
@@ -187,7 +176,7 @@ class RevisionWriter:
         self._check_open()
         if session.camera != camera.id:
             raise InputError(f"session {session.id} has camera {session.camera}, not {camera.id}")
-        if session.id.bytes in self._sessions:
+        if session.id.bytes in self._known.sessions:
             return False
         if session.id.bytes in self._interrupted:
             raise RevisionError(
@@ -201,8 +190,8 @@ class RevisionWriter:
                 "or make another map"
             )
         self._descriptor = descriptor
-        camera_key = self._camera_key(camera)
-        frontend_key = self._frontend_key(descriptor, frontend)
+        camera_key = self._known.camera(camera)
+        frontend_key = self._known.frontend(descriptor, frontend)
         again = self._hidden[sessions].get(session.id.bytes)
         if again is not None:
             check_same_session(again, session, camera_key, frontend_key)
@@ -212,7 +201,7 @@ class RevisionWriter:
             self._rows.put(
                 sessions, session_row(session, key, self._revision_key, camera_key, frontend_key)
             )
-        self._sessions[session.id.bytes] = (key, camera_key, frontend_key)
+        self._known.sessions[session.id.bytes] = (key, camera_key, frontend_key)
         self._add_path(path_id(session.id), key, partial)
         self._checkpoint_if_due()
         return True
@@ -256,7 +245,7 @@ class RevisionWriter:
         """
         self._check_open()
         node = stored.node
-        self._check_node(stored)
+        self._known.check_node(stored)
         again = self._hidden[nodes].get(node.id.bytes)
         if again is not None:
             check_same_node(again, node, stored.landmark_hash)
@@ -281,7 +270,7 @@ class RevisionWriter:
             InputError: the node is not in the map, or the words do not rise.
         """
         self._check_open()
-        self._rows.put_words(self._node_key(node, "words"), vocabulary, found)
+        self._rows.put_words(self._known.node(node, "words"), vocabulary, found)
         self._checkpoint_if_due()
 
     def add_edge(self, edge: Edge) -> None:
@@ -292,7 +281,7 @@ class RevisionWriter:
         """
         self._check_open()
         check_edge(edge)
-        a, b = self._node_key(edge.a, "edge"), self._node_key(edge.b, "edge")
+        a, b = self._known.node(edge.a, "edge"), self._known.node(edge.b, "edge")
         self._rows.put_edge(edge, a, b)
         self._checkpoint_if_due()
 
@@ -304,11 +293,11 @@ class RevisionWriter:
                 sequence number.
         """
         self._check_open()
-        path_key = self._path_keys.get(entry.path.bytes)
+        path_key = self._known.paths.get(entry.path.bytes)
         if path_key is None:
             raise InputError(f"path {entry.path} is not in the map; add its session first")
-        node_key = self._node_key(entry.node, "path entry")
-        taken = self._sequences_of(path_key)
+        node_key = self._known.node(entry.node, "path entry")
+        taken = self._known.sequences(path_key)
         if entry.sequence in taken:
             raise InputError(f"path {entry.path} has an entry {entry.sequence} already")
         self._rows.new(
@@ -345,20 +334,20 @@ class RevisionWriter:
             InputError: the session or a node is not in the map.
         """
         self._check_open()
-        if session.bytes not in self._sessions:
+        if session.bytes not in self._known.sessions:
             raise InputError(f"attempts of session {session}, which is not in the map")
         if not len(made):
             return
         columns: dict[str, NDArray[np.generic]] = {
             name: np.asarray(
-                self._node_keys(getattr(made, name), node_ids)
+                self._known.nodes(getattr(made, name), node_ids)
                 if name in {"reference", "node"}
                 else getattr(made, name),
                 kind,
             )
             for name, kind in COLUMNS
         }
-        key, *_ = self._sessions[session.bytes]
+        key, *_ = self._known.sessions[session.bytes]
         self._rows.put_attempts(key, AttemptTable(columns, made.policy, made.policies))
         self._checkpoint_if_due()
 
@@ -369,7 +358,7 @@ class RevisionWriter:
             InputError: the equivalent is not in the map, or the omission is stored already.
         """
         self._check_open()
-        node_key = self._node_key(omission.node, "omission")
+        node_key = self._known.node(omission.node, "omission")
         if omission.omitted.bytes in self._omitted:
             raise InputError(f"node {omission.omitted} is omitted twice")
         uuid, node_from_omitted = (
@@ -392,7 +381,7 @@ class RevisionWriter:
             InputError: the map has no such session.
         """
         self._check_open()
-        found = self._sessions.get(amendment.session.bytes)
+        found = self._known.sessions.get(amendment.session.bytes)
         if found is None:
             raise InputError(f"amendment: session {amendment.session} is not in the map")
         if self._amended is None:
@@ -417,7 +406,7 @@ class RevisionWriter:
             InputError: a node is not in the map, or a value cannot be stored.
         """
         self._check_open()
-        table, values = mark_row(mark, lambda node: self._node_key(node, type(mark).__name__))
+        table, values = mark_row(mark, lambda node: self._known.node(node, type(mark).__name__))
         self._rows.new(table, **values)
         self._checkpoint_if_due()
 
@@ -539,49 +528,15 @@ class RevisionWriter:
         if not self.resumable and self._rows.size_bytes > _BATCH_BYTES:
             self.checkpoint()
 
-    def _camera_key(self, camera: StereoCamera) -> int:
-        if camera.id not in self._camera_keys:
-            key = self._camera_keys[camera.id] = self._keys.next(cameras)
-            self._rows.put(cameras, camera_row(camera, key))
-        return self._camera_keys[camera.id]
-
-    def _frontend_key(self, descriptor: DescriptorKind, frontend: str) -> int:
-        content = (descriptor, frontend)
-        if content not in self._frontend_keys:
-            key = self._frontend_keys[content] = self._keys.next(frontends)
-            row = {"key": key, "descriptor": str(descriptor), "hash": frontend}
-            self._rows.put(frontends, row)
-        return self._frontend_keys[content]
-
     def _add_path(self, path: PathId, session_key: int, partial: bool) -> None:
         key = self._shown_again(paths, path.bytes)
         if key is None:
             key = self._rows.new(paths, uuid=path.bytes, session=session_key, partial=int(partial))
-        self._path_keys[path.bytes] = key
-
-    def _check_node(self, stored: StoredNode) -> None:
-        node = stored.node
-        if node.session.bytes not in self._sessions:
-            raise InputError(f"node {node.id}: its session {node.session} is not in the map")
-        _, camera_key, frontend_key = self._sessions[node.session.bytes]
-        if self._keys.find_node(node.id) is not None:
-            raise InputError(f"node {node.id} is in the map already; a node is saved once")
-        if not np.isfinite(node.driven_m):
-            raise InputError(f"node {node.id}: driven_m is {node.driven_m}, must be finite")
-        if self._camera_keys.get(node.camera) != camera_key:
-            raise InputError(
-                f"node {node.id} is of camera {node.camera}, its session {node.session} of "
-                "another; a recalibrated robot begins another session"
-            )
-        if self._frontend_keys.get((stored.descriptor, stored.frontend)) != frontend_key:
-            raise IncompatibleError(
-                f"node {node.id} comes from front-end {stored.frontend} ({stored.descriptor}), "
-                f"its session {node.session} from another; begin another session"
-            )
+        self._known.paths[path.bytes] = key
 
     def _insert_node(self, stored: StoredNode) -> int:
         node = stored.node
-        session_key, camera_key, frontend_key = self._sessions[node.session.bytes]
+        session_key, camera_key, frontend_key = self._known.sessions[node.session.bytes]
         key = self._rows.new(
             nodes,
             uuid=node.id.bytes,
@@ -597,31 +552,6 @@ class RevisionWriter:
         size_bytes = len(stored.landmarks) + len(stored.thumbnail or b"")
         self._rows.put(frames, {"node": key, "revision": self._revision_key, **blobs}, size_bytes)
         return key
-
-    def _node_key(self, node: NodeId, what: str) -> int:
-        key = self._keys.find_node(node)
-        if key is None:
-            raise InputError(f"{what}: node {node} is not in the map; add it first")
-        return key
-
-    def _node_keys(
-        self, indices: NDArray[np.int32], node_ids: Sequence[NodeId]
-    ) -> NDArray[np.int64]:
-        used, inverse = np.unique(indices, return_inverse=True)
-        keys = [self._node_key(node_ids[int(index)], "attempt") for index in used]
-        return np.array(keys, np.int64)[inverse]
-
-    def _sequences_of(self, path_key: int) -> set[int]:
-        """Sequence numbers of the visible entries of a path."""
-        if path_key not in self._sequences:
-            query = (
-                self._view.select(path_entries)
-                .with_only_columns(path_entries.c.sequence)
-                .where(path_entries.c.path == path_key)
-            )
-            with self._database.reading() as connection:
-                self._sequences[path_key] = set(connection.execute(query).scalars())
-        return self._sequences[path_key]
 
     def _shown_again(self, table: Table, uuid: bytes) -> int | None:
         """Key of a hidden row that this revision shows again; None without one."""
