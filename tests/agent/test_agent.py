@@ -6,6 +6,7 @@ import pytest
 from tests.centre.conftest import Site, admit_here, drive
 
 from engram.agent import Agent, AgentSettings
+from engram.agent.link import CentreRefusedError, Unreachable
 from engram.centre.backup import back_up
 from engram.centre.worker import merging
 from engram.errors import InputError, StorageFullError
@@ -107,3 +108,55 @@ def test_a_drive_between_fetching_and_parking_is_not_lost(site):
 def test_a_folder_that_is_not_enrolled_is_named(tmp_path):
     with pytest.raises(InputError, match="engram agent enrol"):
         Agent(tmp_path)
+
+
+def test_a_hand_in_of_more_parts_than_one_answer_names_is_sent_whole(site, monkeypatch):
+    monkeypatch.setattr("engram.centre.api.transfers._WANTED_AT_ONCE", 3)
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000, 10)
+    agent.hand_in()
+    site.settle()
+    assert [row["state"] for row in agent.status()["outbox"]] == ["settled"]
+    with Map.open(site.centre.map_path("fleet")) as store:
+        assert store.node_count() == 10
+
+
+def test_a_download_of_more_parts_than_one_request_names_is_fetched_whole(site, monkeypatch):
+    monkeypatch.setattr("engram.agent.fetching._ASKED_AT_ONCE", 3)
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000, 10)
+    first.hand_in()
+    site.settle()
+    assert second.switch()
+    with Map.open(second.live) as store:
+        assert store.node_count() == 10
+
+
+def test_a_robot_without_a_mission_hands_in_and_fetches_nothing(site):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    first.hand_in()
+    for agent in (first, second):
+        agent.step(fetch=False)
+    site.work()
+    second.step(fetch=False)
+    assert second.status()["staged"] is None
+    assert site.work() == 0  # no download was asked for
+    site.settle()
+    assert second.status()["staged"] is not None
+
+
+def test_what_the_centre_cannot_make_is_told_apart_from_a_broken_link(site):
+    agent = site.robot("r1")
+    site.link.fates = ["lost"]
+    agent.step()
+    assert isinstance(agent.trouble, Unreachable)
+    agent.step()
+    assert agent.trouble is None
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    site.settle()
+    with Agent(agent.folder, AgentSettings(download={"nothing": 1}), client=site.link) as wrong:
+        wrong.state.remember(staged=None)
+        wrong.step()
+        assert isinstance(wrong.trouble, CentreRefusedError)

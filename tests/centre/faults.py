@@ -127,7 +127,7 @@ class _Streamed:
     def json(self) -> Any:
         return self._answer.json()
 
-    def iter_bytes(self, size: int) -> Iterator[bytes]:
+    def iter_bytes(self, size: int = 4_096) -> Iterator[bytes]:
         body = self._answer.content
         if self._share is not None:
             body = body[: int(self._share * len(body))]

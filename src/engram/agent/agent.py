@@ -25,7 +25,7 @@ from engram.agent.link import CentreRefusedError, Link, Unreachable, new_client
 from engram.agent.sending import FAILED, QUEUED, SENT, Outbox
 from engram.agent.settings import AgentSettings
 from engram.agent.state import AgentState
-from engram.errors import InputError, MapError, StorageFullError
+from engram.errors import EngramError, InputError, MapError, StorageFullError
 from engram.files import WriterLock
 from engram.maps import Map, check_file, copy_map
 from engram.monitor import write_whole
@@ -81,6 +81,9 @@ class Agent:
         wait: waits some seconds, for the cap of the link.
         chance: uniform in [0, 1), for the jitter of retries.
 
+    Attributes:
+        trouble: why the last round failed; None after a good one. `Unreachable` passes by itself.
+
     Raises:
         InputError: the robot is not enrolled.
     """
@@ -101,7 +104,9 @@ class Agent:
         self.folder = folder
         self.settings = settings or AgentSettings()
         self.state = AgentState(folder / "agent.sqlite")
+        self.trouble: EngramError | None = None
         self._chance = chance
+        self._owns_client = client is None
         self.live = folder / "live" / MAP
         for part in _PARTS:
             (folder / part).mkdir(exist_ok=True)
@@ -123,8 +128,10 @@ class Agent:
         self.close()
 
     def close(self) -> None:
-        """Closes its files."""
+        """Closes its files, and its connections."""
         self.state.close()
+        if self._owns_client:
+            self.link.close()
 
     def hand_in(self) -> str | None:
         """Queues what the live map holds; call it after each drive. No link is needed.
@@ -159,27 +166,32 @@ class Agent:
         self.fall_back()
         return True
 
-    def step(self) -> float:
+    def step(self, *, fetch: bool = True) -> float:
         """One round: report, send, fetch. Never raises for the link's sake.
+
+        Args:
+            fetch: whether to fetch the wanted version; False while the next mission is not known.
 
         Returns:
             Seconds until the next round.
         """
         try:
-            busy = self._round()
+            busy = self._round(fetch)
         except (Unreachable, CentreRefusedError, MapError) as error:
+            self.trouble = error
             failures = self.state.fact("failures", 0) + 1
             self.state.remember(failures=failures, trouble=str(error))
             longest: float = self.settings.first_retry_s * 2.0 ** min(failures - 1, 40)
             return min(longest, self.settings.longest_retry_s) * (0.5 + self._chance() / 2)
+        self.trouble = None
         self.state.remember(failures=0, trouble="")
         return 0.0 if busy else self.settings.idle_s
 
-    def _round(self) -> bool:
+    def _round(self, fetch: bool) -> bool:
         wanted = self.link.ask("PUT", f"/v1/maps/{self._map}/robots/me/report", self._report())
         self.state.remember(wanted=wanted["version"], durable=wanted["durable_revision"])
         busy = self.outbox.send(self.link, wanted["durable_revision"])
-        return self._fetch(wanted["revision"], wanted["version"]) or busy
+        return (fetch and self._fetch(wanted["revision"], wanted["version"])) or busy
 
     def _report(self) -> dict[str, Any]:
         fact = self.state.fact

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     import httpx
 
 BUNDLE = "application/vnd.engram.bundle"
-_PIECE = 65536
 
 
 class CentreRefusedError(EngramError):
@@ -75,6 +74,10 @@ class Link:
         self.sent_bytes = 0
         self.received_bytes = 0
 
+    def close(self) -> None:
+        """Closes the client's connections."""
+        self._client.close()
+
     def ask(self, method: str, path: str, body: Any = None) -> Any:
         """One request with JSON in and out.
 
@@ -107,7 +110,7 @@ class Link:
                 if answer.status_code >= 400:
                     answer.read()
                     self._refuse(answer)
-                for piece in answer.iter_bytes(_PIECE):
+                for piece in answer.iter_bytes():  # in pieces of a size, a cut loses one
                     self.received_bytes += len(piece)
                     yield from opened.feed(piece)
                     self._pace(len(piece))

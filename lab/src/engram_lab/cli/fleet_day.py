@@ -38,7 +38,7 @@ def fleet_day(
     from engram.cli.progress import Bars
     from engram_lab.fleet_day import run_day
 
-    report = run_day(out, Bars(), workers)
+    report = run_day(out, Bars(), workers, lambda line: typer.echo(line, err=True))
     if as_json:
         print(json.dumps(report.to_dict()))
     else:
@@ -58,30 +58,32 @@ def _show(report: DayReport) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table("robot", "download", title="Second foray: own map against the fleet's")
-    for column in (
-        "localised: own",
-        "fleet's",
-        "new nodes: own",
-        "fleet's",
-        "sent, kB",
-        "received",
-    ):
+    table = Table("robot", "map", title="Second foray: own map, and a download of the fleet's")
+    for column in ("nodes", "localised", "new nodes", "sent kB", "received kB"):
         table.add_column(column, justify="right")
     for one in report.forays:
-        table.add_row(
-            one.robot,
-            one.download,
-            f"{one.alone:.0%}",
-            f"{one.shared:.0%}",
-            str(one.nodes_alone),
-            str(one.nodes_shared),
-            f"{one.sent_bytes / 1e3:.0f}",
-            f"{one.received_bytes / 1e3:.0f}",
+        fallen = ", fell back" if one.fell_back else ""
+        rows = (
+            ("own", one.alone, "", ""),
+            (
+                f"{one.download}{fallen}",
+                one.shared,
+                f"{one.sent_bytes / 1e3:.0f}",
+                f"{one.received_bytes / 1e3:.0f}",
+            ),
         )
+        for name, (whose, drive, sent, received) in zip((one.robot, ""), rows, strict=True):
+            counts = (str(drive.held), f"{drive.localised:.0%}", str(drive.added))
+            table.add_row(name, whose, *counts, sent, received)
+        table.add_section()
     console = Console()
     console.print(table)
-    console.print(
+    typer.echo(
         f"{report.nodes} nodes in {report.revisions} revisions; {report.passed_bytes / 1e6:.1f} MB "
         f"passed the link, which broke {report.cuts} times; {report.faults} faults in any map"
+    )
+    longest = max(report.stages_s, key=lambda one: report.stages_s[one])
+    typer.echo(
+        f"{sum(report.stages_s.values()):.0f} s, of which {report.stages_s[longest]:.0f} s: "
+        f"{longest}"
     )

@@ -44,7 +44,11 @@ class CuttingProxy:
         with suppress(OSError):  # closed
             while True:
                 ours, _ = self._listener.accept()
-                theirs = socket.create_connection(("127.0.0.1", self._target))
+                try:
+                    theirs = socket.create_connection(("127.0.0.1", self._target))
+                except OSError:  # nobody there now: the caller hears it, others may come
+                    ours.close()
+                    continue
                 left = [self._cut_bytes]
                 for source, sink in ((ours, theirs), (theirs, ours)):
                     source.settimeout(_LONGEST_S)
@@ -56,11 +60,11 @@ class CuttingProxy:
         with suppress(OSError):  # the other way was dropped
             while piece := source.recv(_PIECE):
                 with self._lock:
-                    part = piece[: max(left[0], 0)]
-                    left[0] -= len(piece)
+                    part = piece[: left[0]]
+                    is_cut = len(part) == left[0]
+                    self.cuts += is_cut and bool(part)  # once, not once a direction
+                    left[0] -= len(part)
                     self.passed_bytes += len(part)
-                    is_cut = left[0] <= 0
-                    self.cuts += is_cut
                 sink.sendall(part)
                 if is_cut:
                     break

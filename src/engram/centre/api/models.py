@@ -153,7 +153,7 @@ class HandIn(BaseModel):
     begun_ns: int
     ended_ns: int | None
     wanted: Annotated[
-        list[str], Field(description="parts to send, while it is open", examples=[[_HASH]])
+        list[str], Field(description="the next parts to send, while it is open", examples=[[_HASH]])
     ] = []
 
 
