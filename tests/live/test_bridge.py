@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 import engram.live.link
 from engram.frontend import StereoPair
 from engram.geometry import SE3
+from engram.localiser import LocalisationStatus
 from engram.robot import map_drive, open_drive
 
 PACKAGE = Path(__file__).parents[2] / "ros" / "engram_bridge"
@@ -164,6 +165,7 @@ def test_the_wheels_pose_at_the_time_of_an_image() -> None:
     assert wheels.at(10) is None, "the clock went back"
 
 
+PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEAD_RECKONING}
 BASE_FROM_CAMERA = rigid.of_xyz_rpy([0.5, 0.1, 1.2, -np.pi / 2, 0.0, -np.pi / 2])
 
 
@@ -209,8 +211,12 @@ def test_the_map_corrects_and_stays_while_nothing_is_seen() -> None:
     kept = belief.map_from_odom
     np.testing.assert_allclose((kept @ belief.odom_from_base)[:3, 3], [10.0, 20.0, 0.0], atol=1e-9)
     assert belief.map_pose is not None
-    for ahead in range(2, 40):
-        belief.hear(seen(ahead, float(ahead), "lost", map_from_live), 0.0)
+    belief.hear(seen(2, 2.0, LocalisationStatus.DEAD_RECKONING, map_from_live), 0.0)
+    assert belief.map_pose is not None, "carried on by odometry, with its covariance"
+    unplaced = [one for one in LocalisationStatus if one not in PLACED]
+    for ahead in range(3, 40):
+        status = unplaced[ahead % len(unplaced)]
+        belief.hear(seen(ahead, float(ahead), status, map_from_live), 0.0)
         assert belief.map_pose is None, "no pose of a lost robot"
     np.testing.assert_array_equal(belief.map_from_odom, kept)
 
@@ -223,6 +229,8 @@ def test_the_report_never_pretends() -> None:
     assert belief.report(2.5)[0] == 2
     belief.hear({"is": "alive", "status": "no images", "trouble": ""}, 3.0)
     assert belief.report(3.1)[:2] == (2, "no images")
+    belief.began()
+    assert belief.report(3.1)[:2] == (1, "starting"), "what the old process said is not said again"
     belief.hear({"is": "alive", "status": "lost", "trouble": ""}, 3.0)
     assert belief.report(3.1)[:2] == (1, "lost")
 

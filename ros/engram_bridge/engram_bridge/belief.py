@@ -44,6 +44,8 @@ class Belief:
         with self.lock:
             self._odom_from_start = self.odom_from_base
             self._covariance_at_start = self.odom_covariance
+            # What the old process said of itself is not true of the new one.
+            self._last, self._alive = {}, {}
 
     def hear(self, message, now_s: float) -> bool:
         """Takes a message; True if it moved the robot."""
@@ -87,7 +89,7 @@ class Belief:
         """
         if self._last.get("map_covariance") is None or self._last.get("map_from_live") is None:
             return None
-        if self._last.get("status") not in ("localised", "dead reckoning"):
+        if self._last.get("status") not in ("localised", "dead_reckoning"):
             return None
         map_from_base = _matrix(self._last["map_from_live"], 4) @ self._camera_from_base
         covariance = _matrix(self._last["map_covariance"], 6)

@@ -67,10 +67,10 @@ class Bridge(Node):
         super().__init__("engram")
         for name, value in _PARAMETERS.items():
             self.declare_parameter(name, value)
-        self._belief = Belief(rigid.of_xyz_rpy(self._given("base_from_camera")))
+        self._base_from_camera = rigid.of_xyz_rpy(self._given("base_from_camera"))
+        self._belief = Belief(self._base_from_camera)
         self._pairs = Pairs(int(1e6 * self._given("pair_tolerance_ms")))
         self._wheels = Wheels()
-        self._base_from_camera = rigid.of_xyz_rpy(self._given("base_from_camera"))
         self._infos = [None, None]
         self._path = Path()
         self._publish()

@@ -92,10 +92,6 @@ class Supervisor:
         with self._lock:
             return self._link is not None and self._send(message)
 
-    def change(self, command) -> None:
-        """Uses other arguments from the next start on."""
-        self._command = list(command)
-
     def _run(self) -> None:
         wait_s = _FIRST_WAIT_S
         while not self._ended.is_set():

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError, MissingExtraError
 from engram.frontend import StereoPair
-from engram.localiser import Localisation
+from engram.localiser import Localisation, LocalisationStatus
 from engram.localiser.attempts import best_success
 from engram.maps import Map
 from engram.robot.robot import Seen
 
 _STATUS_COLOURS = {
-    "localised": (60, 180, 75),
-    "dead reckoning": (255, 165, 0),
-    "lost": (220, 50, 50),
+    LocalisationStatus.LOCALISED: (60, 180, 75),
+    LocalisationStatus.DEAD_RECKONING: (255, 165, 0),
+    LocalisationStatus.LOST: (220, 50, 50),
 }
 _GREY = (140, 140, 140)
 _JPEG_QUALITY = 80
@@ -67,13 +67,12 @@ class Viewer:
         if isinstance(seen.arrived, StereoPair):
             image = rr.Image(seen.arrived.left).compress(jpeg_quality=_JPEG_QUALITY)
             stream.log("live/image", image)
-        status = found.status.value
-        colour = _STATUS_COLOURS.get(status, _GREY)
+        colour = _STATUS_COLOURS.get(found.status, _GREY)
         pixels, best = seen.frame.landmarks.pixels, best_success(seen.outcomes)
         stream.log("live/image/landmarks", rr.Points2D(pixels, colors=_GREY, radii=1.0))
         inliers = pixels[:0] if best is None else pixels[best.match.live_rows]
         stream.log("live/image/inliers", rr.Points2D(inliers, colors=colour, radii=2.0))
-        stream.log("status", rr.TextLog(status, color=colour))
+        stream.log("status", rr.TextLog(found.status.value, color=colour))
         stream.log("confidence", rr.Scalars(max(found.confidence, -20.0)))
         stream.log("inliers", rr.Scalars(found.inliers))
         self._show_candidates(seen)
@@ -91,7 +90,10 @@ class Viewer:
     def _show_candidates(self, seen: Seen) -> None:
         tried = [one for one in seen.outcomes if one.candidate.node in self._opened.graph]
         places = [self._opened.frame.pose(one.candidate.node).translation for one in tried]
-        colours = [_STATUS_COLOURS["localised" if one.accepted else "lost"] for one in tried]
+        right, wrong = (
+            _STATUS_COLOURS[one] for one in (LocalisationStatus.LOCALISED, LocalisationStatus.LOST)
+        )
+        colours = [right if one.accepted else wrong for one in tried]
         points = self._rr.Points3D(np.reshape(places, (-1, 3)), colors=colours, radii=0.6)
         self._stream.log("map/tried", points)
 
