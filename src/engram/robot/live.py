@@ -192,10 +192,12 @@ class IntoMap:
                 f"{opened.location} already holds session {session.id}; give its recording to "
                 "engram map, which continues an interrupted session"
             )
-        configuration = configuration_of(owner.settings, owner.options)
-        writer = begin_or_resume(
-            opened, session, owner.camera, made_by, configuration, f"map {session.robot}"
-        )
+        about = {
+            "author": session.robot,
+            "message": f"map {session.robot}",
+            "configuration": configuration_of(owner.settings, owner.options),
+        }
+        writer = begin_or_resume(opened, session, owner.camera, made_by, about)
         self._drive = SavedDrive(
             opened, writer, self.localiser, owner.settings, self._words, waits=False
         )

@@ -12,8 +12,8 @@ from engram.doctor import Diagnosis
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, Frontend, feature_kind
 from engram.graph.model import Session
-from engram.localiser import Localisation, Position
-from engram.maps import Map, SessionState, open_map
+from engram.localiser import Localisation, Localiser, Position
+from engram.maps import Map, RevisionWriter, SessionState, open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.examining import LookedAhead, facts_of, refuse_unfit
 from engram.robot.front import Front
@@ -120,7 +120,8 @@ def map_drive(
             report.known = True
             return report
         report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
-        _map(opened, sequence, settings, options, monitor, start, report)
+        settings = settings.for_descriptor(opened.descriptor)
+        _Mapping(opened, sequence, settings, options, start, report).run(monitor)
     report.skipped = sequence.skipped
     return report
 
@@ -135,76 +136,76 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
         raise ConfigError(f"{what} has {found} features, not {asked}; omit --features, or {mend}")
 
 
-def _map(
-    opened: Map,
-    sequence: DriveSequence,
-    settings: Settings,
-    options: RobotOptions,
-    monitor: Monitor,
-    start: Callable[[Map], Position | None] | None,
-    report: MapReport,
-) -> None:
-    """Drives through the sequence; commits at the end, or leaves the session for a later run."""
-    settings = settings.for_descriptor(opened.descriptor)
-    front = Front(settings)
-    front.examination.evidence.facts = facts_of(sequence)
-    try:
-        with closing(LookedAhead(front, sequence, monitor)) as drive:
-            report.diagnosis = front.diagnosis
-            refuse_unfit(report.diagnosis, sequence.info.name, options)
-            _map_on(opened, drive, front, settings, options, monitor, start, report)
-    except KeyboardInterrupt:
-        report.interrupted = True
+@dataclass(frozen=True)
+class _Mapping:
+    """One run of `map_drive`, on the open map."""
 
+    opened: Map
+    sequence: DriveSequence
+    settings: Settings
+    options: RobotOptions
+    start: Callable[[Map], Position | None] | None
+    report: MapReport
 
-def _map_on(
-    opened: Map,
-    drive: LookedAhead,
-    front: Front,
-    settings: Settings,
-    options: RobotOptions,
-    monitor: Monitor,
-    start: Callable[[Map], Position | None] | None,
-    report: MapReport,
-) -> None:
-    """The same for a drive that is fit, or forced."""
-    sequence, session, diagnosis = drive.sequence, report.session, report.diagnosis
-    assert diagnosis is not None
-    forced = ", ".join(one.code for one in diagnosis.fatal)
-    writer = begin_or_resume(
-        opened,
-        session,
-        sequence.camera,
-        _made_by(sequence, settings),
-        {**configuration_of(settings, options), "doctor": diagnosis.to_dict()},
-        f"map {sequence.info.name}" + (f" (forced: {forced})" if forced else ""),
-        options.author,
-    )
-    words = node_words(opened, settings, options.relocaliser)
-    localiser = localiser_in(
-        opened,
-        sequence.camera,
-        settings,
-        policy=options.policy,
-        budget=options.budget,
-        relocaliser=options.relocaliser,
-        live=session.id,
-        saves=True,
-        threads=options.threads,
-        clock=session,
-    )
-    position = None if start is None or report.resumed else start(opened)
-    if position is not None:
-        localiser.place_at(position)
-    saved = SavedDrive(opened, writer, localiser, settings, words)
-    robot = Robot(front, localiser, saved.mapper, deadline_ms=options.deadline_ms)
-    try:
-        with robot, closing(robot.drive(drive, monitor)) as found:
-            report.results.extend(one for one in found if not one.resumed)
-        saved.finish()
-    finally:
-        saved.close()
-    report.revision = saved.commit().number
+    def run(self, monitor: Monitor) -> None:
+        """Drives through the sequence; commits at the end, or leaves it for a later run."""
+        front = Front(self.settings)
+        front.examination.evidence.facts = facts_of(self.sequence)
+        try:
+            with closing(LookedAhead(front, self.sequence, monitor)) as drive:
+                self.report.diagnosis = front.diagnosis
+                refuse_unfit(front.diagnosis, self.sequence.info.name, self.options)
+                self._save(drive, front, monitor)
+        except KeyboardInterrupt:
+            self.report.interrupted = True
+
+    def _save(self, drive: LookedAhead, front: Front, monitor: Monitor) -> None:
+        """The same for a drive that is fit, or forced."""
+        localiser = self._localiser()
+        words = node_words(self.opened, self.settings, self.options.relocaliser)
+        saved = SavedDrive(self.opened, self._writer(), localiser, self.settings, words)
+        robot = Robot(front, localiser, saved.mapper, deadline_ms=self.options.deadline_ms)
+        try:
+            with robot, closing(robot.drive(drive, monitor)) as found:
+                self.report.results.extend(one for one in found if not one.resumed)
+            saved.finish()
+        finally:
+            saved.close()
+        self.report.revision = saved.commit().number
+
+    def _writer(self) -> RevisionWriter:
+        """The writer of the drive's revision."""
+        diagnosis = self.report.diagnosis
+        assert diagnosis is not None
+        forced = ", ".join(one.code for one in diagnosis.fatal)
+        session, name = self.report.session, self.sequence.info.name
+        configuration = configuration_of(self.settings, self.options)
+        about = {
+            "author": self.options.author or session.robot,
+            "message": f"map {name}" + (f" (forced: {forced})" if forced else ""),
+            "configuration": {**configuration, "doctor": diagnosis.to_dict()},
+        }
+        made_by = _made_by(self.sequence, self.settings)
+        return begin_or_resume(self.opened, session, self.sequence.camera, made_by, about)
+
+    def _localiser(self) -> Localiser:
+        """The localiser, at the position that `start` gives a new drive."""
+        localiser = localiser_in(
+            self.opened,
+            self.sequence.camera,
+            self.settings,
+            policy=self.options.policy,
+            budget=self.options.budget,
+            relocaliser=self.options.relocaliser,
+            live=self.report.session.id,
+            saves=True,
+            threads=self.options.threads,
+            clock=self.report.session,
+        )
+        position = None if self.start is None or self.report.resumed else self.start(self.opened)
+        if position is not None:
+            localiser.place_at(position)
+        return localiser
 
 
 def _made_by(sequence: DriveSequence, settings: Settings) -> tuple[DescriptorKind, str]:

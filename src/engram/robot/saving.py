@@ -84,9 +84,7 @@ def begin_or_resume(
     session: Session,
     camera: StereoCamera,
     made_by: tuple[DescriptorKind, str],
-    configuration: dict[str, Any],
-    message: str,
-    author: str | None = None,
+    about: dict[str, Any],
 ) -> RevisionWriter:
     """The writer of a drive: for a new session, or an interrupted one.
 
@@ -95,9 +93,7 @@ def begin_or_resume(
         session: the drive.
         camera: its camera.
         made_by: kind of its descriptors, and hash of the front-end.
-        configuration: see `configuration_of`.
-        message: message of the revision, shown by ``engram log``.
-        author: author of the revision; None for the robot.
+        about: author, message and configuration (`configuration_of`) of a new revision.
 
     Raises:
         MapError: the map already holds the drive, or cannot be written.
@@ -105,13 +101,7 @@ def begin_or_resume(
     if opened.session_state(session.id) is SessionState.INTERRUPTED:
         return opened.resume_session(session.id)
     return opened.begin_session(
-        session,
-        camera,
-        descriptor=made_by[0],
-        frontend=made_by[1],
-        author=author or session.robot,
-        configuration=configuration,
-        message=message,
+        session, camera, descriptor=made_by[0], frontend=made_by[1], **about
     )
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypedDict, Unpack
 
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.bags import BagSequence, is_bag, open_bag
@@ -116,7 +117,7 @@ def open_sequence(
     path: str | Path,
     *,
     format: str | None = None,  # noqa: A002, the word of the command line
-    **given: Any,
+    **given: Unpack[OpenArguments],
 ) -> Drive:
     """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
 
@@ -126,7 +127,7 @@ def open_sequence(
     Args:
         path: folder or file of the drive.
         format: key of `SEQUENCES`; None recognises the layout by its files.
-        **given: arguments of `options_of`.
+        **given: see `OpenArguments`.
 
     Raises:
         SequenceError: the path does not exist, has no known layout, or its images or stamps
@@ -149,28 +150,10 @@ def open_sequence(
     return layout.open(path, options)
 
 
-def options_of(
-    *,
-    rig: Rig | str = Rig.GREY,
-    channel: Channel | str = Channel.GREY,
-    frames: FrameRange | str | None = None,
-    skip_bad: bool = False,
-    pair_tolerance_ns: int = 5_000_000,
-    robot: str | None = None,
-    start: str | datetime | int | None = None,
-    longitude_deg: float | None = None,
-    zone: str | None = None,
-    times: TimeRange | None = None,
-    calibration: str | Path | None = None,
-    field_of_view_deg: float | None = None,
-    mask: str | Path | None = None,
-    left: str | None = None,
-    right: str | None = None,
-    motion: Sequence[str] = (),
-) -> OpenOptions:
-    """The options of `open_sequence`, from plain values.
+class OpenArguments(TypedDict, total=False):
+    """How to open a drive, as plain values; see `OpenOptions` for the defaults.
 
-    Args:
+    Attributes:
         rig: "grey" or "colour" (or "color"), if the robot has both (KITTI).
         channel: "grey", or one channel of colour images: "red", "green", "blue".
         frames: which frames are used, as `FrameRange` or text START:STOP:STEP.
@@ -189,28 +172,54 @@ def options_of(
         mask: image that is black where the robot sees itself, of the size of the drive's images.
         left, right: topics of a bag's images; None finds them by their names.
         motion: topics of a bag, or files, with odometry or a gyroscope's rates.
+    """
+
+    rig: Rig | str
+    channel: Channel | str
+    frames: FrameRange | str | None
+    skip_bad: bool
+    pair_tolerance_ns: int
+    robot: str | None
+    start: str | datetime | int | None
+    longitude_deg: float | None
+    zone: str | None
+    times: TimeRange | None
+    calibration: str | Path | None
+    field_of_view_deg: float | None
+    mask: str | Path | None
+    left: str | None
+    right: str | None
+    motion: Sequence[str]
+
+
+def options_of(**given: Unpack[OpenArguments]) -> OpenOptions:
+    """The options of `open_sequence`, from plain values.
 
     Raises:
         ConfigError: an argument is out of range.
     """
-    return OpenOptions(
-        rig=parse_choice(Rig, rig),
-        channel=parse_choice(Channel, channel),
-        frames=FrameRange.parse(frames) if isinstance(frames, str) else frames or FrameRange(),
-        skip_bad=skip_bad,
-        pair_tolerance_ns=pair_tolerance_ns,
-        robot=robot,
-        start_ns=parse_start(start),
-        longitude_deg=longitude_deg,
-        zone=zone,
-        times=times or TimeRange(),
-        calibration=None if calibration is None else Path(calibration),
-        field_of_view_deg=field_of_view_deg,
-        mask=None if mask is None else Path(mask),
-        left=left,
-        right=right,
-        motion=tuple(motion),
-    )
+    values: dict[str, Any] = {
+        name: _PARSERS[name](value) if name in _PARSERS and value is not None else value
+        for name, value in given.items()
+    }
+    for absent in [name for name in ("frames", "times") if values.get(name, "") is None]:
+        del values[absent]
+    if "start" in values:
+        values["start_ns"] = values.pop("start")
+    return OpenOptions(**values)
+
+
+_PARSERS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
+    {
+        "rig": partial(parse_choice, Rig),
+        "channel": partial(parse_choice, Channel),
+        "frames": lambda given: FrameRange.parse(given) if isinstance(given, str) else given,
+        "start": parse_start,
+        "calibration": Path,
+        "mask": Path,
+        "motion": tuple,
+    }
+)
 
 
 def recognise(path: Path) -> str:
