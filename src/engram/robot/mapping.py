@@ -161,9 +161,10 @@ class _Mapping:
 
     def _save(self, drive: LookedAhead, front: Front, monitor: Monitor) -> None:
         """The same for a drive that is fit, or forced."""
-        localiser = self._localiser()
+        writer = self._writer()  # first: what follows reads a resumed session's nodes
         words = node_words(self.opened, self.settings, self.options.relocaliser)
-        saved = SavedDrive(self.opened, self._writer(), localiser, self.settings, words)
+        localiser = self._localiser()
+        saved = SavedDrive(self.opened, writer, localiser, self.settings, words)
         robot = Robot(front, localiser, saved.mapper, deadline_ms=self.options.deadline_ms)
         try:
             with robot, closing(robot.drive(drive, monitor)) as found:
