@@ -119,7 +119,8 @@ def graph_chains(
     graph: GraphArrays,
     root: int,
     goals: NDArray[np.int32],
-    usable: NDArray[np.uint8] | None = None,
+    edges: NDArray[np.int32] | None = None,
+    closed: NDArray[np.int32] | None = None,
 ) -> tuple[
     NDArray[np.int32],
     NDArray[np.int32],
@@ -248,7 +249,6 @@ class RecallCandidates:
         sessions: NDArray[np.int32],
         costs: NDArray[np.float64],
         prior: NDArray[np.float64],
-        session_count: int,
     ) -> None: ...
 
 class RecallConstants:

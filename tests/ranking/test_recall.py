@@ -314,7 +314,6 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
             "sessions": node,
             "costs": one,
             "prior": one,
-            "session_count": 1,
         },
     }
     good_run, good_candidates = (make(**values) for make, values in groups.items())
@@ -332,13 +331,6 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match="recall_order"):
             make(**{**groups[make], name: bad})
-    elsewhere = _core.RecallRun(**{**groups[_core.RecallRun], "sessions": np.ones(1, np.int32)})
-    nowhere = _core.RecallCandidates(
-        **{**groups[_core.RecallCandidates], "sessions": np.full(1, -1, np.int32)}
-    )
-    for run, candidates in ((elsewhere, good_candidates), (good_run, nowhere)):
-        with pytest.raises(ValueError, match="no such session"):
-            _core.recall_order(run, candidates, constants)
     for name, bad in (
         ("memory_m", 0.0),
         ("tally_memory_m", np.nan),
@@ -361,3 +353,20 @@ def test_path_memory_is_left_alone() -> None:
     before = memory_of(context.graph, [[0, 1]]).paths
     RecallPolicy().rank(context)
     assert list(context.path_memory.paths) == list(before)
+
+
+def test_sessions_without_candidates_cost_nothing() -> None:
+    """Numbers of sessions are names: work and memory follow the candidates, not the map."""
+    nodes, far = np.arange(2, dtype=np.int32), np.array([2**31 - 1, 7], np.int32)
+    near = np.array([1, 0], np.int32)
+    one = np.ones(2)
+    orders = []
+    for sessions in (far, near):
+        run = _core.RecallRun(
+            9.0, one, nodes, sessions, one, one, np.ones(2, np.bool_), np.array([90, 25])
+        )
+        candidates = _core.RecallCandidates(nodes, sessions, one, np.zeros(2))
+        orders.append(_core.recall_order(run, candidates, RecallPolicy()._bound))
+    for a, b in zip(*orders, strict=True):
+        assert np.array_equal(a, b)
+    assert orders[0][0].tolist() == [0, 1]

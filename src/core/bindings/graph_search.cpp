@@ -88,16 +88,25 @@ auto graph_candidates(const Graph &arrays, int64_t reference,
 }
 
 auto graph_chains(const Graph &arrays, int64_t root, const Input<int32_t, 1> &goals,
-                  std::optional<Input<uint8_t, 1>> usable) {
+                  std::optional<Input<int32_t, 1>> edges,
+                  std::optional<Input<int32_t, 1>> closed) {
   const engram::GraphView graph = arrays.view();
   check_node(graph, root, "root");
-  if (usable && usable->shape(0) != static_cast<size_t>(graph.edge_count))
-    throw std::invalid_argument("graph_chains: expected usable (E,)");
+  if (!edges && closed)
+    throw std::invalid_argument("graph_chains: closed nodes need a list of usable edges");
+  for (const auto &list : {edges, closed})
+    if (list && !std::is_sorted(list->data(), list->data() + list->shape(0)))
+      throw std::invalid_argument("graph_chains: edges and closed must be ascending");
   // The search counts each goal once, and finds it by halving.
   std::vector<int32_t> ascending(goals.data(), goals.data() + goals.shape(0));
   std::sort(ascending.begin(), ascending.end());
   ascending.erase(std::unique(ascending.begin(), ascending.end()), ascending.end());
-  const engram::SearchLimits limits{nullptr,          0, 0, 0, usable ? usable->data() : nullptr,
+  engram::Passage passage{};
+  if (edges)
+    passage = {edges->data(), static_cast<int64_t>(edges->shape(0)),
+               closed ? closed->data() : nullptr,
+               closed ? static_cast<int64_t>(closed->shape(0)) : 0};
+  const engram::SearchLimits limits{nullptr,          0, 0, 0, edges ? &passage : nullptr,
                                     ascending.data(), static_cast<int32_t>(ascending.size())};
   std::vector<int32_t> nodes, parents, halves;
   std::vector<double> poses, errors_out;
@@ -192,7 +201,9 @@ void bind_graph_search(nb::module_ &module) {
              "reference_from_live"_a, "live_error"_a, "limits"_a,
              "Columns of a Neighbourhood: the nodes near the live camera.");
   module.def("graph_chains", &graph_chains, "graph"_a, "root"_a, "goals"_a,
-             "usable"_a = nb::none(),
+             "edges"_a = nb::none(), "closed"_a = nb::none(),
              "Least uncertain chains from a root: nodes (N,), parent rows (N,), half edges (N,), "
-             "root_from_node (N, 12), errors (N, 6: tau, s0, s1, s2).");
+             "root_from_node (N, 12), errors (N, 6: tau, s0, s1, s2). Usable are `edges`, and those "
+             "that touch none of the `closed` nodes; without `closed` no other edge, without "
+             "`edges` all.");
 }

@@ -47,19 +47,13 @@ struct Run {
 struct Candidates {
   Input<int32_t, 1> nodes, sessions;
   Input<double, 1> costs, prior;
-  int64_t session_count;
 
   Candidates(Input<int32_t, 1> nodes, Input<int32_t, 1> sessions, Input<double, 1> costs,
-             Input<double, 1> prior, int64_t session_count)
-      : nodes(nodes), sessions(sessions), costs(costs), prior(prior), session_count(session_count) {
+             Input<double, 1> prior)
+      : nodes(nodes), sessions(sessions), costs(costs), prior(prior) {
     require_length(sessions, nodes.shape(0));
     require_length(costs, nodes.shape(0));
     require_length(prior, nodes.shape(0));
-  }
-
-  void check(const Input<int32_t, 1> &some) const {
-    for (size_t i = 0; i < some.shape(0); ++i)
-      require(some.data()[i] >= 0 && some.data()[i] < session_count, "no such session");
   }
 };
 
@@ -77,8 +71,6 @@ void check(const engram::RecallConstants &c) {
 auto recall_order(const Run &run, const Candidates &candidates,
                   const engram::RecallConstants &constants) {
   const size_t count = candidates.nodes.shape(0);
-  candidates.check(candidates.sessions);
-  candidates.check(run.sessions);
   check(constants);
   engram::RecallJudgement judged;
   {
@@ -94,7 +86,7 @@ auto recall_order(const Run &run, const Candidates &candidates,
                                  static_cast<int64_t>(run.nodes.shape(0))};
     const engram::RecallCandidates seen{candidates.nodes.data(),      candidates.sessions.data(),
                                         candidates.costs.data(),      candidates.prior.data(),
-                                        static_cast<int64_t>(count),  candidates.session_count};
+                                        static_cast<int64_t>(count)};
     judged = ENGRAM_CALL(recall_order, made, seen, constants);
   }
   return nb::make_tuple(engram::to_numpy(std::move(judged.order), {count}),
@@ -113,9 +105,8 @@ void bind_recall(nb::module_ &module) {
            "inliers"_a);
   nb::class_<Candidates>(module, "RecallCandidates",
                          "The candidates, nearest first, (Y,) each.")
-      .def(nb::init<Input<int32_t, 1>, Input<int32_t, 1>, Input<double, 1>, Input<double, 1>,
-                    int64_t>(),
-           "nodes"_a, "sessions"_a, "costs"_a, "prior"_a, "session_count"_a);
+      .def(nb::init<Input<int32_t, 1>, Input<int32_t, 1>, Input<double, 1>, Input<double, 1>>(),
+           "nodes"_a, "sessions"_a, "costs"_a, "prior"_a);
   using engram::RecallConstants;
   nb::class_<RecallConstants>(module, "RecallConstants",
                               "See `engram.ranking.recall.RecallConstants`.")

@@ -177,9 +177,18 @@ private:
       const int32_t target = graph_.target[half];
       if (target < 0 || target >= graph_.node_count)
         throw std::invalid_argument("forward star: an edge leads to a node that is not there");
-      if (limits_.usable == nullptr || limits_.usable[half / 2])
+      if (limits_.passage == nullptr || usable(*limits_.passage, half / 2, node, target))
         relax(row, half, target);
     }
+  }
+
+  static bool usable(const Passage &passage, int32_t edge, int32_t a, int32_t b) {
+    const auto holds = [](const int32_t *first, int64_t count, int32_t value) {
+      return std::binary_search(first, first + count, value);
+    };
+    return (passage.closed != nullptr && !holds(passage.closed, passage.closed_count, a) &&
+            !holds(passage.closed, passage.closed_count, b)) ||
+           holds(passage.edges, passage.edge_count, edge);
   }
 
   void relax(int32_t row, int32_t half, int32_t target) {

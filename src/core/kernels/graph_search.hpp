@@ -38,12 +38,20 @@ struct Reached {
   ChainError error; // in the root's frame
 };
 
+// Which edges a search may use: those of a list, and others but those at some nodes.
+struct Passage {
+  const int32_t *edges; // ascending: always usable
+  int64_t edge_count;
+  const int32_t *closed; // ascending nodes, at which no other edge is usable; null closes all
+  int64_t closed_count;
+};
+
 struct SearchLimits {
   const double *anchor;  // (3) in the root's frame: errors are weighed as seen there; or null
   double reach_m;        // nodes further than this from the anchor are not gone through,
   double slack_sigmas;   // plus so many standard deviations of where they are,
   double slack_m;        // but no more than this
-  const uint8_t *usable; // (edges) 0 for edges to leave out; or null
+  const Passage *passage; // or null: all edges are usable
   const int32_t *goals;  // (goal_count) ascending, each once: stop when all are reached
   int32_t goal_count;    // 0 to go on to the end
 };

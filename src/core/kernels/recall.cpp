@@ -35,7 +35,13 @@ public:
           const RecallConstants &constants)
       : candidates_(candidates), constants_(constants),
         failed_(-std::log(static_cast<double>(constants.needed))),
-        of_sessions_(at(candidates.session_count)), of_nodes_(at(candidates.count)) {
+        sessions_(candidates.sessions, candidates.sessions + candidates.count),
+        of_nodes_(at(candidates.count)) {
+    std::sort(sessions_.begin(), sessions_.end());
+    sessions_.erase(std::unique(sessions_.begin(), sessions_.end()), sessions_.end());
+    of_sessions_.resize(sessions_.size());
+    for (int64_t row = 0; row < candidates.count; ++row)
+      session_of_.push_back(at(place_of(candidates.sessions[row])));
     hear(run);
     const size_t count = at(candidates.count);
     judged.tally.resize(count);
@@ -72,7 +78,14 @@ public:
   RecallJudgement judged;
 
 private:
-  size_t session(int64_t row) const { return at(candidates_.sessions[row]); }
+  size_t session(int64_t row) const { return session_of_[at(row)]; }
+
+  // Among those of the candidates, or their number: a map has many more.
+  int64_t place_of(int32_t session) const {
+    const auto found = std::lower_bound(sessions_.begin(), sessions_.end(), session);
+    const bool known = found != sessions_.end() && *found == session;
+    return (known ? found : sessions_.end()) - sessions_.begin();
+  }
 
   // A failure without a prediction tells nothing: a lost robot has dozens of them in every frame.
   static bool tells(const RecallRun &run, int64_t j) {
@@ -93,7 +106,9 @@ private:
       if (!tells(run, j))
         continue;
       const double back_m = run.at_m[j] - run.driven_m;
-      Shown &drive = of_sessions_[at(run.sessions[j])];
+      const int64_t place = place_of(run.sessions[j]);
+      Shown elsewhere;
+      Shown &drive = at(place) < sessions_.size() ? of_sessions_[at(place)] : elsewhere;
       count(run, j, std::exp(back_m / constants_.tally_memory_m), drive);
       const double margin = margin_of(run, j);
       if (std::isnan(margin))
@@ -167,6 +182,8 @@ private:
   const RecallCandidates &candidates_;
   const RecallConstants &constants_;
   const double failed_; // margin of an attempt that came to nothing: as if of one inlier
+  std::vector<int32_t> sessions_;   // of the candidates, ascending
+  std::vector<size_t> session_of_;  // by row, its place among them
   std::vector<Shown> of_sessions_;
   std::vector<Tally> of_nodes_;
 };

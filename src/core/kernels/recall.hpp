@@ -24,10 +24,10 @@ struct RecallRun {
 // The candidates, nearest first: of equals the first is preferred.
 struct RecallCandidates {
   const int32_t *nodes;
-  const int32_t *sessions; // that saved them, below `session_count`
+  const int32_t *sessions; // that saved them
   const double *costs; // margin lost by distance, but for what looks win
   const double *prior; // margin at no distance as past drives have it
-  int64_t count, session_count;
+  int64_t count;
 };
 
 // See `RecallConstants` in engram/ranking/recall.py for those that are named alike.

@@ -55,6 +55,20 @@ class ChainTree:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Passage:
+    """Which edges a search may use.
+
+    Attributes:
+        edges: (K,) int32, ascending indices in `ExperienceGraph.edges`: always usable.
+        closed: (C,) int32, ascending dense indices; other edges are usable unless they touch one
+            of these nodes. None if no other edge is usable.
+    """
+
+    edges: NDArray[np.int32]
+    closed: NDArray[np.int32] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class HalfEdges:
     """Every edge both ways, a struct of arrays.
 
@@ -453,16 +467,17 @@ class ExperienceGraph:
         return limits
 
     def chains_from(
-        self, root: int, *, goals: Sequence[int] = (), usable: NDArray[np.uint8] | None = None
+        self, root: int, *, goals: Sequence[int] = (), passage: Passage | None = None
     ) -> ChainTree:
         """Least uncertain chains from a node to all others, or until all goals are reached.
 
         Args:
             root: dense index.
             goals: dense indices of the nodes to reach; empty for all nodes.
-            usable: (E,) uint8, 0 for edges to leave out, in the order of `edges`; None for all.
+            passage: which edges to use; None for all.
         """
-        columns = _core.graph_chains(self._arrays(), root, np.array(goals, dtype=np.int32), usable)
+        lists = () if passage is None else (passage.edges, passage.closed)
+        columns = _core.graph_chains(self._arrays(), root, np.array(goals, np.int32), *lists)
         row_of = {int(node): row for row, node in enumerate(columns[0])}
         return ChainTree(root, row_of, *columns)
 

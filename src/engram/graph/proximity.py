@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from engram.config import check_bounds
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.chain_error import ChainError
-from engram.graph.graph import ChainTree, ExperienceGraph
+from engram.graph.graph import ChainTree, ExperienceGraph, Passage
 from engram.graph.model import Edge, EdgeKind
 from engram.graph.neighbourhood import Neighbourhood, Search
 
@@ -249,25 +249,30 @@ def _view_from_end(
     graph: ExperienceGraph, end: int, chain: set[int], known: Sequence[int]
 ) -> _EndView:
     """The view to the known nodes only: the cost depends on the chain, not on the map."""
-    members = np.array(sorted(chain), dtype=np.int32)
-    in_chain = np.zeros(len(graph), dtype=bool)
-    in_chain[members] = True
-    inside = in_chain[graph.edge_ends].sum(axis=1)
-    outer = (inside == 0).astype(np.uint8)
-    inner = np.zeros_like(outer)
+    outer, inner = [], []
     # An odometry edge at the end joins it to the older part of the same chain.
     for edge, number in graph.numbered_edges_of(end):
-        if inside[number] == 1 and edge.kind is not EdgeKind.PROXIMITY:
-            outer[number] = 1
+        if not _is_inside(graph, number, chain) and edge.kind is not EdgeKind.PROXIMITY:
+            outer.append(number)
     for node in chain:
         for edge, number in graph.numbered_edges_of(node):
-            if inside[number] == 2 and edge.kind is EdgeKind.ODOMETRY:
-                inner[number] = 1
-    outward = [node for node in known if not in_chain[node]]
+            if _is_inside(graph, number, chain) and edge.kind is EdgeKind.ODOMETRY:
+                inner.append(number)
+    members = np.array(sorted(chain), np.int32)
+    outward = [node for node in known if node not in chain]
     return _EndView(
-        graph.chains_from(end, goals=outward or [end], usable=outer),
-        graph.chains_from(end, usable=inner),
+        graph.chains_from(
+            end,
+            goals=outward or [end],
+            passage=Passage(np.array(sorted(outer), np.int32), closed=members),
+        ),
+        graph.chains_from(end, passage=Passage(np.array(sorted(inner), np.int32))),
     )
+
+
+def _is_inside(graph: ExperienceGraph, edge: int, chain: set[int]) -> bool:
+    """Whether both ends of an edge belong to the chain."""
+    return chain.issuperset(graph.edge_ends[edge].tolist())
 
 
 def _fused_at_junction(

@@ -8,6 +8,8 @@ them. If it comes later, the robot was rather carried elsewhere.
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,9 @@ from engram.localiser.localisation import Position
 
 # A trial ends this far beyond the distance that settles it: nothing came that could contradict.
 _PATIENCE_M = 20.0
+# Newest fixes that may be withdrawn, and frames that wait for it: a robot may stand for hours on a
+# weak match. Ten seconds at 20 Hz.
+MOST_ON_TRIAL = 200
 
 
 class FixChain:
@@ -29,7 +34,7 @@ class FixChain:
     def __init__(self, sure_confidence: float, settle_after_m: float) -> None:
         self._sure = sure_confidence
         self._after_m = settle_after_m
-        self._on_trial: list[int] = []
+        self._on_trial: deque[int] = deque(maxlen=MOST_ON_TRIAL)
         self._moved_m = 0.0
         self.position: Position | None = None
 
@@ -47,7 +52,9 @@ class FixChain:
             alone: its confidence without the fixes before it.
         """
         before = tuple(self._on_trial)
-        self._on_trial, self._moved_m, self.position = [stamp_ns], 0.0, found
+        self._on_trial.clear()
+        self._on_trial.append(stamp_ns)
+        self._moved_m, self.position = 0.0, found
         if alone >= self._sure:
             self.settle()
         return before
@@ -72,4 +79,5 @@ class FixChain:
 
     def settle(self) -> None:
         """The fixes stay, whatever comes."""
-        self._on_trial, self.position = [], None
+        self._on_trial.clear()
+        self.position = None

@@ -86,11 +86,19 @@ class LoopConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Question:
-    """A saved node, its frame, and (N,) bool: which nodes would close a loop."""
+    """A saved node that may close a loop.
+
+    Attributes:
+        node: the node.
+        frame: its frame.
+        known: nodes of the map when it was saved.
+        excluded: (K,) int64, dense indices of those that would close no loop, each once.
+    """
 
     node: NodeId
     frame: Frame
-    news: NDArray[np.bool_]
+    known: int
+    excluded: NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,6 +137,8 @@ class LoopSearch:
         self._frames = 0
         self._asked: deque[tuple[int, Future[_Match | None]]] = deque()
         self._waiting: list[_Match] = []
+        # Own nodes, by dense index, within `own_exclusion_m`; None before the first question.
+        self._recent: deque[int] | None = None
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="engram-loops")
 
     def __enter__(self) -> Self:
@@ -144,7 +154,7 @@ class LoopSearch:
     def ask(self, node: Node, frame: Frame) -> None:
         """Starts the lookup of a node that was just saved and added to the graph."""
         self._book.learn_new_nodes()
-        question = _Question(node.id, frame, self._news(node))
+        question = _Question(node.id, frame, len(self._graph), self._excluded(node))
         self._asked.append((self._frames, self._thread.submit(self._answer, question)))
 
     def closed(self) -> list[Edge]:
@@ -210,31 +220,36 @@ class LoopSearch:
         certain = sigma_m <= self.config.certain_m
         return certain and agrees(known[0] @ second.a_from_b, prediction, self._acceptance)
 
-    def _news(self, node: Node) -> NDArray[np.bool_]:
-        """(N,) bool: nodes neither known to be near this node nor just saved."""
-        graph = self._graph
-        index = graph.index(node.id)
-        own = graph.sessions == graph.sessions[index]
-        recent = graph.driven_m > node.driven_m - self.config.own_exclusion_m
-        news: NDArray[np.bool_] = ~(own & recent)
-        near = graph.neighbourhood(
-            index,
-            SE3.identity(),
-            np.zeros((6, 6)),
-            Search(self.config.near_m, np.pi),
+    def _excluded(self, node: Node) -> NDArray[np.int64]:
+        """(K,) int64: nodes known to be near this node, or just saved."""
+        index = self._graph.index(node.id)
+        near = self._graph.neighbourhood(
+            index, SE3.identity(), np.zeros((6, 6)), Search(self.config.near_m, np.pi)
         )
-        news[near.nodes] = False
-        return news
+        return np.unique(np.concatenate([self._just_saved(index), near.nodes.astype(np.int64)]))
+
+    def _just_saved(self, index: int) -> NDArray[np.int64]:
+        """(K,) int64: this node and its session's last ones."""
+        graph = self._graph
+        if self._recent is None:  # of a session that is resumed there may be some
+            self._recent = deque(np.flatnonzero(graph.sessions == graph.sessions[index]).tolist())
+        else:
+            self._recent.append(index)
+        beyond_m = graph.driven_m[index] - self.config.own_exclusion_m
+        while self._recent and graph.driven_m[self._recent[0]] <= beyond_m:
+            self._recent.popleft()
+        return np.array(self._recent, np.int64)
 
     def _answer(self, question: _Question) -> _Match | None:
         """The best accepted match among the most likely places."""
-        if not question.news.any():
+        if len(question.excluded) == question.known:
             return None
         compared = self._book.compare(self._book.words_of(question.frame))
-        evidence = compared.evidence[: len(question.news)]
-        likely = np.where(question.news, evidence, -np.inf)
+        likely = compared.evidence[: question.known].copy()
+        likely[question.excluded] = -np.inf
+        excluded = set(question.excluded.tolist())
         likeliest = best_places(self._book, likely, _SHORTLIST)
-        places = [place for place in likeliest if question.news[place]]
+        places = [place for place in likeliest if place not in excluded]
         matches = [self._matched(question, place) for place in spread(places, self.config.attempts)]
         believed = [found for found in matches if found is not None]
         return max(believed, key=lambda found: found.inliers, default=None)

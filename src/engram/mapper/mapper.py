@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from engram.mapper.memory import Memory, match_of
 from engram.mapper.saver import Records, Saver
 from engram.maps import StoredSession
 from engram.odometry import Motion
+
+EdgeKey: TypeAlias = tuple[NodeId, NodeId, EdgeKind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +103,7 @@ class Mapper(Memory):
         # Edges of loops closed since the last frame.
         self._closures: list[Edge] = []
         # Edges that rest on fixes on trial.
-        self._waiting: list[Edge] = []
+        self._waiting: dict[EdgeKey, Edge] = {}
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
         """See `Keeper`: closes the loops found so far before the frame is localised."""
@@ -154,10 +157,10 @@ class Mapper(Memory):
 
     def _proved(self, found: Localisation) -> list[Edge]:
         """Edges that waited for their fixes; dropped if the robot is lost before these agree."""
-        waiting, self._waiting = self._waiting, []
         if self._localiser.on_trial and found.status is not LocalisationStatus.LOST:
-            self._waiting = waiting
             return []
+        waiting = list(self._waiting.values())
+        self._waiting.clear()
         if self._localiser.on_trial or not waiting:
             return []
         self._graph.add_edges(waiting)
@@ -168,6 +171,10 @@ class Mapper(Memory):
             edges += lay_proximity_edges(self._graph, self._graph.index(edge.b))
         return edges
 
+    def _wait_with(self, edges: list[Edge]) -> None:
+        """Holds edges back; a robot that stands measures the same ones again and again."""
+        self._waiting |= {(edge.a, edge.b, edge.kind): edge for edge in edges}
+
     def _join(self, found: Localisation) -> list[Edge]:
         """Ties the experience to the matched node, and the matched nodes to each other."""
         matched = match_edges(
@@ -177,7 +184,7 @@ class Mapper(Memory):
             if not self._waiting and self._experience and self._since_saved is not None:
                 assert found.position is not None
                 matched.append(edge_through_live(self._since_saved, found.position, EdgeKind.TIE))
-            self._waiting += matched
+            self._wait_with(matched)
             return []
         self._joined = True
         edges = self._end_experience(found)
@@ -253,7 +260,10 @@ class Mapper(Memory):
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
         elif not self._experience and position is not None and self._localiser.certain:
             tie = _edge(position, node.id, EdgeKind.TIE)
-            (self._waiting if self._localiser.on_trial else edges).append(tie)
+            if self._localiser.on_trial:
+                self._wait_with([tie])
+            else:
+                edges.append(tie)
             edges += self._edge_to_last_saved(position, node.id)
         self._graph.add_edges(edges)
         edges += lay_proximity_edges(self._graph, self._graph.index(node.id))

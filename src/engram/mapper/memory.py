@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.model import NodeId, PathEntry, PathEntryKind, PathId
 from engram.localiser import Hint, Keeper, Localisation, LocalisationStatus, Localiser, Position
+from engram.localiser.chain import MOST_ON_TRIAL
 from engram.mapper.saver import Records, Saver
 from engram.maps import StoredSession
 from engram.odometry import Motion
@@ -77,7 +79,7 @@ class Memory(Keeper):
         self._localiser = localiser
         self._saver = saver
         self._stored = stored
-        self._held: list[_Held] = []
+        self._held: deque[_Held] = deque()
         self.walk = Walk(path)
         if stored is not None and stored.last_entry is not None:
             self.walk = Walk(path, stored.next_sequence, stored.last_entry.node)
@@ -125,14 +127,15 @@ class Memory(Keeper):
         """Adds the frame's attempts and its visit, and hands all to the saver once it is sure."""
         records = replace(records, attempts=self._localiser.attempts())
         self._held.append(_Held(live.stamp_ns, records, visit))
-        if not self._localiser.on_trial:
-            self._release()
-        else:
+        waiting = MOST_ON_TRIAL if self._localiser.on_trial else 0
+        if waiting:
             self._saver.hold(records)
+        self._release(waiting)
 
-    def _release(self) -> None:
-        held, self._held = self._held, []
-        for one in held:
+    def _release(self, waiting: int = 0) -> None:
+        """Hands frames to the saver, but for so many of the newest."""
+        while len(self._held) > waiting:
+            one = self._held.popleft()
             if one.visit is not None:
                 self.walk.visit(*one.visit, one.stamp_ns)
             records = replace(one.records, path_entries=self.walk.take_new())

@@ -299,9 +299,7 @@ class RecallPolicy:
                 run.accepted,
                 run.inliers,
             ),
-            _core.RecallCandidates(
-                nodes, graph.sessions_of(nodes), costs, prior, graph.session_count
-            ),
+            _core.RecallCandidates(nodes, graph.sessions_of(nodes), costs, prior),
             self._bound,
         )
 

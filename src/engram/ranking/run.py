@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 # Attempts farther back do not reflect the light here.
 _REMEMBERED_M = 200.0
+# More than a usual drive makes on that way; a robot that stands makes them without end.
+_REMEMBERED = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +84,11 @@ class RunAttempts:
 
 
 class RunLog:
-    """Collects the attempts of one session as it drives."""
+    """Collects the attempts of one session as it drives: the last 4,096 of 200 m at most.
+
+    A failure without a prediction is not kept, as it tells nothing: a lost robot has dozens per
+    frame.
+    """
 
     def __init__(self) -> None:
         self._columns = _columns(64)
@@ -100,14 +106,17 @@ class RunLog:
         landmarks: int,
     ) -> None:
         """Add the R attempts of one frame; see `RunAttempts` for the arguments."""
-        count = len(nodes)
-        self._frames += count > 0
+        self._frames += len(nodes) > 0
+        telling = np.array(accepted, np.bool_) | ~np.isnan(distance_m)
+        count = int(telling.sum())
         if self._end + count > len(self._columns[0]):
             self._make_room(driven_m, count)
         place = slice(self._end, self._end + count)
-        values = (driven_m, nodes, distance_m, rates, accepted, inliers, landmarks)
-        for column, value in zip(self._columns, values, strict=True):
-            column[place] = value
+        for column, values in zip(
+            self._columns[1:-1], (nodes, distance_m, rates, accepted, inliers), strict=True
+        ):
+            column[place] = np.asarray(values)[telling]
+        self._columns[0][place], self._columns[-1][place] = driven_m, landmarks
         self._end += count
 
     def attempts(self, driven_m: float) -> RunAttempts:
@@ -126,6 +135,7 @@ class RunLog:
     def _forget(self, driven_m: float) -> None:
         at_m = self._columns[0][self._start : self._end]
         self._start += int(np.searchsorted(at_m, driven_m - _REMEMBERED_M))
+        self._start = max(self._start, self._end - _REMEMBERED)
 
     def _make_room(self, driven_m: float, count: int) -> None:
         self._forget(driven_m)
