@@ -15,7 +15,6 @@ from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser import AcceptanceConfig, Position
 from engram.localiser.attempts import Candidate, Outcome
 from engram.localiser.hypotheses import Hypotheses
-from engram.odometry import OdometryStatus, OdometryStep
 
 SESSION = SessionId(UUID(int=1))
 SURE = 1e-6 * np.eye(6)
@@ -60,7 +59,7 @@ def seen_from(node: int, metres: float, rank: int = 0) -> Outcome:
 
 
 def drive(hypotheses: Hypotheses, metres: float) -> None:
-    hypotheses.carry_on(OdometryStep(OdometryStatus.OK, ahead(metres), SURE))
+    hypotheses.carry_on(ahead(metres), SURE)
 
 
 def accepted(outcomes: Sequence[Outcome]) -> list[int]:
@@ -101,12 +100,15 @@ def test_the_nodes_that_would_confirm_it_are_told_nearest_first() -> None:
     assert hypotheses.nodes_near(3) == [13, 14, 12]
 
 
-def test_it_ends_where_nobody_knows_how_the_robot_moved() -> None:
+@pytest.mark.parametrize(("sigma_m", "believed"), [(0.4, [15]), (1.2, [])])
+def test_it_outlives_a_short_gap_and_ends_where_agreement_would_say_nothing(
+    sigma_m: float, believed: list[int]
+) -> None:
     hypotheses = waiting()
     hypotheses.judge([seen_from(10, 0.5)])
-    hypotheses.carry_on(OdometryStep(OdometryStatus.NO_CONSENSUS))
-    drive(hypotheses, 5.0)
-    assert accepted(hypotheses.judge([seen_from(15, 0.5)])) == []
+    hypotheses.carry_on(ahead(1.0), np.diag([sigma_m**2] * 3 + [1e-4] * 3))
+    drive(hypotheses, 4.0)
+    assert accepted(hypotheses.judge([seen_from(15, 0.5)])) == believed
 
 
 def test_it_is_forgotten_in_time() -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
@@ -233,10 +234,11 @@ def test_a_lost_robot_has_a_budget_of_its_own_and_a_matcher_that_gives_up_sooner
     )
 
 
-def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
-    tmp_path: Path,
+@pytest.mark.parametrize(("fixes_missed", "latest"), [(None, 1), (6, 8)])
+def test_a_robot_that_is_elsewhere_than_it_believes_is_found_before_it_is_lost(
+    tmp_path: Path, fixes_missed: int | None, latest: int
 ) -> None:
-    """What it sees contradicts what it expects, again and again in the same way."""
+    """One that is only told its place looks at once; one that had fixes, when they stay away."""
     path = tmp_path / "town.engram"
     world, road = World(60.0), np.arange(0.0, 45.0, 0.7)
     map_simulated(path, drive(world, road))
@@ -253,11 +255,11 @@ def test_a_robot_that_is_elsewhere_than_it_believes_is_found_once_it_is_lost(
         ) as localiser,
     ):
         nodes = sorted(opened.graph.nodes, key=lambda node: node.stamp_ns)
-        localiser.place_at(Position.at(nodes[4].id))  # some four metres too far on
+        wrong = Position.at(nodes[4].id)  # some four metres too far on
+        localiser.place_at(wrong, agreed=0 if fixes_missed is None else 10)
         found = localised(localiser, live)
     where = [k for k, one in enumerate(found) if one.node is not None]
-    # Lost after ten metres; a weak match waits for a second one four metres on.
-    assert 14 <= where[0] <= 26
+    assert (fixes_missed or 0) <= where[0] <= latest
     assert where == list(range(where[0], 40))
     for k in where:
         node = next(n for n in range(len(nodes)) if nodes[n].id == found[k].node)

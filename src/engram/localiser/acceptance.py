@@ -40,6 +40,9 @@ class AcceptanceConfig:
             good.
         settle_after_m: distance along which weaker fixes must agree to be believed for good,
             metres. Until then a contradicting one withdraws them, and no edge rests on them.
+        doubt_after: fixes that should have come since the last one, and did not, after which a
+            robot looks for itself all over the map; so does one that was told its place, until its
+            first fix.
         min_inliers: fewest inliers of a match with a prediction.
         min_inliers_lost: fewest inliers of a match without a prediction; above every wrong match
             that passes the other tests.
@@ -63,6 +66,7 @@ class AcceptanceConfig:
     min_confidence_lost: float = 6.5
     sure_confidence: float = 12.0
     settle_after_m: float = 10.0
+    doubt_after: float = 3.0
     min_inliers: int = 20
     min_inliers_lost: int = 60
     min_inliers_plausible: int = 35

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.neighbourhood import Neighbourhood
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import Position
-from engram.odometry import OdometryStep
 
 # Distance between two matches from which one false cause no longer explains both.
 _BASE_LINE_M = 4.0
@@ -41,6 +42,7 @@ class Hypotheses:
         graph: the experience graph.
         search: finds the nodes near a position.
         acceptance: thresholds by which two positions agree.
+        vague_m: standard deviation of a position beyond which agreement with it says nothing.
     """
 
     def __init__(
@@ -48,26 +50,28 @@ class Hypotheses:
         graph: ExperienceGraph,
         search: Callable[[Position], Neighbourhood],
         acceptance: AcceptanceConfig,
+        vague_m: float = 1.0,
     ) -> None:
         self._graph = graph
         self._search = search
         self._acceptance = acceptance
+        self._vague_m = vague_m
         self._waiting: list[_Hypothesis] = []
 
     def forget(self) -> None:
-        """Drops all: the robot was found, or its motion is unknown."""
+        """Drops all: the robot was found."""
         self._waiting.clear()
 
-    def carry_on(self, odometry: OdometryStep) -> None:
-        """Carries all positions on by one step of odometry."""
-        motion, covariance = odometry.prev_from_curr, odometry.covariance
-        if motion is None or covariance is None:
-            self.forget()
-            return
+    def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:
+        """Carries all positions on by the robot's motion; drops those that became too vague."""
         for one in self._waiting:
-            one.position = one.position.carried_on(motion, covariance)
-            one.driven_m += motion.distance_m
-        self._waiting = [one for one in self._waiting if one.driven_m <= _FORGOTTEN_AFTER_M]
+            one.position = one.position.carried_on(prev_from_curr, covariance)
+            one.driven_m += prev_from_curr.distance_m
+        self._waiting = [
+            one
+            for one in self._waiting
+            if one.driven_m <= _FORGOTTEN_AFTER_M and one.position.sigma_m <= self._vague_m
+        ]
 
     def nodes_near(self, count: int) -> list[int]:
         """Nodes, by dense index, that could confirm one: `count` for each, nearest first."""

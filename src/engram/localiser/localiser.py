@@ -109,7 +109,9 @@ class Localiser:
             else None
         )
         self._prover = Prover(known.graph, self.config.acceptance)
-        self._hypotheses = Hypotheses(known.graph, self._nodes_near, self.config.acceptance)
+        self._hypotheses = Hypotheses(
+            known.graph, self._nodes_near, self.config.acceptance, self.config.followed_gap_m
+        )
         self._lenses = self._lenses_of_map()
         self._tried = Tried(self.config.recent, drive.basin, self._lenses)
         self.position: Position | None = None
@@ -322,12 +324,12 @@ class Localiser:
         self._open_loop_m += motion.moved_m
         if motion.guessed_m:
             self._guessed_m2 += motion.guessed_m**2
-            self._hypotheses.forget()
         else:
             self._driven_m += motion.moved_m
-            self._hypotheses.carry_on(motion.odometry)
+        self._hypotheses.carry_on(motion.prev_from_curr, motion.covariance)
         if self._relocaliser is not None:
-            self._relocaliser.carry_on(None if motion.guessed_m else motion.prev_from_curr)
+            followed = motion.guessed_m <= self.config.followed_gap_m
+            self._relocaliser.carry_on(motion.prev_from_curr if followed else None)
         if self.position is not None:
             self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
         self._prover.carry_on(motion.prev_from_curr, motion.covariance)
@@ -340,6 +342,10 @@ class Localiser:
     @property
     def _lost(self) -> bool:
         return not self.certain or self._open_loop_m > self.config.lost_after_m
+
+    @property
+    def _looks_elsewhere(self) -> bool:
+        return self._lost or self._prover.doubted
 
     def _lenses_of_map(self) -> Lenses:
         told = self._background
@@ -424,8 +430,8 @@ class Localiser:
     ) -> list[Candidate]:
         """What to attempt, best first.
 
-        A lost robot alternates proposed nodes and nodes of its neighbourhood. A robot with no node
-        near it spends its budget on proposed ones, even before it counts as lost.
+        A lost robot, and one whose position is doubtful, alternates proposed nodes and nodes of its
+        neighbourhood. A robot with no node near it spends its budget on proposed ones.
         """
         budget = self._budget.attempts
         ranked = []
@@ -438,7 +444,7 @@ class Localiser:
                 for row in order[: budget + len(self._damaged)]
                 if int(neighbourhood.nodes[row]) not in self._damaged
             ][:budget]
-        if (ranked and not self._lost) or self._relocaliser is None:
+        if (ranked and not self._looks_elsewhere) or self._relocaliser is None:
             return ranked
         if not keeper.may_propose(certain=self.certain):
             return ranked
@@ -491,7 +497,7 @@ class Localiser:
             and prediction.sigma_yaw_rad < self.config.guide_below_rad
         )
         # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
-        doubted = self._lost and not (self.certain and self._own_session is not None)
+        doubted = self._looks_elsewhere and not (self.certain and self._own_session is not None)
         node, standing = self._graph.node(index).id, self._prover.standing
         return Candidate(index, node, prediction, guided, row, doubted, standing)
 

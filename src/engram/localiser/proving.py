@@ -35,12 +35,18 @@ class Prover:
         self._record = Record()
         self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
         self.standing = Standing()
+        self._told = False
         self.withdraws: tuple[int, ...] = ()
 
     @property
     def on_trial(self) -> bool:
         """Whether the last fixes may still be withdrawn."""
         return self._chain.on_trial
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the position may well be wrong: nobody confirmed it, or fixes fail to come."""
+        return self._told or self.standing.missed >= self._accepted.doubt_after
 
     def begin_frame(self) -> None:
         """Begins a frame: nothing is withdrawn yet."""
@@ -52,11 +58,13 @@ class Prover:
 
     def forget(self, agreed: int = 0) -> None:
         """The position is another, confirmed by so many fixes; those before it stay."""
+        self._told = not agreed
         self._record.forget(agreed)
         self._chain.settle()
 
     def settled(self) -> None:
         """The live frame was saved as a node, which is the position from now on."""
+        self._told = False
         self._record.settled()
 
     def missed(self) -> None:
@@ -92,6 +100,7 @@ class Prover:
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, found, alone)
+        self._told = False
         self._record.fixed(success.match.inliers, agrees=fits is True)
 
     def _agrees(self, found: Position, before: Position | None) -> bool | None:

@@ -16,7 +16,7 @@ from engram.ranking import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 6
+METHOD_VERSION = 7
 
 
 class NeighbourhoodSearch(StrEnum):
@@ -55,6 +55,8 @@ class LocaliserConfig:
         greatest_gap_m: largest standard deviation of motion that odometry did not measure. Beyond
             it since the last match or saved node the robot is lost; beyond it in one gap an
             experience ends.
+        followed_gap_m: largest standard deviation of motion, guessed or measured, along which what
+            speaks for places of a lost robot is carried on.
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
@@ -71,6 +73,7 @@ class LocaliserConfig:
     own_exclusion_m: float = 30.0
     lost_after_m: float = 10.0
     greatest_gap_m: float = 3.0
+    followed_gap_m: float = 1.0
     guide_below_m: float = 0.3
     guide_below_rad: float = float(np.deg2rad(3.0))
     lost_max_samples: int = 500
