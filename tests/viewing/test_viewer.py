@@ -7,38 +7,36 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from engram.errors import MissingExtraError
-from engram.maps import open_map
-from engram.robot import RobotOptions, Settings, map_drive, open_drive, robot_on
-from engram.viewing.viewer import Viewer
+from engram.cli.app import app
+from engram.errors import InputError, MissingExtraError
+from engram.robot import map_drive, open_drive
+from engram.viewing.viewer import Viewer, viewer_for
 
 
 def test_without_rerun_the_command_that_installs_it_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with (
-        open_map(tmp_path / "empty.engram", create=True) as opened,
-        pytest.raises(MissingExtraError, match=r"engram-localisation\[view\]"),
-    ):
-        Viewer(opened)
+    with pytest.raises(MissingExtraError, match=r"engram-localisation\[view\]"):
+        Viewer()
 
 
-def test_a_drive_becomes_a_recording(street: Path, tmp_path: Path) -> None:
+def test_what_is_neither_window_nor_recording_is_refused() -> None:
+    with pytest.raises(InputError, match=r"NAME\.rrd"):
+        viewer_for("street.png")
+
+
+@pytest.mark.parametrize("verb", ["map", "localise", "live"])
+def test_a_drive_becomes_a_recording(verb: str, street: Path, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="needs the extra view")
     path, recording = tmp_path / "street.engram", tmp_path / "street.rrd"
-    map_drive(path, open_drive(street, frames="::2"))
-    sequence = open_drive(street, frames="1::4")
-    with (
-        open_map(path) as opened,
-        robot_on(opened, sequence, Settings(), RobotOptions(lanes=1, threads=False)) as robot,
-    ):
-        viewer = Viewer(opened, recording)
-        for found in robot.drive(sequence):
-            assert robot.last is not None
-            viewer.see(robot.last, found)
-        viewer.close()
+    if verb != "map":
+        map_drive(path, open_drive(street, frames="0:6:2"))
+    given = ["--play", str(street)] if verb == "live" else [str(street), "--frames", "1::6"]
+    ran = CliRunner().invoke(app, [verb, str(path), *given, "--view", str(recording)])
+    assert ran.exit_code == 0, ran.output
     checked = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "verify", str(recording)],
         capture_output=True,

@@ -28,6 +28,7 @@ def map_(
     force: Annotated[
         bool, typer.Option("--force", help="Map a drive that the doctor finds unfit, too.")
     ] = False,
+    view: options.View = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -46,14 +47,20 @@ def map_(
     """
     from engram.cli.progress import Bars
     from engram.cli.wording import mapped_text, warnings
-    from engram.robot import RobotOptions, map_drive
+    from engram.robot import Beginning, RobotOptions, map_drive
+    from engram.viewing.viewer import viewer_for
 
     sequence = drive.open(path)
     given = settings.read()
     asked = RobotOptions(**effort.over(given), force=force)
     resolved = _for_people(given.of_robot(descriptor), no_thumbnails)
-    with Bars().stage("map", len(sequence)) as monitor:
-        report = map_drive(map_path, sequence, resolved, asked, monitor, descriptor=descriptor)
+    with viewer_for(view) as viewer, Bars().stage("map", len(sequence)) as monitor:
+
+        def begin(begun: Beginning) -> None:
+            if viewer is not None:
+                viewer.watch(begun.robot, begun.opened)
+
+        report = map_drive(map_path, sequence, resolved, asked, monitor, begin, descriptor)
     if as_json:
         print(json.dumps(report.to_dict()))
     else:
@@ -102,6 +109,7 @@ def localise(
     no_images: Annotated[
         bool, typer.Option("--no-images", help="Such files hold no images.")
     ] = False,
+    view: options.View = None,
     explain: Annotated[
         int | None,
         typer.Option("--explain", metavar="FRAME", min=0, help="Explain this frame's candidates."),
@@ -121,6 +129,7 @@ def localise(
       engram localise town.engram drives/tuesday --ranking distance --lanes 1 --json
       engram localise town.engram drives/tuesday --rate 20 --deadline 40
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures matches
+      engram localise town.engram drives/tuesday --view window
       engram localise town.engram drives/tuesday --explain 120
     """
     from engram.cli.explaining import explain_and_print
@@ -133,14 +142,16 @@ def localise(
     sequence, resolved, tried = drive.open(path), given.of_robot(), effort.over(given)
     if explain is None:
         asked = RobotOptions(**tried, deadline_ms=deadline, relocaliser=found_by)
-        outputs = Outputs(trajectory, pictures, rate, as_json, remember, recorder, not no_images)
+        outputs = Outputs(
+            trajectory, pictures, rate, as_json, remember, recorder, not no_images, view
+        )
         with open_map(map_path, at) as opened:
             localise_and_print(opened, sequence, resolved, asked, outputs)
         tell_losses(sequence)
         return
     refused = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
-        "--remember": remember or None, "--recorder": recorder,
+        "--remember": remember or None, "--recorder": recorder, "--view": view,
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")

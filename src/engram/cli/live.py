@@ -40,6 +40,7 @@ def live(
             "--deadline", metavar="MS", help="Start no attempt later than this after the frame."
         ),
     ] = None,
+    view: options.View = None,
     settings: options.SettingsGiven,
 ) -> None:
     """Localise while a robot drives.
@@ -56,6 +57,7 @@ def live(
     """
     from engram.live import LiveOptions, LiveProcess, Played, Served
     from engram.robot import RobotOptions, open_drive
+    from engram.viewing.viewer import viewer_for
 
     if (play is None) == (socket is None):
         raise ConfigError("give --socket PATH to serve a robot, or --play DRIVE, one of them")
@@ -64,10 +66,12 @@ def live(
     asked = RobotOptions(policy=ranking, lanes=lanes, rounds=rounds, deadline_ms=deadline)
     resolved = LiveOptions(map_path, name, maps, settings.read().of_robot(), asked)
     with ExitStack() as stack:
+        viewer = stack.enter_context(viewer_for(view))
         if socket is not None:
-            LiveProcess(stack.enter_context(Served(socket)), resolved).run()
+            LiveProcess(stack.enter_context(Served(socket)), resolved, watcher=viewer).run()
         elif play is not None:
-            LiveProcess(Played(open_drive(play), _print, rate), resolved).run()
+            transport = Played(open_drive(play), _print, rate)
+            LiveProcess(transport, resolved, watcher=viewer).run()
 
 
 def _print(message: dict[str, Any]) -> None:

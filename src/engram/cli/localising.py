@@ -31,6 +31,7 @@ class Outputs:
         remember: keep path and attempts in the map.
         recorder: folder of flight records; None for none.
         record_images: whether they hold images.
+        view: "window" or a recording to watch it in Rerun; None for neither.
     """
 
     trajectory: Path | None
@@ -40,6 +41,7 @@ class Outputs:
     remember: bool = False
     recorder: Path | None = None
     record_images: bool = True
+    view: str | None = None
 
 
 def localise_and_print(
@@ -59,10 +61,16 @@ def localise_and_print(
     from engram.robot import robot_on, summarise
     from engram.viewing.pictures import PictureWriter
     from engram.viewing.trajectory import write_trajectory
+    from engram.viewing.viewer import viewer_for
 
     results: list[Localisation] = []
     interrupted = False
-    with robot_on(opened, sequence, settings, asked, remembers=outputs.remember) as robot:
+    with (
+        viewer_for(outputs.view) as viewer,
+        robot_on(opened, sequence, settings, asked, remembers=outputs.remember) as robot,
+    ):
+        if viewer is not None:
+            viewer.watch(robot, opened)
         robot.recorder = _recorder(opened, sequence, outputs)
         writer = None
         if outputs.pictures is not None:

@@ -85,6 +85,10 @@ Descriptor: TypeAlias = Annotated[
 NoThumbnails: TypeAlias = Annotated[
     bool, typer.Option("--no-thumbnails", help="Store no small pictures for people.")
 ]
+View: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--view", metavar="window|FILE.rrd", help="Watch it in Rerun, or record that."),
+]
 Settings: TypeAlias = Annotated[
     Path | None,
     typer.Option(

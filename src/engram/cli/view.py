@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated
 
@@ -41,15 +40,17 @@ def view(
     from engram.robot import open_map, robot_on
     from engram.viewing.viewer import Viewer
 
-    with open_map(map_path, at) as opened, closing(Viewer(opened, save)) as viewer:
-        if path is not None:
+    with open_map(map_path, at) as opened, Viewer(save) as viewer:
+        if path is None:
+            viewer.show(opened)
+        else:
             sequence = drive.open(path)
             with (
                 robot_on(opened, sequence, settings.read().of_robot()) as robot,
                 Bars().stage("view", len(sequence)) as monitor,
             ):
-                for found in robot.drive(sequence, monitor):
-                    if robot.last is not None:
-                        viewer.see(robot.last, found)
+                viewer.watch(robot, opened)
+                for _ in robot.drive(sequence, monitor):
+                    pass
     if save is not None:
         typer.echo(f"{save} is written; look at it with rerun {save}")

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # Forward of the camera (z) along x, its right (x) along −y, its down (y) along −z: REP 103.
-_MAP_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+MAP_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 # Variance added to edges by kind, so that first guesses lead along odometry, which joins no
 # look-alikes, m².
@@ -286,7 +286,7 @@ class _Placing:
     def _laid_out_alone(self, poses: Poses, members: Indices) -> Poses:
         """A component by itself: its first node at the origin, level, looking along x."""
         first = int(members[0])
-        poses.set(first, SE3(_MAP_FROM_CAMERA.copy(), np.zeros(3)))
+        poses.set(first, SE3(MAP_FROM_CAMERA.copy(), np.zeros(3)))
         fixed = np.zeros(len(self._graph), np.bool_)
         fixed[first] = True
         self._chain(poses, members, fixed)

@@ -7,22 +7,22 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from engram.errors import EngramError, InputError
 from engram.frontend import DescriptorKind, StereoPair
 from engram.geometry import SE3, StereoCamera
-from engram.graph.model import NodeId
 from engram.localiser import Localisation, Position
 from engram.maps import Map, open_map
-from engram.maps.map_frame import MapFrame
 from engram.odometry import Motion, OutsideMotion
 from engram.robot.front import Arrived, Front
 from engram.robot.live import Saving, SavingState
 from engram.robot.robot import Robot
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
+from engram.robot.whereabouts import Whereabouts
 
 # Between attempts to open a map that cannot be opened.
 _AGAIN_AFTER_S = 2.0
@@ -59,11 +59,20 @@ class Step:
         motion: motion since the previous usable frame; None if the frame was not taken.
         found: the localisation; None without a robot, or if the frame was not taken.
         trouble: what went wrong; "" if nothing did.
+        map_from_live: pose in the map frame; None where it is not known.
     """
 
     motion: Motion | None = None
     found: Localisation | None = None
     trouble: str = ""
+    map_from_live: SE3 | None = None
+
+
+class Watcher(Protocol):
+    """Shows people what a robot does, such as `engram.viewing.viewer.Viewer`."""
+
+    def watch(self, robot: Robot, opened: Map) -> None:
+        """Shows a map, and from now on each frame of a robot in it."""
 
 
 class Driving:
@@ -75,17 +84,23 @@ class Driving:
     Args:
         options: map and robot.
         now: the clock, seconds.
+        watcher: shows each robot that drives; None for nobody.
     """
 
-    def __init__(self, options: LiveOptions, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        options: LiveOptions,
+        now: Callable[[], float] = time.monotonic,
+        watcher: Watcher | None = None,
+    ) -> None:
         self.options = options
+        self._watcher = watcher
         self.trouble = ""
         self._now = now
         self._camera: StereoCamera | None = None
         self._front: tuple[DescriptorKind, Front] | None = None
         self._map: Map | None = None
-        # Laid out once: what the robot itself saves has no place before it is committed.
-        self._frame: MapFrame | None = None
+        self._whereabouts: Whereabouts | None = None
         self._robot: Robot | None = None
         self._saved = Saving()
         self._belief: Position | None = None
@@ -97,14 +112,6 @@ class Driving:
     def saving(self) -> Saving:
         """Whether and where the drive is saved; of the last drive while none runs."""
         return self._saved if self._robot is None else self._robot.saving
-
-    def map_from(self, node: NodeId) -> SE3 | None:
-        """``map_from_node`` in the map frame; None for a node that the opened map does not have."""
-        if self._map is None or node not in self._map.graph:
-            return None
-        if self._frame is None:
-            self._frame = self._map.frame
-        return self._frame.pose(node)
 
     def step(
         self,
@@ -138,8 +145,9 @@ class Driving:
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
             return Step(trouble=self.trouble)
         self._belief = found.position
+        map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
         self.trouble = robot.saving.reason if robot.saving.state is SavingState.FAILED else ""
-        return Step(found.motion, found, self.trouble)
+        return Step(found.motion, found, self.trouble, map_from_live)
 
     def _driven(self, stamp_ns: int, wheels_from_live: SE3 | None) -> OutsideMotion | None:
         """What the wheels measured since the frame before; None if they did not."""
@@ -187,7 +195,7 @@ class Driving:
             What became of the drive; "" if none was saved.
         """
         robot, self._robot = self._robot, None
-        opened, self._map, self._frame = self._map, None, None
+        opened, self._map, self._whereabouts = self._map, None, None
         self._open_after = -np.inf
         if robot is None or opened is None:
             return ""
@@ -236,6 +244,9 @@ class Driving:
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
             return None
         self._use_belief()
+        self._whereabouts = Whereabouts(self._map.frame)
+        if self._watcher is not None:
+            self._watcher.watch(self._robot, self._map)
         self.trouble = ""
         return self._robot
 

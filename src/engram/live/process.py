@@ -19,7 +19,7 @@ from engram.errors import EngramError, InputError
 from engram.frontend import StereoPair
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.model import NodeId
-from engram.live.driving import Driving, LiveOptions, Step
+from engram.live.driving import Driving, LiveOptions, Step, Watcher
 from engram.live.transport import Command, FrameEvent, Message, Transport
 from engram.localiser import Position
 
@@ -77,6 +77,7 @@ class LiveProcess:
         transport: brings frames and commands.
         options: map and robot.
         now: the clock, seconds.
+        watcher: shows each robot that drives; None for nobody.
     """
 
     def __init__(
@@ -84,9 +85,10 @@ class LiveProcess:
         transport: Transport,
         options: LiveOptions,
         now: Callable[[], float] = time.monotonic,
+        watcher: Watcher | None = None,
     ) -> None:
         self._transport = transport
-        self._driving = Driving(options, now)
+        self._driving = Driving(options, now, watcher)
         self._now = now
         self._health = Health()
         self._track = Track()
@@ -147,12 +149,11 @@ class LiveProcess:
     def _placed(self, step: Step) -> Message:
         """The pose in the map frame, where the belief's node has a place in it."""
         position = None if step.found is None else step.found.position
-        map_from_node = None if position is None else self._driving.map_from(position.node)
-        if position is None or map_from_node is None:
+        if position is None or step.map_from_live is None:
             return {}
-        adjoint = map_from_node.adjoint()
+        adjoint = (step.map_from_live @ position.node_from_live.inverse()).adjoint()
         return {
-            "map_from_live": _flat((map_from_node @ position.node_from_live).matrix()),
+            "map_from_live": _flat(step.map_from_live.matrix()),
             "map_covariance": _flat(adjoint @ position.covariance @ adjoint.T),
         }
 

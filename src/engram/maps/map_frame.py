@@ -94,6 +94,11 @@ class MapFrame:
         """
         return self.poses.pose(self._graph.index(node))
 
+    def find(self, node: NodeId) -> SE3 | None:
+        """``map_from_node``; None for a node that has no place in the frame (yet)."""
+        at = self._graph.index(node) if node in self._graph else len(self.poses.translations)
+        return self.poses.pose(at) if at < len(self.poses.translations) else None
+
     def placements(self) -> list[Placement]:
         """Where every node lies."""
         return [

@@ -4,7 +4,7 @@ from engram.maps import open_map
 from engram.robot.examining import examine_drive
 from engram.robot.front import Front, arriving
 from engram.robot.inspecting import check_map, describe_map, seal_map
-from engram.robot.mapping import MapReport, map_drive
+from engram.robot.mapping import Beginning, MapReport, map_drive
 from engram.robot.recorder import Recorder, RecorderConfig
 from engram.robot.recording import ExtractReport, extract_log
 from engram.robot.results import localise_drive, measure, measured, summarise
@@ -14,6 +14,7 @@ from engram.robot.settings import RobotOptions, Settings, load_settings
 from engram.robot.starting import robot_on
 
 __all__ = [
+    "Beginning",
     "DriveSequence",
     "ExtractReport",
     "Front",

@@ -12,7 +12,7 @@ from engram.doctor import Diagnosis
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, Frontend, feature_kind
 from engram.graph.model import Session
-from engram.localiser import Localisation, Localiser, Position
+from engram.localiser import Localisation, Localiser
 from engram.maps import Map, RevisionWriter, SessionState, open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.examining import LookedAhead, facts_of, refuse_unfit
@@ -72,13 +72,28 @@ class MapReport:
         }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Beginning:
+    """A drive that is about to be mapped.
+
+    Attributes:
+        opened: the map, open for writing.
+        robot: the robot before its first frame.
+        resumed: whether the drive continues an earlier run, so that the robot knows its place.
+    """
+
+    opened: Map
+    robot: Robot
+    resumed: bool
+
+
 def map_drive(
     map_path: Path | str,
     sequence: DriveSequence,
     settings: Settings | None = None,
     options: RobotOptions | None = None,
     monitor: Monitor = QUIET,
-    start: Callable[[Map], Position | None] | None = None,
+    begin: Callable[[Beginning], None] | None = None,
     descriptor: str | None = None,
 ) -> MapReport:
     """Adds a drive to a map; creates the map if there is none.
@@ -92,8 +107,7 @@ def map_drive(
         settings: the resolved configuration, kept with the revision; None for the defaults.
         options: how to map it; None for the defaults.
         monitor: receives the status of each frame, and may stop the drive.
-        start: gives the robot's position before its first frame, from the open map; None, or a
-            result of None, if unknown. Not used when a drive is resumed.
+        begin: called before the first frame, to tell the robot its place or to watch it.
         descriptor: required kind of descriptor; None for that of the frame log, the map or the
             settings, whichever is known first.
 
@@ -121,7 +135,7 @@ def map_drive(
             return report
         report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
         settings = settings.for_descriptor(opened.descriptor)
-        _Mapping(opened, sequence, settings, options, start, report).run(monitor)
+        _Mapping(opened, sequence, settings, options, begin, report).run(monitor)
     report.skipped = sequence.skipped
     return report
 
@@ -144,7 +158,7 @@ class _Mapping:
     sequence: DriveSequence
     settings: Settings
     options: RobotOptions
-    start: Callable[[Map], Position | None] | None
+    begin: Callable[[Beginning], None] | None
     report: MapReport
 
     def run(self, monitor: Monitor) -> None:
@@ -166,6 +180,8 @@ class _Mapping:
         localiser = self._localiser()
         saved = SavedDrive(self.opened, writer, localiser, self.settings, words)
         robot = Robot(front, localiser, saved.mapper, deadline_ms=self.options.deadline_ms)
+        if self.begin is not None:
+            self.begin(Beginning(self.opened, robot, self.report.resumed))
         try:
             with robot, closing(robot.drive(drive, monitor)) as found:
                 self.report.results.extend(one for one in found if not one.resumed)
@@ -190,8 +206,7 @@ class _Mapping:
         return begin_or_resume(self.opened, session, self.sequence.camera, made_by, about)
 
     def _localiser(self) -> Localiser:
-        """The localiser, at the position that `start` gives a new drive."""
-        localiser = localiser_in(
+        return localiser_in(
             self.opened,
             self.sequence.camera,
             self.settings,
@@ -203,10 +218,6 @@ class _Mapping:
             threads=self.options.threads,
             clock=self.report.session,
         )
-        position = None if self.start is None or self.report.resumed else self.start(self.opened)
-        if position is not None:
-            localiser.place_at(position)
-        return localiser
 
 
 def _made_by(sequence: DriveSequence, settings: Settings) -> tuple[DescriptorKind, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -88,6 +88,8 @@ class Robot:
         self._early_ns: list[int] = []
         self._track: deque[tuple[int, Localisation]] = deque(maxlen=_REMEMBERED)
         self.recorder: Recorder | None = None
+        # Called after each step with the frame and its result, such as by a viewer.
+        self.watch: Callable[[Seen, Localisation], None] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -173,6 +175,8 @@ class Robot:
         if deadline is not None and time.perf_counter() > deadline:
             found = replace(found, late=True)
         self.last = Seen(arrived, frame, self._localiser.outcomes)
+        if self.watch is not None:
+            self.watch(self.last, found)
         if self.recorder is not None:
             self.recorder.note(arrived, frame, found, self._localiser.outcomes)
         self._track.append((frame.stamp_ns, found))

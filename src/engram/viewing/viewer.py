@@ -1,19 +1,22 @@
-"""A map and a robot in it, in the Rerun viewer: `engram view`."""
+"""A map and a robot in it, in the Rerun viewer: `engram view`, and `--view` of other verbs."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, MissingExtraError
 from engram.frontend import StereoPair
+from engram.graph.model import SessionId
 from engram.localiser import Localisation, LocalisationStatus
 from engram.localiser.attempts import best_success
 from engram.maps import Map
-from engram.robot.robot import Seen
+from engram.robot.robot import Robot, Seen
+from engram.robot.whereabouts import Whereabouts
 
 _STATUS_COLOURS = {
     LocalisationStatus.LOCALISED: (60, 180, 75),
@@ -22,13 +25,16 @@ _STATUS_COLOURS = {
 }
 _GREY = (140, 140, 140)
 _JPEG_QUALITY = 80
+# Positions of the driven path that are sent again with each new one.
+_STRIP = 50
 
 
 class Viewer:
     """Shows a map from above by experience, and a robot's frames as they come.
 
+    A frame costs the loop that calls `see` a few milliseconds, most of them for its image.
+
     Args:
-        opened: the map.
         save: write a recording here and open no window; None opens the viewer.
 
     Raises:
@@ -36,8 +42,7 @@ class Viewer:
         InputError: the recording cannot be written.
     """
 
-    def __init__(self, opened: Map, save: Path | None = None) -> None:
-        self._opened = opened
+    def __init__(self, save: Path | None = None) -> None:
         self._rr = _rerun()
         self._stream = self._rr.RecordingStream("engram")
         if save is None:
@@ -47,13 +52,34 @@ class Viewer:
                 self._stream.save(str(save))
             except (OSError, RuntimeError) as error:
                 raise InputError(f"{save}: cannot be written: {error}") from error
+        self._whereabouts: Whereabouts | None = None
         self._driven: list[NDArray[np.float64]] = []
-        self._show_map()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """Writes what was not written yet."""
         self._stream.flush()
         self._stream.disconnect()
+
+    def watch(self, robot: Robot, opened: Map) -> None:
+        """Shows a map, and from now on each frame of a robot in it."""
+        self.show(opened)
+        robot.watch = self.see
+
+    def show(self, opened: Map) -> None:
+        """Shows a map, in which the next frames are; the one before goes."""
+        self._whereabouts, self._driven = Whereabouts(opened.frame), []
+        numbers: dict[SessionId, int] = {}
+        for node in opened.graph.nodes:
+            numbers.setdefault(node.session, len(numbers))
+        colours = [_hue(numbers[node.session]) for node in opened.graph.nodes]
+        points = self._rr.Points3D(opened.frame.positions, colors=colours, radii=0.3)
+        self._stream.log("map/nodes", points, static=True)
 
     def see(self, seen: Seen, found: Localisation) -> None:
         """Shows a frame, its inliers, the candidates, and how sure the robot is.
@@ -78,34 +104,44 @@ class Viewer:
         self._show_candidates(seen)
         self._show_place(found, colour)
 
-    def _show_map(self) -> None:
-        graph, rr = self._opened.graph, self._rr
-        positions = self._opened.frame.positions
-        sessions = list(dict.fromkeys(node.session for node in graph.nodes))
-        for number, session in enumerate(sessions):
-            rows = [at for at, node in enumerate(graph.nodes) if node.session == session]
-            points = rr.Points3D(positions[rows], colors=_hue(number), radii=0.3)
-            self._stream.log(f"map/{str(session)[:8]}", points, static=True)
-
     def _show_candidates(self, seen: Seen) -> None:
-        tried = [one for one in seen.outcomes if one.candidate.node in self._opened.graph]
-        places = [self._opened.frame.pose(one.candidate.node).translation for one in tried]
         right, wrong = (
             _STATUS_COLOURS[one] for one in (LocalisationStatus.LOCALISED, LocalisationStatus.LOST)
         )
-        colours = [right if one.accepted else wrong for one in tried]
+        places, colours = [], []
+        for one in seen.outcomes:
+            map_from_node = self._whereabouts and self._whereabouts.of(one.candidate.node)
+            if map_from_node:
+                places.append(map_from_node.translation)
+                colours.append(right if one.accepted else wrong)
         points = self._rr.Points3D(np.reshape(places, (-1, 3)), colors=colours, radii=0.6)
         self._stream.log("map/tried", points)
 
     def _show_place(self, found: Localisation, colour: tuple[int, int, int]) -> None:
-        position = found.position
-        if position is None or position.node not in self._opened.graph:
+        map_from_live = self._whereabouts and self._whereabouts.after(found)
+        if not map_from_live:
             return
-        map_from_live = self._opened.frame.pose(position.node) @ position.node_from_live
-        self._driven.append(map_from_live.translation)
-        points = self._rr.Points3D([map_from_live.translation], colors=colour, radii=0.8)
-        self._stream.log("map/robot", points)
-        self._stream.log("map/driven", self._rr.LineStrips3D([self._driven], colors=_GREY))
+        here = map_from_live.translation
+        self._stream.log("map/robot", self._rr.Points3D([here], colors=colour, radii=0.8))
+        self._driven.append(here)
+        part = (len(self._driven) - 1) // _STRIP
+        strip = self._rr.LineStrips3D([self._driven[max(part * _STRIP - 1, 0) :]], colors=_GREY)
+        self._stream.log(f"map/driven/{part}", strip)
+
+
+def viewer_for(view: str | None) -> Viewer | nullcontext[None]:
+    """The viewer of an option ``--view``: a window, a recording, or none.
+
+    Raises:
+        InputError: it is neither "window" nor a file NAME.rrd; or as `Viewer`.
+    """
+    if view is None:
+        return nullcontext()
+    if view == "window":
+        return Viewer()
+    if not view.endswith(".rrd"):
+        raise InputError(f"--view {view}: give window, or a file to write, NAME.rrd")
+    return Viewer(Path(view))
 
 
 def _rerun() -> Any:

@@ -21,7 +21,7 @@ from engram.geometry import SE3
 from engram.localiser import Position
 from engram.maps import Map, copy_map
 from engram.monitor import Monitor
-from engram.robot import map_drive, open_drive
+from engram.robot import Beginning, map_drive, open_drive
 from engram.sequences.trajectories import read_truth
 
 # Rounds in which a hand-in or a download is over. Each broken connection takes one, and what
@@ -93,7 +93,7 @@ class DayRobot:
         sequence = open_drive(log, robot=self.name)
         whose = f"{held} nodes" if held else "no map yet"
         with self._monitor.stage(f"{self.name} drives {log.stem}, {whose}", len(sequence)) as part:
-            found = map_drive(path, sequence, monitor=part, start=_yard)
+            found = map_drive(path, sequence, monitor=part, begin=_place_at_yard)
         if found.interrupted:
             raise KeyboardInterrupt
         return Drive(held, found.to_dict()["share_localised"], found.saved)
@@ -189,12 +189,13 @@ def _nodes(path: Path) -> int:
         return store.node_count()
 
 
-def _yard(opened: Map) -> Position | None:
-    """Where a foray begins: as a drive that the map holds began; None if it holds no start."""
-    starts = (node.id for node in opened.graph.nodes if node.driven_m < _YARD_M)
+def _place_at_yard(foray: Beginning) -> None:
+    """A foray begins as a drive that the map holds began, if it holds a start."""
+    starts = (node.id for node in foray.opened.graph.nodes if node.driven_m < _YARD_M)
     first = next(starts, None)
-    covariance = np.diag([_YARD_M**2] * 3 + [_YARD_RAD**2] * 3)
-    return None if first is None else Position(first, SE3.identity(), covariance)
+    if first is not None and not foray.resumed:
+        covariance = np.diag([_YARD_M**2] * 3 + [_YARD_RAD**2] * 3)
+        foray.robot.place_at(Position(first, SE3.identity(), covariance))
 
 
 def _length_m(log: Path) -> float:

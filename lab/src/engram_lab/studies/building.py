@@ -14,9 +14,8 @@ from typing import Any
 
 from engram.config import to_dict
 from engram.errors import InputError
-from engram.localiser import Position
 from engram.maps import Map
-from engram.robot import MapReport, RobotOptions, Settings, map_drive
+from engram.robot import Beginning, MapReport, RobotOptions, Settings, map_drive
 from engram.sequences import FrameLog
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.starting import TrueNodes
@@ -105,10 +104,10 @@ def build_map(
         before = path if built.sessions else base
         if before is not None:
             shutil.copyfile(before, draft)
-        start = partial(_start, drive=drive, drives=(*drives, *known))
+        begin = partial(_place, drive=drive, drives=(*drives, *known))
         log = FrameLog(drive.path)
         try:
-            report = map_drive(draft, log, settings, options, start=start)
+            report = map_drive(draft, log, settings, options, begin=begin)
         finally:
             log.close()
         if report.interrupted or report.revision is None:
@@ -174,17 +173,19 @@ def read_record(path: Path) -> BuiltMap:
         ) from error
 
 
-def _start(opened: Map, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> Position | None:
-    """Where the drive begins, by truth; None in an empty map, or where truth is not known."""
+def _place(begun: Beginning, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> None:
+    """Tells the robot where its drive begins, by truth, where that and a node there are known."""
     truth = drive.truth()
-    if truth is None:
-        return None
+    if truth is None or begun.resumed:
+        return
     log = FrameLog(drive.path)
     try:
         first = truth.at(int(log.stamps_ns[0]))
     finally:
         log.close()
-    return None if first is None else true_nodes(opened, drives).start(first)
+    start = None if first is None else true_nodes(begun.opened, drives).start(first)
+    if start is not None:
+        begun.robot.place_at(start)
 
 
 def true_nodes(opened: Map, drives: Sequence[EvaluatedDrive]) -> TrueNodes:

@@ -1,0 +1,57 @@
+"""A robot that maps has a place in the map frame, from its first frame on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from engram.geometry import SE3
+from engram.robot import Beginning, RobotOptions, map_drive, open_drive, open_map
+from engram.robot.whereabouts import Whereabouts
+
+
+def test_a_first_drive_lies_where_the_committed_frame_will_have_it(
+    street: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "street.engram"
+    seen: list[tuple[object, SE3 | None]] = []
+
+    def begin(begun: Beginning) -> None:
+        whereabouts = Whereabouts(begun.opened.frame)
+        begun.robot.watch = lambda _, found: seen.append((found.saved, whereabouts.after(found)))
+
+    map_drive(path, open_drive(street, frames="::2"), begin=begin)
+    assert seen
+    assert all(map_from_live is not None for _, map_from_live in seen)
+    with open_map(path) as opened:
+        away_m = [
+            np.linalg.norm(here.translation - opened.frame.pose(saved).translation)
+            for saved, here in seen
+            if saved is not None and here is not None
+        ]
+    assert len(away_m) > 3
+    # The layout also levels the ground, so heights differ a little.
+    assert max(away_m) < 0.5
+
+
+def test_a_second_drive_lies_in_the_frame_of_the_first(street: Path, tmp_path: Path) -> None:
+    path = tmp_path / "street.engram"
+    map_drive(path, open_drive(street, frames="::2"))
+    here = []
+
+    def begin(begun: Beginning) -> None:
+        whereabouts = Whereabouts(begun.opened.frame)
+        begun.robot.watch = lambda _, found: here.append((found, whereabouts.after(found)))
+
+    map_drive(path, open_drive(street, frames="1::2"), options=RobotOptions(), begin=begin)
+    with open_map(path) as opened:
+        for found, map_from_live in here:
+            if found.localised:
+                expected = opened.frame.pose(found.node) @ found.node_from_live
+                assert map_from_live is not None
+                np.testing.assert_allclose(
+                    map_from_live.translation, expected.translation, atol=0.5
+                )
+            elif found.position is None:
+                assert map_from_live is None
