@@ -2,19 +2,24 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.fleet.robots import merged, robot_map
+from tests.fleet.robots import merged, rewritten, robot_map
+from tests.sequences.bag_maker import bag, made
 
 from engram.errors import InputError
+from engram.graph.model import Clock
 from engram.maps import Map, check_file
-from engram.robot.anchoring import anchor_map, read_anchors
+from engram.robot.anchoring import anchor_map
+from engram.robot.anchors import read_anchors
 from engram.robot.exporting import export_map
 from engram.robot.goals import add_goal, list_goals
 from engram.sequences.trajectories import read_tum
 
 PLACES_M = np.arange(0.0, 20.0, 1.0)
+METRES_PER_DEGREE = 111_320 * np.cos(np.deg2rad(50.0))
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +107,43 @@ def test_gps_gives_a_place_on_earth(copy, tmp_path):
     points = [one["geometry"]["coordinates"] for one in json.loads(out.read_text())["features"]]
     assert max(point[1] for point in points) == pytest.approx(50 + 19 / 111_320, abs=1e-5)
     assert max(abs(point[0] - 14) for point in points) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_the_fixes_of_a_bag_anchor_its_nodes_between_them(road, tmp_path, kind):
+    """Nodes lie between two fixes, and the robot drives on meanwhile."""
+    copy = rewritten(
+        road, tmp_path / "copy.engram", session=lambda one: replace(one, clock=Clock.UTC)
+    )
+    with Map.open(copy) as store:
+        found = [
+            (node.stamp_ns, store.frame.pose(node.id).translation) for node in store.graph.nodes
+        ]
+    stamps, places = zip(*sorted(found, key=lambda one: one[0]), strict=True)
+    stamps_ns, east_m = np.array(stamps), np.array(places)[:, 0]
+    with bag(tmp_path / "gps", kind) as maker:
+        for stamp_ns in range(int(stamps_ns[0]) + 30_000_000, int(stamps_ns[-1]), 170_000_000):
+            here = 50.0, 14.0 + np.interp(stamp_ns, stamps_ns, east_m) / METRES_PER_DEGREE
+            maker.fix("/gps/fix", stamp_ns, here)
+            maker.fix("/gps/fix", stamp_ns + 1_000, (0.0, 0.0), status=-1)
+    report = anchor_map(copy, made(tmp_path / "gps", kind), author="tests")
+    assert report.anchors > 5
+    assert max(report.residuals_m.values()) < 0.1
+    with Map.open(copy) as store:
+        assert store.frame.geographic(0.0, 0.0) == pytest.approx((50.0, 14.0), abs=1e-3)
+
+
+def test_a_bag_of_two_receivers_asks_which(copy, tmp_path):
+    with bag(tmp_path / "gps", "mcap") as maker:
+        maker.fix("/gps/fix", 10**18, (50.0, 14.0), status=-1)
+        maker.fix("/rtk/fix", 10**18, (50.0, 14.0))
+    source = made(tmp_path / "gps", "mcap")
+    with pytest.raises(InputError, match=r"--topic; topics with fixes: /gps/fix, /rtk/fix"):
+        anchor_map(copy, source, author="tests")
+    with pytest.raises(InputError, match="holds no fix"):
+        anchor_map(copy, source, topic="/gps/fix", author="tests")
+    with pytest.raises(InputError, match="no anchor is of one of its nodes"):
+        anchor_map(copy, source, topic="/rtk/fix", author="tests")
 
 
 def test_exports_hold_every_node(copy, tmp_path):

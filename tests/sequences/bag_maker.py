@@ -133,6 +133,18 @@ class BagMaker:
         )
         self.write(topic, "nav_msgs/msg/Odometry", message, stamp_ns)
 
+    def fix(self, topic: str, stamp_ns: int, place: tuple[float, float], status: int = 0) -> None:
+        types = self.types
+        message = types["sensor_msgs/msg/NavSatFix"](
+            self.header(stamp_ns, "gps"),
+            types["sensor_msgs/msg/NavSatStatus"](status, 1),
+            *place,
+            250.0,
+            np.diag([0.25, 0.25, 1.0]).ravel(),
+            2,
+        )
+        self.write(topic, "sensor_msgs/msg/NavSatFix", message, stamp_ns)
+
     def imu(self, topic: str, stamp_ns: int, rates_rad_s: Iterable[float]) -> None:
         types = self.types
         vector, none = types["geometry_msgs/msg/Vector3"], np.zeros(9)

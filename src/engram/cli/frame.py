@@ -32,9 +32,14 @@ def anchor(
     map_path: options.MapPath,
     positions: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="CSV or GeoJSON: node or time, and a position."),
+        typer.Argument(
+            metavar="FILE", help="CSV or GeoJSON: node or time, and a position; or a bag with GPS."
+        ),
     ],
     *,
+    topic: Annotated[
+        str | None, typer.Option("--topic", metavar="TOPIC", help="Of a bag's NavSatFix.")
+    ] = None,
     grid: Annotated[
         Path | None,
         typer.Option("--grid", metavar="MAP.YAML", help="Positions are pixels u,v of this grid."),
@@ -47,18 +52,20 @@ def anchor(
     """Fit a map's frame to known positions.
 
     A line names a node, or a time (UTC) at which one was saved, and where it is: lat,lon or x,y in
-    metres, or u,v pixels of an occupancy grid; z and sigma in metres may follow. Goals stay with
-    their nodes. The anchoring is a revision, which revert takes back.
+    metres, or u,v pixels of an occupancy grid; z and sigma in metres may follow. Of a bag the GPS
+    fixes count that were taken while nodes were saved. Goals stay with their nodes. The anchoring
+    is a revision, which revert takes back.
 
     \b
     Examples:
       engram anchor town.engram gps.csv
+      engram anchor town.engram monday.mcap
       engram anchor town.engram corners.csv --grid map.yaml --dry-run
     """
     from engram.cli.history import user
     from engram.robot.anchoring import anchor_map
 
-    report = anchor_map(map_path, positions, grid=grid, author=user(), dry_run=dry_run)
+    report = anchor_map(map_path, positions, grid=grid, topic=topic, author=user(), dry_run=dry_run)
     typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
 
 

@@ -1,0 +1,94 @@
+"""The fixes of a bag's satellite receiver: `sensor_msgs/NavSatFix`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engram.errors import InputError
+from engram.sequences.bags.bag import Bag
+from engram.sequences.bags.messages import Decoder, stamp_of
+from engram.sequences.bags.records import DamageError
+
+FIX = "sensor_msgs/msg/NavSatFix"
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A position by satellites.
+
+    Attributes:
+        time_ns: UTC, ns.
+        latitude_deg, longitude_deg: WGS 84, degrees.
+        altitude_m: above the ellipsoid, metres; None if unknown.
+        sigma_m: standard deviation of the horizontal position, metres; None if unknown.
+    """
+
+    time_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float | None
+    sigma_m: float | None
+
+
+def read_fixes(path: Path, topic: str | None = None) -> list[Fix]:
+    """The fixes of a bag, by rising time; messages without a fix are left out.
+
+    Args:
+        path: the bag.
+        topic: topic of the fixes; None if the bag has only one.
+
+    Raises:
+        InputError: there is no such topic, or more than one, or it holds no fix.
+        SequenceError: the bag cannot be read.
+    """
+    bag = Bag(path)
+    named = _topic_of(bag, topic)
+    decoder, found = Decoder(bag.is_ros1), dict[int, Fix]()
+    for record in bag.records({named}):
+        try:
+            message = decoder.message(record, FIX)
+        except DamageError as error:
+            bag.note(f"{named}: {error}")
+            continue
+        fix = _fix(message, stamp_of(message, record))
+        if fix is not None:
+            found[fix.time_ns] = fix
+    if not found:
+        facts = f"; {bag.lost[0]}" if bag.lost else ""
+        raise InputError(f"{path}: {named} holds no fix: every message says so{facts}")
+    return [found[time_ns] for time_ns in sorted(found)]
+
+
+def _topic_of(bag: Bag, topic: str | None) -> str:
+    known = sorted(one.name for one in bag.topics.values() if one.type == FIX and one.count != 0)
+    if topic is not None and topic not in known:
+        raise InputError(f"--topic {topic}: holds no {FIX}; {_listed(known)}")
+    if topic is None and len(known) != 1:
+        raise InputError(f"{bag.path}: name the topic with --topic; {_listed(known)}")
+    return known[0] if topic is None else topic
+
+
+def _listed(known: list[str]) -> str:
+    return f"topics with fixes: {', '.join(known) or 'none'}"
+
+
+def _fix(message: Any, time_ns: int) -> Fix | None:
+    """A message as a fix; None where the receiver had none."""
+    at = float(message.latitude), float(message.longitude)
+    if message.status.status < 0 or not np.isfinite(at).all():
+        return None
+    if abs(at[0]) > 90 or abs(at[1]) > 180:
+        return None
+    variance = max(float(message.position_covariance[0]), float(message.position_covariance[4]))
+    known = message.position_covariance_type > 0 and np.isfinite(variance) and variance > 0
+    height = float(message.altitude)
+    return Fix(
+        time_ns,
+        *at,
+        height if np.isfinite(height) else None,
+        float(np.sqrt(variance)) if known else None,
+    )
