@@ -12,24 +12,48 @@ from engram.robot import Settings
 from engram_lab.misplaced import Street
 from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
 from engram_lab.town import Campaign, campaign_named
+from engram_lab.town.campaigns import SessionPlan
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 
 FITTED_TOWNS = (301, 302)
 HELD_OUT_TOWNS = (401,)
 LOOP_M = 200.0
+_FIRST_DAY = datetime(2025, 7, 14, tzinfo=UTC)
 # Day, hour (UTC), weather and robot of each drive; two by night, one of them in rain.
 _DRIVES = (
     (0, 8.5, "clear", "wildcat"), (0, 17.0, "clear", "courier"), (1, 11.0, "overcast", "wildcat"),
     (1, 22.5, "fair", "wildcat"), (2, 10.0, "showers", "courier"), (2, 23.0, "rain", "wildcat"),
 )  # fmt: skip
 
+# Later drives of such a town: six more the usual way round, then three against it.
+_LATER = (
+    (3, 9.5, "fair", "wildcat", False), (3, 14.0, "overcast", "wildcat", False),
+    (4, 16.0, "broken", "wildcat", False), (5, 11.0, "showers", "wildcat", False),
+    (6, 12.0, "clear", "courier", False), (6, 22.0, "fair", "wildcat", False),
+    (7, 9.0, "clear", "wildcat", True), (8, 10.0, "overcast", "wildcat", True),
+    (8, 16.5, "fair", "wildcat", True),
+)  # fmt: skip
+
+
+def longer_trial_town(seed: int) -> Campaign:
+    """The same town with nine more drives, the last three of them the other way round."""
+    town = trial_town(seed)
+    first = town.sessions[0]
+    later = tuple(
+        SessionPlan(number, _FIRST_DAY + timedelta(days=day, hours=hour), weather, robot, reverse,
+                    first.seed + 7919 * number)
+        for number, (day, hour, weather, robot, reverse) in enumerate(_LATER, len(town.sessions))
+    )  # fmt: skip
+    return replace(town, sessions=(*town.sessions, *later))
+
 
 def trial_town(seed: int) -> Campaign:
     """Six drives around one loop, in all kinds of light, by two kinds of robots."""
-    first = datetime(2025, 7, 14, tzinfo=UTC)
     hamlet = campaign_named("hamlet", seed)
     sessions = tuple(
-        replace(plan, start=first + timedelta(days=day, hours=hour), weather=weather, robot=robot)
+        replace(
+            plan, start=_FIRST_DAY + timedelta(days=day, hours=hour), weather=weather, robot=robot
+        )
         for plan, (day, hour, weather, robot) in zip(hamlet.sessions, _DRIVES, strict=True)
     )
     return replace(hamlet, name="trial", home="trial", length_m=LOOP_M, sessions=sessions)
