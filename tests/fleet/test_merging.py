@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import Reason, Seed
 from engram.fleet.merge.state import Merge
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
+from engram.localiser import Localiser
 from engram.maps import Map, check_file, open_map
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
@@ -341,3 +343,25 @@ def test_short_runs_that_only_the_robot_knows_how_to_place_are_looked_for_everyw
     assert all(one.taken + one.omitted <= 5 for one in short)  # 4 m
     assert sum(one.omitted for one in short) == len(by_day.saved)
     assert report.components == 1
+
+
+def test_what_a_withdrawn_fix_would_have_omitted_is_taken(fleet, tmp_path, monkeypatch):
+    """The first two fixes stand on trial until the third contradicts them."""
+    centre = Path(shutil.copy(fleet["first"][0], tmp_path / "centre.engram"))
+    seen: list[int] = []
+    plain = Localiser.localise
+
+    def localise(self, live, *given):
+        seen.append(live.stamp_ns)
+        found = plain(self, live, *given)
+        return replace(found, withdraws=tuple(seen[:2])) if len(seen) == 3 else found
+
+    monkeypatch.setattr(Localiser, "localise", localise)
+    monkeypatch.setattr(Localiser, "on_trial", property(lambda _: len(seen) < 4))
+    (report,) = merged(centre, fleet["same"][0])
+    with Map.open(centre) as store:
+        stamps = {node.stamp_ns for node in store.load().nodes}
+        assert set(seen[:2]) <= stamps
+        assert not set(seen[2:]) & stamps
+        assert report.taken == 2
+    assert_sound(centre)

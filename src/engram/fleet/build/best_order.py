@@ -27,7 +27,7 @@ from engram.fleet.build.orders import (
 )
 from engram.fleet.build.scratch import keeping, read_kept, write_kept
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.replay import MergeOptions
+from engram.fleet.merge.settings import MergeOptions
 from engram.graph.model import Session
 from engram.maps import Map, copy_map
 from engram.measures import failure, route_not_localised

@@ -26,8 +26,8 @@ from engram.fleet.build.orders import (
 )
 from engram.fleet.build.scratch import BuildPlan, MergingBegun, Scratch, sole_builder
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
+from engram.fleet.merge.settings import MergeOptions
 from engram.graph.model import SessionId, path_id
 from engram.maps import Map, copy_map
 from engram.monitor import QUIET, Monitor, interruptible

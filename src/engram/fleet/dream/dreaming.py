@@ -26,7 +26,7 @@ from engram.fleet.build.orders import JudgeOptions, OrderResult, Orders
 from engram.fleet.download.updating import UpdateReport, update
 from engram.fleet.merge.gate import check_held_out
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.replay import MergeOptions
+from engram.fleet.merge.settings import MergeOptions
 from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.maps import Map, copy_map
 from engram.measures import Drive, Estimator, route_not_localised

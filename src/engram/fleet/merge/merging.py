@@ -15,8 +15,8 @@ from engram.fleet.merge.checks import check_fits, check_readable
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.geometry import GeometryGate
 from engram.fleet.merge.pictures import picture_before_and_after
-from engram.fleet.merge.replay import MergeOptions
 from engram.fleet.merge.report import MergeReport
+from engram.fleet.merge.settings import MergeOptions
 from engram.fleet.merge.state import Merge
 from engram.fleet.merge.steps import Gates, merge_one
 from engram.maps import FORMAT_VERSION, Map, copy_map, publish_map

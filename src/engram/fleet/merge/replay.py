@@ -5,18 +5,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
 
-import msgspec
-
-from engram.config import check_bounds
-from engram.errors import ConfigError
 from engram.fleet.merge.behind_gaps import Ahead, look_along, position_behind_gap
 from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
+from engram.fleet.merge.settings import MergeOptions
 from engram.fleet.merge.state import Merge
 from engram.fleet.merge.whole_segments import SeedFrom, Unit, localises_well
 from engram.frontend import Frame, FrameStatus
@@ -34,11 +30,11 @@ from engram.graph.model import (
 )
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
 from engram.localiser import (
-    RELOCALISERS,
     Budget,
     Hint,
     Keeper,
     Localisation,
+    LocalisationStatus,
     Localiser,
     Position,
     Relocaliser,
@@ -48,7 +44,6 @@ from engram.mapper import match_edges
 from engram.maps import StoredNode
 from engram.monitor import Monitor
 from engram.odometry import Motion, OdometryStatus, OdometryStep
-from engram.ranking import check_for_robot
 from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in, relocaliser_in
 from engram.sequences import LoggedFrame
@@ -64,71 +59,36 @@ _ITERATION_GAP = 100
 _AGREED = 5
 
 
-@dataclass(frozen=True, slots=True)
-class MergeOptions:
-    """How maps are merged.
+@dataclass(slots=True, eq=False)
+class _Held:
+    """A replayed node, held back while its fix or one before it may still be withdrawn."""
 
-    Attributes:
-        policy: key of `POLICIES`.
-        lanes, rounds: the budget of each replayed frame, lost or not: a count, so that the same
-            input gives the same map.
-        relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
-        author: who merges; None for the robots whose drives bring something new.
-        sure_inliers, unit, segment_share, seed: see their descriptions.
-    """
+    stored: StoredNode
+    live: Frame
+    found: Localisation
+    outcomes: Sequence[Outcome]
+    attempts: list[Attempt]
 
-    policy: str = "recall"
-    lanes: int = 2
-    rounds: int = 4
-    relocaliser: str | None = "fabmap"
-    author: str | None = None
-    sure_inliers: Annotated[
-        int,
-        msgspec.Meta(
-            ge=0,
-            description="inliers needed before omitting a node that other drives in the robot's "
-            "map matched: frames that match the node need not match another that the node itself "
-            "barely matches. 0 omits on every match, as [G16] does",
-        ),
-    ] = 40
-    unit: Annotated[
-        Unit,
-        msgspec.Meta(
-            description="what is omitted or taken at once: each frame, or a whole segment, as "
-            "[G16] Fig. 4 draws it"
-        ),
-    ] = Unit.FRAME
-    segment_share: Annotated[
-        float,
-        msgspec.Meta(
-            ge=0,
-            le=1,
-            description="unit segment: share of its frames that must localise for it to be "
-            "omitted; [G16] gives none",
-        ),
-    ] = 0.5
-    seed: Annotated[
-        SeedFrom,
-        msgspec.Meta(
-            description="where the replay of a segment starts: at a neighbour that the fleet map "
-            "knows, or always by place recognition, as [G16] §V-A does"
-        ),
-    ] = SeedFrom.NEIGHBOUR
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
-        check_for_robot(self.policy)
-        Budget(self.lanes, self.rounds)  # refuses an invalid budget
-        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
-            raise ConfigError(
-                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+    def withdrawn(self, *, is_the_fix: bool) -> None:
+        """The position is unknown; of the disproved fix also the match is none."""
+        self.found = replace(self.found, position=None)
+        if is_the_fix:
+            self.found = replace(
+                self.found,
+                status=LocalisationStatus.LOST,
+                node=None,
+                node_from_live=None,
+                covariance=None,
             )
+            self.outcomes = ()
+            self.attempts = [replace(one, accepted=False) for one in self.attempts]
 
 
 class Replay(Keeper):
     """Replays segments one after another and adds what the fleet map lacks.
 
-    Each segment is a drive of `Robot.step`, with this object as the keeper.
+    Each segment is a drive of `Robot.step`, with this object as the keeper. What fixes on trial
+    would omit or tie is held back until they have proved themselves.
 
     Args:
         merge: the known and added records.
@@ -162,6 +122,7 @@ class Replay(Keeper):
         self._ahead: Ahead | None = None  # found behind a gap, ahead of its turn
         self._run: list[int] = []  # nodes taken in a row, by their dense indices
         self._visited: NodeId | None = None  # matched or taken last
+        self._held: list[_Held] = []
         self._kept: list[KeptNode] = []
         # Whether the segment is omitted as a whole; None where each frame decides.
         self._omits: bool | None = None
@@ -182,6 +143,7 @@ class Replay(Keeper):
             for stored, logged in self._stream(segment):
                 self._stored = stored
                 robot.step(logged)
+            self._release()
             self._end_run()
             self._iterations[session.id] = self._localiser.iteration + _ITERATION_GAP
         return SegmentReport.of(session, seed, self._kept)
@@ -213,30 +175,25 @@ class Replay(Keeper):
         return not certain
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """See `Keeper`: omits or takes the node."""
-        stored, outcomes = self._stored, self._localiser.outcomes
-        node = stored.node
+        """See `Keeper`: omits or takes the node, once its fix is no longer on trial."""
+        outcomes, attempts = self._localiser.outcomes, self._localiser.attempts()
         if self._ahead is not None and self._ahead.found is found:
-            outcomes = self._ahead.outcomes
-        else:
-            self._remember(node, found)
-        reason = self._reason(node, live, found)
-        if reason is None:
-            # The fleet map covers this place already.
-            self._merge.omit(node.id, _measured(found), stored.landmark_hash)
-            self._link(node.id)
-        else:
-            self._take(stored, live, found)
-        if found.localised:
-            self._matched(node, outcomes)
+            outcomes, attempts = self._ahead.outcomes, []
+        self._held.append(_Held(self._stored, live, found, outcomes, attempts))
+        if not self._localiser.on_trial:
+            self._release()
         report = self._merge.report
         report.match_attempts += found.attempts
         report.proposed_attempts += found.proposed
         report.lookups += found.looked_up
-        self._kept.append(KeptNode(node.stamp_ns, found.motion.odometry.moved_m, reason))
-        self._monitor.advance("added" if reason else "covered")
         self._monitor.check()
         return found
+
+    def withdrawn(self, found: Localisation) -> None:
+        """See `Keeper`: the frame was not localised, nor do those after it have a position."""
+        for one in self._held:
+            if one.found.stamp_ns >= found.stamp_ns:
+                one.withdrawn(is_the_fix=one.found.stamp_ns == found.stamp_ns)
 
     @property
     def _whole(self) -> bool:
@@ -360,9 +317,30 @@ class Replay(Keeper):
 
     # -- the outcome of a frame
 
-    def _remember(self, node: Node, found: Localisation) -> None:
+    def _release(self) -> None:
+        """Omits or takes the nodes that were held back, in the order of time."""
+        held, self._held = self._held, []
+        for one in held:
+            node, found = one.stored.node, one.found
+            self._remember(node, found, one.attempts)
+            reason = self._reason(node, one.live, found)
+            if reason is None:
+                # The fleet map covers this place already.
+                self._merge.omit(node.id, _measured(found), one.stored.landmark_hash)
+                self._link(node.id)
+            else:
+                self._take(one)
+                if one is held[-1]:
+                    self._localiser.settle_in(node.id)
+            if found.localised:
+                self._matched(node, one.outcomes)
+            moved_m = found.motion.odometry.moved_m
+            self._kept.append(KeptNode(node.stamp_ns, moved_m, reason))
+            self._monitor.advance("added" if reason else "covered")
+
+    def _remember(self, node: Node, found: Localisation, attempts: list[Attempt]) -> None:
         """Records the attempts and matches of a frame."""
-        self.attempts[node.session] += self._localiser.attempts()
+        self.attempts[node.session] += attempts
         if found.node is not None and found.node != self._visited:
             self._visited = found.node
             path, kind = path_id(node.session), PathEntryKind.REPLAYED
@@ -384,10 +362,10 @@ class Replay(Keeper):
             return Reason.NO_MATCH
         return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
-    def _take(self, stored: StoredNode, frame: Frame, found: Localisation) -> None:
+    def _take(self, held: _Held) -> None:
         """Takes a node, with its own edges and the one to its match."""
-        node = stored.node
-        index = self._merge.take(stored, frame)
+        node, found = held.stored.node, held.found
+        index = self._merge.take(held.stored, held.live)
         self._taken.add(node.id)
         self._run.append(index)
         self._link(node.id)
@@ -396,7 +374,6 @@ class Replay(Keeper):
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
             self._merge.add_edge(match)
         self._merge.write_edges(lay_proximity_edges(self._merge.graph, index))
-        self._localiser.settle_in(node.id)
         self._visited = node.id
 
     def _matched(self, node: Node, outcomes: Sequence[Outcome]) -> None:

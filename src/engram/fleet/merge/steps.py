@@ -18,9 +18,10 @@ from engram.fleet.merge.checks import check_fits, check_readable, notes
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.geometry import GeometryGate
 from engram.fleet.merge.positions import recomposed, uncertainty_m2
-from engram.fleet.merge.replay import MergeOptions, Replay
+from engram.fleet.merge.replay import Replay
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.segments import Segment, string_segments
+from engram.fleet.merge.settings import MergeOptions
 from engram.fleet.merge.state import Merge
 from engram.frontend import DescriptorKind
 from engram.graph.attempts import Attempts
