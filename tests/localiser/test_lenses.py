@@ -150,3 +150,14 @@ def test_a_start_that_ignores_the_mounting_is_not_believed(tmp_path):
         assert not first.localised
         unknown = Position.mounted(node, CAMERA, CAMERA, SURE)
     assert unknown.node_from_live.distance_m == 0
+
+
+def test_a_robot_that_stands_at_a_node_is_placed_by_both_mountings(tmp_path):
+    path, node_rig = tmp_path / "street.engram", replace(CAMERA, cam_from_rig=SE3.identity())
+    map_simulated(path, drive(WORLD, ROAD[:3], camera=node_rig))
+    live = drive(WORLD, ROAD[:1], camera=replace(CAMERA, cam_from_rig=MOUNTING.inverse()))
+    with Map.open(path) as opened, localiser_in(
+        opened, live[0].frame.camera, Settings(), relocaliser=None
+    ) as localiser:  # fmt: skip
+        standing = localiser.standing_at(opened.graph.node(0).id, live[0].frame, SURE)
+    np.testing.assert_allclose(standing.node_from_live.matrix(), MOUNTING.matrix(), atol=1e-12)

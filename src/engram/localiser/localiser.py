@@ -205,6 +205,12 @@ class Localiser:
             self._open_loop_m = open_loop_m
         self._guessed_m2 = guessed_m**2
 
+    def standing_at(self, node: NodeId, live: Frame, covariance: NDArray[np.float64]) -> Position:
+        """Where a robot is that stands where the robot of a node stood; see `Position.mounted`."""
+        known = self._graph.node(self._graph.index(node)).camera
+        camera = self._background.cameras.get(known, live.camera)
+        return Position.mounted(node, camera, live.camera, covariance)
+
     def lose(self) -> None:
         """Discards the position: the robot was restarted or carried elsewhere."""
         self.position = None

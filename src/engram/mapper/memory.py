@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from engram.frontend import Frame
-from engram.geometry import SE3
 from engram.graph.model import NodeId, PathEntry, PathEntryKind, PathId
-from engram.localiser import Hint, Keeper, Localisation, LocalisationStatus, Localiser, Position
+from engram.localiser import Hint, Keeper, Localisation, LocalisationStatus, Localiser
 from engram.localiser.chain import MOST_ON_TRIAL
 from engram.mapper.saver import Records, Saver
 from engram.maps import StoredSession
@@ -93,7 +92,7 @@ class Memory(Keeper):
         entry, position = self._stored.last_entry, None
         if entry and entry.stamp_ns == live.stamp_ns and entry.kind is PathEntryKind.MATCHED:
             spread = np.diag([_RESUMED_SIGMA_M**2] * 3 + [_RESUMED_SIGMA_RAD**2] * 3)
-            position = Position(entry.node, SE3.identity(), spread)
+            position = self._localiser.standing_at(entry.node, live, spread)
         followed = Localisation(
             live.stamp_ns, LocalisationStatus.DEAD_RECKONING, 0, 0, 0.0, motion, resumed=True
         )
