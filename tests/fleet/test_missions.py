@@ -10,7 +10,15 @@ from tests.mapping_rig import map_simulated
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions, download
-from engram.fleet.download.forecast import BINS, FARTHEST_H, INTERVALS, LEVEL, Forecast
+from engram.fleet.download.forecast import (
+    BINS,
+    INTERVALS,
+    LEVEL,
+    MOST_DRIVES,
+    Forecast,
+    Light,
+    Weather,
+)
 from engram.fleet.download.selections import SELECTIONS, along_route, select_region
 from engram.fleet.download.stock import Stock
 from engram.maps import Map, check_file
@@ -64,10 +72,12 @@ def test_every_mission_is_as_connected_as_the_fleet_map_and_says_what_it_did(
     assert components == report.components == len({labels[node] for node in nodes})
     if policy != "budget":  # fills the rest of its bytes with what is near in time
         assert nodes <= allowed
-        widened = report.why.get("widened")
-        has_data = hour == WITH and (place != "route" or policy == "paths")
-        assert (widened is None) is (hour == WITH) or not has_data
-        assert widened is None or widened in report.text()
+        widened, told = report.why.get("widened"), report.text()
+        if hour == WITHOUT:  # `paths` begins with the first epoch that has data
+            assert widened or (policy == "paths" and f"epochs {report.why['epochs'][0]}" in told)
+        elif place == "anywhere":
+            assert widened is None
+        assert widened is None or widened in told
     assert check_file(tmp_path / "out.engram").problems == ()
 
 
@@ -99,15 +109,31 @@ def test_without_any_hour_near_everything_of_the_area_goes_along(centre, monkeyp
     assert "all hours are sent" in found.why["widened"]
 
 
-def test_forecasts_are_intervals_or_say_that_they_cannot_know():
-    for drives in (1, 40):
-        for place, interval in enumerate(INTERVALS[drives == 1]):
-            expected = (BINS[place] + BINS[place + 1]) / 2
-            forecast = Forecast.of(expected, drives, apart_h=1.0)
-            assert forecast.known is (interval is not None)
-            assert 0 <= forecast.low <= forecast.high <= 1
-            assert ("not known for such" in forecast.text()) is not forecast.known
-            assert f"{LEVEL:.0%}" in forecast.text() or not forecast.known
-            assert not Forecast.of(expected, drives, apart_h=FARTHEST_H + 1).known
-    assert any(INTERVALS[True])
-    assert any(INTERVALS[False])
+@pytest.mark.parametrize("alike", [True, False, None])
+@pytest.mark.parametrize("drives", [1, 40])
+def test_forecasts_are_intervals_or_say_that_they_cannot_know(drives, alike):
+    for place in range(len(BINS) - 1):
+        lost = (BINS[place] + BINS[place + 1]) / 2
+        forecast = Forecast.of(lost, lost, drives, Light(alike))
+        for weather, missed in forecast.missed.items():
+            table = INTERVALS.get((weather, alike, drives < MOST_DRIVES))
+            assert missed == (None if table is None or alike is None else table[place])
+            assert missed is None or 0 <= missed[0] < missed[1] <= 1
+        assert forecast.text().count("not known") == list(forecast.missed.values()).count(None)
+        assert f"{LEVEL:.0%}" in forecast.text()
+    assert (alike is not True) or forecast.missed.keys() == set(Weather)
+
+
+def test_light_is_told_by_the_sun_where_the_latitude_is_known(centre):
+    """Drives at 9:00 and 18:00 in January: at 60° north the sun is down by 18:00."""
+    with Map.open(centre) as store:
+        stock = Stock(store)
+
+        def alike(hour: float | None, latitude_deg: float | None) -> bool | None:
+            return Light.of(stock, DownloadOptions(start_h=hour, latitude_deg=latitude_deg)).alike
+
+        assert alike(23.0, 60.0) is True  # as dark as 18:00
+        assert alike(12.0, 0.0) is True
+        assert alike(10.0, None) is True
+        assert alike(3.5, None) is None  # far from all hours, and the sun is not known
+        assert alike(None, 60.0) is None

@@ -339,9 +339,7 @@ def test_a_file_that_was_downloaded_is_a_source_too(tmp_path):
     assert Content.of(one) == Content.of(world.robot)
 
 
-def killed_at(
-    statement: int, centre: Path, robot: Path, options: DownloadOptions = WHOLE
-) -> bool:
+def killed_at(statement: int, centre: Path, robot: Path, options: DownloadOptions = WHOLE) -> bool:
     """Runs an update in a child that dies before its n-th statement; whether it died."""
     child = os.fork()
     if child:

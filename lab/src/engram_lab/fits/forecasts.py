@@ -1,4 +1,4 @@
-"""The interval of a download's forecast: missions in towns by weather and size of the map.
+"""The interval of a download's forecast: missions in towns by weather, light and size of the map.
 
     python -m engram_lab.fits.forecasts collect TOWN... --out rows.csv    # resumable
     python -m engram_lab.fits.forecasts fit rows.csv…                     # the table that ships
@@ -14,25 +14,42 @@ from __future__ import annotations
 import argparse
 import csv
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+from scipy import stats
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions
-from engram.fleet.download.forecast import BINS, FARTHEST_H, INTERVALS, LEVEL, MOST_DRIVES, Forecast
+from engram.fleet.download.daylight import DUSK_DEG, LOW_DEG
+from engram.fleet.download.forecast import (
+    ALIKE_DEG,
+    BINS,
+    LEVEL,
+    MOST_DRIVES,
+    Forecast,
+    Light,
+    Weather,
+)
+from engram.graph.sun import sun_height_deg
 from engram.measures import route_not_localised
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram_lab.town.conditions import OXFORD
 from engram_lab.trial import try_downloads
 
-NAMES = ("town", "drives", "mission", "weather", "apart_h", "policy", "expected", "missed")
+NAMES = (
+    "town", "drives", "mission", "weather", "apart_deg", "policy", "expected", "lost", "missed",
+)  # fmt: skip
+# Wider intervals promise nothing.
+_WIDEST = 0.5
+_FEWEST = 5
 POLICIES = {
     "copy": DownloadOptions(),
     "tod": DownloadOptions("tod"),
     "budget": DownloadOptions("budget", budget_percent=50.0),
 }
-WET = frozenset({"rain", "showers"})
 Row = dict[str, str]
 
 
@@ -46,18 +63,22 @@ def collect(town: Path, out: Path) -> None:
             map_drive(centre, open_drive(log), Settings(), RobotOptions())
             for mission in logs[count:]:
                 if (town.name, str(count), mission.stem) not in done:
-                    apart_h = min(hours_apart(one, mission) for one in logs[:count])
-                    append(out, list(missions(town, centre, count, mission, apart_h)))
+                    apart = min(abs(sun_deg(one) - sun_deg(mission)) for one in logs[:count])
+                    append(out, list(missions(town, centre, count, mission, apart)))
 
 
-def hours_apart(drive: Path, mission: Path) -> float:
-    """Difference in hour of day of two drives, by their names: 005-0716T2300-rain-wildcat."""
-    clocks = [one.stem.split("-")[1].partition("T")[2] for one in (drive, mission)]
-    hours = [int(clock[:2]) + int(clock[2:]) / 60 for clock in clocks]
-    return abs((hours[0] - hours[1] + 12) % 24 - 12)
+def sun_deg(drive: Path) -> float:
+    """Height of the sun on a drive, by its name: 005-0716T2300-rain-wildcat."""
+    clock = drive.stem.split("-")[1]
+    day = datetime.strptime(f"2025{clock}", "%Y%m%dT%H%M").replace(tzinfo=UTC)
+    hour = day.hour + day.minute / 60 + OXFORD.longitude_deg / 15
+    height = sun_height_deg(day.timetuple().tm_yday - 1, hour, OXFORD.latitude_deg)
+    return float(np.clip(height, DUSK_DEG, LOW_DEG))
 
 
-def missions(town: Path, centre: Path, count: int, mission: Path, apart_h: float) -> Iterator[Row]:
+def missions(
+    town: Path, centre: Path, count: int, mission: Path, apart_deg: float
+) -> Iterator[Row]:
     """One drive in each kind of download."""
     for name, asked in POLICIES.items():
         try:
@@ -71,9 +92,10 @@ def missions(town: Path, centre: Path, count: int, mission: Path, apart_h: float
             count,
             mission.stem,
             mission.stem.split("-")[2],
-            f"{apart_h:.2f}",
+            f"{apart_deg:.2f}",
             name,
             f"{trial.report.expected_missed:.4f}",
+            f"{trial.report.expected_missed - trial.report.copy_missed:.4f}",
             f"{route_not_localised([trial.steps]):.4f}",
         )
         yield dict(zip(NAMES, map(str, values), strict=True))
@@ -93,58 +115,96 @@ def read(paths: Sequence[Path]) -> list[Row]:
     """Rows of tables; of the fleet study's, those of held-out drives in downloads."""
     rows: list[Row] = []
     for path in paths:
-        if not path.exists():
-            continue
-        with path.open(encoding="utf-8", newline="") as file:
-            found = list(csv.DictReader(file))
-        rows += [_of_study(one) if "experiment" in one else one for one in found if _counts(one)]
+        if path.exists():
+            with path.open(encoding="utf-8", newline="") as file:
+                found = list(csv.DictReader(file))
+            rows += of_study(found) if found and "experiment" in found[0] else found
     return rows
 
 
-def _counts(row: Row) -> bool:
-    return "experiment" not in row or (row["map"].startswith("held out") and row["arm"] == "B")
+def of_study(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the fleet study: its maps of 28 drives have the light of every hour."""
+    held = [
+        one
+        for one in rows
+        if one["map"].startswith("held out") and one["arm"] == "B" and one["expected_missed"]
+    ]
+    whole = {
+        one["drive"]: float(one["expected_missed"]) for one in held if one["map"].endswith("copy")
+    }
+    made = []
+    for one in held:
+        expected = float(one["expected_missed"])
+        values = (one["campaign"], "28", one["drive"], one["drive"].split("-")[2], "0", one["map"],
+                  f"{expected:.4f}", f"{expected - whole[one['drive']]:.4f}",
+                  one["share_not_localised"])  # fmt: skip
+        made.append(dict(zip(NAMES, values, strict=True)))
+    return made
 
 
-def _of_study(row: Row) -> Row:
-    weather = row["drive"].split("-")[2]
-    values = (row["campaign"], "28", row["drive"], weather, "0", row["map"], row["expected_missed"],
-              row["share_not_localised"])  # fmt: skip
-    return dict(zip(NAMES, values, strict=True))
+def class_of(row: Row) -> tuple[Weather, bool, bool, int]:
+    """Which missions a mission is alike: a key of `INTERVALS`, and a bin; all are one if wet."""
+    weather = Weather(row["weather"]) if row["weather"] in set(Weather) else Weather.DRY
+    alike = float(row["apart_deg"]) <= ALIKE_DEG
+    bin_of = int(np.digitize(float(row["lost"]), BINS[1:-1])) if weather is Weather.DRY else 0
+    return weather, alike, int(row["drives"]) < MOST_DRIVES, bin_of
+
+
+def interval(towns: Mapping[str, Sequence[float]]) -> tuple[float, float] | None:
+    """What four in five missions of one more town miss, by those of some towns.
+
+    The spread within a town is that of quantiles; between towns it is that of a normal prediction
+    (Student's t), since a handful of them tells little of how far the next may lie. Missions of one
+    town alone stand for themselves only.
+    """
+    missed = [np.asarray(one) for one in towns.values()]
+    if sum(map(len, missed)) < _FEWEST:
+        return None
+    tail = (1 - LEVEL) / 2
+    means = np.array([one.mean() for one in missed])
+    within = np.concatenate([one - one.mean() for one in missed])
+    low, high = np.quantile(within, [tail, 1 - tail])
+    between = 0.0
+    if len(means) > 1:
+        quantile = stats.t.ppf(1 - tail, len(means) - 1)
+        between = quantile * means.std(ddof=1) * np.sqrt(1 + 1 / len(means))
+    middle = means.mean()
+    ends = np.clip([middle - np.hypot(low, between), middle + np.hypot(high, between)], 0, 1)
+    return (float(ends[0]), float(ends[1])) if np.ptp(ends) <= _WIDEST else None
 
 
 def fit(rows: Sequence[Row]) -> None:
-    """Prints quantiles of what dry missions missed, by what was expected and the map's size."""
-    tail = (1 - LEVEL) / 2
-    for few in (True, False):
-        own = [one for one in rows if (int(one["drives"]) < MOST_DRIVES) is few]
-        dry = [
-            one for one in own if one["weather"] not in WET and float(one["apart_h"]) <= FARTHEST_H
-        ]
-        expected = np.array([float(one["expected"]) for one in dry])
-        missed = np.array([float(one["missed"]) for one in dry])
-        places = np.digitize(expected, BINS[1:-1])
-        print("few drives:" if few else "many drives:")
-        for place in range(len(BINS) - 1):
-            here = missed[places == place]
-            ends = np.quantile(here, [tail, 1 - tail]) if len(here) else [np.nan] * 2
-            print(f"  {BINS[place]:.2f} to {BINS[place + 1]:.2f}: {ends[0]:.3f} {ends[1]:.3f} "
-                  f"({len(here)} missions)")  # fmt: skip
+    """Prints the table that ships, and how many missions and towns each interval rests on."""
+    found: dict[tuple[Weather, bool, bool, int], dict[str, list[float]]] = {}
+    for row in rows:
+        towns = found.setdefault(class_of(row), {})
+        towns.setdefault(row["town"], []).append(float(row["missed"]))
+    for key in sorted(found):
+        weather, alike, few, place = key
+        ends = interval(found[key])
+        count = sum(map(len, found[key].values()))
+        told = "None" if ends is None else f"({ends[0]:.3f}, {ends[1]:.3f})"
+        lost = f"lost {BINS[place]:g} to {BINS[place + 1]:g}" if weather is Weather.DRY else "all"
+        print(f"{weather}, {'light known' if alike else 'other light'}, "
+              f"{'few' if few else 'many'} drives, {lost}: "
+              f"{told}  # {count} missions of {len(found[key])} towns")  # fmt: skip
 
 
 def judge(rows: Sequence[Row]) -> None:
-    """Prints how many dry missions lie within their interval, and the median width."""
-    dry = [one for one in rows if one["weather"] not in WET]
-    found = [
-        Forecast.of(float(one["expected"]), int(one["drives"]), float(one["apart_h"]))
-        for one in dry
-    ]
-    known = [(one, row) for one, row in zip(found, dry, strict=True) if one.known]
-    inside = [one.low <= float(row["missed"]) <= one.high for one, row in known]
-    widths = [100 * (one.high - one.low) for one, _ in known]
-    print(f"{len(rows)} missions, {len(rows) - len(dry)} in rain or showers: no promise; of "
-          f"{len(dry)} dry ones {len(dry) - len(known)} without a promise")  # fmt: skip
-    print(f"within the {LEVEL:.0%} interval: {np.mean(inside):.1%}; median width "
-          f"{np.median(widths):.1f} points ({len(INTERVALS)} tables)")  # fmt: skip
+    """Prints how many missions lie within their interval, and the median width."""
+    inside, widths = [], []
+    for row in rows:
+        weather, alike, _, _ = class_of(row)
+        forecast = Forecast.of(
+            float(row["expected"]), float(row["lost"]), int(row["drives"]), Light(alike)
+        )
+        ends = forecast.missed[weather]
+        if ends is None:
+            continue
+        inside.append(ends[0] <= float(row["missed"]) <= ends[1])
+        widths.append(100 * (ends[1] - ends[0]))
+    print(f"{len(rows)} missions, {len(inside)} with a promise; {np.mean(inside):.1%} within the "
+          f"{LEVEL:.0%} interval; median width {np.median(widths):.1f} points")  # fmt: skip
 
 
 def main() -> None:

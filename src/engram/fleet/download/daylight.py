@@ -37,7 +37,7 @@ _LEAST_SUN_WEIGHT = 0.05
 _NIGHT_DEG, _NOON_DEG = -10.0, 45.0
 # The range of heights that decides whether two sessions match at all: from civil dusk to a low sun.
 # Source: lab/reports/constants-fleet.md.
-_DUSK_DEG, _LOW_DEG = -6.0, 10.0
+DUSK_DEG, LOW_DEG = -6.0, 10.0
 _LATITUDES_DEG = (-60.0, -52.5, -45.0, -37.5, -30.0, -15.0, 0.0, 15.0, 30.0, 37.5, 45.0, 52.5, 60.0)
 # Most attempts of one pair of sessions that count: more repeat the same light.
 _PAIR_ATTEMPTS = 20.0
@@ -65,6 +65,33 @@ def importance(stock: Stock, options: DownloadOptions) -> Array:
     apart_deg = np.maximum(np.maximum(low - height, height - high), 0.0)
     side = (_near_in_hours(hours, options, _SIDE_H) + _LEAST_SIDE) / (1 + _LEAST_SIDE)
     return np.asarray(np.exp(-0.5 * (apart_deg / _SUN_DEG) ** 2) * side + _LEAST_SUN_WEIGHT)
+
+
+def light_apart_deg(stock: Stock, options: DownloadOptions) -> float | None:
+    """How much the height of the sun on the mission differs from that on the drive nearest to it.
+
+    Returns:
+        Degrees, between dusk and a low sun, beyond which light hardly changes; None if hours or
+        latitude are unknown.
+    """
+    hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
+    if options.start_h is None or not np.isfinite(hours).all():
+        return None
+    latitude_deg = latitude_of(stock, options)
+    if latitude_deg is None:
+        return None
+    height = np.clip(_heights(stock, hours, latitude_deg), DUSK_DEG, LOW_DEG)
+    ends = np.clip(_mission_heights(stock, options, latitude_deg), DUSK_DEG, LOW_DEG)
+    return float(np.abs(np.subtract.outer(ends, height)).min(axis=1).max())
+
+
+def nearest_hours(stock: Stock, options: DownloadOptions) -> float:
+    """Hours from a mission's start to the time of day of the nearest drive; infinite if unknown."""
+    starts = [hour_of_day(one, one.start_ns) for one in stock.sessions]
+    if options.start_h is None:
+        return np.inf
+    apart = [abs((options.start_h - one + 12) % 24 - 12) for one in starts if one is not None]
+    return min(apart, default=np.inf)
 
 
 def latitude_of(stock: Stock, options: DownloadOptions) -> float | None:
@@ -98,8 +125,8 @@ def learnt_latitude(stock: Stock) -> float | None:
     by_hours, _ = pairs.fit(np.minimum(np.minimum(hours_apart, 24 - hours_apart), _FAR_H) / _FAR_H)
     fits = []
     for latitude_deg in _LATITUDES_DEG:
-        height = np.clip(_heights(stock, hours, latitude_deg), _DUSK_DEG, _LOW_DEG)[judged]
-        apart = np.abs(height[:, None] - height[None, :]) / (_LOW_DEG - _DUSK_DEG)
+        height = np.clip(_heights(stock, hours, latitude_deg), DUSK_DEG, LOW_DEG)[judged]
+        apart = np.abs(height[:, None] - height[None, :]) / (LOW_DEG - DUSK_DEG)
         fits.append((*pairs.fit(apart), latitude_deg))
     likelihood, slope, latitude = max(fits)
     return latitude if slope > 0 and likelihood - by_hours > _LEAST_EVIDENCE else None

@@ -7,7 +7,6 @@ and no host, and the file is compacted at the end.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,13 +20,12 @@ from engram.errors import InputError
 from engram.files import check_parent, draft_folder
 from engram.fleet.download.bridges import components
 from engram.fleet.download.coverage import Coverage, expected_missed
-from engram.fleet.download.forecast import Forecast
+from engram.fleet.download.forecast import Forecast, Light
 from engram.fleet.download.marks import write_marks
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Part
 from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
 from engram.fleet.download.stock import Stock
-from engram.graph.clock import hour_of_day
 from engram.maps import Map, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
@@ -297,15 +295,6 @@ def revision_of(stock: Stock, options: DownloadOptions) -> dict[str, Any]:
     }
 
 
-def hours_from(stock: Stock, start_h: float | None) -> float:
-    """Hours from a mission's start to the time of day of the nearest drive; infinite if unknown."""
-    starts = [hour_of_day(one, one.start_ns) for one in stock.sessions]
-    known = [one for one in starts if one is not None]
-    if start_h is None or not known:
-        return math.inf
-    return min(abs((start_h - one + 12) % 24 - 12) for one in known)
-
-
 def _report(
     part: Part,
     why: Mapping[str, Any],
@@ -317,6 +306,7 @@ def _report(
     """The report of a file that will be named `out`."""
     stock, sent = part.stock, part.sent
     missed = expected_missed(coverage, sent)
+    copy_missed = expected_missed(coverage, stock.everything())
     with Map.open(file) as written:
         info = written.info()
         content_hash = written.content_hash()
@@ -340,6 +330,8 @@ def _report(
         of_bytes=stock.store.info().size_bytes,
         why=dict(why),
         expected_missed=missed,
-        copy_missed=expected_missed(coverage, stock.everything()),
-        forecast=Forecast.of(missed, len(stock.sessions), hours_from(stock, options.start_h)),
+        copy_missed=copy_missed,
+        forecast=Forecast.of(
+            missed, missed - copy_missed, len(stock.sessions), Light.of(stock, options)
+        ),
     )

@@ -1,85 +1,122 @@
 """The interval of a forecast: what a mission will miss, calibrated on missions in other towns.
 
-`Coverage` expects a share of the route without a match. In dry weather missions miss less than
-that, and by how much depends on how many drives the map holds; the table below says what four in
-five of them missed. In rain and showers the same expectation came with 25 to 99 % missed: there is
-no interval for them, nor for expectations that calibration met too seldom, nor for missions whose
-hour is far from that of any drive in the map.
+`Coverage` expects a share of the route without a match, and its level is too dark in dry weather
+and too bright in wet. So a mission is compared with those that calibration met: in the same kind of
+weather, in a map of about as many drives, in the light of one of them or not, and with about as
+much expected to be lost by the nodes left out. The table below says what four in five of those
+missed. Where calibration met too few, or their towns differ too much, nothing is promised.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
+from typing import TypeAlias
 
 import numpy as np
 
+from engram.fleet.download.daylight import light_apart_deg, nearest_hours
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.stock import Stock
+
+Interval: TypeAlias = tuple[float, float]
+
 # Share of missions that the interval holds.
 LEVEL = 0.8
-# Expected shares between which missions are alike.
-BINS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+# Losses by nodes left out, of the expected share, between which missions are alike.
+BINS = (0.0, 0.02, 0.15, 0.3, 0.45, 0.6, 0.75, 1.0)
 # Maps of fewer drives are calibrated apart.
 MOST_DRIVES = 8
-# A mission farther than this from the hour of any drive in the map is in another light, hours.
-FARTHEST_H = 3.0
-# (low, high) of each bin, for maps of few and of many drives; None where fewer than five missions
-# were met. Source: `engram_lab.fits.forecasts fit`, lab/reports/forecasts.md.
-INTERVALS: dict[bool, tuple[tuple[float, float] | None, ...]] = {
-    # Three bins together: there were twelve such missions.
-    True: (None, None, None, *((0.0, 0.01),) * 3, None, None, None, None),
-    False: (
+# A mission is in the light of a drive if the sun stands as high, to so many degrees between dusk
+# and a low sun; without a known latitude, if it is within so many hours.
+ALIKE_DEG = 4.0
+ALIKE_H = 3.0
+
+
+class Weather(StrEnum):
+    """What the camera looks through."""
+
+    DRY = "dry"
+    SHOWERS = "showers"
+    RAIN = "rain"
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """What the map knows of the mission's light.
+
+    Attributes:
+        alike: whether some drive of the map had the same; None if that is unknown.
+    """
+
+    alike: bool | None
+
+    @staticmethod
+    def of(stock: Stock, options: DownloadOptions) -> Light:
+        """By the height of the sun where the latitude is known, else by the hour."""
+        apart_deg = light_apart_deg(stock, options)
+        if apart_deg is not None:
+            return Light(apart_deg <= ALIKE_DEG)
+        return Light(True if nearest_hours(stock, options) <= ALIKE_H else None)
+
+
+def _few(*known: Interval | None) -> tuple[Interval | None, ...]:
+    """Intervals of the first bins; none for the others."""
+    return known + (None,) * (len(BINS) - 1 - len(known))
+
+
+# (low, high) of each bin, by weather, by whether a drive of the map had the mission's light, and by
+# whether the map has few drives. Source: `engram_lab.fits.forecasts fit`, lab/reports/forecasts.md.
+INTERVALS: dict[tuple[Weather, bool, bool], tuple[Interval | None, ...]] = {
+    (Weather.DRY, True, True): _few((0.0, 0.02), (0.0, 0.17)),
+    (Weather.DRY, True, False): (
         (0.0, 0.01),
         (0.0, 0.01),
-        (0.0, 0.02),
-        (0.0, 0.12),
-        (0.0, 0.14),
-        (0.01, 0.46),
+        (0.0, 0.15),
+        (0.0, 0.24),
         (0.19, 0.52),
-        None,
-        (0.61, 0.93),
-        (0.70, 1.0),
+        (0.51, 0.88),
+        (0.63, 0.99),
     ),
+    (Weather.SHOWERS, True, True): ((0.40, 0.65),) * (len(BINS) - 1),
+    (Weather.RAIN, False, True): ((0.99, 1.0),) * (len(BINS) - 1),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a mission in dry weather will miss.
+    """What a mission will miss, for each kind of weather that it may meet.
 
     Attributes:
         expected: share of the route without a match that `Coverage` expects.
-        low, high: the interval of the share; 0 and 1 if it is not known.
-        known: whether calibration met enough such missions.
+        missed: ends of the interval of the share by weather; None where it is not known.
     """
 
     expected: float
-    low: float
-    high: float
-    known: bool
+    missed: dict[Weather, Interval | None]
 
     @staticmethod
-    def of(expected: float, drives: int, apart_h: float) -> Forecast:
+    def of(expected: float, lost: float, drives: int, light: Light) -> Forecast:
         """The forecast of one mission.
 
         Args:
             expected: share of the route without a match by `Coverage`.
+            lost: of that, by nodes that are left out.
             drives: sessions in the map.
-            apart_h: hours from the mission's start to the time of day of the nearest of them.
+            light: whether the map knows the mission's light.
         """
-        table = INTERVALS[drives < MOST_DRIVES]
-        place = int(np.digitize(expected, BINS[1:-1]))
-        found = table[place] if apart_h <= FARTHEST_H else None
-        if found is None:
-            return Forecast(expected, 0.0, 1.0, known=False)
-        return Forecast(expected, *found, known=True)
+        place = int(np.digitize(lost, BINS[1:-1]))
+        missed: dict[Weather, Interval | None] = dict.fromkeys(Weather)
+        if light.alike is not None:
+            for weather in Weather:
+                table = INTERVALS.get((weather, light.alike, drives < MOST_DRIVES), _few())
+                missed[weather] = table[place]
+        return Forecast(expected, missed)
 
     def text(self) -> str:
         """The forecast as one line of text."""
-        if not self.known:
-            return (
-                "share of the route without a match: not known for such a mission (expected "
-                f"{self.expected:.1%})"
-            )
-        return (
-            f"share of the route without a match, dry weather: {self.low:.1%} to {self.high:.1%} "
-            f"({LEVEL:.0%} of such missions); not known for rain and showers"
+        told = ", ".join(
+            f"{weather}: " + ("not known" if one is None else f"{one[0]:.1%} to {one[1]:.1%}")
+            for weather, one in self.missed.items()
         )
+        return f"share of the route without a match, {LEVEL:.0%} of such missions, {told}"
