@@ -57,6 +57,7 @@ def extract(
     max_sigma_px: float,
     sigma_floor_px: float,
     sigma_scale: float,
+    second_threshold: int = 0,
 ) -> tuple[
     NDArray[np.float32],
     NDArray[np.float32],

@@ -204,6 +204,30 @@ def test_octaves_share_the_landmarks() -> None:
     assert np.abs(result[1] - 9.5).max() < 0.3
 
 
+def test_a_second_look_changes_nothing_where_the_first_finds_enough() -> None:
+    left, right = shifted_pair(300, 400, 9.5, seed=16)
+    once, twice = (
+        _core.extract(left, right, with_descriptors=True, second_threshold=second, **EXTRACT)
+        for second in (0, 3)
+    )
+    for before, after in zip(once, twice, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_a_second_look_finds_disparities_behind_a_drop() -> None:
+    left, right = shifted_pair(200, 320, 12.5, seed=21, noise=1.0)
+    right = cv2.blur(right, (9, 9))
+    settings = {**EXTRACT, "landmarks": 600}
+    _, first, _, _, _, _ = _core.extract(left, right, with_descriptors=False, **settings)
+    _, second, sigma, _, _, _ = _core.extract(
+        left, right, with_descriptors=False, second_threshold=3, **settings
+    )
+    found = [int((np.abs(each - 12.5) < 1).sum()) for each in (first, second)]
+    assert found[1] > 2 * found[0]
+    assert found[1] > 0.8 * len(second)
+    assert 0 < sigma.max() <= EXTRACT["max_sigma_px"]
+
+
 def test_any_image_size_is_read_within_bounds() -> None:
     rng = np.random.default_rng(17)
     for height, width in [(1, 1), (2, 3), (35, 35), (36, 64), (64, 35), (35, 300), (77, 131)]:
@@ -213,6 +237,7 @@ def test_any_image_size_is_read_within_bounds() -> None:
                 image,
                 image,
                 with_descriptors=True,
+                second_threshold=1,
                 **{**EXTRACT, "octaves": 4, "fast_threshold": 1, "max_disparity_px": most},
             )
 
@@ -223,6 +248,7 @@ def test_any_image_size_is_read_within_bounds() -> None:
         ({"octaves": 5}, "octaves must lie in 1 to 4"),
         ({"landmarks": 0}, "landmarks must lie"),
         ({"fast_threshold": 255}, "FAST threshold must lie"),
+        ({"second_threshold": 255}, "second_threshold must lie"),
         ({"max_disparity_px": 501}, "max_disparity_px must lie"),
         ({"cell_px": 0}, "cell_px must be"),
     ],
@@ -245,7 +271,8 @@ def digest() -> str:
     """Hash of all that extraction computes on two images."""
     total = hashlib.sha256()
     for left, right in (shifted_pair(200, 330, 21.75, seed=20, noise=5.0), (IMAGES["noise"],) * 2):
-        for part in _core.extract(left, right, with_descriptors=True, **EXTRACT)[:5]:
+        settings = {**EXTRACT, "landmarks": 600, "second_threshold": 3}
+        for part in _core.extract(left, right, with_descriptors=True, **settings)[:5]:
             total.update(np.ascontiguousarray(part).tobytes())
         total.update(_core.detect_corners(left, 3)[1].tobytes())
     return total.hexdigest()

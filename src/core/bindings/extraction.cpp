@@ -180,15 +180,17 @@ auto measure_disparities(const GreyImage &left_array, const GreyImage &right_arr
 auto extract(const GreyImage &left_array, const GreyImage &right_array, int landmarks, int octaves,
              int fast_threshold, int cell_px, bool with_descriptors, int max_disparity_px,
              float min_disparity_px, float uniqueness, float max_residual, float max_sigma_px,
-             float sigma_floor_px, float sigma_scale) {
+             float sigma_floor_px, float sigma_scale, int second_threshold) {
   const Image left = view(left_array), right = view(right_array);
   require_same_size(left, right);
+  require(second_threshold >= 0 && second_threshold <= 254,
+          "second_threshold must lie in 0 to 254");
   require(landmarks >= 1 && landmarks <= 1'000'000, "landmarks must lie in 1 to 1000000");
   require(octaves >= 1 && octaves <= engram::most_octaves, "octaves must lie in 1 to 4");
   require(cell_px >= 4, "cell_px must be at least 4");
   require_threshold(fast_threshold);
   const engram::ExtractionSettings settings{
-      landmarks, octaves, fast_threshold, cell_px,
+      landmarks, octaves, fast_threshold, cell_px, second_threshold,
       stereo_settings(max_disparity_px, min_disparity_px, uniqueness, max_residual, max_sigma_px,
                       sigma_floor_px, sigma_scale)};
   const auto room = static_cast<size_t>(landmarks);
@@ -288,7 +290,7 @@ void bind_extraction(nb::module_ &module) {
   module.def("extract", &extract, "left"_a, "right"_a, "landmarks"_a, "octaves"_a,
              "fast_threshold"_a, "cell_px"_a, "with_descriptors"_a, "max_disparity_px"_a,
              "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a, "sigma_floor_px"_a,
-             "sigma_scale"_a,
+             "sigma_scale"_a, "second_threshold"_a = 0,
              "Stereo pair → pixels (N, 2), disparities, σ (N,) float32, descriptors (N, 32), "
              "octaves (N,) uint8, number of corners.");
 }

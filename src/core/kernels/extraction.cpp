@@ -11,7 +11,7 @@ namespace engram::ENGRAM_ISA {
 namespace {
 
 struct Workspace {
-  Buffer<uint8_t> left_levels[most_octaves], right_half, smoothed, scores;
+  Buffer<uint8_t> left_levels[most_octaves], right_half, right_quarter, smoothed, scores;
   Buffer<Corner> corners, kept;
   Buffer<int32_t> order;
   Buffer<float> measured; // four per corner: u, v, disparity, σ
@@ -34,16 +34,43 @@ inline bool inside_border(const Image &image, int64_t x, int64_t y) {
          y < image.height - corner_border;
 }
 
+// How one look at a pair finds corners and their disparities.
+struct Look {
+  int32_t threshold;
+  StereoImages images, halved; // `halved` is empty where it is not to be searched
+  StereoSettings stereo, half_stereo;
+};
+
+StereoSettings at_half_size(StereoSettings stereo) {
+  stereo.max_disparity_px = (stereo.max_disparity_px + 1) / 2;
+  stereo.min_disparity_px /= 2;
+  stereo.max_sigma_px /= 2;
+  return stereo;
+}
+
+// Disparity and σ at a corner of the full-size image.
+bool measure(const Look &look, int64_t x, int64_t y, float *disparity_px, float *sigma_px) {
+  if (inside_border(look.images.left, x, y) &&
+      measure_disparity(look.images, x, y, look.stereo, disparity_px, sigma_px))
+    return true;
+  if (!inside_border(look.halved.left, x / 2, y / 2) ||
+      !measure_disparity(look.halved, x / 2, y / 2, look.half_stereo, disparity_px, sigma_px))
+    return false;
+  *disparity_px *= 2;
+  *sigma_px *= 2;
+  return true;
+}
+
 // Landmarks of one octave, written from `first` on; returns how many.
-int64_t extract_octave(const Image &level, int octave, int64_t wanted, const StereoImages &images,
-                       const ExtractionSettings &settings, const ExtractedLandmarks &out,
-                       int64_t first, int64_t *corner_count, Workspace &work) {
+int64_t extract_octave(const Image &level, int octave, int64_t wanted, const Look &look,
+                       int32_t cell_px, const ExtractedLandmarks &out, int64_t first,
+                       int64_t *corner_count, Workspace &work) {
   Corner *corners = work.corners.room_for(most_corners(level.width, level.height));
   uint8_t *scores = work.scores.room_for(score_stride(level.width) * level.height);
-  const int64_t count = detect_corners(level, settings.fast_threshold, corners, scores);
+  const int64_t count = detect_corners(level, look.threshold, corners, scores);
   *corner_count += count;
   int32_t *order = work.order.room_for(count);
-  order_corners(corners, count, level, settings.cell_px, order);
+  order_corners(corners, count, level, cell_px, order);
 
   float *measured = work.measured.room_for(4 * count);
   for (int64_t i = 0; i < count; ++i)
@@ -57,8 +84,7 @@ int64_t extract_octave(const Image &level, int octave, int64_t wanted, const Ste
     own[0] = at_full_size(static_cast<float>(corner.x) + own[0], scale);
     own[1] = at_full_size(static_cast<float>(corner.y) + own[1], scale);
     const auto x = static_cast<int64_t>(own[0] + 0.5f), y = static_cast<int64_t>(own[1] + 0.5f);
-    if (inside_border(images.left, x, y) &&
-        measure_disparity(images, x, y, settings.stereo, own + 2, own + 3))
+    if (measure(look, x, y, own + 2, own + 3))
       ++found;
     else
       own[2] = 0;
@@ -94,25 +120,41 @@ int64_t share_up_to(int octave, const ExtractionSettings &settings) {
   return settings.landmarks * so_far / all;
 }
 
+ExtractionCounts look_at(const Look &look, const ExtractionSettings &settings,
+                         const ExtractedLandmarks &out, Workspace &work) {
+  ExtractionCounts counts{0, 0};
+  Image level = look.images.left;
+  for (int octave = 0; octave < settings.octaves; ++octave) {
+    if (octave == 1)
+      level = look.images.left_half;
+    else if (octave > 1)
+      level = halved(level, work.left_levels[octave - 1]);
+    const int64_t wanted = share_up_to(octave, settings) - counts.landmarks;
+    counts.landmarks += extract_octave(level, octave, wanted, look, settings.cell_px, out,
+                                       counts.landmarks, &counts.corners, work);
+  }
+  return counts;
+}
+
 } // namespace
 
 ExtractionCounts extract(const Image &left, const Image &right, const ExtractionSettings &settings,
                          const ExtractedLandmarks &out) {
   static thread_local Workspace work;
-  const StereoImages images{left, right, halved(left, work.left_levels[0]),
-                            halved(right, work.right_half)};
-  ExtractionCounts counts{0, 0};
-  Image level = left;
-  for (int octave = 0; octave < settings.octaves; ++octave) {
-    if (octave == 1)
-      level = images.left_half;
-    else if (octave > 1)
-      level = halved(level, work.left_levels[octave - 1]);
-    const int64_t wanted = share_up_to(octave, settings) - counts.landmarks;
-    counts.landmarks += extract_octave(level, octave, wanted, images, settings, out,
-                                       counts.landmarks, &counts.corners, work);
-  }
-  return counts;
+  const StereoSettings &stereo = settings.stereo;
+  Look look{settings.fast_threshold,
+            {left, right, halved(left, work.left_levels[0]), halved(right, work.right_half)},
+            {},
+            stereo,
+            at_half_size(stereo)};
+  const ExtractionCounts first = look_at(look, settings, out, work);
+  if (first.landmarks == settings.landmarks || settings.second_threshold == 0)
+    return first;
+  look.threshold = settings.second_threshold;
+  look.halved = {look.images.left_half, look.images.right_half,
+                 halved(look.images.left_half, work.left_levels[1]),
+                 halved(look.images.right_half, work.right_quarter)};
+  return look_at(look, settings, out, work);
 }
 
 } // namespace engram::ENGRAM_ISA

@@ -13,6 +13,7 @@ struct ExtractionSettings {
   int32_t landmarks; // at most so many, all octaves together
   int32_t octaves;   // 1 to most_octaves, each half the size of the one before
   int32_t fast_threshold, cell_px;
+  int32_t second_threshold; // of the second look; 0: none
   StereoSettings stereo;
 };
 
@@ -34,5 +35,10 @@ ENGRAM_DECLARE_KERNELS(
     // Octave by octave: corners, in the order of order_corners(), are given a disparity until the
     // octave's share of landmarks is reached; what an octave leaves over goes to the next. Shares
     // fall with the octave's scale, 1 : 1/2 : 1/4 …. Landmarks come out by octave, in raster order.
+    //
+    // Where that gives fewer than were asked for, a second look replaces it: corners above the
+    // second threshold, and what has no disparity in the images is given one in the halved images,
+    // where windows are twice as large and a blur is half as wide. Drops on a lens, fog and the
+    // dark leave few corners, and those are often sharp in one image only.
     ExtractionCounts extract(const Image &left, const Image &right,
                              const ExtractionSettings &settings, const ExtractedLandmarks &out);)

@@ -135,6 +135,7 @@ def _corners(
         max_sigma_px=config.max_sigma_px,
         sigma_floor_px=config.sigma_floor_px,
         sigma_scale=config.sigma_scale,
+        second_threshold=config.second_threshold,
     )
     described = descriptors if with_brief else None
     return Keypoints(pixels, disparity_px, sigma_px, octaves, corners, described)

@@ -10,7 +10,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.config import check_bounds, config_hash
+from engram.config import check_bounds, config_hash, to_dict
 from engram.errors import ConfigError, IncompatibleError, SequenceError
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
@@ -36,6 +36,10 @@ class FrontendConfig:
         fast_threshold: least FAST score of a corner, grey levels. Low, so that dark and
             low-contrast images give corners: the grid keeps the best of each cell, and noise
             fails the stereo match.
+        second_threshold: least FAST score of a corner in a second look, grey levels, which replaces
+            the first one where this gave fewer landmarks than were asked for: rain, fog, dirt, the
+            dark. It also measures disparities in the halved images, through what blurs one of them.
+            0: no second look.
         cell_px: side of the grid's cells, from which the best corners are taken in turn.
         max_disparity_px: largest disparity, which bounds the nearest landmark.
         min_disparity_px: smallest disparity, which bounds the farthest landmark.
@@ -57,6 +61,7 @@ class FrontendConfig:
     landmarks: Annotated[int, Meta(ge=1, le=100_000)] = 600
     octaves: Annotated[int, Meta(ge=1, le=4)] = 2
     fast_threshold: Annotated[int, Meta(ge=1, le=254)] = 7
+    second_threshold: Annotated[int, Meta(ge=0, le=254)] = 0
     cell_px: Annotated[int, Meta(ge=4, le=4096)] = 32
     max_disparity_px: Annotated[int, Meta(ge=1, le=500)] = 124
     min_disparity_px: Annotated[float, Meta(ge=1 / 64, le=500)] = 0.5
@@ -88,8 +93,9 @@ class Frontend:
 
     def __init__(self, config: FrontendConfig | None = None) -> None:
         self.config = config or FrontendConfig()
-        settings = config_hash(self.config)
-        self.hash = config_hash({"version": FRONTEND_VERSION, "settings": settings})
+        self.hash = config_hash(
+            {"version": FRONTEND_VERSION, "settings": _settings_hash(self.config)}
+        )
 
     def extract(self, pair: StereoPair) -> Frame:
         """Corners with a disparity, their descriptors and points; image content never raises.
@@ -145,6 +151,14 @@ class Frontend:
 def make_thumbnail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The (h, w) uint8 image, halved until it is at most 160 px wide."""
     return _core.thumbnail(image, _THUMBNAIL_WIDTH_PX)
+
+
+def _settings_hash(config: FrontendConfig) -> str:
+    """Of what decides about landmarks; without a second look, as it was before there was one."""
+    settings = to_dict(config)
+    if not config.second_threshold:
+        del settings["second_threshold"]
+    return config_hash(settings)
 
 
 def _landmarks_for(image: NDArray[np.uint8], at_512x384: int) -> int:

@@ -66,10 +66,12 @@ class Eyes:
     frontend: Frontend
 
     @staticmethod
-    def of(name: str) -> Eyes:
-        """A kind by its name."""
+    def of(name: str, second_threshold: int = 0) -> Eyes:
+        """A kind by its name, with or without the front-end's second look."""
         kind = feature_kind(name)
-        config = FrontendConfig(descriptor=kind.name, thumbnails=False)
+        config = FrontendConfig(
+            descriptor=kind.name, second_threshold=second_threshold, thumbnails=False
+        )
         return Eyes(kind, fitted_matcher(MatcherConfig(), BRIEF, kind.name), Frontend(config))
 
     def match(self, reference: Frame, live: Frame) -> Match:
@@ -236,12 +238,15 @@ def table(found: Mapping[str, Sequence[Row]]) -> str:
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--kinds", default="brief,net", help="joined by commas")
+    parser.add_argument(
+        "--second", type=int, default=0, metavar="LEVELS", help="frontend.second_threshold"
+    )
     parser.add_argument("--out", type=Path, help="OUT.csv and OUT.table.md are written")
     asked = parser.parse_args()
     found: dict[str, list[Row]] = {}
     for name in asked.kinds.split(","):
         found[name] = []
-        for row in rows_of(Eyes.of(name), Bars()):
+        for row in rows_of(Eyes.of(name, asked.second), Bars()):
             found[name].append(row)
             print(
                 name,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -89,8 +90,7 @@ class Places:
             ahead_m, aside_m: of all places, or (P,) of each.
         """
         conditions = Conditions(visit.start, visit.weather, visit.day)
-        today = Today(visit.day, conditions.hour, conditions.season, 0.45)
-        renderer = TownRenderer(self._town, today)
+        renderer = self._renderer(visit)
         camera, found = self.robot.camera, []
         starts_m = self._starts_m + ahead_m
         asides_m = np.broadcast_to(aside_m, starts_m.shape)
@@ -105,3 +105,13 @@ class Places:
             left, right = model.expose(luminance, inverse_depths, pose, moment.rain, k)
             found.append((world_from_cam, StereoPair(k, left, right, camera)))
         return found
+
+    def depths_m(self, visit: Visit, world_from_cams: Iterable[SE3]) -> list[NDArray[np.float32]]:
+        """Depth along the left camera's axis: (h, w) for each pose, infinite for the sky."""
+        renderer = self._renderer(visit)
+        return [renderer.depth(pose, self.robot.camera)[0] for pose in world_from_cams]
+
+    def _renderer(self, visit: Visit) -> TownRenderer:
+        conditions = Conditions(visit.start, visit.weather, visit.day)
+        today = Today(visit.day, conditions.hour, conditions.season, 0.45)
+        return TownRenderer(self._town, today)
