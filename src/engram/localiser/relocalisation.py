@@ -166,6 +166,62 @@ class ByAppearance:
         self._tried.clear()
 
 
+class Suggested:
+    """Proposes nodes that something outside the camera suggests, before those of another.
+
+    Suggestions, such as the nodes near a satellite fix, are candidates like any: a match decides.
+    They take at most half of a frame's attempts, as the receiver may be wrong.
+
+    Args:
+        inner: proposes the other half; None for nothing.
+        suggest: nodes for a live frame, by dense index, best first.
+    """
+
+    def __init__(
+        self, inner: Relocaliser | None, suggest: Callable[[Frame], Sequence[int]]
+    ) -> None:
+        self.inner = inner
+        self.name = "suggested" if inner is None else inner.name
+        self._suggest = suggest
+        self._frames_seen = 0
+        self._tried: dict[int, int] = {}
+
+    @property
+    def new_place(self) -> float | None:
+        """See `Relocaliser`."""
+        return None if self.inner is None else self.inner.new_place
+
+    def propose(self, live: Frame, count: int, allowed: Callable[[int], bool]) -> list[int]:
+        """See `Relocaliser`."""
+        self._frames_seen += 1
+        oldest = self._frames_seen - _PATIENCE
+        fresh = [
+            node
+            for node in self._suggest(live)
+            if allowed(node) and self._tried.get(node, oldest) <= oldest
+        ]
+        first = spread(fresh, (count + 1) // 2)
+        rest = [] if self.inner is None else self.inner.propose(live, count, allowed)
+        return list(dict.fromkeys(first + rest))[:count]
+
+    def carry_on(self, motion: SE3 | None) -> None:
+        """See `Relocaliser`."""
+        if self.inner is not None:
+            self.inner.carry_on(motion)
+
+    def failed(self, nodes: Sequence[int]) -> None:
+        """See `Relocaliser`."""
+        self._tried.update(dict.fromkeys(nodes, self._frames_seen))
+        if self.inner is not None:
+            self.inner.failed(nodes)
+
+    def forget(self) -> None:
+        """See `Relocaliser`."""
+        self._tried.clear()
+        if self.inner is not None:
+            self.inner.forget()
+
+
 def best_places(book: PlaceBook, likely: NDArray[np.float64], most: int) -> list[int]:
     """The most likely nodes, best first, without those whose words are unreadable.
 

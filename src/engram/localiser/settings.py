@@ -62,7 +62,7 @@ class LocaliserConfig:
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They make a failed attempt four times cheaper and keep 98.8 % of the matches it would
             accept. Source: `lab/reports/constants.md`.
-        neighbourhood, path_entries, success, lens_depth_m: see their descriptions.
+        neighbourhood, path_entries, success, lens_depth_m, fix_sigmas: see their descriptions.
         recent: how the ranking weights this session's recent attempts.
         matcher, acceptance: settings of the two halves of an attempt.
     """
@@ -108,6 +108,14 @@ class LocaliserConfig:
             "best offsets of two cameras in one street",
         ),
     ] = 7.0
+    fix_sigmas: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="nodes within so many standard deviations of a satellite fix are proposed "
+            "to a lost robot in an anchored map; a match decides; 0: fixes propose nothing",
+        ),
+    ] = 3.0
     recent: RecentConfig = field(default_factory=RecentConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)

@@ -1,14 +1,25 @@
-"""Anchors from the fixes of a satellite receiver, at the times of the nodes near them."""
+"""Fixes of a satellite receiver: as anchors of nodes, and as places where a lost robot may be."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.frontend import Frame
+from engram.localiser import Relocaliser
+from engram.localiser.relocalisation import Suggested
+from engram.maps import Map
 from engram.robot.anchors import NEAR_NS, GivenAnchor
+from engram.robot.localisers import relocaliser_in
+from engram.robot.session import DriveSequence
+from engram.robot.settings import Settings
+from engram.sequences import BagSequence
 from engram.sequences.bags.fixes import Fix
+
+# Standard deviation of a fix that states none, metres.
+_USUAL_SIGMA_M = 5.0
 
 # A robot drives straight enough between fixes that are closer in time.
 _APART_NS = 2_000_000_000
@@ -60,3 +71,67 @@ def _position(
         a.latitude_deg + share * (b.latitude_deg - a.latitude_deg),
         a.longitude_deg + share * (b.longitude_deg - a.longitude_deg),
     )
+
+
+class LatestFix:
+    """The newest fix of a stream at a time that rises from call to call.
+
+    Args:
+        fixes: by rising time.
+    """
+
+    def __init__(self, fixes: Iterator[Fix]) -> None:
+        self._fixes = fixes
+        self._latest: Fix | None = None
+        self._next = next(fixes, None)
+
+    def __call__(self, time_ns: int) -> Fix | None:
+        """The newest fix before a time; None if it is older than two seconds."""
+        while self._next is not None and self._next.time_ns <= time_ns:
+            self._latest, self._next = self._next, next(self._fixes, None)
+        latest = self._latest
+        return None if latest is None or time_ns - latest.time_ns > _APART_NS else latest
+
+
+def relocaliser_with_fixes(
+    opened: Map, sequence: DriveSequence, settings: Settings, name: str | None
+) -> str | Relocaliser | None:
+    """The relocaliser of a drive, which also proposes nodes near its satellite fixes.
+
+    Args:
+        opened: the map; fixes propose nothing in one that is not anchored to the earth.
+        sequence: the drive; only bags hold fixes.
+        settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
+        name: key of `RELOCALISERS`; None for none.
+
+    Returns:
+        `name`, if there are no fixes to use.
+    """
+    sigmas = settings.localiser.fix_sigmas
+    fixes = sequence.fixes() if isinstance(sequence, BagSequence) and sigmas else None
+    if fixes is None or opened.frame.origin is None:
+        return name
+    inner = None if name is None else relocaliser_in(opened, name, settings.frontend.descriptor)
+    return Suggested(inner, nodes_near(opened, LatestFix(fixes), sigmas))
+
+
+def nodes_near(
+    opened: Map, latest: Callable[[int], Fix | None], sigmas: float
+) -> Callable[[Frame], list[int]]:
+    """The nodes near the newest fix, for `Suggested`.
+
+    Args:
+        opened: the map, anchored to the earth.
+        latest: the newest fix at a time, ns; None without one.
+        sigmas: how far from a fix, in its standard deviations.
+    """
+    frame = opened.frame
+
+    def suggest(live: Frame) -> list[int]:
+        fix = latest(live.stamp_ns)
+        if fix is None:
+            return []
+        within_m = sigmas * (fix.sigma_m or _USUAL_SIGMA_M)
+        return frame.near(fix.latitude_deg, fix.longitude_deg, within_m)
+
+    return suggest

@@ -14,7 +14,14 @@ from engram.errors import MapError, MapLockedError
 from engram.frontend import DescriptorKind, Frame, Frontend, StereoPair
 from engram.geometry import StereoCamera
 from engram.graph.model import Clock, Session, SessionId, path_id
-from engram.localiser import KEEPS_NOTHING, Hint, Keeper, Localisation, Localiser
+from engram.localiser import (
+    KEEPS_NOTHING,
+    Hint,
+    Keeper,
+    Localisation,
+    Localiser,
+    Relocaliser,
+)
 from engram.mapper import Memory, Saver
 from engram.maps import Map, SessionState
 from engram.odometry import Motion
@@ -93,6 +100,7 @@ class Owner:
         settings: the resolved configuration.
         options: how it localises.
         recorded: the session, if known before the first frame.
+        finder: the relocaliser; None for that of the options.
     """
 
     name: str | None
@@ -100,6 +108,7 @@ class Owner:
     settings: Settings
     options: RobotOptions
     recorded: Session | None = None
+    finder: str | Relocaliser | None = None
 
     def made_by(self, first: Arrived) -> tuple[DescriptorKind, str]:
         """Kind of descriptors and hash of the front-end, those of the log for a logged frame."""
@@ -115,7 +124,7 @@ class Owner:
             self.settings,
             policy=self.options.policy,
             budget=self.options.budget,
-            relocaliser=self.options.relocaliser,
+            relocaliser=self.finder or self.options.relocaliser,
             saves=saves,
             threads=self.options.threads,
         )

@@ -16,6 +16,7 @@ from engram.localiser import Localisation, Localiser
 from engram.maps import Map, RevisionWriter, SessionState, open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.examining import LookedAhead, facts_of, refuse_unfit
+from engram.robot.fixed import relocaliser_with_fixes
 from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
 from engram.robot.results import summarise
@@ -212,7 +213,9 @@ class _Mapping:
             self.settings,
             policy=self.options.policy,
             budget=self.options.budget,
-            relocaliser=self.options.relocaliser,
+            relocaliser=relocaliser_with_fixes(
+                self.opened, self.sequence, self.settings, self.options.relocaliser
+            ),
             live=self.report.session.id,
             saves=True,
             threads=self.options.threads,

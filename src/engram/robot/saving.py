@@ -12,6 +12,7 @@ from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.graph.model import Session
 from engram.localiser import ByAppearance, FrameMatcher, Localiser
+from engram.localiser.relocalisation import Suggested
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeSaver, Saver
 from engram.maps import Map, Revision, RevisionWriter, SessionState
 from engram.places import RECOGNISERS
@@ -129,6 +130,8 @@ def loop_search(
 ) -> LoopSearch | nullcontext[None]:
     """Loop search by the words of the relocaliser; a null context if it has none."""
     finder = localiser.relocaliser
+    if isinstance(finder, Suggested):
+        finder = finder.inner
     if not isinstance(finder, ByAppearance):
         return nullcontext()
     matching = settings.localiser

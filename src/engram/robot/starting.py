@@ -8,6 +8,7 @@ from engram.errors import ConfigError, RevisionError
 from engram.geometry import StereoCamera
 from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
+from engram.robot.fixed import relocaliser_with_fixes
 from engram.robot.front import Front
 from engram.robot.live import Into, IntoMap, IntoMemory, LiveKeeper, Owner
 from engram.robot.localisers import localiser_in
@@ -42,9 +43,10 @@ def robot_on(
     """
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
     session = session_of_drive(sequence)
+    finder = relocaliser_with_fixes(opened, sequence, settings, options.relocaliser)
     if remembers:
         _check_newest(opened)
-        owner = Owner(session.robot, sequence.camera, settings, options, session)
+        owner = Owner(session.robot, sequence.camera, settings, options, session, finder)
         return _keeping(owner, IntoMemory(owner, opened))
     localiser = localiser_in(
         opened,
@@ -52,7 +54,7 @@ def robot_on(
         settings,
         policy=policy or options.policy,
         budget=options.budget,
-        relocaliser=options.relocaliser,
+        relocaliser=finder,
         live=session.id,
         threads=options.threads,
         clock=sequence.info,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,34 +47,36 @@ def read_fixes(path: Path, topic: str | None = None) -> list[Fix]:
         SequenceError: the bag cannot be read.
     """
     bag = Bag(path)
-    named = _topic_of(bag, topic)
-    decoder, found = Decoder(bag.is_ros1), dict[int, Fix]()
-    for record in bag.records({named}):
-        try:
-            message = decoder.message(record, FIX)
-        except DamageError as error:
-            bag.note(f"{named}: {error}")
-            continue
-        fix = _fix(message, stamp_of(message, record))
-        if fix is not None:
-            found[fix.time_ns] = fix
+    known = fix_topics(bag)
+    listed = f"topics with fixes: {', '.join(known) or 'none'}"
+    if topic is not None and topic not in known:
+        raise InputError(f"--topic {topic}: holds no {FIX}; {listed}")
+    if topic is None and len(known) != 1:
+        raise InputError(f"{path}: name the topic with --topic; {listed}")
+    named = topic or known[0]
+    found = {one.time_ns: one for one in fixes_of(bag, named, Decoder(bag.is_ros1))}
     if not found:
         facts = f"; {bag.lost[0]}" if bag.lost else ""
         raise InputError(f"{path}: {named} holds no fix: every message says so{facts}")
     return [found[time_ns] for time_ns in sorted(found)]
 
 
-def _topic_of(bag: Bag, topic: str | None) -> str:
-    known = sorted(one.name for one in bag.topics.values() if one.type == FIX and one.count != 0)
-    if topic is not None and topic not in known:
-        raise InputError(f"--topic {topic}: holds no {FIX}; {_listed(known)}")
-    if topic is None and len(known) != 1:
-        raise InputError(f"{bag.path}: name the topic with --topic; {_listed(known)}")
-    return known[0] if topic is None else topic
+def fix_topics(bag: Bag) -> list[str]:
+    """Names of the topics with fixes, empty ones left out."""
+    return sorted(one.name for one in bag.topics.values() if one.type == FIX and one.count != 0)
 
 
-def _listed(known: list[str]) -> str:
-    return f"topics with fixes: {', '.join(known) or 'none'}"
+def fixes_of(bag: Bag, topic: str, decoder: Decoder) -> Iterator[Fix]:
+    """The fixes of a topic in the order of the bag; messages without a fix are left out."""
+    for record in bag.records({topic}):
+        try:
+            message = decoder.message(record, FIX)
+        except DamageError as error:
+            bag.note(f"{topic}: {error}")
+            continue
+        fix = _fix(message, stamp_of(message, record))
+        if fix is not None:
+            yield fix
 
 
 def _fix(message: Any, time_ns: int) -> Fix | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from engram.graph.model import Clock
 from engram.odometry import MotionSource
 from engram.sequences.bags.bag import Bag
 from engram.sequences.bags.calibrating import read_cameras, read_transforms
+from engram.sequences.bags.fixes import Fix, fix_topics, fixes_of
 from engram.sequences.bags.messages import Decoder, stamp_of
 from engram.sequences.bags.motion import BagMotion
 from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
@@ -90,6 +92,14 @@ class BagSequence:
     def motion(self) -> MotionSource | None:
         """A new pass through the motion by wheels or gyroscope; None without one."""
         return self._motion.source(self._shift_ns)
+
+    def fixes(self) -> Iterator[Fix] | None:
+        """A new pass through the fixes of its satellite receiver; None without exactly one."""
+        names = fix_topics(self._bag)
+        if len(names) != 1:
+            return None
+        found = fixes_of(self._bag, names[0], self._decoder)
+        return (replace(one, time_ns=one.time_ns + self._shift_ns) for one in found)
 
     @property
     def frame(self) -> str:

@@ -1,0 +1,88 @@
+"""Satellite fixes propose where a lost robot is; a match decides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.sequences.bag_maker import StereoBag, bag, made, rectified_infos
+
+from engram.frontend import Frame
+from engram.localiser.relocalisation import Exhaustive, Suggested
+from engram.robot import RobotOptions, Settings, map_drive, open_drive, open_map, robot_on
+from engram.robot.anchoring import anchor_map
+from engram.robot.fixed import LatestFix
+from engram.sequences.bags.fixes import Fix
+
+START_NS = 1_700_000_000_000_000_000
+METRES_PER_DEGREE = 111_320 * float(np.cos(np.deg2rad(50.0)))
+
+
+def fix_at(time_ns: int, east_m: float = 0.0) -> Fix:
+    return Fix(time_ns, 50.0, 14.0 + east_m / METRES_PER_DEGREE, None, 1.0)
+
+
+def test_the_newest_fix_counts_until_it_is_old() -> None:
+    latest = LatestFix(iter([fix_at(10), fix_at(20, 1.0)]))
+    assert latest(9) is None
+    assert latest(10) == fix_at(10)
+    assert latest(25) == fix_at(20, 1.0)
+    assert latest(20 + 2_000_000_001) is None
+
+
+def test_suggested_nodes_take_half_of_the_attempts_and_are_not_repeated() -> None:
+    class Graph:
+        def __len__(self) -> int:
+            return 40
+
+    finder = Suggested(Exhaustive(Graph(), None), lambda _: [30, 20, 10])  # type: ignore[arg-type]
+    frame: Frame = None  # type: ignore[assignment]
+    first = finder.propose(frame, 4, lambda _: True)
+    assert first[:2] == [30, 20]
+    assert len(first) == len(set(first)) == 4
+    finder.failed(first)
+    assert finder.propose(frame, 4, lambda _: True)[0] == 10
+    finder.forget()
+    assert finder.propose(frame, 4, lambda node: node != 30)[0] == 20
+
+
+@pytest.fixture(scope="module")
+def anchored(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of the street along a circle of latitude."""
+    folder = tmp_path_factory.mktemp("anchored")
+    path = folder / "street.engram"
+    map_drive(path, open_drive(street, frames="::2", start=START_NS))
+    with open_map(path) as opened:
+        lines = [
+            f"{node.id},50.0,{14 + opened.frame.pose(node.id).translation[0] / METRES_PER_DEGREE}"
+            for node in opened.graph.nodes
+        ]
+    given = folder / "gps.csv"
+    given.write_text("\n".join(["node,lat,lon", *lines]))
+    anchor_map(path, given, author="tests")
+    return path
+
+
+@pytest.mark.parametrize("sigmas", [3.0, 0.0])
+def test_a_robot_without_recognition_is_found_by_its_fixes(
+    sigmas: float, anchored: Path, street: Path, tmp_path: Path
+) -> None:
+    live = open_drive(street, frames="5::2", start=START_NS)
+    pairs = [(pair.stamp_ns, pair.left, pair.right) for pair in live]
+    with open_map(anchored) as opened:
+        middle = opened.frame.positions[len(opened.graph) // 2 :, 0].min()
+    drive = StereoBag(pairs, rectified_infos(live.camera))
+    with bag(tmp_path / "drive", "mcap") as maker:
+        for number, (stamp_ns, *images) in enumerate(pairs):
+            for side, image in enumerate(images):
+                drive._write(maker, number, stamp_ns, side, image)
+            maker.fix("/gps/fix", stamp_ns, (50.0, 14.0 + middle / METRES_PER_DEGREE))
+    settings = Settings()
+    settings = replace(settings, localiser=replace(settings.localiser, fix_sigmas=sigmas))
+    options = RobotOptions(relocaliser=None)
+    sequence = open_drive(made(tmp_path / "drive", "mcap"))
+    with open_map(anchored) as opened, robot_on(opened, sequence, settings, options) as robot:
+        found = [one.localised for one in robot.drive(sequence)]
+    assert any(found) == (sigmas > 0)
