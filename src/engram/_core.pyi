@@ -272,6 +272,44 @@ def recall_order(
     run: RecallRun, candidates: RecallCandidates, constants: RecallConstants
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
 
+# --- odometry
+
+class OdometrySettings:
+    match: MatchSettings
+    window_frames: int
+    window_landmarks: int
+    window_iterations: int
+    window_offset_sigma_px: float
+    min_inliers: int
+    unexpected_inliers: int
+    plausible_inliers: int
+    usual_share: float
+    acceleration_m_s2: float
+    angular_acceleration_rad_s2: float
+    max_prediction_s: float
+    keyframe_flow_px: float
+    keyframe_share: float
+
+class Odometry:
+    @property
+    def tracks(self) -> int: ...
+    @property
+    def offset_px(self) -> float: ...
+    def __init__(self, settings: OdometrySettings) -> None: ...
+    def step(
+        self,
+        live: Features,
+        stamp_ns: int,
+        expected: NDArray[np.float64] | None = None,
+        covariance: NDArray[np.float64] | None = None,
+    ) -> tuple[
+        int,
+        NDArray[np.float64] | None,
+        NDArray[np.float64] | None,
+        NDArray[np.float64] | None,
+        int,
+    ]: ...
+
 # --- path memory
 
 class PathBits:

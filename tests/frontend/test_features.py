@@ -242,10 +242,10 @@ def test_twice_the_same_bits_match_as_once() -> None:
             (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.baseline_m),
         )
 
-    from engram.frontend.matching import _settings
+    from engram.frontend.matching import core_settings
 
-    one = _core.attempt(*(features(f, 1) for f in once), _settings(config), 3)
-    two = _core.attempt(*(features(f, 2) for f in once), _settings(doubled), 3)
+    one = _core.attempt(*(features(f, 1) for f in once), core_settings(config), 3)
+    two = _core.attempt(*(features(f, 2) for f in once), core_settings(doubled), 3)
     assert one is not None
     assert two is not None
     for a, b in zip(one, two, strict=True):

@@ -10,7 +10,7 @@ from tests.scenes import Scene
 
 from engram import _core
 from engram.frontend import Frame, MatcherConfig
-from engram.frontend.matching import _settings, features
+from engram.frontend.matching import core_settings, features
 from engram.geometry import SE3
 
 CONFIG = MatcherConfig()
@@ -19,7 +19,7 @@ REFERENCE_FROM_LIVE = SE3.exp([0.2, -0.05, 0.6, 0.02, 0.05, 0.01])
 
 def found(reference: Frame, live: Frame, predicted: SE3, covariance: np.ndarray) -> list:
     rows, columns = _core.match_rows(
-        features(reference), features(live), _settings(CONFIG), predicted.matrix(), covariance
+        features(reference), features(live), core_settings(CONFIG), predicted.matrix(), covariance
     )
     return list(zip(rows.tolist(), columns.tolist(), strict=True))
 

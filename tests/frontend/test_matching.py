@@ -16,7 +16,7 @@ from engram.errors import ConfigError, IncompatibleError, InputError
 from engram.frontend import TEBLID
 from engram.frontend.matching import (
     MatcherConfig,
-    _settings,
+    core_settings,
     features,
     match_frames,
     matcher_hash,
@@ -89,7 +89,7 @@ def test_agrees_with_poselib() -> None:
     live, _ = scene.seen_from(REFERENCE_FROM_LIVE, outliers=0.6)
     match = match_frames(reference, live, CONFIG, 3)
     assert match.reference_from_live is not None
-    rows, columns = _core.match_rows(features(reference), features(live), _settings(CONFIG))
+    rows, columns = _core.match_rows(features(reference), features(live), core_settings(CONFIG))
     camera = {
         "model": "PINHOLE",
         "width": CAMERA.width,
@@ -204,7 +204,7 @@ def test_the_rows_found_near_a_prediction_are_those_of_a_plain_search() -> None:
     rows, columns = _core.match_rows(
         features(reference),
         features(live),
-        _settings(CONFIG),
+        core_settings(CONFIG),
         REFERENCE_FROM_LIVE.matrix(),
         covariance,
     )
@@ -229,7 +229,7 @@ def test_unguided_rows_are_those_of_brute_force() -> None:
     reference, _ = scene.seen_from(SE3.identity())
     live, _ = scene.seen_from(REFERENCE_FROM_LIVE, flipped_bits=0.2)
     config = MatcherConfig(patch_ratio=100.0, same_corner_px=1e-3)
-    rows, columns = _core.match_rows(features(reference), features(live), _settings(config))
+    rows, columns = _core.match_rows(features(reference), features(live), core_settings(config))
     distances = _core.hamming_matrix(
         reference.landmarks.descriptors, live.landmarks.descriptors
     ).astype(int)
@@ -249,7 +249,7 @@ def test_patches_of_unlike_size_are_not_compared() -> None:
     reference, _ = scene.seen_from(SE3.identity())
     live, _ = scene.seen_from(REFERENCE_FROM_LIVE)
     live.landmarks.octaves[:] = 3
-    rows, _ = _core.match_rows(features(reference), features(live), _settings(CONFIG))
+    rows, _ = _core.match_rows(features(reference), features(live), core_settings(CONFIG))
     assert len(rows) < 10  # but for points whose depth is in great doubt
 
 
@@ -329,7 +329,7 @@ def test_kernels_refuse_arrays_that_do_not_fit() -> None:
     for rows in ([50], [-1]):
         index = np.array(rows, np.int32)
         with pytest.raises(IndexError):
-            _core.estimate_pose(frame, frame, index, index, _settings(CONFIG), 0)
+            _core.estimate_pose(frame, frame, index, index, core_settings(CONFIG), 0)
 
 
 def test_hash_and_seed_follow_their_inputs() -> None:

@@ -10,6 +10,7 @@ void bind_extraction(nb::module_ &module);
 void bind_graph_search(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
 void bind_matching(nb::module_ &module);
+void bind_odometry(nb::module_ &module);
 void bind_ordering(nb::module_ &module);
 void bind_patch_network(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
@@ -26,6 +27,7 @@ NB_MODULE(_core, module) {
   bind_graph_search(module);
   bind_hamming(module);
   bind_matching(module);
+  bind_odometry(module);
   bind_ordering(module);
   bind_patch_network(module);
   bind_path_scores(module);

@@ -145,17 +145,13 @@ def match_frames(
 
     Source: SPEC §2.4–2.6.
     """
-    if reference.descriptor != live.descriptor:
-        raise IncompatibleError(
-            f"cannot match {live.descriptor} descriptors with {reference.descriptor}: "
-            "use the front-end that the map was made with"
-        )
+    check_same_kind(reference, live)
     if (predicted is None) != (predicted_covariance is None):
         raise InputError("give a prediction and its covariance together or not at all")
     found = _core.attempt(
         features(reference),
         features(live),
-        _settings(config, same_camera=reference.camera == live.camera),
+        core_settings(config, same_camera=reference.camera == live.camera),
         seed,
         None if predicted is None else predicted.matrix(),
         None if predicted_covariance is None else np.ascontiguousarray(predicted_covariance),
@@ -193,8 +189,22 @@ def features(frame: Frame) -> _core.Features:
     )
 
 
+def check_same_kind(reference: Frame, live: Frame) -> None:
+    """Refuses two frames whose descriptors cannot be compared.
+
+    Raises:
+        IncompatibleError: the frames have different kinds of descriptors.
+    """
+    if reference.descriptor != live.descriptor:
+        raise IncompatibleError(
+            f"cannot match {live.descriptor} descriptors with {reference.descriptor}: "
+            "use the front-end that the map was made with"
+        )
+
+
 @lru_cache(maxsize=16)
-def _settings(config: MatcherConfig, *, same_camera: bool = False) -> _core.MatchSettings:
+def core_settings(config: MatcherConfig, *, same_camera: bool = False) -> _core.MatchSettings:
+    """The settings in the form of the kernels; for frames of one camera if `same_camera`."""
     settings = _core.MatchSettings()
     values = {name: getattr(config, name) for name in MatcherConfig.__dataclass_fields__}
     values["max_view_angle_cosine"] = math.cos(values.pop("max_view_angle_rad"))

@@ -1,0 +1,232 @@
+#include "kernels/odometry.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "kernels/pose.hpp"
+#include "kernels/tracked_window.hpp"
+#include "kernels/twist.hpp"
+
+// Frames are matched to the last keyframe, not to the previous frame, so that errors do not add up
+// while the camera rests or moves slowly. The motion between successive frames follows by
+// composition. See engram.odometry.
+
+namespace engram::ENGRAM_ISA {
+namespace {
+
+constexpr double kSecondsPerNs = 1e-9;
+// Steps that determine the usual number of inliers and the usual interval.
+constexpr size_t kUsualOf = 20;
+// Frames are missing if one comes later than this many usual intervals after the last.
+constexpr double kGapRatio = 1.5;
+
+void remember(std::vector<double> &values, double value) {
+  if (values.size() == kUsualOf)
+    values.erase(values.begin());
+  values.push_back(value);
+}
+
+// Of at least one value, which are moved about.
+template <class T> T median(std::vector<T> &values) {
+  const auto middle = values.begin() + static_cast<int64_t>(values.size() / 2);
+  std::nth_element(values.begin(), middle, values.end());
+  if (values.size() % 2 == 1)
+    return *middle;
+  return (*std::max_element(values.begin(), middle) + *middle) / 2;
+}
+
+double usual(std::vector<double> values, double unknown) {
+  return values.empty() ? unknown : median(values);
+}
+
+double seconds_since(const OdometryTrack &track, int64_t stamp_ns) {
+  return static_cast<double>(stamp_ns - track.stamp_ns) * kSecondsPerNs;
+}
+
+// By constant velocity, or what is expected where that says nothing.
+std::optional<Prediction> predict(const OdometryTrack &track, const OdometrySettings &settings,
+                                  double interval_s, const ExpectedMotion *expected) {
+  const RigidTransform &keyframe_from_prev = track.keyframe_from_prev;
+  if (!track.velocity || !(interval_s > 0 && interval_s <= settings.max_prediction_s)) {
+    if (expected == nullptr)
+      return std::nullopt;
+    return Prediction{compose(keyframe_from_prev, expected->prev_from_curr),
+                      track.covariance + carried(keyframe_from_prev, expected->covariance)};
+  }
+  Tangent moved = *track.velocity;
+  for (double &entry : moved)
+    entry *= interval_s;
+  Covariance noise{};
+  for (int i = 0; i < 6; ++i) {
+    const double sigma = (i < 3 ? settings.acceleration_m_s2
+                                : settings.angular_acceleration_rad_s2) *
+                         (interval_s * interval_s);
+    noise[7 * i] = sigma * sigma;
+  }
+  return Prediction{compose(keyframe_from_prev, exponential(moved)),
+                    track.covariance + carried(keyframe_from_prev, noise)};
+}
+
+// The matcher refines in single precision: many small updates skew the rotation by 1e-6.
+PoseEstimate attempted(const KeptFrame &key, const FrameView &live, const MatchSettings &match,
+                       int64_t stamp_ns, const Prediction *prediction) {
+  PoseEstimate found =
+      attempt(key.view(), live, match, static_cast<uint64_t>(stamp_ns), prediction);
+  if (found.found)
+    found.reference_from_live = renormalised(found.reference_from_live);
+  return found;
+}
+
+int32_t inliers_of(const PoseEstimate &match) {
+  return match.found ? static_cast<int32_t>(match.inliers.size()) : 0;
+}
+
+class Step {
+public:
+  Step(OdometryState &state, const OdometrySettings &settings, const FrameView &live,
+       int64_t stamp_ns, const ExpectedMotion *expected)
+      : state_(state), settings_(settings), live_(live), stamp_ns_(stamp_ns),
+        expected_(expected), track_(*state.track),
+        interval_s_(seconds_since(track_, stamp_ns)) {}
+
+  OdometryMotion run() {
+    const PoseEstimate match = matched();
+    if (!believes(match)) {
+      const double offset_px = track_.window.offset_px; // the camera's: kept when the chain breaks
+      begin(state_, settings_, live_, stamp_ns_, offset_px);
+      OdometryMotion none;
+      none.status = match.found ? OdometryMotion::Status::too_few_matches
+                                : OdometryMotion::Status::no_consensus;
+      return none;
+    }
+    remember(state_.inliers, inliers_of(match));
+    remember(state_.intervals_s, interval_s_);
+    add_to_window(track_.window, live_, match, settings_);
+    return advance(match, optimise_window(track_.window, match, settings_));
+  }
+
+  static void begin(OdometryState &state, const OdometrySettings &settings,
+                    const FrameView &first, int64_t stamp_ns, double offset_px) {
+    OdometryTrack track;
+    track.window = begin_window(first, settings, offset_px);
+    track.stamp_ns = stamp_ns;
+    state.track = std::move(track);
+  }
+
+private:
+  // To the keyframe; if that fails, to the previous frame.
+  PoseEstimate matched() {
+    PoseEstimate match = matched_to_keyframe();
+    if (inliers_of(match) < settings_.min_inliers && track_.window.newest) {
+      keep_previous_as_keyframe();
+      match = matched_to_keyframe();
+    }
+    return match;
+  }
+
+  // Guided; if that fails, unguided.
+  PoseEstimate matched_to_keyframe() const {
+    const KeptFrame &key = keyframe_of(track_.window);
+    if (const auto prediction = predict(track_, settings_, interval_s_, expected_)) {
+      PoseEstimate match = attempted(key, live_, settings_.match, stamp_ns_, &*prediction);
+      if (inliers_of(match) >= settings_.min_inliers)
+        return match;
+    }
+    return attempted(key, live_, settings_.match, stamp_ns_, nullptr);
+  }
+
+  // Whether enough landmarks agree on the motion; after a gap in time more are needed.
+  bool believes(const PoseEstimate &match) const {
+    const int32_t inliers = inliers_of(match);
+    if (inliers < settings_.min_inliers || !is_gap())
+      return inliers >= settings_.min_inliers;
+    const double share = settings_.usual_share * usual(state_.inliers, HUGE_VAL);
+    const double needed =
+        std::min(std::max(share, static_cast<double>(settings_.min_inliers)),
+                 static_cast<double>(settings_.unexpected_inliers));
+    return inliers >= needed || (inliers >= settings_.plausible_inliers && explains(match));
+  }
+
+  // Whether frames are missing, judged by the camera's usual interval.
+  bool is_gap() const {
+    if (interval_s_ > 0 && interval_s_ <= settings_.max_prediction_s)
+      return false;
+    return !(interval_s_ > 0 && interval_s_ <= kGapRatio * usual(state_.intervals_s, 0));
+  }
+
+  // Whether the last speed, with acceleration or braking, explains the pose.
+  bool explains(const PoseEstimate &match) const {
+    if (!track_.velocity)
+      return false;
+    const Tangent moved =
+        logarithm(compose(inverse(track_.keyframe_from_prev), match.reference_from_live));
+    Vec3 changed;
+    for (int i = 0; i < 3; ++i)
+      changed[i] = moved[i] - (*track_.velocity)[i] * interval_s_;
+    return norm(changed) <= 0.5 * settings_.acceleration_m_s2 * interval_s_ * interval_s_;
+  }
+
+  // Makes the frame the previous one.
+  OdometryMotion advance(const PoseEstimate &match, const PlacedPose &keyframe_from_curr) {
+    const RigidTransform prev_from_keyframe = inverse(track_.keyframe_from_prev);
+    OdometryMotion motion;
+    motion.status = OdometryMotion::Status::ok;
+    motion.prev_from_curr = compose(prev_from_keyframe, keyframe_from_curr.pose);
+    motion.covariance =
+        carried(prev_from_keyframe, track_.covariance + keyframe_from_curr.covariance);
+    motion.inliers = inliers_of(match);
+    track_.velocity.reset();
+    if (interval_s_ > 0) {
+      track_.velocity = logarithm(motion.prev_from_curr);
+      for (double &entry : *track_.velocity)
+        entry /= interval_s_;
+    }
+    track_.stamp_ns = stamp_ns_;
+    track_.keyframe_from_prev = keyframe_from_curr.pose;
+    track_.covariance = keyframe_from_curr.covariance;
+    if (has_moved_on(match))
+      keep_previous_as_keyframe();
+    return motion;
+  }
+
+  bool has_moved_on(const PoseEstimate &match) const {
+    const KeptFrame &before = keyframe_of(track_.window);
+    const auto fewer = std::min(static_cast<int64_t>(before.octaves.size()), live_.count);
+    if (inliers_of(match) < settings_.keyframe_share * static_cast<double>(fewer))
+      return true;
+    std::vector<float> flow_px;
+    for (const RowPair &pair : match.inliers) {
+      const float *there = live_.pixels + 2 * pair.live;
+      const float *here = before.pixels.data() + 2 * pair.reference;
+      flow_px.push_back(std::max(std::abs(there[0] - here[0]), std::abs(there[1] - here[1])));
+    }
+    return median(flow_px) > static_cast<float>(settings_.keyframe_flow_px);
+  }
+
+  void keep_previous_as_keyframe() {
+    keep_newest(track_.window, settings_);
+    track_.keyframe_from_prev = RigidTransform{};
+    track_.covariance = {};
+  }
+
+  OdometryState &state_;
+  const OdometrySettings &settings_;
+  const FrameView &live_;
+  const int64_t stamp_ns_;
+  const ExpectedMotion *expected_;
+  OdometryTrack &track_;
+  const double interval_s_;
+};
+
+} // namespace
+
+OdometryMotion odometry_step(OdometryState &state, const OdometrySettings &settings,
+                             const FrameView &live, int64_t stamp_ns,
+                             const ExpectedMotion *expected) {
+  if (state.track)
+    return Step(state, settings, live, stamp_ns, expected).run();
+  Step::begin(state, settings, live, stamp_ns, 0);
+  return {};
+}
+
+} // namespace engram::ENGRAM_ISA

@@ -1,0 +1,378 @@
+"""Twin of the core's odometry: the same steps in NumPy, over the core's match and window."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram import _core
+from engram.frontend import Frame, FrameStatus, Match, MatcherConfig, match_frames
+from engram.geometry import SE3, propagate_covariance
+from engram.odometry import OdometryConfig, OdometryStatus, OdometryStep, WindowConfig
+from engram.odometry.outside import Guess
+
+_S_PER_NS = 1e-9
+# Steps that determine the usual number of inliers and the usual interval.
+_USUAL_OF = 20
+# Frames are missing if one comes later than this many usual intervals after the last.
+_GAP_RATIO = 1.5
+_UNSEEN = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """A frame with its estimated pose.
+
+    Attributes:
+        frame: the frame.
+        world_from_cam: its pose in the window's world.
+        tracks: (N,) int32, the track of each landmark, `_UNSEEN` if no other frame shares it.
+        stereo: (N, 3) float32, left u, left v, disparity, px.
+        pixel_sigma_px, disparity_sigma_px: (N,) float32, between views.
+    """
+
+    frame: Frame
+    world_from_cam: SE3
+    tracks: NDArray[np.int32]
+    stereo: NDArray[np.float32]
+    pixel_sigma_px: NDArray[np.float32]
+    disparity_sigma_px: NDArray[np.float32]
+
+
+class Window:
+    """Keyframes and the newest frame, with poses in the camera of the window's first frame.
+
+    The oldest pose is fixed, the others move. The next frame replaces the newest one unless
+    `keep_newest` was called, so that the window spans motion, not time.
+    """
+
+    def __init__(
+        self, first: Frame, config: WindowConfig, matcher: MatcherConfig, offset_px: float = 0.0
+    ) -> None:
+        self._config = config
+        self._matcher = matcher
+        self._keyframes = [self._place(first, SE3.identity())]
+        self._newest: _Placed | None = None
+        self._next_track = 0
+        self._offset_px = offset_px
+
+    @property
+    def offset_px(self) -> float:
+        """Estimated excess of the camera's disparities, px."""
+        return self._offset_px
+
+    @property
+    def keyframe(self) -> Frame:
+        """The newest keyframe, to which the next frame is matched."""
+        return self._keyframes[-1].frame
+
+    @property
+    def has_newest(self) -> bool:
+        """Whether the newest frame is not a keyframe."""
+        return self._newest is not None
+
+    def add(self, frame: Frame, match: Match) -> None:
+        """Replace the newest frame by one that was matched to `keyframe`."""
+        assert match.reference_from_live is not None
+        key = self._keyframes[-1]
+        tracks = key.tracks.copy()
+        fresh = match.reference_rows[tracks[match.reference_rows] == _UNSEEN]
+        tracks[fresh] = np.arange(self._next_track, self._next_track + len(fresh), dtype=np.int32)
+        self._next_track += len(fresh)
+        self._keyframes[-1] = replace(key, tracks=tracks)
+        self._newest = self._place(frame, key.world_from_cam @ match.reference_from_live)
+        self._newest.tracks[match.live_rows] = tracks[match.reference_rows]
+
+    def keep_newest(self) -> None:
+        """Make the newest frame a keyframe; the oldest one leaves when the window is full."""
+        assert self._newest is not None
+        self._keyframes = [*self._keyframes, self._newest][-(self._config.frames - 1) :]
+        self._newest = None
+
+    def optimise(self, match: Match) -> tuple[SE3, NDArray[np.float64]]:
+        """Adjust all poses but the oldest, and all landmarks.
+
+        Returns:
+            keyframe_from_newest and its (6, 6) float64 covariance; those of `match` if the
+            landmarks do not determine the window.
+
+        Source: SPEC §2.4.
+        """
+        assert self._newest is not None
+        assert match.reference_from_live is not None
+        assert match.covariance is not None
+        placed = [*self._keyframes, self._newest]
+        adjusted = self._adjust(placed) if self._config.iterations else None
+        if adjusted is None:
+            return match.reference_from_live, match.covariance
+        matrices, covariance, self._offset_px = adjusted
+        moved = [
+            replace(each, world_from_cam=SE3(matrix[:3, :3], matrix[:3, 3]))
+            for each, matrix in zip(placed, matrices, strict=True)
+        ]
+        self._keyframes, self._newest = moved[:-1], moved[-1]
+        # As in a match: landmarks share errors, which do not average out.
+        shared = 1 + match.inliers / self._matcher.independent_landmarks
+        keyframe_from_world = moved[-2].world_from_cam.inverse()
+        carry = keyframe_from_world.adjoint()
+        return (
+            keyframe_from_world @ moved[-1].world_from_cam,
+            shared * carry @ _covariance_of_last_step(covariance) @ carry.T,
+        )
+
+    def _place(self, frame: Frame, world_from_cam: SE3) -> _Placed:
+        marks = frame.landmarks
+        growth = np.sqrt(self._matcher.octave_scale) ** marks.octaves.astype(np.float32)
+        return _Placed(
+            frame,
+            world_from_cam,
+            tracks=np.full(len(marks), _UNSEEN, dtype=np.int32),
+            stereo=np.column_stack([marks.pixels, marks.disparity_px]),
+            pixel_sigma_px=(self._matcher.pixel_sigma_px * growth).astype(np.float32),
+            disparity_sigma_px=np.hypot(
+                marks.disparity_sigma_px, np.float32(self._matcher.disparity_sigma_px)
+            ),
+        )
+
+    def _adjust(
+        self, placed: list[_Placed]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float] | None:
+        track = np.concatenate([each.tracks for each in placed])
+        used = np.flatnonzero(track != _UNSEEN)
+        numbered = _number_longest(track[used], self._config.landmarks)
+        used, numbered = used[numbered != _UNSEEN], numbered[numbered != _UNSEEN]
+        sizes = [len(each.tracks) for each in placed]
+        frame_of = np.repeat(np.arange(len(placed), dtype=np.int32), sizes)
+        camera = placed[-1].frame.camera
+        adjusted = _core.adjust_window(
+            (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m),
+            np.array([each.world_from_cam.matrix() for each in placed]),
+            frame_of[used],
+            numbered,
+            np.concatenate([each.stereo for each in placed])[used],
+            np.concatenate([each.pixel_sigma_px for each in placed])[used],
+            np.concatenate([each.disparity_sigma_px for each in placed])[used],
+            fixed=1,
+            iterations=self._config.iterations,
+            chi2=self._matcher.chi2,
+            offset_px=self._offset_px,
+            offset_sigma_px=self._config.offset_sigma_px,
+        )
+        return None if adjusted is None else (adjusted[0], adjusted[1], adjusted[3])
+
+
+def _number_longest(track: NDArray[np.int32], most: int) -> NDArray[np.int32]:
+    """Number the tracks from 0; `_UNSEEN` for those seen once and, beyond `most`, the shortest."""
+    if len(track) == 0:
+        return track
+    # By what lives, not by span: a landmark always in sight keeps its first number for hours.
+    living, place = np.unique(track, return_inverse=True)
+    length = np.bincount(place, minlength=len(living))
+    # Lengths are at most the frames of the window; 16 bits are sorted by radix, 64 by merging.
+    shortness = (length.max() - length).astype(np.uint16)
+    kept = np.argsort(shortness, kind="stable")[:most]
+    kept = kept[length[kept] >= 2]
+    number = np.full(len(length), _UNSEEN, dtype=np.int32)
+    number[kept] = np.arange(len(kept), dtype=np.int32)
+    return np.asarray(number[place])
+
+
+def _covariance_of_last_step(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance, in the world, of the last pose relative to the one before it.
+
+    The last block belongs to the newest frame; without a block before it the keyframe is held.
+    """
+    newest = covariance[-6:, -6:]
+    if len(covariance) == 6:
+        return newest
+    key, cross = covariance[-12:-6, -12:-6], covariance[-12:-6, -6:]
+    return newest + key - cross - cross.T
+
+
+class Odometry:
+    """Estimates the motion of one camera from frame to frame.
+
+    Frames are matched to the last *keyframe*, not to the previous frame, so that errors do not add
+    up while the camera rests or moves slowly. The motion between successive frames follows by
+    composition.
+    """
+
+    def __init__(self, config: OdometryConfig | None = None) -> None:
+        self._config = config or OdometryConfig()
+        self._track: _Track | None = None
+        # Inliers and intervals, s, of the last steps, for this camera and light.
+        self._inliers: deque[int] = deque(maxlen=_USUAL_OF)
+        self._intervals: deque[float] = deque(maxlen=_USUAL_OF)
+
+    def step(self, frame: Frame, expected: Guess | None = None) -> OdometryStep:
+        """The motion since the last usable frame; see `OdometryStep` for failures.
+
+        Args:
+            frame: the next frame.
+            expected: the motion by wheels and gyroscope, which guides the match where the last
+                speed says nothing; None if unknown.
+
+        Raises:
+
+        Source: SPEC §2.4; [G16] §III-A.
+        """
+        if frame.status is not FrameStatus.OK:
+            return OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+        if self._track is None:
+            self._track = _Track(frame, self._config)
+            return OdometryStep(OdometryStatus.FIRST)
+
+        interval_s = (frame.stamp_ns - self._track.stamp_ns) * _S_PER_NS
+        match = self._track.match(frame, expected)
+        if not self._believes(match, interval_s):
+            self._track = _Track(frame, self._config, self._track.offset_px)
+            return OdometryStep(_reason(match))
+
+        self._inliers.append(match.inliers)
+        self._intervals.append(interval_s)
+        keyframe_from_curr, covariance = self._track.place(frame, match)
+        return self._track.advance(frame, match, keyframe_from_curr, covariance)
+
+    def _believes(self, match: Match, interval_s: float) -> bool:
+        """Whether enough landmarks agree on the motion; after a gap in time more are needed."""
+        config = self._config
+        if match.inliers < config.min_inliers or not self._is_gap(interval_s):
+            return match.inliers >= config.min_inliers
+        usual = float(np.median(self._inliers)) if self._inliers else np.inf
+        needed = np.clip(config.usual_share * usual, config.min_inliers, config.unexpected_inliers)
+        if match.inliers >= needed:
+            return True
+        assert self._track is not None
+        return match.inliers >= config.plausible_inliers and self._track.explains(match, interval_s)
+
+    def _is_gap(self, interval_s: float) -> bool:
+        """Whether frames are missing, judged by the camera's usual interval."""
+        if 0 < interval_s <= self._config.max_prediction_s:
+            return False
+        usual_s = float(np.median(self._intervals)) if self._intervals else 0.0
+        return not 0 < interval_s <= _GAP_RATIO * usual_s
+
+
+class _Track:
+    """An unbroken run of frames: the window, the last motion, the pose of the previous frame."""
+
+    def __init__(self, first: Frame, config: OdometryConfig, offset_px: float = 0.0) -> None:
+        self._config = config
+        self._window = Window(first, config.window, config.matcher, offset_px)
+        self.stamp_ns = first.stamp_ns
+        self._keyframe_from_prev = SE3.identity()
+        self._covariance = np.zeros((6, 6))  # of keyframe_from_prev
+        self._velocity: NDArray[np.float64] | None = None  # (6,) tangent per second
+
+    @property
+    def offset_px(self) -> float:
+        """The camera's estimated disparity offset, px; kept when the chain breaks."""
+        return self._window.offset_px
+
+    def explains(self, match: Match, interval_s: float) -> bool:
+        """Whether the last speed, with acceleration or braking, explains a match's pose."""
+        if self._velocity is None or match.reference_from_live is None:
+            return False
+        prev_from_curr = self._keyframe_from_prev.inverse() @ match.reference_from_live
+        changed_m = np.linalg.norm(prev_from_curr.log()[:3] - self._velocity[:3] * interval_s)
+        return bool(changed_m <= 0.5 * self._config.acceleration_m_s2 * interval_s**2)
+
+    def match(self, frame: Frame, expected: Guess | None = None) -> Match:
+        """Match to the keyframe; if that fails, to the previous frame."""
+        match = self._match_to_keyframe(frame, expected)
+        if match.inliers < self._config.min_inliers and self._window.has_newest:
+            self._keep_previous_as_keyframe()
+            match = self._match_to_keyframe(frame, expected)
+        return match
+
+    def place(self, frame: Frame, match: Match) -> tuple[SE3, NDArray[np.float64]]:
+        """keyframe_from_curr after joint optimisation, with its (6, 6) covariance."""
+        self._window.add(frame, match)
+        return self._window.optimise(match)
+
+    def advance(
+        self,
+        frame: Frame,
+        match: Match,
+        keyframe_from_curr: SE3,
+        covariance: NDArray[np.float64],
+    ) -> OdometryStep:
+        """Make the frame the previous one; returns the motion that led to it.
+
+        Args:
+            frame: the frame.
+            match: its match to the keyframe.
+            keyframe_from_curr: its pose in the keyframe.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation, rotation].
+        """
+        prev_from_keyframe = self._keyframe_from_prev.inverse()
+        prev_from_curr = prev_from_keyframe @ keyframe_from_curr
+        carry = prev_from_keyframe.adjoint()
+        step = OdometryStep(
+            OdometryStatus.OK,
+            prev_from_curr,
+            carry @ (self._covariance + covariance) @ carry.T,
+            match.inliers,
+        )
+        interval_s = (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
+        self._velocity = prev_from_curr.log() / interval_s if interval_s > 0 else None
+        self.stamp_ns = frame.stamp_ns
+        self._keyframe_from_prev, self._covariance = keyframe_from_curr, covariance
+        if self._has_moved_on(frame, match):
+            self._keep_previous_as_keyframe()
+        return step
+
+    def _match_to_keyframe(self, frame: Frame, expected: Guess | None) -> Match:
+        """Guided by constant velocity or what is expected; if that fails, unguided."""
+        key, matcher = self._window.keyframe, self._config.matcher
+        seed = frame.stamp_ns % 2**64
+        prediction = self._predict(frame, expected)
+        if prediction is not None:
+            match = match_frames(key, frame, matcher, seed, *prediction)
+            if match.inliers >= self._config.min_inliers:
+                return match
+        return match_frames(key, frame, matcher, seed)
+
+    def _predict(
+        self, frame: Frame, expected: Guess | None
+    ) -> tuple[SE3, NDArray[np.float64]] | None:
+        interval_s = (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
+        if self._velocity is None or not 0 < interval_s <= self._config.max_prediction_s:
+            if expected is None or not expected.has_way:
+                return None
+            return (
+                self._keyframe_from_prev @ expected.prev_from_curr,
+                propagate_covariance(
+                    self._keyframe_from_prev, self._covariance, expected.covariance
+                ),
+            )
+        prev_from_curr = SE3.exp(self._velocity * interval_s)
+        sigma = np.repeat(
+            [self._config.acceleration_m_s2, self._config.angular_acceleration_rad_s2], 3
+        )
+        noise = np.diag((sigma * interval_s**2) ** 2)
+        return (
+            self._keyframe_from_prev @ prev_from_curr,
+            propagate_covariance(self._keyframe_from_prev, self._covariance, noise),
+        )
+
+    def _keep_previous_as_keyframe(self) -> None:
+        self._window.keep_newest()
+        self._keyframe_from_prev = SE3.identity()
+        self._covariance = np.zeros((6, 6))
+
+    def _has_moved_on(self, frame: Frame, match: Match) -> bool:
+        before = self._window.keyframe.landmarks
+        if match.inliers < self._config.keyframe_share * min(len(before), len(frame.landmarks)):
+            return True
+        flow = frame.landmarks.pixels[match.live_rows] - before.pixels[match.reference_rows]
+        return bool(np.median(np.abs(flow).max(axis=1)) > self._config.keyframe_flow_px)
+
+
+def _reason(match: Match) -> OdometryStatus:
+    if match.reference_from_live is None:
+        return OdometryStatus.NO_CONSENSUS
+    return OdometryStatus.TOO_FEW_MATCHES
