@@ -4,11 +4,25 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from contextlib import suppress
 
 import pytest
+from sqlalchemy import Table
 
 from engram.errors import EngramError, MapCorruptError
 from engram.maps import Map, check_file
+from engram.maps.rows import sealed
+from engram.maps.schema import (
+    attempts,
+    cameras,
+    edges,
+    frontends,
+    nodes,
+    path_entries,
+    paths,
+    revisions,
+    sessions,
+)
 
 from .maps import begin, session, write_drive
 
@@ -65,3 +79,77 @@ def test_a_name_in_a_definition_cannot_end_it(tmp_path, sound):
     connection.close()
     with pytest.raises(EngramError):
         Map.open(path)
+
+
+def change(path, table: Table, **values: object) -> None:
+    """Changes the first row under a right checksum, as a stranger can."""
+    connection = sqlite3.connect(path)
+    names = [one.name for one in table.columns]
+    first = names[0]
+    found = connection.execute(f"SELECT {', '.join(names)} FROM {table.name} ORDER BY 1").fetchone()
+    row = sealed(table, dict(zip(names, found, strict=True)) | values)
+    given = ", ".join(f"{name} = ?" for name in row)
+    connection.execute(
+        f"UPDATE {table.name} SET {given} WHERE {first} = ?", [*row.values(), found[0]]
+    )
+    connection.commit()
+    connection.close()
+
+
+STRANGE_ROWS = [
+    (nodes, {"uuid": b"short"}),
+    (nodes, {"session": 77}),
+    (sessions, {"uuid": b""}),
+    (sessions, {"clock": "cuckoo"}),
+    (edges, {"a_from_b": b"\xff" * 96}),
+    (paths, {"uuid": bytes(17)}),
+    (path_entries, {"kind": "forged"}),
+    (attempts, {"body": b"\x91" * 100_000}),
+    (revisions, {"configuration": "[" * 100_000}),
+    (revisions, {"contents": '{"nodes": "many"}'}),
+    (frontends, {"descriptor": "unknown"}),
+    (cameras, {"width": 2**62}),
+]
+
+
+@pytest.mark.parametrize(("table", "values"), STRANGE_ROWS)
+def test_what_is_wrong_under_a_right_checksum_is_refused_by_name(tmp_path, sound, table, values):
+    path = shutil.copy(sound, tmp_path / "strange.engram")
+    change(path, table, **values)
+    assert check_file(path).problems
+    with suppress(EngramError), Map.open(path) as store:
+        for read in (
+            store.load,
+            store.log,
+            store.content_hash,
+            store.info,
+            lambda: store.graph,
+            lambda: store.blob_sizes,
+            lambda: store.omissions,
+            lambda: [store.frames.frame(node.id) for node in store.graph.nodes],
+        ):
+            with suppress(EngramError):  # any other error is a failure
+                read()
+
+
+def test_a_value_of_another_type_than_its_column_is_refused(tmp_path, sound):
+    """A page that was moved into another table, or a table that once was not strict."""
+    path = shutil.copy(sound, tmp_path / "strange.engram")
+    connection = sqlite3.connect(path)
+    (strict,) = connection.execute("SELECT sql FROM sqlite_schema WHERE name = 'frames'").fetchone()
+    kept = connection.execute("SELECT * FROM frames ORDER BY 1").fetchall()
+    connection.execute("DROP TABLE frames")
+    connection.execute(strict.replace("STRICT", ""))
+    for node, revision, _, thumbnail, checksum in kept:
+        connection.execute(
+            "INSERT INTO frames VALUES (?, ?, 'text', ?, ?)", [node, revision, thumbnail, checksum]
+        )
+    connection.execute("PRAGMA writable_schema = ON")
+    connection.execute("UPDATE sqlite_schema SET sql = ? WHERE name = 'frames'", [strict])
+    connection.commit()
+    connection.close()
+    assert check_file(path).problems
+    with Map.open(path) as store:
+        for node in store.load().nodes:
+            with pytest.raises(MapCorruptError):
+                store.frames.frame(node.id)

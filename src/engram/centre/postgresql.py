@@ -40,7 +40,7 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.files import Holder
-from engram.maps.database import damage_named, raise_tables, replaced
+from engram.maps.database import damage_named, raise_tables, reading_rows, replaced
 from engram.maps.rows import sealed
 from engram.maps.schema import (
     FORMAT_VERSION,
@@ -129,7 +129,7 @@ class PostgresDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for selects."""
-        with damage_named(self.name), _translated(self.name), self._engine.connect() as connection:
+        with reading_rows(self.name), _translated(self.name), self._engine.connect() as connection:
             yield connection
 
     def first(self, query: Select[Any], parameters: dict[str, Any]) -> Sequence[Any] | None:

@@ -7,14 +7,17 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Protocol
 
 from sqlalchemy import Connection, Executable, Select, Table, delete, insert, text
+from sqlalchemy.exc import NoResultFound
 from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.base import ReadOnlyColumnCollection
 
 from engram import __version__
-from engram.errors import MapCorruptError
+from engram.errors import EngramError, MapCorruptError
 from engram.files import Holder
 from engram.maps.rows import sealed
 from engram.maps.schema import FORMAT_VERSION, map_format, missing_in, rebuilt_from
+
+_STUMBLES = (TypeError, ValueError, LookupError, ArithmeticError, NoResultFound)
 
 
 @contextmanager
@@ -33,6 +36,32 @@ def damage_named(name: str) -> Iterator[None]:
         if str(error).startswith(name):
             raise
         raise MapCorruptError(f"{name}: {error}") from error
+
+
+@contextmanager
+def reading_rows(name: str) -> Iterator[None]:
+    """`damage_named`, where rows become records: what they stumble over is a damaged row.
+
+    Checksums find damage, not what a stranger wrote on purpose: a text of the wrong form, a number
+    out of range, a row that refers to none. Whatever such values raise is one error, with its
+    cause.
+
+    Args:
+        name: path or address of the map.
+
+    Raises:
+        MapCorruptError: a row holds what no map holds.
+    """
+    with damage_named(name):
+        try:
+            yield
+        except EngramError:
+            raise
+        except _STUMBLES as error:
+            raise MapCorruptError(
+                f"a record holds what no map holds ({type(error).__name__}: {error!s:.200}); run "
+                "engram check, and restore a copy"
+            ) from error
 
 
 class Lock(Protocol):

@@ -17,7 +17,7 @@ from engram.frontend import DescriptorKind, Frame, FrameStatus
 from engram.frontend.blobs import blob_hash, decode_landmarks, decode_thumbnail, is_intact
 from engram.geometry import StereoCamera
 from engram.graph.model import Node, NodeId
-from engram.maps.database import Database, damage_named
+from engram.maps.database import Database, reading_rows
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.records import StoredNode
 from engram.maps.rows import Row, verified
@@ -70,7 +70,7 @@ class FrameReader:
                 if node in self._cache:
                     self._cache.move_to_end(node)
                 return frame
-        with damage_named(self._database.name):
+        with reading_rows(self._database.name):
             frame = self._read(node)
         self._remember(node, frame)
         return frame
@@ -111,7 +111,7 @@ class FrameReader:
             for one in batch:
                 if one.id.bytes not in found:
                     raise InputError(f"the map has no node {one.id}")
-                with damage_named(self._database.name):
+                with reading_rows(self._database.name):
                     stored = self._stored_node(one, found[one.id.bytes])
                 yield stored
 
@@ -197,7 +197,7 @@ class FrameReader:
         row, blob = self._node_row(node)
         camera = self._cameras.get(row["camera"])
         frontend = self._frontends.get(row["frontend"])
-        if camera is None or frontend is None or blob is None:
+        if camera is None or frontend is None or not isinstance(blob, bytes):
             raise MapCorruptError(f"node {node}: its camera, front-end or frame is missing")
         if blob_hash(blob) != row["landmark_hash"]:
             raise MapCorruptError(f"node {node}: its landmarks are not those that were saved")

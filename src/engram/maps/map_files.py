@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from engram.errors import MapCorruptError
+from engram.files import current_holder
 from engram.maps.checking import check
 from engram.maps.database import Database, Place
 from engram.maps.records import CheckReport, Problem
 from engram.maps.sqlite import SqliteDatabase, map_path
+from engram.maps.write_ahead import log_problems
 
 
 def open_database(location: Path | str | Place) -> Database:
@@ -64,9 +67,19 @@ def check_file(location: Path | str | Place, *, thin: bool = False) -> CheckRepo
         NotAMapError: the file does not exist or is not a map.
         FormatVersionError: a newer Engram wrote it.
     """
+    lost = [] if not isinstance(location, Path | str) else _log_problems(map_path(location))
     try:
         database = open_database(location)
     except MapCorruptError as error:
-        return CheckReport((Problem("file", "", str(error)),), 0, 0, (), 0)
+        return CheckReport((*lost, Problem("file", "", str(error))), 0, 0, (), 0)
     with closing(database):
-        return check(database, thin=thin)
+        found = check(database, thin=thin)
+    return replace(found, problems=(*lost, *found.problems))
+
+
+def _log_problems(path: Path) -> list[Problem]:
+    """Faults of a log that nobody writes to now."""
+    path = path.resolve()
+    if current_holder(path) is not None:
+        return []
+    return [Problem("file", "", fact) for fact in log_problems(path)]

@@ -33,7 +33,7 @@ from engram.maps import marks, reading
 from engram.maps.checking import check
 from engram.maps.collector import no_collections
 from engram.maps.content import content_hash, record_hashes
-from engram.maps.database import Database
+from engram.maps.database import Database, reading_rows
 from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import FrameReader
 from engram.maps.laying_out import frame_of, graph_of
@@ -232,7 +232,8 @@ class MapReader:
     @property
     def frame(self) -> MapFrame:
         """The map frame: where its nodes and goals lie, for messages, display and exports."""
-        return self.derived(frame_of, self.revision, len(self.graph))
+        with reading_rows(self.location):
+            return self.derived(frame_of, self.revision, len(self.graph))
 
     def grown_graph(self) -> ExperienceGraph | None:
         """The graph in memory if it has all nodes of the map; None if it would have to be read."""
@@ -457,7 +458,7 @@ class MapReader:
     def _read_contents(self) -> _Contents:
         with self._contents_lock:
             if self._contents is None:
-                with no_collections():
+                with no_collections(), reading_rows(self.location):
                     found = self.load()
                     self._contents = _Contents.of(found)
                 # Attempts refer to sessions by position: both must be read together.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 from sqlalchemy import Connection, Table, select
@@ -17,6 +16,7 @@ from engram.maps.rows import (
     Row,
     checked_int,
     checked_text,
+    node_from_bytes,
     transform_bytes,
     transform_from_bytes,
     verified,
@@ -150,9 +150,9 @@ def _is_removed(row: Row, removed: list[tuple[int, SE3]]) -> bool:
 
 def _node_ids(connection: Connection, keys: set[int]) -> dict[int, NodeId]:
     query = select(nodes.c.key, nodes.c.uuid).where(nodes.c.key.in_(keys))
-    return {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
+    return {row[0]: node_from_bytes(row[1]) for row in connection.execute(query)}
 
 
 def _all_node_ids(connection: Connection, view: View) -> dict[int, NodeId]:
     query: Any = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
-    return {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
+    return {row[0]: node_from_bytes(row[1]) for row in connection.execute(query)}

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from uuid import UUID
 
 from sqlalchemy import Connection, func, select
 
 from engram.errors import InputError
 from engram.graph.model import NodeId, SessionId
-from engram.maps.rows import Row, verified
+from engram.maps.rows import Row, node_from_bytes, uuid_from_bytes, verified
 from engram.maps.schema import hidden, nodes, revisions, sessions
 from engram.maps.view import View, place_in_history
 
@@ -67,7 +66,7 @@ def origin_of(connection: Connection, view: View, prefix: str) -> Origin:
         count = connection.execute(select(func.count()).select_from(nodes).where(brought)).scalar()
         raise InputError(f"none of the map's {count} nodes begins with {prefix!r}")
     if len(rows) > 1:
-        listed = ", ".join(str(UUID(bytes=row["uuid"])) for row in rows[:_LISTED])
+        listed = ", ".join(str(node_from_bytes(row["uuid"])) for row in rows[:_LISTED])
         more = f" and {len(rows) - _LISTED} more" if len(rows) > _LISTED else ""
         raise InputError(f"{len(rows)} nodes begin with {prefix!r}, give more: {listed}{more}")
     return _origin(connection, view, rows[0])
@@ -90,8 +89,8 @@ def _origin(connection: Connection, view: View, row: Row) -> Origin:
         .order_by(place_in_history(), hidden.c.key)
     )
     return Origin(
-        node=NodeId(UUID(bytes=row["uuid"])),
-        session=SessionId(UUID(bytes=session["uuid"])),
+        node=node_from_bytes(row["uuid"]),
+        session=SessionId(uuid_from_bytes(session["uuid"], "a session")),
         robot=session["robot"],
         stamp_ns=row["stamp_ns"],
         driven_m=row["driven_m"],

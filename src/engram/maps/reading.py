@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +35,7 @@ from engram.maps.rows import (
     camera_from_row,
     edges_from_rows,
     from_json,
+    node_from_bytes,
     node_from_row,
     path_entry_from_row,
     session_from_row,
@@ -232,7 +232,7 @@ def load_vocabulary(connection: Connection, view: View) -> bytes | None:
 def load_omissions(connection: Connection, view: View) -> dict[NodeId, Omission]:
     """Omitted nodes, each with its newest visible equivalent."""
     query = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
-    node_ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(query)}
+    node_ids = {row[0]: node_from_bytes(row[1]) for row in connection.execute(query)}
     landmarks = {
         row["uuid"]: row["landmark_hash"] for row in view.rows(connection, omitted_landmarks)
     }
@@ -265,14 +265,14 @@ def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
     found: dict[NodeId, bytes] = {}
     for table in (omitted_landmarks, nodes):
         query = view.select(table).with_only_columns(table.c.uuid, table.c.landmark_hash)
-        found |= {NodeId(UUID(bytes=row[0])): row[1] for row in connection.execute(query)}
+        found |= {node_from_bytes(row[0]): row[1] for row in connection.execute(query)}
     return found
 
 
 def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:
     """Size in bytes of each node's landmarks and of its thumbnail."""
     seen = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
-    ids = {row[0]: NodeId(UUID(bytes=row[1])) for row in connection.execute(seen)}
+    ids = {row[0]: node_from_bytes(row[1]) for row in connection.execute(seen)}
     query = select(
         frames.c.node, func.length(frames.c.landmarks), func.length(frames.c.thumbnail)
     ).order_by(frames.c.node)

@@ -5,20 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from typing import Any
-from uuid import UUID
 
 from sqlalchemy import Connection, delete, func, select, update
 
 from engram import __version__
 from engram.errors import MapCorruptError, RevisionError
 from engram.files import Holder
-from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind, SessionId, path_id
+from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, SessionId, path_id
 from engram.maps import reading
 from engram.maps.keys import KeyBook
 from engram.maps.records import InterruptedSession, Revision, RevisionStatus, StoredSession
 from engram.maps.rows import (
     Row,
     checked_text,
+    node_from_bytes,
     node_from_row,
     sealed,
     session_from_row,
@@ -274,7 +274,7 @@ def _last_path_entry(
     return PathEntry(
         path_id(session),
         row["sequence"],
-        NodeId(UUID(bytes=uuid)),
+        node_from_bytes(uuid),
         PathEntryKind(row["kind"]),
         row["stamp_ns"],
     )

@@ -179,6 +179,11 @@ def uuid_from_bytes(data: bytes, what: str) -> UUID:
         raise MapCorruptError(f"{what} has no UUID of 16 bytes: {error}") from error
 
 
+def node_from_bytes(data: bytes) -> NodeId:
+    """The id of a node from its 16 bytes."""
+    return NodeId(uuid_from_bytes(data, "a node"))
+
+
 def camera_row(camera: StereoCamera, key: int) -> Row:
     """Columns of `cameras`."""
     mounting = camera.cam_from_rig

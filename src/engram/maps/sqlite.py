@@ -25,7 +25,7 @@ from sqlalchemy.sql.compiler import SQLCompiler
 from engram import __version__
 from engram.errors import InputError, MapCorruptError, MapError, NotAMapError, StorageFullError
 from engram.files import Holder, WriterLock, current_holder, naming, new_file, publish
-from engram.maps.database import damage_named, raise_tables, replaced
+from engram.maps.database import damage_named, raise_tables, reading_rows, replaced
 from engram.maps.rows import sealed
 from engram.maps.schema import FORMAT_VERSION, map_format, metadata, missing_in
 from engram.sqlite import FileKind, SqliteFile
@@ -102,7 +102,7 @@ class SqliteDatabase:
         """A connection for selects."""
         with (
             self._unchanged(),
-            damage_named(self.name),
+            reading_rows(self.name),
             self._file.errors(),
             self._reader.connect() as connection,
         ):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from sqlalchemy import Connection, select
 from engram.errors import InputError, MapCorruptError
 from engram.graph.model import NodeId
 from engram.maps.database import Database
-from engram.maps.rows import Row, sealed, verified
+from engram.maps.rows import Row, node_from_bytes, sealed, verified
 from engram.maps.schema import nodes, words
 
 _DTYPE = np.dtype("<u2")
@@ -73,7 +72,7 @@ def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDA
     for row in connection.execute(query):
         try:
             kept = next(verified(words, [row]))
-            found[NodeId(UUID(bytes=row[-1]))] = decode_words(kept["body"])
+            found[node_from_bytes(row[-1])] = decode_words(kept["body"])
         except (MapCorruptError, ValueError):
             continue  # computed again later; `engram check` names the row
     return found

@@ -130,6 +130,17 @@ def hash_of(vocabulary: Vocabulary) -> bytes:
     return vocabulary_hash(encode_vocabulary(vocabulary))
 
 
+# What malformed headers raise; of nested ones JSON raises the last.
+_MALFORMED = (
+    safetensors.SafetensorError,
+    InputError,
+    ValueError,
+    LookupError,
+    TypeError,
+    RecursionError,
+)
+
+
 def decode_vocabulary(body: bytes) -> Vocabulary:
     """Inverse of `encode_vocabulary`, for bytes of any origin.
 
@@ -141,7 +152,7 @@ def decode_vocabulary(body: bytes) -> Vocabulary:
         about = _metadata(body)
         arrays = _checked_arrays(tensors)
         return _assembled(about, arrays)
-    except (safetensors.SafetensorError, InputError, ValueError, KeyError, TypeError) as error:
+    except _MALFORMED as error:
         raise MapCorruptError(f"not a usable vocabulary: {error}") from error
 
 

@@ -110,7 +110,7 @@ def decode_manifest(body: bytes) -> Manifest:
     """
     try:
         return msgspec.json.decode(body, type=WireManifest).full(None)
-    except (msgspec.DecodeError, InputError) as error:
+    except (msgspec.DecodeError, RecursionError, InputError) as error:
         raise MapCorruptError(f"not a manifest: {error}") from error
 
 

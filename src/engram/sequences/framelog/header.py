@@ -91,7 +91,7 @@ class FrameLogHeader:
             return FrameLogHeader(
                 info,
                 camera,
-                feature_kind(values["descriptor"]).name,
+                feature_kind(_text(values["descriptor"])).name,
                 _text(values["frontend"]),
                 _text(values["odometry"]),
                 _text(values["frames"]),

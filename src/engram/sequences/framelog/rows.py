@@ -92,7 +92,7 @@ def encode_row(number: int, logged: LoggedFrame, pair_hash: str) -> dict[str, An
         "landmarks": encode_landmarks(frame.landmarks, frame.camera),
         "thumbnail": thumbnail,
     }
-    row["digest"] = _digest(
+    row["digest"] = row_digest(
         row, row["landmarks"][:HASH_BYTES], None if thumbnail is None else thumbnail[:HASH_BYTES]
     )
     return row
@@ -109,7 +109,10 @@ def decode_step(row: Any) -> StepRow:
     for name, kinds in _COLUMN_KINDS.items():
         if not isinstance(columns[name], kinds):
             raise MapCorruptError(f"{where} of the frame log: {name} is {columns[name]!r:.40}")
-    if _digest(columns, columns["landmarks_hash"], columns["thumbnail_hash"]) != columns["digest"]:
+    if (
+        row_digest(columns, columns["landmarks_hash"], columns["thumbnail_hash"])
+        != columns["digest"]
+    ):
         raise MapCorruptError(f"{where} of the frame log does not match its hash")
     try:
         odometry = _step(columns)
@@ -186,7 +189,8 @@ def _floats(content: bytes | None, shape: tuple[int, int]) -> NDArray[np.float64
     return values
 
 
-def _digest(row: dict[str, Any], landmarks_hash: bytes, thumbnail_hash: bytes | None) -> bytes:
+def row_digest(row: dict[str, Any], landmarks_hash: bytes, thumbnail_hash: bytes | None) -> bytes:
+    """The digest of a row: over its columns and the hashes that its blobs begin with."""
     content = [
         *(row[name] for name in ("number", "stamp_ns", "status", "pair_hash")),
         *(row[name] for name in ("odometry_status", "inliers")),

@@ -1,0 +1,219 @@
+"""Changes of rows: as damage leaves them, or sealed anew, as a stranger would."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Table
+
+from engram.frontend.blobs import content_digest
+from engram.maps.rows import sealed
+from engram.maps.schema import frames, metadata, nodes
+from engram.sequences.framelog.file import frames_table, log_table
+from engram.sequences.framelog.rows import row_digest
+from engram_lab.mutations import values
+from engram_lab.mutations.case import Case, Subject
+from engram_lab.mutations.samples import Samples
+
+Row = dict[str, Any]
+
+
+def of_a_map(samples: Samples, folder: Path, chance: random.Random) -> Case:
+    """Rows of a map under their old checksums, which `check` must miss."""
+    return _in_a_map(samples, folder, chance, sealing=False)
+
+
+def sealed_in_a_map(samples: Samples, folder: Path, chance: random.Random) -> Case:
+    """Rows of a map under right checksums, which readers must survive."""
+    return _in_a_map(samples, folder, chance, sealing=True)
+
+
+def blobs_of_a_map(samples: Samples, folder: Path, chance: random.Random) -> Case:
+    """Landmarks, thumbnails, attempts under right hashes and checksums."""
+    path = Path(shutil.copy(samples.town, folder / "town.engram"))
+    with closing(sqlite3.connect(path)) as connection, connection:
+        what = chance.choice([_landmarks, _thumbnail, _attempts])(connection, chance)
+    return Case(Subject.MAP, what, sealed=True, path=path)
+
+
+def many_rows(samples: Samples, folder: Path, chance: random.Random) -> Case:
+    """One row of a map over and over."""
+    path = Path(shutil.copy(samples.town, folder / "town.engram"))
+    table = chance.choice(_keyed())
+    count = chance.choice([2, 100, 20_000])
+    with closing(sqlite3.connect(path)) as connection, connection:
+        row = _any_row(connection, table, chance)
+        for key in range(10_000, 10_000 + count):
+            copy = {**row, "key": key}
+            if "uuid" in copy:
+                copy["uuid"] = chance.randbytes(16)
+            try:
+                _insert(connection, table, sealed(table, copy))
+            except sqlite3.IntegrityError:
+                break
+    return Case(Subject.MAP, f"{count} times a row of {table.name}", sealed=True, path=path)
+
+
+def of_a_drive(samples: Samples, folder: Path, chance: random.Random) -> Case:
+    """Rows of a frame log, under their old hashes or new ones."""
+    source = chance.choice([samples.framelog, samples.flight])
+    path = Path(shutil.copy(source, folder / source.name))
+    sealing = chance.random() < 0.7
+    with closing(sqlite3.connect(path)) as connection, connection:
+        what = _change_drive(connection, chance, sealing)
+    return Case(Subject.DRIVE, what, sealed=sealing, path=path)
+
+
+def changed_value(value: Any, chance: random.Random) -> Any:
+    """A value of the same type."""
+    ways: dict[type, Callable[[Any, random.Random], Any]] = {
+        int: values.integer,
+        float: values.real,
+        str: values.text,
+        bytes: values.blob,
+    }
+    return ways[type(value)](value, chance) if type(value) in ways else value
+
+
+def _in_a_map(samples: Samples, folder: Path, chance: random.Random, *, sealing: bool) -> Case:
+    path = Path(shutil.copy(samples.town, folder / "town.engram"))
+    what = []
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for _ in range(chance.choice([1, 1, 1, 2, 4])):
+            table = chance.choice(metadata.sorted_tables)
+            try:
+                what.append(_change(connection, table, chance, sealing))
+            except (sqlite3.IntegrityError, sqlite3.DataError, OverflowError):
+                what.append("nothing")  # the table itself refuses it
+    return Case(Subject.MAP, "; ".join(what), sealed=sealing, path=path)
+
+
+def _change(connection: sqlite3.Connection, table: Table, chance: random.Random, seal: bool) -> str:
+    row = _any_row(connection, table, chance)
+    if not row:
+        return f"{table.name} is empty"
+    key = next(iter(row))
+    name = f"{table.name} {row[key]}"
+    deed = chance.randrange(10)
+    if deed == 0:
+        connection.execute(f"DELETE FROM {table.name} WHERE {key} = ?", [row[key]])
+        return f"{name} deleted"
+    if deed == 1 and not seal:
+        copy = {**row, key: row[key] + 1_000}
+        _insert(connection, table, copy)
+        return f"{name} copied"
+    columns = [one for one in row if one != "checksum" or not seal]
+    column = chance.choice(columns)
+    nullable = table.c[column].nullable and chance.random() < 0.3
+    new = None if nullable else changed_value(row[column], chance)
+    changed = {**row, column: new}
+    if seal:
+        sealed(table, changed)
+    _update(connection, table, changed, key, row[key])
+    return f"{name} {column} = {new!r:.60}"
+
+
+def _landmarks(connection: sqlite3.Connection, chance: random.Random) -> str:
+    frame = _any_row(connection, frames, chance)
+    body = values.landmarks(frame["landmarks"][16:], chance)
+    digest_ = content_digest(body)
+    _update(connection, frames, sealed(frames, {**frame, "landmarks": digest_ + body}))
+    (node,) = _rows(connection, nodes, f"WHERE key = {frame['node']}")
+    _update(connection, nodes, sealed(nodes, {**node, "landmark_hash": digest_}))
+    return f"landmarks of node row {frame['node']}"
+
+
+def _thumbnail(connection: sqlite3.Connection, chance: random.Random) -> str:
+    frame = _any_row(connection, frames, chance)
+    picture = values.picture(frame["thumbnail"], chance)
+    _update(connection, frames, sealed(frames, {**frame, "thumbnail": picture}))
+    return f"thumbnail of node row {frame['node']}"
+
+
+def _attempts(connection: sqlite3.Connection, chance: random.Random) -> str:
+    table = metadata.tables["attempts"]
+    row = _any_row(connection, table, chance)
+    body = values.packed_attempts(row["body"], chance)
+    _update(connection, table, sealed(table, {**row, "body": body}))
+    return f"attempts row {row['key']}"
+
+
+def _change_drive(connection: sqlite3.Connection, chance: random.Random, seal: bool) -> str:
+    if chance.random() < 0.3:
+        (row,) = _rows(connection, log_table)
+        header = values.text(row["header"], chance)
+        changed = {**row, "header": header}
+        if seal:
+            changed["digest"] = content_digest(header.encode(errors="replace"))
+        _update(connection, log_table, changed)
+        return f"header {header!r:.60}"
+    row = _any_row(connection, frames_table, chance)
+    names = [one for one in row if one not in {"number", "digest"}]
+    column = chance.choice(names)
+    new = _drive_value(column, row[column], chance)
+    changed = {**row, column: new}
+    if seal:
+        _seal_frame(changed)
+    try:
+        _update(connection, frames_table, changed)
+    except sqlite3.IntegrityError:
+        return "nothing"
+    return f"frame {row['number']} {column} = {new!r:.60}"
+
+
+def _drive_value(column: str, value: Any, chance: random.Random) -> Any:
+    if column in {"landmarks", "thumbnail"}:
+        make = values.landmarks if column == "landmarks" else values.picture
+        body = make(value[16:], chance)
+        return content_digest(body) + body
+    return changed_value(value, chance)
+
+
+def _seal_frame(row: Row) -> None:
+    thumbnail = row["thumbnail"]
+    row["digest"] = row_digest(
+        row, row["landmarks"][:16], None if thumbnail is None else thumbnail[:16]
+    )
+
+
+def _keyed() -> Sequence[Table]:
+    return [table for table in metadata.sorted_tables if "key" in table.c]
+
+
+def _rows(connection: sqlite3.Connection, table: Table, where: str = "") -> list[Row]:
+    names = [one.name for one in table.columns]
+    listed = ", ".join(names)
+    found = connection.execute(f"SELECT {listed} FROM {table.name} {where} ORDER BY 1")
+    return [dict(zip(names, row, strict=True)) for row in found]
+
+
+def _any_row(connection: sqlite3.Connection, table: Table, chance: random.Random) -> Row:
+    found = _rows(connection, table)
+    return chance.choice(found) if found else {}
+
+
+def _insert(connection: sqlite3.Connection, table: Table, row: Row) -> None:
+    marks = ", ".join("?" * len(row))
+    connection.execute(
+        f"INSERT INTO {table.name} ({', '.join(row)}) VALUES ({marks})", list(row.values())
+    )
+
+
+def _update(
+    connection: sqlite3.Connection,
+    table: Table,
+    row: Row,
+    key: str | None = None,
+    value: Any = None,
+) -> None:
+    if key is None:
+        key = next(iter(row))
+        value = row[key]
+    given = ", ".join(f"{name} = ?" for name in row)
+    connection.execute(f"UPDATE {table.name} SET {given} WHERE {key} = ?", [*row.values(), value])
