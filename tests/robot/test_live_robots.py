@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tests.synthetic_world import Seen, World, drive
 
+from engram.doctor import DoctorConfig
 from engram.errors import ConfigError, StorageFullError
 from engram.fleet.merge import merge
 from engram.maps import Map, RevisionWriter, check_file, open_map
@@ -225,6 +226,21 @@ def test_what_an_unfit_robot_mapped_is_sealed_and_not_committed(path: Path) -> N
         assert town.revision == 0
         (waiting,) = town.interrupted()
         assert waiting.nodes > 15
+
+
+def test_an_unfit_robot_stops_mapping_when_the_doctor_has_seen_enough(path: Path) -> None:
+    settings = Settings(doctor=DoctorConfig(frames=15))
+    with (
+        open_map(path, create=True) as town,
+        town.robot(CAMERA, settings, name="r1", maps=True) as robot,
+    ):
+        words = run(robot, [*FIRST[:12], FIRST[3], *FIRST[12:]])
+        assert robot.saving.state is SavingState.SEALED
+    assert "saved" in words[:14]
+    assert "saved" not in words[16:]
+    with open_map(path) as town:
+        assert town.revision == 0
+        assert town.interrupted()
 
 
 def test_what_an_unfit_robot_remembers_is_dropped(path: Path) -> None:

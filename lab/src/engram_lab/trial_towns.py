@@ -80,6 +80,25 @@ def streets(
             yield _street(seed, drives, mapped, seed, drives[live], settings, lost_rounds)
 
 
+def all_streets(
+    towns: Sequence[int], settings: Settings, lost_rounds: int, monitor: Monitor = QUIET
+) -> Iterator[tuple[SessionPlan, str, Street]]:
+    """Each map of each town with every drive that it was not built from; see `streets`.
+
+    Yields:
+        The plan of the drive, the name of the street, the street.
+    """
+    for seed in towns:
+        drives, plans = _drives(seed, settings, monitor), trial_town(seed).sessions
+        for mapped in dict.fromkeys(mapped for mapped, _ in _STREETS):
+            for live in range(len(drives)):
+                if live not in mapped:
+                    yield (
+                        plans[live],
+                        *_street(seed, drives, mapped, seed, drives[live], settings, lost_rounds),
+                    )
+
+
 def other_towns(
     towns: Sequence[int], settings: Settings, lost_rounds: int, monitor: Monitor = QUIET
 ) -> Iterator[tuple[str, Street]]:

@@ -28,6 +28,8 @@ from engram.robot.whereabouts import Whereabouts
 _AGAIN_AFTER_S = 2.0
 # A stamp that is earlier by less is a frame that came late; by more, a clock that was set back.
 _LATE_FRAME_NS = 1_000_000_000
+# What a robot found is then no longer kept.
+_KEEPS_NO_MORE = {SavingState.FAILED, SavingState.SEALED}
 # Added to a position that was kept over a restart: wide enough that it proposes and proves nothing.
 _KEPT_SIGMA_M, _KEPT_SIGMA_RAD = 2.0, 0.3
 
@@ -146,7 +148,7 @@ class Driving:
             return Step(trouble=self.trouble)
         self._belief = found.position
         map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
-        self.trouble = robot.saving.reason if robot.saving.state is SavingState.FAILED else ""
+        self.trouble = robot.saving.reason if robot.saving.state in _KEEPS_NO_MORE else ""
         return Step(found.motion, found, self.trouble, map_from_live)
 
     def _driven(self, stamp_ns: int, wheels_from_live: SE3 | None) -> OutsideMotion | None:

@@ -14,13 +14,12 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import ConfigError, MapCorruptError
+from engram.errors import ConfigError
 from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
@@ -28,14 +27,13 @@ from engram.graph.model import Edge, EdgeKind, Node, NodeId
 from engram.graph.neighbourhood import Search
 from engram.localiser import (
     AcceptanceConfig,
-    Matcher,
     Position,
     Prediction,
-    accept_lost,
     agrees,
     best_places,
     spread,
 )
+from engram.localiser.attempts import Attempter, Candidate
 from engram.places.book import PlaceBook
 
 # Most likely places, from which those to attempt are chosen apart from each other.
@@ -116,8 +114,8 @@ class LoopSearch:
     Args:
         graph: the experience graph; searched by the calling thread only.
         book: the words of its nodes.
-        matcher: the first half of an attempt.
-        acceptance: thresholds of the second half, as for a lost robot: there is no prediction.
+        attempter: makes attempts, as of a lost robot: there is no prediction.
+        acceptance: thresholds by which two matches agree.
         config: settings.
     """
 
@@ -125,14 +123,14 @@ class LoopSearch:
         self,
         graph: ExperienceGraph,
         book: PlaceBook,
-        matcher: Matcher,
+        attempter: Attempter,
         acceptance: AcceptanceConfig,
         config: LoopConfig | None = None,
     ) -> None:
         self.config = config or LoopConfig()
         self._graph = graph
         self._book = book
-        self._matcher = matcher
+        self._attempter = attempter
         self._acceptance = acceptance
         self._frames = 0
         self._asked: deque[tuple[int, Future[_Match | None]]] = deque()
@@ -257,17 +255,16 @@ class LoopSearch:
     def _matched(self, question: _Question, place: int) -> _Match | None:
         """The match with a place, if it is accepted."""
         known = self._graph.node(place).id
-        try:
-            match = self._matcher.match(question.frame, question.node, known, None)
-        except MapCorruptError:
+        candidate = Candidate(place, known, None, guided=False, row=None)
+        outcome = self._attempter.attempt(question.frame, question.node, 0, candidate)
+        if outcome.damaged:
             self._book.unreadable.add(place)  # not to be proposed again; `engram check` names it
+        match, evidence = outcome.match, outcome.evidence
+        if not outcome.accepted or evidence is None or evidence.spread is None:
             return None
-        if match.reference_from_live is None or match.covariance is None:
-            return None
-        over = cache(partial(self._matcher.spread, question.frame, question.node, known, match))
-        if not accept_lost(match, over, self._acceptance):
-            return None
+        assert match.reference_from_live is not None
+        assert match.covariance is not None
         edge = Edge(
             known, question.node, EdgeKind.MATCH, match.reference_from_live, match.covariance
         )
-        return _Match(edge, match.inliers, over().depth_m)
+        return _Match(edge, match.inliers, evidence.spread.depth_m)

@@ -321,6 +321,12 @@ class LiveKeeper(Keeper):
         except MapError as error:
             self._fail(error)
 
+    def examined(self, fatal: Sequence[Finding]) -> None:
+        """Stops keeping a drive that the doctor found unfit; `close` does not commit it."""
+        if fatal and not self._owner.options.force and self.saving.state is SavingState.ON:
+            self._keeper = KEEPS_NOTHING
+            self.saving.state, self.saving.reason = SavingState.SEALED, _reasons(fatal)
+
     def close(self, fatal: Sequence[Finding] = ()) -> None:
         """Ends the drive and commits it as a revision, unless the doctor found it unfit.
 
@@ -336,8 +342,7 @@ class LiveKeeper(Keeper):
             if self.saving.session is not None:
                 self._into.end(self.saving, well=not failed, unfit=unfit)
                 if unfit and not failed:
-                    reasons = "; ".join(one.message for one in fatal)
-                    self.saving.state, self.saving.reason = SavingState.SEALED, reasons
+                    self.saving.state, self.saving.reason = SavingState.SEALED, _reasons(fatal)
         except MapError as error:
             if not failed:
                 self._fail(error)
@@ -374,3 +379,7 @@ class LiveKeeper(Keeper):
     def _fail(self, error: MapError) -> None:
         self._keeper = KEEPS_NOTHING
         self.saving.state, self.saving.reason = SavingState.FAILED, str(error)
+
+
+def _reasons(fatal: Sequence[Finding]) -> str:
+    return "; ".join(one.message for one in fatal)

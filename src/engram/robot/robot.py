@@ -163,7 +163,7 @@ class Robot:
             deadline_ms = self._deadline_ms
         if not self._in_order(arrived):
             return self._left_out(arrived)
-        frame, motion = self._front.take(arrived, motion, clock)
+        frame, motion = self._taken(arrived, motion, clock)
         deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
         self._localiser.move(motion)
         found = self._known(frame, motion)
@@ -302,6 +302,17 @@ class Robot:
             return None
         back = SE3.exp((share - 1) * twist)
         return found.position.carried_on(back, (1 - share) * motion.covariance)
+
+    def _taken(
+        self, arrived: Arrived, motion: Motion | OutsideMotion | None, clock: StageClock
+    ) -> tuple[Frame, Motion]:
+        """Frame and motion; once the doctor has seen enough, an unfit drive is kept no longer."""
+        examination = self._front.examination
+        waits = self._live is not None and not examination.full
+        taken = self._front.take(arrived, motion, clock)
+        if self._live is not None and waits and examination.full:
+            self._live.examined(self.diagnosis.fatal)
+        return taken
 
     def _known(self, frame: Frame, motion: Motion) -> Localisation | None:
         """Applies the keeper's hint; returns its result if the frame needs no localising."""

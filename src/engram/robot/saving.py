@@ -12,6 +12,7 @@ from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.graph.model import Session
 from engram.localiser import ByAppearance, FrameMatcher, Localiser
+from engram.localiser.attempts import Attempter
 from engram.localiser.relocalisation import Suggested
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeSaver, Saver
 from engram.maps import Map, Revision, RevisionWriter, SessionState
@@ -138,7 +139,7 @@ def loop_search(
     return LoopSearch(
         localiser.graph,
         finder.book,
-        FrameMatcher(opened.frames, matching.matcher),
+        Attempter(opened.frames, matching, FrameMatcher(opened.frames, matching.matcher)),
         matching.acceptance,
         LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
     )
