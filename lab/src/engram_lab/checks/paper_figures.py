@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
 
 from engram_lab.intervals import Interval, Resamples, SessionSums
 
@@ -34,6 +34,8 @@ PARTS = {
     "held out in tod+paths": "by hour\nand path",
 }
 MERGED = {"single": "one agent", "4 groups": "four, merged"}
+# Each curve stands so much farther right than the one before.
+_ASIDE = 1.025
 ARMS = {"A": "Γ(distance)", "B": "recall"}
 
 
@@ -65,17 +67,25 @@ def sessions_of(rows: Sequence[Row], arm: str, experiment: str, name: str) -> li
 
 
 def bars(axes: Axes, at: float, found: Interval, colour: str) -> None:
-    """One bar with its interval and its value above."""
+    """One bar with its interval, and its value beside that."""
     axes.bar(at, found.estimate, 0.38, color=colour)
     error = [[found.estimate - found.low], [found.high - found.estimate]]
     axes.errorbar(at, found.estimate, error, color="black", capsize=3)
-    axes.text(at, found.high + 0.8, f"{found.estimate:.1f}", ha="center", fontsize=8)
+    axes.annotate(
+        f"{found.estimate:.1f}",
+        (at, found.estimate),
+        (3, 2),
+        textcoords="offset points",
+        fontsize=8,
+    )
 
 
-def curve(axes: Axes, rows: Sequence[Row], across: str, measure: str, label: str) -> None:
-    """One curve with its intervals as bars, per cent."""
+def curve(
+    axes: Axes, rows: Sequence[Row], across: str, measure: str, label: str, *, place: int
+) -> None:
+    """One curve with its intervals as bars, per cent; set aside by its place, so that none hide."""
     rows = sorted(rows, key=lambda one: float(one[across]))
-    x = [float(one[across]) for one in rows]
+    x = [_ASIDE ** (place - 1) * float(one[across]) for one in rows]
     y, low, high = (
         np.array([100 * float(one[f"{measure}{end}"]) for one in rows])
         for end in ("", "_low", "_high")
@@ -87,11 +97,10 @@ def lanes(rows: Sequence[Row]) -> Figure:
     """Route missed against the number of lanes ([L15] Fig. 11)."""
     figure, axes = _axes("lanes, Np", "route missed, %")
     usual = [one for one in pooled(rows) if not one["map_sessions"] and one["lanes"].isdigit()]
-    for policy, label in LANES.items():
+    for place, (policy, label) in enumerate(LANES.items()):
         own = [one for one in usual if one["policy"] == policy]
-        curve(axes, own, "lanes", "share_not_localised", label)
-    axes.set_xscale("log", base=2)
-    axes.set_xticks([1, 2, 4, 8, 16], ["1", "2", "4", "8", "16"])
+        curve(axes, own, "lanes", "share_not_localised", label, place=place)
+    _doubling(axes, (1, 2, 4, 8, 16))
     return _ended(figure, axes, logarithmic=True)
 
 
@@ -100,9 +109,10 @@ def growth(rows: Sequence[Row]) -> Figure:
     figure, axes = _axes("drives in the map", "P(> 10 m), %")
     usual = [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
     steps = {"1", "2", "4", "8", "16", "20", "24", "31"}
-    for policy, label in GROWTH.items():
+    for place, (policy, label) in enumerate(GROWTH.items()):
         own = [one for one in usual if one["policy"] == policy and one["map_sessions"] in steps]
-        curve(axes, own, "map_sessions", "p_gt_10m", label)
+        curve(axes, own, "map_sessions", "p_gt_10m", label, place=place)
+    _doubling(axes, (1, 2, 4, 8, 16, 31))
     return _ended(figure, axes, logarithmic=True)
 
 
@@ -134,6 +144,12 @@ def _axes(across: str, up: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
+def _doubling(axes: Axes, ticks: Sequence[int]) -> None:
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(ticks, [str(one) for one in ticks])
+    axes.xaxis.set_minor_locator(NullLocator())
+
+
 def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
     if logarithmic:
         axes.set_yscale("log")
@@ -141,7 +157,7 @@ def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
         axes.yaxis.set_minor_formatter(NullFormatter())
         axes.yaxis.set_major_formatter("{x:g}")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="upper right" if logarithmic else "best")
     return figure
 
 
