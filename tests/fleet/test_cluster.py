@@ -162,5 +162,5 @@ def test_a_scheduler_that_cannot_be_is_told_before_anything_is_begun(
 def test_what_dask_raises_is_told_as_an_error_of_workers():
     failed: Future[None] = Future()
     failed.set_exception(distributed.KilledWorker("task", SimpleNamespace(address="worker"), 3))
-    with pytest.raises(WorkerError, match=r"group 7 was not mapped .* KilledWorker"):
-        cluster._outcome(failed, 7, "tcp://nowhere:1")
+    with pytest.raises(WorkerError, match=r"group 7 was not done .* KilledWorker"):
+        cluster._outcome(failed, "group 7", "tcp://nowhere:1")

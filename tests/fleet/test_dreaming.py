@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import random
 import shutil
+import signal
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import Engine, event
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
@@ -147,6 +152,67 @@ def test_a_stopped_dream_goes_on_to_the_same_result(town, tmp_path, checks):
     assert (report.behaviour, report.order) == (whole.behaviour, whole.order)
     assert report.better_by == whole.better_by
     assert nodes_of(centre) == nodes_of(fresh)
+
+
+def dreams_till_killed(
+    statement: int, centre: Path, robots: list[Path], drives: list[Path]
+) -> bool:
+    """Dreams in a child that dies before its n-th statement; whether it died."""
+    child = os.fork()
+    if child:
+        return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    left = statement
+
+    def die(*_: object) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    try:
+        event.listen(Engine, "before_cursor_execute", die)
+        dream(centre, robots, drives, options=ASKED)
+    finally:
+        os._exit(0)
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
+def test_killed_at_random_a_dream_goes_on_to_the_same_result(town, tmp_path):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    fresh = Path(shutil.copy(town[0], tmp_path / "fresh.engram"))
+    whole = dream(fresh, robots, drives, options=ASKED)
+    rng, kills = random.Random(7), 0
+    while dreams_till_killed(rng.randrange(9000), centre, robots, drives):
+        kills += 1
+        assert nodes_of(centre) in (nodes_of(town[0]), nodes_of(fresh))
+        assert check_file(centre).problems == ()
+    assert kills >= 2
+    assert nodes_of(centre) == nodes_of(fresh)
+    again = dream(centre, robots, drives, options=ASKED)
+    assert (again.behaviour, again.order) == (whole.behaviour, whole.order)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["processes", "cluster"])
+def test_side_by_side_or_on_a_cluster_the_result_is_the_same(town, tmp_path, how):
+    centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
+    here = Path(shutil.copy(town[0], tmp_path / "here.engram"))
+    whole = dream(here, robots, drives, options=ASKED)
+    if how == "processes":
+        report = dream(centre, robots, drives, options=replace(ASKED, workers=2))
+    else:
+        distributed = pytest.importorskip("distributed", reason="no extra `cluster`")
+        with distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, protocol="tcp",
+            dashboard_address=None,
+        ) as started:  # fmt: skip
+            asked = replace(ASKED, scheduler=started.scheduler_address)
+            report = dream(centre, robots, drives, options=asked)
+    assert report.complete
+    assert (report.behaviour, report.order) == (whole.behaviour, whole.order)
+    assert report.better_by == whole.better_by
+    assert nodes_of(centre) == nodes_of(here)
 
 
 @pytest.mark.long

@@ -32,6 +32,13 @@ def dream(
         float | None,
         typer.Option("--minutes", help="Stop trying after so long [default: try everything]."),
     ] = None,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, help="Processes that try side by side.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Try on a Dask cluster instead."),
+    ] = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -45,7 +52,7 @@ def dream(
     \b
     Examples:
       engram dream fleet.engram --validate a.framelog --validate b.framelog --validate c.framelog
-      engram dream fleet.engram r1.engram r2.engram --validate … --minutes 30
+      engram dream fleet.engram r1.engram r2.engram --validate … --minutes 30 --workers 2
     """
     from engram.cli.fleet import merging_of
     from engram.cli.progress import Bars
@@ -56,6 +63,8 @@ def dream(
     given = settings.read()
     asked = DreamOptions(
         minutes=minutes,
+        workers=workers,
+        scheduler=scheduler,
         merging=merging_of(given),
         judge_at_m=given.build.max_gap_m,
         estimator=given.build.estimator,

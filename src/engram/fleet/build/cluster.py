@@ -1,13 +1,13 @@
-"""Maps groups on a Dask cluster. Dask is an extra, imported only if a scheduler is given."""
+"""Work on a Dask cluster. Dask is an extra, imported only if a scheduler is given."""
 
 from __future__ import annotations
 
 import asyncio
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeVar
 from uuid import uuid4
 
 from engram.errors import EngramError, MissingExtraError, WorkerError
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 _CONNECT_S = 30
 
-# A group's map and result, or the error of a drive.
-_Outcome: TypeAlias = tuple[GroupResult, bytes, list[str]] | EngramError
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 
 class _GivenUpError(Exception):
-    """Raised in a worker: the client no longer waits for this group."""
+    """Raised in a worker: the client no longer waits for this task."""
 
 
 def map_groups_on_cluster(
@@ -37,31 +37,63 @@ def map_groups_on_cluster(
 ) -> None:
     """Maps groups on the workers of a cluster, which read the drives themselves.
 
-    Whole maps come back over the network: no shared disk is needed.
+    Whole maps come back over the network: no shared disk is needed. For errors see
+    `run_on_cluster`.
 
     Args:
         tasks: the groups.
         scheduler: address of the Dask scheduler.
         monitor: receives progress per frame; an exception of its `check` stops the workers too.
         mapped: called with each finished group.
+    """
+    named = {f"group {task.number}": task for task in tasks}
+
+    def done(name: str, made: tuple[GroupResult, bytes]) -> None:
+        result, content = made
+        _keep(named[name].path, content)
+        mapped(result)
+
+    run_on_cluster(_map_group, named, scheduler, monitor, done)
+
+
+def _map_group(task: GroupTask, monitor: Monitor) -> tuple[GroupResult, bytes]:
+    """Runs in the worker."""
+    return map_group_far_away(task, monitor)
+
+
+def run_on_cluster(
+    work: Callable[[Task, Monitor], Result],
+    tasks: Mapping[str, Task],
+    scheduler: str,
+    monitor: Monitor,
+    done: Callable[[str, Result], None],
+) -> None:
+    """Runs each task on a worker of a cluster.
+
+    Args:
+        work: a function of a module, as for `run_in_processes`; it shares no disk with the caller.
+        tasks: name → task.
+        scheduler: address of the Dask scheduler.
+        monitor: receives the words of all tasks; an exception of its `check` stops the workers too.
+        done: called for each finished task with its name and result.
 
     Raises:
         MissingExtraError: Dask is not installed.
-        WorkerError: the scheduler cannot be reached or is lost, or a group's workers died
+        WorkerError: the scheduler cannot be reached or is lost, or a task's workers died
             repeatedly.
-        EngramError: a group cannot be mapped.
+        EngramError: raised by a task.
     """
     heard: queue.SimpleQueue[list[str] | Future] = queue.SimpleQueue()
-    topic = f"engram-build-{uuid4().hex}"
+    topic = f"engram-{uuid4().hex}"
     with _connected(scheduler) as client:  # closing it stops the workers
         client.subscribe_topic(topic, lambda event: heard.put(list(event[1])))
-        groups: dict[Future, GroupTask] = {}
-        for task in tasks:
+        names: dict[Future, str] = {}
+        for name, task in tasks.items():
             # Not a cached pure function: each task is submitted once.
-            future = client.submit(_map_on_worker, task, topic, pure=False, retries=MAX_RETRIES)
-            groups[future] = task
+            future = client.submit(_on_worker, work, task, topic, pure=False, retries=MAX_RETRIES)
+            names[future] = name
             future.add_done_callback(heard.put)
-        while groups:
+        while names:
             monitor.check()
             try:
                 said = heard.get(timeout=LISTEN_S)
@@ -69,10 +101,9 @@ def map_groups_on_cluster(
                 continue
             words = said
             if not isinstance(said, list):
-                task = groups.pop(said)
-                result, content, words = _outcome(said, task.number, scheduler)
-                _keep(task.path, content)
-                mapped(result)
+                name = names.pop(said)
+                result, words = _outcome(said, name, scheduler)
+                done(name, result)
             for word in words:
                 monitor.advance(word)
 
@@ -130,7 +161,7 @@ def _connected(scheduler: str) -> Client:
 
 def _missing() -> MissingExtraError:
     return MissingExtraError(
-        "building on a cluster needs Dask: pip install 'engram-localisation[cluster]'"
+        "work on a cluster needs Dask: pip install 'engram-localisation[cluster]'"
     )
 
 
@@ -141,7 +172,9 @@ def _silent(scheduler: str, error: Exception) -> WorkerError:
     )
 
 
-def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
+def _on_worker(
+    work: Callable[[Task, Monitor], Result], task: Task, topic: str
+) -> tuple[Result, list[str]] | EngramError:
     """Runs in the worker. Errors of a drive are returned, not raised: a retry would repeat them."""
     from distributed import get_worker
 
@@ -156,30 +189,30 @@ def _map_on_worker(task: GroupTask, topic: str) -> _Outcome:
 
     told = WordsTogether(send)
     try:
-        result, content = map_group_far_away(task, told)
+        result = work(task, told)
     except EngramError as error:
         return error
-    return result, content, told.take()
+    return result, told.take()
 
 
-def _outcome(future: Future, group: int, scheduler: str) -> tuple[GroupResult, bytes, list[str]]:
-    """The result of a group; fetches its map from the worker.
+def _outcome(future: Future, name: str, scheduler: str) -> tuple[Any, list[str]]:
+    """The result of a task, fetched from the worker, and its last words.
 
     Raises:
         WorkerError: the cluster failed.
-        EngramError: a drive cannot be mapped.
+        EngramError: raised by the task.
     """
     try:
-        outcome: _Outcome = future.result()
+        outcome: tuple[Any, list[str]] | EngramError = future.result()
     except CancelledError as error:
         raise WorkerError(
-            f"the scheduler at {scheduler} was lost, and group {group} with it ({error}); finished "
-            "groups are kept: run the same command again"
+            f"the scheduler at {scheduler} was lost, and {name} with it ({error}); what is "
+            "finished is kept: run the same command again"
         ) from error
     except Exception as error:  # anything that Dask or a worker may raise
         raise WorkerError(
-            f"group {group} was not mapped on the cluster after {MAX_RETRIES + 1} tries: "
-            f"{type(error).__name__}: {error}; finished groups are kept: run the "
+            f"{name} was not done on the cluster after {MAX_RETRIES + 1} tries: "
+            f"{type(error).__name__}: {error}; what is finished is kept: run the "
             "same command again, with fewer workers if memory was short"
         ) from error
     if isinstance(outcome, EngramError):

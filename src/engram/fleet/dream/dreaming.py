@@ -21,9 +21,10 @@ from msgspec import Meta
 from engram.config import check_bounds, config_hash, plain, to_dict
 from engram.errors import ConfigError, InputError
 from engram.files import draft_folder
-from engram.fleet.build.best_order import find_best_order, results_in
+from engram.fleet.build.best_order import results_in
 from engram.fleet.build.orders import JudgeOptions, OrderResult, Orders
 from engram.fleet.download.updating import UpdateReport, update
+from engram.fleet.dream.trying import Try, try_all
 from engram.fleet.merge.gate import check_held_out
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.settings import MergeOptions
@@ -52,6 +53,8 @@ class DreamOptions:
 
     Attributes:
         minutes, judge_at_m, resamples, level, seed: see their descriptions.
+        workers: processes that try behaviours side by side.
+        scheduler: address of a Dask scheduler whose workers try instead.
         merging: how robots' maps are merged usually.
         localising: policy and budget of the validation.
         estimator: what orders are judged over.
@@ -60,6 +63,8 @@ class DreamOptions:
     minutes: Annotated[
         float | None, Meta(gt=0, description="time for trying, minutes; none: until all is tried")
     ] = None
+    workers: Annotated[int, Meta(ge=1, description="processes")] = 1
+    scheduler: str | None = None
     merging: MergeOptions = field(default_factory=MergeOptions)
     localising: RobotOptions = field(default_factory=RobotOptions)
     judge_at_m: Annotated[
@@ -126,24 +131,6 @@ class DreamReport:
         else:
             lines.append(f"revision {self.added.revision}: {self.added.nodes} nodes added")
         return "\n".join(lines)
-
-
-class _Deadline(Monitor):
-    """Stops work after some time."""
-
-    def __init__(self, monitor: Monitor, minutes: float | None) -> None:
-        self._monitor = monitor
-        self._end_s = np.inf if minutes is None else time.monotonic() + 60 * minutes
-        self.over = False
-
-    def advance(self, word: str = "") -> None:
-        self._monitor.advance(word)
-
-    def check(self) -> None:
-        self._monitor.check()
-        if time.monotonic() >= self._end_s:
-            self.over = True
-            raise KeyboardInterrupt
 
 
 def dream(
@@ -235,23 +222,20 @@ def _try(
     options: DreamOptions,
     monitor: Monitor,
 ) -> bool:
-    """Tries behaviours one after another, until the time is over; whether all were tried."""
-    deadline = _Deadline(monitor, options.minutes)
-    for name, changes in BEHAVIOURS.items():
-        place = folder / name.replace(" ", "-")
-        try:
-            deadline.check()
-            find_best_order(
-                handed, place, settings, replace(options.merging, **changes), judge, deadline
-            )
-        except KeyboardInterrupt:
-            if not deadline.over:
-                raise
+    """Tries behaviours, until the time is over; whether all were tried."""
+    end_s = None if options.minutes is None else time.time() + 60 * options.minutes
+    places = {name: folder / name.replace(" ", "-") for name in BEHAVIOURS}
+    asked = {
+        name: Try(
+            place, handed, judge, settings, replace(options.merging, **BEHAVIOURS[name]), end_s
+        )
+        for name, place in places.items()
+    }
+    complete = try_all(asked, options.workers, options.scheduler, monitor)
+    for name, place in places.items():
         if found := results_in(place):
             report.tried[name] = found
-        if deadline.over:
-            return False
-    return True
+    return complete
 
 
 def _add(
