@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import runpy
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -30,9 +31,13 @@ if not PACKAGE.exists():
 sys.path.insert(0, str(PACKAGE))
 
 from engram_bridge import images, rigid  # noqa: E402
+from engram_bridge.asking import Asking  # noqa: E402
 from engram_bridge.belief import Belief  # noqa: E402
+from engram_bridge.frames import StaticFrames  # noqa: E402
 from engram_bridge.pairs import Pairs  # noqa: E402
+from engram_bridge.parameters import PARAMETERS, checked, image_topic, live_command  # noqa: E402
 from engram_bridge.supervisor import Supervisor  # noqa: E402
+from engram_bridge.troubles import Troubles  # noqa: E402
 from engram_bridge.wheels import Wheels  # noqa: E402
 
 TWIST = st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6)
@@ -219,6 +224,137 @@ def test_the_map_corrects_and_stays_while_nothing_is_seen() -> None:
         belief.hear(seen(ahead, float(ahead), status, map_from_live), 0.0)
         assert belief.map_pose is None, "no pose of a lost robot"
     np.testing.assert_array_equal(belief.map_from_odom, kept)
+
+
+def test_a_late_frame_changes_nothing_and_a_clock_set_back_forgets_the_correction() -> None:
+    belief = Belief(BASE_FROM_CAMERA)
+    now_ns = 10**12
+    belief.hear(seen(now_ns, 1.0, "localised", SE3.identity()), 0.0)
+    kept = belief.map_from_odom
+    assert not belief.hear(seen(now_ns - 10**8, 9.0), 0.0)
+    assert belief.map_from_odom is kept
+    assert belief.stamp_ns == now_ns
+    before = belief.odom_from_base
+    assert belief.hear(seen(now_ns - 10**10, 1.0), 0.0)
+    assert belief.map_from_odom is None
+    np.testing.assert_allclose(belief.odom_from_base, before, atol=1e-12)
+
+
+def test_what_nobody_watched_makes_odometry_less_certain() -> None:
+    """At 10 m/s, a process that is away for two seconds misses twenty metres."""
+    belief = Belief(BASE_FROM_CAMERA)
+    for tenth in range(5):
+        belief.hear(seen(tenth * 10**8, float(tenth)), 0.0)
+    belief.began()
+    belief.hear(seen(24 * 10**8, 0.0), 0.0)
+    assert np.sqrt(belief.odom_covariance[0, 0]) == pytest.approx(20.0, rel=0.1)
+
+
+def test_nothing_moves_before_the_mounting_is_known() -> None:
+    belief = Belief()
+    assert not belief.hear(seen(0, 0.0, "localised", SE3.identity()), 0.0)
+    assert belief.map_pose is None
+    belief.mount(BASE_FROM_CAMERA)
+    assert belief.hear(seen(1, 1.0, "localised", SE3.identity()), 0.0)
+    assert belief.map_pose is not None
+
+
+def test_the_mounting_is_found_over_the_tree_of_fixed_frames() -> None:
+    frames, upright = StaticFrames(), [0.0, 0.0, 0.0, 1.0]
+    frames.add("base_link", "mast", [0.0, 0.0, 1.0], upright)
+    frames.add("/mast", "optical", [0.5, 0.0, 0.0], [-0.5, 0.5, -0.5, 0.5])
+    frames.add("chassis", "base_link", [9.0, 9.0, 9.0], upright)
+    frames.add("chassis", "lidar", [9.0, 9.0, 11.0], upright)
+    found = frames.between("base_link", "/optical")
+    np.testing.assert_allclose(found @ [0, 0, 2, 1], [2.5, 0, 1, 1], atol=1e-12)
+    np.testing.assert_allclose(frames.between("base_link", "lidar")[:3, 3], [0, 0, 2], atol=1e-12)
+    assert frames.between("base_link", "nowhere") is None
+    frames.add("optical", "chassis", [0.0, 0.0, 0.0], upright)
+    assert frames.between("nowhere", "optical") is None, "a circle ends"
+    with pytest.raises(ValueError, match="not finite"):
+        frames.add("a", "b", [np.nan, 0.0, 0.0], upright)
+
+
+def test_each_command_is_answered_once() -> None:
+    sent: list[dict[str, Any]] = []
+    asking = Asking(lambda message: sent.append(message) or len(sent) < 3)
+    answers: list[tuple[bool, str]] = []
+    asking.ask({"do": "save"}, lambda *answer: answers.append(answer))
+    asking.ask({"do": "map", "on": True}, lambda *answer: answers.append(answer))
+    assert asking.hear({"id": sent[0]["id"], "ok": True, "text": "revision 3"})
+    assert not asking.hear({"id": sent[0]["id"], "ok": True, "text": "again"})
+    asking.gone()
+    assert answers == [(True, "revision 3"), (False, "engram live ended before it answered")]
+    done, text = asking.wait({"do": "save"}, 1.0)
+    assert not done
+    assert "not connected" in text
+
+
+def test_troubles_name_the_inputs_that_never_come() -> None:
+    now, logged = [0.0], []
+    troubles = Troubles(SimpleNamespace(warning=logged.append), lambda: now[0])
+    troubles.expect(0, "l/image", "l/info")
+    troubles.expect(1, "r/image", "r/info")
+    assert troubles.text(waiting=True) == "", "they have had no time yet"
+    now[0] = 2.0
+    for _ in range(3):
+        troubles.saw_image(0)
+        troubles.saw_info(0)
+        troubles.saw_info(1)
+    assert troubles.text(waiting=True) == "nothing came on r/image yet"
+    troubles.saw_image(1)
+    assert "3 left and 1 right" in troubles.text(waiting=True)
+    troubles.saw_pair()
+    assert troubles.text(waiting=True) == ""
+    troubles.add("a", "the disk burns")
+    troubles.add("a", "the disk burns")
+    assert logged == ["the disk burns"]
+    assert troubles.text(waiting=False) == "the disk burns"
+    now[0] = 20.0
+    assert troubles.text(waiting=False) == ""
+
+
+def test_parameters_make_the_command_and_are_checked() -> None:
+    given = checked({**PARAMETERS, "map": "/m.engram", "mapping": True, "settings": ["", "a=1"]})
+    command = live_command(given)
+    assert command[:3] == ["engram", "live", "/m.engram"]
+    assert command[-4:] == ["--deadline", "40.0", "--set", "a=1"]
+    assert image_topic(given, "left") == ("left/image_rect", False)
+    assert image_topic({**given, "compressed": True}, "left")[0] == "left/image_rect/compressed"
+    assert image_topic({**given, "left": "a/compressed"}, "left") == ("a/compressed", True)
+    for wrong in ({"map": ""}, {"map": "m", "base_from_camera": [1.0, 2.0]}, {"status_rate": 0.0}):
+        with pytest.raises(ValueError, match=r"map is empty|has 2 numbers|above 0"):
+            checked({**PARAMETERS, "map": "m", **wrong})
+
+
+def test_the_files_parameters_are_the_nodes() -> None:
+    """`config/engram.yaml` shows each parameter with its default."""
+    lines = (PACKAGE / "config" / "engram.yaml").read_text().splitlines()
+    named = [line.split(":")[0].strip() for line in lines if line.startswith("    ")]
+    assert sorted(named) == sorted(PARAMETERS)
+
+
+def test_the_launch_file_starts_the_installed_program_with_known_parameters(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`launch` comes with ROS only: stand-ins record what the file asks of it."""
+    for name, held in {
+        "ament_index_python.packages": {"get_package_share_directory": lambda _: str(PACKAGE)},
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {"DeclareLaunchArgument": lambda *a, **k: ("argument", a, k)},
+        "launch.substitutions": {"LaunchConfiguration": lambda name: name},
+        "launch_ros.actions": {"Node": lambda **k: ("node", (), k)},
+    }.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**held))
+    made = runpy.run_path(str(PACKAGE / "launch" / "engram.launch.py"))[
+        "generate_launch_description"
+    ]()
+    arguments = {names[0]: given for kind, names, given in made if kind == "argument"}
+    (node,) = (given for kind, _, given in made if kind == "node")
+    assert Path(arguments["config"]["default_value"]).is_file()
+    assert f"{node['executable']} = engram_bridge.node:main" in (PACKAGE / "setup.py").read_text()
+    assert set(node["parameters"][1]) <= set(PARAMETERS)
+    assert set(node["parameters"][1]) <= set(arguments)
 
 
 def test_the_report_never_pretends() -> None:

@@ -15,6 +15,12 @@ _COLOURS = {
 }
 
 
+# Bayer patterns: OpenCV names them by the second row's second and third pixel.
+_BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
+# YUV 4:2:2: which byte of a pixel is its brightness.
+_BRIGHTNESS = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
+
+
 class ImageError(ValueError):
     """An image message that cannot be used: says what was found, and what is understood."""
 
@@ -40,9 +46,15 @@ def grey(message):
         pixels = _rows(message, data, width, channels).astype(np.uint32)
         mixed = _RED * pixels[:, :, red] + _GREEN * pixels[:, :, green] + _BLUE * pixels[:, :, blue]
         return ((mixed + 32768) >> 16).astype(np.uint8)
+    if encoding in _BRIGHTNESS:
+        return np.ascontiguousarray(_rows(message, data, width, 2)[:, :, _BRIGHTNESS[encoding]])
+    if encoding.startswith("bayer_") and encoding[6:10] in _BAYER and encoding.endswith("8"):
+        cv2 = _opencv("Bayer images")
+        pattern = getattr(cv2, f"COLOR_BAYER_{_BAYER[encoding[6:10]]}2GRAY")
+        return cv2.cvtColor(_rows(message, data, width, 1)[:, :, 0], pattern)
     raise ImageError(
         f"encoding {encoding!r} of a {width} × {height} image is not understood; publish mono8, "
-        f"mono16, {', '.join(_COLOURS)}"
+        f"mono16, {', '.join(_COLOURS)}, yuv422 or bayer_*8"
     )
 
 
@@ -52,17 +64,40 @@ def uncompressed(message):
     Raises:
         ImageError: it cannot be decoded, or OpenCV is missing.
     """
-    try:
-        import cv2
-    except ImportError as error:
-        raise ImageError(
-            "compressed images need OpenCV: install python3-opencv, or republish them with "
-            "image_transport"
-        ) from error
+    cv2 = _opencv("compressed images")
     image = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise ImageError(f"a compressed image ({message.format!r}) cannot be decoded")
     return image
+
+
+def camera_info(message):
+    """A sensor_msgs/CameraInfo with the names of ROS's YAML files."""
+    return {
+        "image_width": message.width,
+        "image_height": message.height,
+        "distortion_model": message.distortion_model,
+        "distortion_coefficients": _entries(message.d, 1),
+        "camera_matrix": _entries(message.k, 3),
+        "rectification_matrix": _entries(message.r, 3),
+        "projection_matrix": _entries(message.p, 3),
+    }
+
+
+def _entries(values, rows: int):
+    data = [float(one) for one in values]
+    return {"rows": rows, "cols": len(data) // rows, "data": data}
+
+
+def _opencv(what: str):
+    try:
+        import cv2
+    except ImportError as error:
+        raise ImageError(
+            f"{what} need OpenCV: install python3-opencv, or republish them with image_transport "
+            "or image_proc"
+        ) from error
+    return cv2
 
 
 def _rows(message, data, width: int, bytes_a_pixel: int):

@@ -1,296 +1,336 @@
-"""The ROS 2 node: images in; odometry, pose, transforms, status out; services."""
+"""The ROS 2 node: images in; odometry, pose, transforms, status out; services.
+
+A managed (lifecycle) node where `rclpy` has them, and it manages itself unless told otherwise. The
+status is published in every state.
+"""
 
 from __future__ import annotations
 
 import functools
-import json
 import time
 
+import numpy as np
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry, Path
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
-from rclpy.time import Time
+from rclpy.executors import ExternalShutdownException
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from engram_bridge import images, rigid
+from engram_bridge.asking import Asking
 from engram_bridge.belief import Belief
+from engram_bridge.frames import StaticFrames
+from engram_bridge.output import Poses, StatusReport, TFMessage, Ticking
 from engram_bridge.pairs import Pairs
+from engram_bridge.parameters import PARAMETERS, RUNNING, checked, image_topic, live_command
 from engram_bridge.supervisor import Supervisor
+from engram_bridge.troubles import Troubles
 from engram_bridge.wheels import Wheels
 
 try:
-    from tf2_msgs.msg import TFMessage
-except ImportError:  # an installation without tf: poses go out as topics only
-    TFMessage = None
+    from rclpy.lifecycle import LifecycleNode as Base
+    from rclpy.lifecycle import TransitionCallbackReturn as Done
+except ImportError:  # before Humble: a plain node, active at once
+    from rclpy.node import Node as Base
+
+    Done = None
 try:
-    from engram_msgs.msg import Status
-except ImportError:  # not built: the same is said as JSON
-    Status = None
+    from engram_msgs.srv import SwitchMap
+except ImportError:  # not built: the parameter `map` switches
+    SwitchMap = None
 
-_PARAMETERS = {
-    "command": ["engram"],
-    "map": "",
-    "robot": "robot",
-    "mapping": False,
-    "deadline_ms": 40.0,
-    "settings": [""],
-    "left": "left/image_rect",
-    "right": "right/image_rect",
-    "left_info": "left/camera_info",
-    "right_info": "right/camera_info",
-    "wheels": "",
-    "compressed": False,
-    "rectified": True,
-    "pair_tolerance_ms": 2.0,
-    "map_frame": "map",
-    "odom_frame": "odom",
-    "base_frame": "base_link",
-    "publish_odom_tf": True,
-    "publish_map_tf": True,
-    "base_from_camera": [0.0, 0.0, 0.0, -1.5707963, 0.0, -1.5707963],
-    "status_rate": 5.0,
-}
-_PATH = 1000  # poses of the path that is shown
-_QUIET_S = 5.0  # between two warnings of one kind
+_KEEP_UP_S = 0.05  # between two repetitions of map -> odom while no frame comes
+_ANSWER_S = 10.0  # services and parameters wait so long for the live process
+_MANY = 100  # fixed transforms that may wait
 
 
-class Bridge(Node):
+class Bridge(Base):
     """Subscribes to a stereo camera, keeps `engram live` running, and publishes what it says."""
 
     def __init__(self) -> None:
         super().__init__("engram")
-        for name, value in _PARAMETERS.items():
+        for name, value in PARAMETERS.items():
             self.declare_parameter(name, value)
-        self._base_from_camera = rigid.of_xyz_rpy(self._given("base_from_camera"))
-        self._belief = Belief(self._base_from_camera)
-        self._pairs = Pairs(int(1e6 * self._given("pair_tolerance_ms")))
-        self._wheels = Wheels()
-        self._infos = [None, None]
-        self._path = Path()
-        self._publish()
-        self._supervisor = Supervisor(self._command(), self._hear, self.get_logger().warning)
-        self._subscribe()
-        self._serve()
         self.add_on_set_parameters_callback(self._changed)
-        self.create_timer(1.0 / self._given("status_rate"), self._report)
-        self._supervisor.start()
+        self._troubles = Troubles(self.get_logger())
+        self._belief = Belief()
+        self._supervisor = self._pairs = None
+        self._active = False
+        self._made = []
+        rate_hz, robot = (self.get_parameter(one).value for one in ("status_rate", "robot"))
+        self._status = StatusReport(self, self._state, max(rate_hz, 1.0), robot)
+
+    # Lifecycle: each returns whether it was done.
+
+    def on_configure(self, _state=None):
+        """Reads the parameters, and starts the live process."""
+        try:
+            self._given = checked({one: self.get_parameter(one).value for one in PARAMETERS})
+            self._configure()
+        except Exception as error:  # the status says why; it can be tried again
+            self._troubles.add("configure", f"not configured: {error}", lasting=True)
+            self._clean_up()
+            return _done(False)
+        self._troubles.forget("configure")
+        return _done(True)
+
+    def on_activate(self, _state=None):
+        """Hands images over from now on."""
+        self._active = True
+        return _done(True)
+
+    def on_deactivate(self, _state=None):
+        """Leaves images alone; the position waits."""
+        self._active = False
+        return _done(True)
+
+    def on_cleanup(self, _state=None):
+        """Ends the live process, which commits what it mapped."""
+        self._clean_up()
+        return _done(True)
+
+    def on_shutdown(self, _state=None):
+        """As `on_cleanup`."""
+        self._clean_up()
+        return _done(True)
 
     def close(self) -> None:
-        """Ends the live process, which commits what it mapped."""
-        self._supervisor.close()
+        """Ends everything: the live process commits what it mapped."""
+        self._clean_up()
+        self._status.close()
 
-    def _given(self, name: str):
-        return self.get_parameter(name).value
+    def _configure(self) -> None:
+        given = self._given
+        mounting = list(given["base_from_camera"])
+        self._base_from_camera = rigid.of_xyz_rpy(mounting) if len(mounting) == 6 else None
+        self._belief = Belief(self._base_from_camera)
+        self._pairs = Pairs(int(1e6 * given["pair_tolerance_ms"]))
+        self._wheels, self._frames = Wheels(), StaticFrames()
+        self._infos, self._camera_frame = [None, None], given["camera_frame"]
+        self._poses = Poses(self, given)
+        self._supervisor = Supervisor(live_command(given), self._hear, self._process_said)
+        self._asking = Asking(self._supervisor.ask)
+        self._subscribe()
+        self._serve()
+        self._keeping_up = Ticking(self, _KEEP_UP_S, self._keep_up)
+        self._supervisor.start()
 
-    def _command(self):
-        command = [*self._given("command"), "live", self._given("map")]
-        command += ["--robot", self._given("robot")]
-        if self._given("mapping"):
-            command.append("--map")
-        if self._given("deadline_ms") > 0:
-            command += ["--deadline", str(self._given("deadline_ms"))]
-        for setting in filter(None, self._given("settings")):
-            command += ["--set", setting]
-        return command
-
-    def _publish(self) -> None:
-        queue = QoSProfile(depth=10)
-        self._odometry = self.create_publisher(Odometry, "odom", queue)
-        self._pose = self.create_publisher(PoseWithCovarianceStamped, "pose", queue)
-        self._driven = self.create_publisher(Path, "path", queue)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", queue)
-        self._status = self.create_publisher(Status or String, "~/status", queue)
-        self._tf = None if TFMessage is None else self.create_publisher(TFMessage, "/tf", queue)
+    def _clean_up(self) -> None:
+        self._active = False
+        for destroy, made in self._made:
+            destroy(made)
+        self._made = []
+        supervisor, self._supervisor = self._supervisor, None
+        if supervisor is not None:
+            supervisor.close()
+            self._keeping_up.close()
+            self._poses.destroy(self)
 
     def _subscribe(self) -> None:
-        kind = CompressedImage if self._given("compressed") else Image
+        given = self._given
         for side, name in enumerate(("left", "right")):
-            self.create_subscription(
-                kind,
-                self._given(name),
-                functools.partial(self._image, side),
-                qos_profile_sensor_data,
-            )
-            self.create_subscription(
-                CameraInfo,
-                self._given(name + "_info"),
-                functools.partial(self._info, side),
-                qos_profile_sensor_data,
-            )
+            topic, compressed = image_topic(given, name)
+            decode = images.uncompressed if compressed else images.grey
+            kind = CompressedImage if compressed else Image
+            self._listen(kind, topic, functools.partial(self._image, side, decode))
+            self._listen(CameraInfo, given[name + "_info"], functools.partial(self._info, side))
+            self._troubles.expect(side, topic, given[name + "_info"])
+        if given["wheels"]:
+            self._listen(Odometry, given["wheels"], self._turned)
+        self._listen(PoseWithCovarianceStamped, "initialpose", self._placed, 10)
+        if TFMessage is not None:
+            kept = QoSProfile(depth=_MANY, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self._listen(TFMessage, "/tf_static", self._fixed, kept)
 
-        if self._given("wheels"):
-            topic = self._given("wheels")
-            self.create_subscription(Odometry, topic, self._turned, qos_profile_sensor_data)
+    def _listen(self, kind, topic: str, take, quality=qos_profile_sensor_data) -> None:
+        def taken(message) -> None:
+            try:
+                take(message)
+            except Exception as error:  # whatever comes, the node goes on and says so
+                self._troubles.add(topic, f"{topic}: {error}")
+
+        made = self.create_subscription(kind, topic, taken, quality)
+        self._made.append((self.destroy_subscription, made))
 
     def _serve(self) -> None:
-        self.create_service(Trigger, "~/save", self._asked("save"))
-        self.create_service(Trigger, "~/relocalise", self._asked("relocalise"))
-        self.create_service(SetBool, "~/map", self._map)
+        served = [
+            (Trigger, "~/save", lambda _: {"do": "save"}),
+            (Trigger, "~/relocalise", lambda _: {"do": "relocalise"}),
+            (SetBool, "~/map", lambda request: {"do": "map", "on": request.data}),
+        ]
+        if SwitchMap is not None:
+            served.append((SwitchMap, "~/switch_map", lambda one: {"do": "switch", "map": one.map}))
+        for kind, name, wanted in served:
+            made = self.create_service(kind, name, functools.partial(self._answer, wanted))
+            self._made.append((self.destroy_service, made))
 
-    def _asked(self, do: str):
-        def answer(_, response):
-            response.success = self._supervisor.ask({"do": do})
-            response.message = "asked" if response.success else "engram live is not connected"
-            return response
+    def _answer(self, wanted, request, response):
+        """Answers when the live process did: what became of it, not that it was asked.
 
-        return answer
-
-    def _map(self, request, response):
-        response.success = self._supervisor.ask({"do": "map", "on": request.data})
-        response.message = "asked" if response.success else "engram live is not connected"
+        Images wait meanwhile; the live process, which commits or opens a map, would take none.
+        """
+        message = wanted(request)
+        response.success, response.message = self._asking.wait(message, _ANSWER_S)
+        if response.success:
+            self._remember(message)
         return response
 
     def _changed(self, parameters):
-        for one in parameters:
-            if one.name == "map":
-                self._supervisor.ask({"do": "switch", "map": one.value})
-            elif one.name not in ("mapping",):
-                reason = f"{one.name} is read at the start: restart the node"
+        """`ros2 param set`: only what can change while the node runs, and only if it was done."""
+        for one in parameters if self._supervisor is not None else ():
+            if one.name not in RUNNING:
+                reason = f"{one.name} is read when the node is configured: restart it"
                 return SetParametersResult(successful=False, reason=reason)
-            else:
-                self._supervisor.ask({"do": "map", "on": one.value})
+            message = {"do": "switch", "map": one.value}
+            if one.name == "mapping":
+                message = {"do": "map", "on": one.value}
+            done, text = self._asking.wait(message, _ANSWER_S)
+            if not done:
+                return SetParametersResult(successful=False, reason=text)
+            self._remember(message)
         return SetParametersResult(successful=True)
 
+    def _remember(self, message) -> None:
+        """What was changed holds for the next process, too."""
+        if message["do"] in ("switch", "map"):
+            key = "map" if message["do"] == "switch" else "mapping"
+            self._given[key] = message[key] if key in message else message["on"]
+            self._supervisor.command = live_command(self._given)
+
+    # What comes in.
+
     def _info(self, side: int, message) -> None:
-        said = {
-            "image_width": message.width,
-            "image_height": message.height,
-            "distortion_model": message.distortion_model,
-            "distortion_coefficients": _entries(message.d, 1),
-            "camera_matrix": _entries(message.k, 3),
-            "rectification_matrix": _entries(message.r, 3),
-            "projection_matrix": _entries(message.p, 3),
-        }
+        self._troubles.saw_info(side)
+        said = images.camera_info(message)
         if self._infos[side] == said:
             return
         self._infos[side] = said
         if all(self._infos):
-            camera = {"rectified": self._given("rectified")}
+            camera = {"rectified": self._given["rectified"]}
             camera.update(zip(("left", "right"), self._infos))  # Python 3.8
             self._supervisor.see(camera, said["image_width"], said["image_height"])
 
     def _turned(self, message) -> None:
-        stamp, pose = message.header.stamp, message.pose.pose
+        pose = message.pose.pose
         at, turn = pose.position, pose.orientation
-        stamp_ns = stamp.sec * 10**9 + stamp.nanosec
-        self._wheels.add(stamp_ns, [at.x, at.y, at.z], [turn.x, turn.y, turn.z, turn.w])
+        xyzw = [turn.x, turn.y, turn.z, turn.w]
+        self._wheels.add(_stamp_ns(message), [at.x, at.y, at.z], xyzw)
 
-    def _image(self, side: int, message) -> None:
-        stamp = message.header.stamp
-        pair = self._pairs.add(side, stamp.sec * 10**9 + stamp.nanosec, message)
-        if pair is None or not all(self._infos):
+    def _fixed(self, message) -> None:
+        for one in message.transforms:
+            at, turn = one.transform.translation, one.transform.rotation
+            xyzw = [turn.x, turn.y, turn.z, turn.w]
+            names = one.header.frame_id, one.child_frame_id
+            self._frames.add(*names, [at.x, at.y, at.z], xyzw)
+        if not self._belief.mounted:
+            self._mount()
+
+    def _mount(self) -> None:
+        """Where the camera is on the robot, once its frame and the fixed transforms are known."""
+        base, camera = self._given["base_frame"], self._camera_frame
+        if not camera:
+            return
+        base_from_camera = self._frames.between(base, camera)
+        if base_from_camera is None:
+            text = f"no transform {base} -> {camera} in /tf_static: set base_from_camera"
+            self._troubles.add("mounting", text, lasting=True)
+            return
+        self._troubles.forget("mounting")
+        x, y, z = base_from_camera[:3, 3]
+        ahead = ", ".join(f"{one:.2f}" for one in base_from_camera[:3, 2])
+        text = f"{camera} is at {x:.3f} {y:.3f} {z:.3f} m on {base} and looks along ({ahead})"
+        self.get_logger().info(f"by /tf_static, {text}")
+        if abs(base_from_camera[2, 2]) > 0.9:
+            text += f"; if {camera} is no optical frame (z ahead), set camera_frame to that"
+            self._troubles.add("mounting", text, lasting=True)
+        self._base_from_camera = base_from_camera
+        self._belief.mount(base_from_camera)
+
+    def _image(self, side: int, decode, message) -> None:
+        self._troubles.saw_image(side)
+        if side == 0 and not self._belief.mounted:
+            self._camera_frame = self._camera_frame or message.header.frame_id
+            self._mount()
+        pair = self._pairs.add(side, _stamp_ns(message), message)
+        if pair is None or not self._active or not all(self._infos):
             return
         stamp_ns, *both = pair
-        try:
-            decode = images.uncompressed if self._given("compressed") else images.grey
-            left, right = (decode(one) for one in both)
-            wheels = self._wheels.at(stamp_ns)
-            wheels = None if wheels is None else wheels @ self._base_from_camera
-            self._supervisor.show(stamp_ns, left, right, wheels)
-        except Exception as error:  # whatever a camera sends, the node goes on and says so
-            self.get_logger().error(f"images: {error}", throttle_duration_sec=_QUIET_S)
+        left, right = (decode(one) for one in both)
+        wheels = self._wheels.at(stamp_ns) if self._belief.mounted else None
+        wheels = None if wheels is None else wheels @ self._base_from_camera
+        self._supervisor.show(stamp_ns, left, right, wheels)
+        self._troubles.saw_pair()
+
+    def _placed(self, message) -> None:
+        """The pose that a person set in RViz, of the robot in the map frame."""
+        if not self._belief.mounted:
+            raise ValueError("the camera's mounting is unknown")
+        pose = message.pose.pose
+        at, turn = pose.position, pose.orientation
+        xyzw = [turn.x, turn.y, turn.z, turn.w]
+        map_from_base = rigid.of_quaternion(xyzw, [at.x, at.y, at.z])
+        map_from_camera = map_from_base @ self._base_from_camera
+        x, y = (float(one) for one in map_from_camera[:2, 3])
+        yaw = float(np.arctan2(map_from_camera[1, 2], map_from_camera[0, 2]))
+        here = {"do": "here", "x_m": x, "y_m": y, "yaw_rad": yaw}
+        self._asking.ask(here, lambda _, text: self.get_logger().info(f"initialpose: {text}"))
+
+    # What goes out.
 
     def _hear(self, message) -> None:
-        if message.get("is") == "hello":
+        kind = message.get("is")
+        if kind == "hello":
             self._belief.began()
-        if message.get("is") == "reply":
-            log = self.get_logger().info if message.get("ok") else self.get_logger().warning
-            log(f"{message.get('do')}: {message.get('text')}")
+        elif kind == "gone":
+            self._asking.gone()
+        elif kind == "reply" and not self._asking.hear(message) and not message.get("ok"):
+            self._troubles.add("live", f"{message.get('do')}: {message.get('text')}")
         if self._belief.hear(message, time.monotonic()):
-            self._say()
+            self._poses.say(self._belief)
 
-    def _say(self) -> None:
-        """What the newest frame changed, stamped with its time: never with a later one."""
-        belief, stamp = self._belief, Time(nanoseconds=self._belief.stamp_ns).to_msg()
-        odometry = Odometry()
-        odometry.header.stamp, odometry.header.frame_id = stamp, self._given("odom_frame")
-        odometry.child_frame_id = self._given("base_frame")
-        _put(odometry.pose.pose, belief.odom_from_base)
-        own = rigid.at_its_own_origin(belief.odom_from_base, belief.odom_covariance)
-        odometry.pose.covariance = own.ravel().tolist()
-        self._odometry.publish(odometry)
-        transforms = []
-        if self._given("publish_odom_tf"):
-            transforms.append(
-                _transform(
-                    stamp, odometry.header.frame_id, odometry.child_frame_id, belief.odom_from_base
-                )
-            )
-        if belief.map_from_odom is not None and self._given("publish_map_tf"):
-            parent, child = self._given("map_frame"), self._given("odom_frame")
-            transforms.append(_transform(stamp, parent, child, belief.map_from_odom))
-        if self._tf is not None and transforms:
-            self._tf.publish(TFMessage(transforms=transforms))
-        if belief.map_pose is not None:
-            self._say_pose(stamp, *belief.map_pose)
+    def _process_said(self, text: str) -> None:
+        self._troubles.add("process", text)
 
-    def _say_pose(self, stamp, map_from_base, covariance) -> None:
-        pose = PoseWithCovarianceStamped()
-        pose.header.stamp, pose.header.frame_id = stamp, self._given("map_frame")
-        _put(pose.pose.pose, map_from_base)
-        pose.pose.covariance = covariance.ravel().tolist()
-        self._pose.publish(pose)
-        self._path.header = pose.header
-        self._path.poses.append(PoseStamped(header=pose.header, pose=pose.pose.pose))
-        del self._path.poses[:-_PATH]
-        self._driven.publish(self._path)
+    def _keep_up(self) -> None:
+        if self._belief.mounted:
+            self._poses.keep_up(self._belief, self.get_clock().now().nanoseconds)
 
-    def _report(self) -> None:
-        """At a fixed rate, whatever happened to camera, map, disk or the live process."""
+    def _state(self):
+        """(level, summary, facts) for the status, at a fixed rate, whatever happened."""
         level, summary, facts = self._belief.report(time.monotonic())
-        facts.update(restarts=self._supervisor.restarts, single_images=self._pairs.single)
-        status = DiagnosticStatus(level=bytes([level]), name="engram", message=summary)
-        status.hardware_id = self._given("robot")
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in facts.items()]
-        array = DiagnosticArray(status=[status])
-        array.header.stamp = self.get_clock().now().to_msg()
-        self._diagnostics.publish(array)
-        if Status is None:
-            self._status.publish(String(data=json.dumps({"summary": summary, **facts})))
-            return
-        self._status.publish(
-            Status(
-                header=array.header,
-                status=str(facts.get("status", "starting")),
-                trouble=str(facts.get("trouble") or ""),
-                node=str(facts.get("node") or ""),
-                confidence=float(facts.get("confidence") or 0.0),
-                attempts=int(facts.get("attempts") or 0),
-                inliers=int(facts.get("inliers") or 0),
-                open_loop_m=float(facts.get("open_loop_m") or 0.0),
-                age_s=float(facts.get("age_s") or -1.0),
-                frames=int(facts.get("frames") or 0),
-                dropped=int(facts.get("dropped") or 0),
-                map=str(facts.get("map") or ""),
-                saving=str(facts.get("saving") or ""),
-            )
-        )
+        supervisor, pairs = self._supervisor, self._pairs
+        facts["restarts"] = 0 if supervisor is None else supervisor.restarts
+        facts["single_images"] = 0 if pairs is None else pairs.single
+        own = self._troubles.text(waiting=self._active)
+        if supervisor is None or not self._active:
+            facts["status"] = "unconfigured" if supervisor is None else "inactive"
+            level, summary = max(level, 1), facts["status"]
+        if own:
+            facts["trouble"] = "; ".join(filter(None, (facts.get("trouble"), own)))
+            level, summary = max(level, 1), f"{facts.get('status')}: {facts['trouble']}"
+        return level, summary, facts
 
 
-def _entries(values, rows: int):
-    data = [float(one) for one in values]
-    return {"rows": rows, "cols": len(data) // rows, "data": data}
+def _stamp_ns(message) -> int:
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def _put(pose, matrix) -> None:
-    pose.position.x, pose.position.y, pose.position.z = (float(one) for one in matrix[:3, 3])
-    turn = pose.orientation
-    turn.x, turn.y, turn.z, turn.w = (float(one) for one in rigid.quaternion(matrix))
+def _done(done: bool):
+    if Done is None:
+        return done
+    return Done.SUCCESS if done else Done.FAILURE
 
 
-def _transform(stamp, parent: str, child: str, matrix):
-    said = TransformStamped()
-    said.header.stamp, said.header.frame_id, said.child_frame_id = stamp, parent, child
-    shift, turn = said.transform.translation, said.transform.rotation
-    shift.x, shift.y, shift.z = (float(one) for one in matrix[:3, 3])
-    turn.x, turn.y, turn.z, turn.w = (float(one) for one in rigid.quaternion(matrix))
-    return said
+def _start(node) -> None:
+    """Configures and activates the node, unless somebody else manages it."""
+    if Done is None:
+        if node.on_configure():
+            node.on_activate()
+    elif node.get_parameter("autostart").value and node.trigger_configure() == Done.SUCCESS:
+        node.trigger_activate()
 
 
 def main() -> None:
@@ -298,8 +338,9 @@ def main() -> None:
     rclpy.init()
     node = Bridge()
     try:
+        _start(node)
         rclpy.spin(node)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
         node.close()

@@ -27,16 +27,18 @@ class Supervisor:
     nowhere while none is.
 
     Args:
-        command: arguments of the process, without ``--socket``.
+        command: arguments of the process, without ``--socket``; `command` may be changed for
+            the next start.
         hear: called with each message, on the supervisor's thread; with ``{"is": "hello"}`` when
-            a new process began.
+            a new process began, and ``{"is": "gone"}`` when it ended.
         said: called with what happened to the process, for the log.
         now: the clock, seconds.
     """
 
     def __init__(self, command, hear, said, now=time.monotonic) -> None:
         self.restarts = 0
-        self._command, self._hear, self._said, self._now = list(command), hear, said, now
+        self.command = list(command)
+        self._hear, self._said, self._now = hear, said, now
         self._folder = tempfile.mkdtemp(prefix="engram-")
         self._path = os.path.join(self._folder, "socket")
         self._log = os.path.join(self._folder, "log")
@@ -98,8 +100,8 @@ class Supervisor:
             began = self._now()
             try:
                 self._serve()
-            except OSError as error:
-                self._said(f"engram live: {error}")
+            except Exception as error:  # whatever happens to one process, the next one is started
+                self._said(f"engram live: {error!r}")
             self._part()
             if self._ended.is_set():
                 return
@@ -111,7 +113,7 @@ class Supervisor:
 
     def _serve(self) -> None:
         """One life of the process."""
-        arguments = [*self._command, "--socket", self._path]
+        arguments = [*self.command, "--once", "--socket", self._path]
         with open(self._log, "wb") as log:
             self._process = subprocess.Popen(
                 arguments, stdin=subprocess.DEVNULL, stdout=log, stderr=log
@@ -182,3 +184,4 @@ class Supervisor:
             if self._link is not None:
                 self._link.close()
             self._link = None
+        self._hear({"is": "gone"})

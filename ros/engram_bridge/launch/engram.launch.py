@@ -12,11 +12,12 @@ from launch_ros.actions import Node
 def generate_launch_description():
     """The bridge with its parameters."""
     shared = Path(get_package_share_directory("engram_bridge"))
-    given = {name: LaunchConfiguration(name) for name in ("map", "mapping")}
+    given = {name: LaunchConfiguration(name) for name in ("map", "mapping", "autostart")}
     return LaunchDescription(
         [
             DeclareLaunchArgument("map", description="The map file, NAME.engram."),
             DeclareLaunchArgument("mapping", default_value="false"),
+            DeclareLaunchArgument("autostart", default_value="true"),
             DeclareLaunchArgument("config", default_value=str(shared / "config" / "engram.yaml")),
             Node(
                 package="engram_bridge",

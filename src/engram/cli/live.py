@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,6 +28,9 @@ def live(
         Path | None,
         typer.Option("--socket", metavar="PATH", help="Listen for a robot's middleware here."),
     ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="End when the middleware goes away.")
+    ] = False,
     name: Annotated[str, typer.Option("--robot", help="Name of the robot.")] = "robot",
     maps: Annotated[
         bool, typer.Option("--map", help="Save what the robot does not recognise.")
@@ -59,6 +63,8 @@ def live(
     from engram.robot import RobotOptions, open_drive
     from engram.viewing.viewer import viewer_for
 
+    # Who is told to end commits what it mapped, as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     if (play is None) == (socket is None):
         raise ConfigError("give --socket PATH to serve a robot, or --play DRIVE, one of them")
     if rate is not None and (play is None or not rate > 0):
@@ -68,7 +74,8 @@ def live(
     with ExitStack() as stack:
         viewer = stack.enter_context(viewer_for(view))
         if socket is not None:
-            LiveProcess(stack.enter_context(Served(socket)), resolved, watcher=viewer).run()
+            serving = stack.enter_context(Served(socket, once=once))
+            LiveProcess(serving, resolved, watcher=viewer).run()
         elif play is not None:
             transport = Played(open_drive(play), _print, rate)
             LiveProcess(transport, resolved, watcher=viewer).run()

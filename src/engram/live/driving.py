@@ -190,6 +190,18 @@ class Driving:
         self._use_belief()
         return "the hint is taken"
 
+    def here(self, x_m: float, y_m: float, yaw_rad: float) -> str:
+        """Takes the camera's place in the map frame as a hint, from a person who looks at the map.
+
+        Raises:
+            InputError: no map is open yet, it has no nodes, or a number is not finite.
+        """
+        if self._map is None:
+            raise InputError("no map is open yet: it is opened with the first image")
+        goal = self._map.frame.goal(x_m, y_m, yaw_rad)
+        self.lose()
+        return self.place(Position(goal.node, goal.node_from_goal, np.zeros((6, 6))))
+
     def pause(self) -> str:
         """Closes robot and map, and so commits what was mapped; the next frame opens them again.
 

@@ -17,7 +17,8 @@ The client sends:
   ``"wheels_from_live"``, 16 numbers, where wheel odometry sees the camera at that time.
 * ``{"do": "map", "on": true}``, ``{"do": "save"}``, ``{"do": "switch", "map": PATH}``,
   ``{"do": "relocalise"}``, ``{"do": "place", "node": …, "node_from_live": …, "covariance": …}``
-  with an older belief as a hint, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer
+  with an older belief as a hint, ``{"do": "here", "x_m": …, "y_m": …, "yaw_rad": …}`` with the
+  camera's place in the map frame, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer
   ``{"is": "reply", "id": …, "ok": …, "text": …}`` repeats.
 
 The process sends ``{"is": "seen", …}`` for each frame that it took and ``{"is": "alive", …}`` five

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from engram.errors import EngramError, InputError
 from engram.frontend import StereoPair
-from engram.geometry import SE3, propagate_covariance
+from engram.geometry import SE3
 from engram.graph.model import NodeId
 from engram.live.driving import Driving, LiveOptions, Step, Watcher
+from engram.live.track import Track
 from engram.live.transport import Command, FrameEvent, Message, Transport
 from engram.localiser import Position
 
@@ -27,29 +28,6 @@ from engram.localiser import Position
 _HEARTBEAT_S = 0.2
 # Without a frame for longer, the camera counts as silent.
 _SILENT_S = 1.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Track:
-    """The robot's own odometry since its start: continuous, never corrected by the map.
-
-    Attributes:
-        odom_from_live: pose of the camera in that of its first image.
-        covariance: (6, 6) float64 of `odom_from_live`, left perturbation, [translation, rotation].
-    """
-
-    odom_from_live: SE3 = field(default_factory=SE3.identity)
-    covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((6, 6)))
-
-    def after(self, step: Step) -> Track:
-        """The track after one more frame; it holds still where nothing is known of the motion."""
-        motion = step.motion
-        if motion is None or motion.prev_from_curr is None or motion.covariance is None:
-            return self
-        return Track(
-            self.odom_from_live @ motion.prev_from_curr,
-            propagate_covariance(self.odom_from_live, self.covariance, motion.covariance),
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +76,9 @@ class LiveProcess:
             "switch": lambda given: self._driving.switch(Path(str(given["map"]))),
             "relocalise": lambda _: self._driving.lose(),
             "place": lambda given: self._driving.place(_position(given)),
+            "here": lambda given: self._driving.here(
+                *(float(given[name]) for name in ("x_m", "y_m", "yaw_rad"))
+            ),
         }
 
     def run(self) -> None:
@@ -119,7 +100,9 @@ class LiveProcess:
 
     def _take(self, event: FrameEvent) -> None:
         step = self._driving.step(event.arrived, event.arrived_s, event.wheels_from_live)
-        self._track = self._track.after(step)
+        arrived = event.arrived
+        stamp_ns = (arrived if isinstance(arrived, StereoPair) else arrived.frame).stamp_ns
+        self._track = self._track.after(step, stamp_ns)
         status = "fault" if step.found is None else step.found.status.value
         before = self._health
         self._health = replace(
@@ -130,12 +113,10 @@ class LiveProcess:
             dropped=before.dropped + event.dropped,
             seen_s=self._now(),
         )
-        arrived = event.arrived
-        pair = arrived if isinstance(arrived, StereoPair) else arrived.frame
         self._transport.tell(
             {
                 "is": "seen",
-                "stamp_ns": pair.stamp_ns,
+                "stamp_ns": stamp_ns,
                 "status": status,
                 "trouble": step.trouble,
                 "odom_from_live": _flat(self._track.odom_from_live.matrix()),

@@ -24,6 +24,7 @@ from engram.live.link import Link, LinkError, Ring
 from engram.live.transport import Command, FrameEvent, Message
 
 _IDLE_S = 0.1
+_LONGEST_ALONE_S = 60.0
 
 
 class Served:
@@ -34,13 +35,17 @@ class Served:
 
     Args:
         path: where the socket's file is made, for its owner alone.
+        once: end with the first client, or if none comes within a minute: nobody is left who
+            would stop the process.
 
     Raises:
         InputError: something else lies there, or another process listens.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, once: bool = False) -> None:
         self._path = path
+        self._once = once
+        self._began_s = time.monotonic()
         self._listening = _listening(path)
         self._link: Link | None = None
         self._sending = Lock()
@@ -55,10 +60,15 @@ class Served:
         self._path.unlink(missing_ok=True)
 
     def events(self) -> Iterator[FrameEvent | Command | None]:
-        """See `Transport`; never ends by itself."""
+        """See `Transport`; ends by itself only if it serves once."""
+        met = False
         while True:
             if self._link is None:
+                alone_s = time.monotonic() - self._began_s
+                if self._once and (met or alone_s > _LONGEST_ALONE_S):
+                    return
                 self._meet()
+                met = self._link is not None
                 yield None
                 continue
             try:

@@ -161,7 +161,7 @@ class GapFiller:
             doubted: whether odometry is doubtful and contradicts it, and counts as missing.
         """
         if odometry.status is OdometryStatus.UNUSABLE_FRAME:
-            return Motion(odometry, ahead=self._ahead(stamp_ns))
+            return Motion(odometry, ahead=self._ahead(stamp_ns, outside))
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         if odometry.status is OdometryStatus.FIRST:
             return Motion(odometry)
@@ -258,11 +258,13 @@ class GapFiller:
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * _sigma_m(covariance))
 
-    def _ahead(self, stamp_ns: int) -> tuple[SE3, NDArray[np.float64]] | None:
+    def _ahead(
+        self, stamp_ns: int, outside: Guess | None
+    ) -> tuple[SE3, NDArray[np.float64]] | None:
         """Guess of the motion since the last usable frame; None before the first."""
         if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
             return None
-        guess = self._guess((stamp_ns - self._stamp_ns) / _NS_PER_S, stamp_ns)
+        guess = self._guess((stamp_ns - self._stamp_ns) / _NS_PER_S, stamp_ns, outside)
         return guess.prev_from_curr, guess.covariance
 
     def _guess(self, seconds: float, stamp_ns: int, outside: Guess | None = None) -> Guess:

@@ -1,0 +1,89 @@
+"""Odometry as it goes out: it never jumps, and says how far it may be off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from engram.geometry import SE3
+from engram.live.driving import Step
+from engram.live.track import Track
+from engram.odometry import GapFiller, OdometryStatus, OdometryStep
+
+MS = 1_000_000
+DARK = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+FAILED = OdometryStep(OdometryStatus.TOO_FEW_MATCHES)
+
+
+def ahead(metres: float) -> OdometryStep:
+    way = SE3(np.eye(3), np.array([0.0, 0.0, metres]))
+    return OdometryStep(OdometryStatus.OK, way, np.eye(6) * 1e-6)
+
+
+class Driven:
+    """A robot with 10 frames a second, and where its track was."""
+
+    def __init__(self) -> None:
+        self.gaps, self.track, self.now_ms, self.way_m = GapFiller(), Track(), 0, [0.0]
+        self.see(OdometryStep(OdometryStatus.FIRST))
+
+    def see(self, step: OdometryStep, after_ms: int = 100) -> Track:
+        self.now_ms += after_ms
+        motion = self.gaps.motion(step, self.now_ms * MS)
+        self.track = self.track.after(Step(motion), self.now_ms * MS)
+        self.way_m.append(float(self.track.odom_from_live.translation[2]))
+        return self.track
+
+    @property
+    def longest_step_m(self) -> float:
+        return float(np.abs(np.diff(self.way_m)).max())
+
+    @property
+    def sigma_m(self) -> float:
+        return float(np.sqrt(self.track.covariance[2, 2]))
+
+
+@pytest.mark.parametrize("stood", [False, True])
+def test_thirty_dark_seconds_bring_no_jump_and_no_false_certainty(stood: bool) -> None:
+    """The robot drives on, or stands; nobody can tell, and the covariance covers both."""
+    robot = Driven()
+    for _ in range(10):
+        robot.see(ahead(0.5))
+    for _ in range(300):
+        robot.see(DARK)
+    assert robot.sigma_m > 50.0
+    robot.see(FAILED)
+    for _ in range(10):
+        robot.see(ahead(0.0 if stood else 0.5))
+    truth_m = 5.0 if stood else 5.0 + 150.0 + 0.5 * 11
+    assert robot.longest_step_m <= 1.1
+    assert abs(robot.way_m[-1] - truth_m) < 3 * robot.sigma_m
+
+
+def test_a_short_gap_is_driven_through() -> None:
+    robot = Driven()
+    for _ in range(10):
+        robot.see(ahead(0.5))
+    for _ in range(3):
+        robot.see(DARK)
+    robot.see(ahead(2.0))
+    assert robot.way_m[-1] == pytest.approx(7.0)
+    assert robot.longest_step_m == pytest.approx(0.5)
+
+
+def test_an_unplugged_camera_is_no_reason_to_jump() -> None:
+    robot = Driven()
+    for _ in range(10):
+        robot.see(ahead(0.5))
+    robot.see(FAILED, after_ms=30_000)
+    assert robot.longest_step_m == pytest.approx(0.5)
+    assert robot.sigma_m > 50.0
+
+
+def test_what_was_measured_over_a_pause_is_taken() -> None:
+    """Wheels, or the same view: the robot did move in between."""
+    robot = Driven()
+    for _ in range(5):
+        robot.see(ahead(0.5))
+    robot.see(ahead(3.0), after_ms=600)
+    assert robot.way_m[-1] == pytest.approx(5.5)
