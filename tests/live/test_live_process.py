@@ -155,6 +155,19 @@ def test_unknown_and_incomplete_commands_are_answered(client: Client) -> None:
     assert "switch needs 'map'" in answered(client, "switch")["text"]
 
 
+def test_a_person_says_where_it_is_and_a_match_decides(
+    client: Client, pairs: list[StereoPair]
+) -> None:
+    assert "no map is open yet" in answered(client, "here", x_m=0, y_m=0, yaw_rad=0)["text"]
+    found = [seen(client, pair) for pair in pairs[:4]]
+    place = np.reshape(found[-1]["map_from_live"], (4, 4))
+    yaw_rad = float(np.arctan2(place[1, 2], place[0, 2]))
+    said = {"x_m": place[0, 3] + 1.0, "y_m": place[1, 3], "yaw_rad": yaw_rad}
+    assert answered(client, "here", **said)["ok"]
+    assert seen(client, pairs[4])["status"] == "localised"
+    assert "finite" in answered(client, "here", x_m="nan", y_m=0, yaw_rad=0)["text"]
+
+
 def test_odometry_goes_on_without_a_map(
     client: Client, pairs: list[StereoPair], town: Path
 ) -> None:
