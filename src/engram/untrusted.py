@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import unicodedata
 from pathlib import Path
@@ -11,6 +12,7 @@ from engram.errors import InputError, SequenceError
 
 # Text files beside images; the longest real one (an hour of ROS images at 100 Hz) has 20 MB.
 _MAX_TEXT_BYTES = 100_000_000
+_PLAIN = re.compile(r"[\n\x20-\x7e]*")
 
 
 def open_regular(path: Path, error: type[InputError] = SequenceError) -> int:
@@ -66,6 +68,8 @@ def printable(text: str) -> str:
 
     Names in bags and files may hold sequences that recolour, clear or retitle a terminal.
     """
+    if _PLAIN.fullmatch(text):
+        return text
     return "".join(
         one if one == "\n" or unicodedata.category(one) not in {"Cc", "Cf", "Cs", "Co"} else "�"
         for one in text

@@ -12,9 +12,9 @@ import typer
 from engram import __version__
 from engram.cli.endings import EXIT_UNFIT_DRIVE, PartlyDoneError, VerbInterruptedError
 from engram.cli.moved import moved_option
+from engram.cli.screen import screen
 from engram.cli.verbs import Program, register
 from engram.errors import EngramError, InputError, UnfitDriveError
-from engram.untrusted import printable
 
 app = typer.Typer(
     name="engram",
@@ -57,6 +57,11 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 
 def main() -> None:
     """Runs the program; an error that Engram foresaw is one line, never a traceback."""
+    with screen():
+        _run()
+
+
+def _run() -> None:
     try:
         code = app(prog_name="engram", standalone_mode=False)
     except _UsageError as error:  # a verb or option that is mistyped
@@ -104,7 +109,7 @@ def _status_of(error: EngramError | VerbInterruptedError) -> int:
 
 def _complain(error: Exception, done: Mapping[str, Any] | None = None) -> None:
     _tell_machines(str(error), type(error).__name__, done)
-    print(f"engram: {printable(str(error))}", file=sys.stderr)
+    print(f"engram: {error}", file=sys.stderr)
 
 
 def _tell_machines(message: str, kind: str, done: Mapping[str, Any] | None = None) -> None:

@@ -45,16 +45,15 @@ def info(
     from engram.config import plain
     from engram.sequences.bags import is_bag
     from engram.sequences.bags.inspecting import describe_bag
-    from engram.untrusted import printable
 
     if is_bag(path) and opening.format in {None, "bag"}:
         facts = describe_bag(path, opening.options())
-        typer.echo(json.dumps(plain(facts)) if as_json else printable(_bag_text(facts)))
+        typer.echo(json.dumps(plain(facts)) if as_json else _bag_text(facts))
         if facts.lost or facts.question:
             raise typer.Exit(3 if facts.lost else 2)
         return
     found = _drive_facts(path, opening)
-    typer.echo(json.dumps(found) if as_json else printable(_drive_text(found)))
+    typer.echo(json.dumps(found) if as_json else _drive_text(found))
 
 
 @drive_group.command("calibration")
@@ -103,7 +102,7 @@ def calibration(
         camera = {name: getattr(sequence.camera, name) for name in _CAMERA}
         typer.echo(json.dumps(plain({**camera, "picture": out, "rows_px": offsets.tolist()})))
         return
-    typer.echo(printable("\n".join(f"# {line}" for line in lines)))
+    typer.echo("\n".join(f"# {line}" for line in lines))
     typer.echo(_toml(sequence.cameras))
     typer.echo(f"one rectified pair: {out}", err=True)
 

@@ -19,7 +19,6 @@ def tell_losses(sequence: Drive) -> None:
         Exit: parts of the bag were lost; what could be read was used.
     """
     from engram.sequences import BagSequence
-    from engram.untrusted import printable
 
     if not isinstance(sequence, BagSequence):
         return
@@ -28,5 +27,5 @@ def tell_losses(sequence: Drive) -> None:
     if sequence.lost:
         typer.echo("the bag is damaged; what could be read was used:", err=True)
         for loss in sequence.lost:
-            typer.echo(printable(f"  {loss}"), err=True)
+            typer.echo(f"  {loss}", err=True)
         raise typer.Exit(EXIT_DAMAGED)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from engram.cli.screen import drawing
 from engram.monitor import Advancing, Monitor
+from engram.untrusted import printable
 
 
 class Bars(Monitor):
@@ -39,18 +42,18 @@ def progress(what: str, total: int) -> Iterator[Callable[[str], None]]:
             return Text("" if speed is None else f"{speed:.0f}/s")
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         Rate(),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[word]}"),
+        TextColumn("{task.fields[word]}", markup=False),
     )
-    console = Console(stderr=True)
+    console = Console(file=drawing(sys.stderr))
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(what, total=total, word="")
+        task = bar.add_task(printable(what), total=total, word="")
 
         def advance(word: str) -> None:
-            bar.update(task, advance=1, word=word)
+            bar.update(task, advance=1, word=printable(word))
 
         yield advance

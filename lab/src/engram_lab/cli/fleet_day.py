@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from engram.cli import options
+from engram.cli.screen import drawing
 
 if TYPE_CHECKING:
     from engram_lab.fleet_day import DayReport
@@ -76,7 +78,7 @@ def _show(report: DayReport) -> None:
             counts = (str(drive.held), f"{drive.localised:.0%}", str(drive.added))
             table.add_row(name, whose, *counts, sent, received)
         table.add_section()
-    console = Console()
+    console = Console(file=drawing(sys.stdout))
     console.print(table)
     typer.echo(
         f"{report.nodes} nodes in {report.revisions} revisions; {report.passed_bytes / 1e6:.1f} MB "

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from engram.cli import options
+from engram.cli.screen import drawing
 
 if TYPE_CHECKING:
     from engram_lab.demo import DemoReport
@@ -45,7 +47,7 @@ def _show(report: DemoReport) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    console = Console(file=drawing(sys.stdout))
     grown = Table("drive", title="The map grows where a drive does not know the place")
     for column in ("localised", "new nodes"):
         grown.add_column(column, justify="right")
@@ -159,7 +161,7 @@ def bench(
 
     from engram_lab.bench import run_bench
 
-    with Console(stderr=True).status("") as status:
+    with Console(file=drawing(sys.stderr)).status("") as status:
         report = run_bench(
             only.split(",") if only else None,
             repeats=repeats,
@@ -168,7 +170,7 @@ def bench(
     if as_json:
         print(json.dumps(report.to_dict()))
     else:
-        Console().print(report.table())
+        Console(file=drawing(sys.stdout)).print(report.table())
 
 
 def _bench_against(other: Path, only: str | None, *, as_json: bool) -> None:

@@ -24,6 +24,7 @@ from engram.centre.refs import Refs
 from engram.centre.service import Centre
 from engram.centre.store.audit import events_after, first_broken
 from engram.maps import map_log
+from engram.untrusted import printable
 
 router = APIRouter(include_in_schema=False)
 VIEWERS = [takes(Role.VIEWER)]
@@ -35,7 +36,12 @@ _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
 )
-_templates = Environment(loader=PackageLoader("engram.centre.pages"), autoescape=True)
+# Names of robots and tags are anybody's: no control characters, no markup.
+_templates = Environment(
+    loader=PackageLoader("engram.centre.pages"),
+    autoescape=True,
+    finalize=lambda value: printable(value) if type(value) is str else value,
+)
 
 
 def _when(stamp_ns: int | None) -> str:
