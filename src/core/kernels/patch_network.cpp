@@ -72,14 +72,15 @@ inline int32_t grouped(const int8_t *weights, int count) {
   return static_cast<int32_t>(word);
 }
 
-// The first convolution reads rows of five values, in groups that begin at even columns.
-constexpr int kSide = 5, kRowGroups = (kSide + kGroup - 1) / kGroup, kGroupStep = kGroup / 2;
+// The first convolution reads 5×5 values from even rows and columns on: four columns in groups along
+// the rows, four of the fifth column in groups along it, and the last one by itself.
+constexpr int kSide = 5, kFourths = 4 / kGroup, kGroupStep = kGroup / 2;
 constexpr int kPadded = kPatchSide + 4, kColumns = kPadded / 2;
 constexpr int32_t kZero = 128; // the input's middle
 
 constexpr int kC1 = kPatchChannels[0], kC2 = kPatchChannels[1], kC3 = kPatchChannels[2];
 constexpr int kSide1 = kPatchSide / 2, kSide2 = kSide1 / 2, kSide3 = kSide2 / 2;
-constexpr int kTaps[4] = {kSide * kRowGroups, 9 * kC1 / kGroup, 9 * kC2 / kGroup, 9 * kC3 / kGroup};
+constexpr int kTaps[4] = {(kSide + 1) * kFourths + 1, 9 * kC1 / kGroup, 9 * kC2 / kGroup, 9 * kC3 / kGroup};
 
 inline int64_t words_before(int layer) {
   int64_t words = 0;
@@ -98,6 +99,27 @@ int32_t *pack_layer(const int8_t *weights, int64_t outputs, int inputs, int rows
           const int8_t *from = weights + (output * rows + row) * inputs + group * kGroup;
           *packed++ = grouped(from, std::min(kGroup, inputs - group * kGroup));
         }
+  return packed;
+}
+
+// The first layer's (outputs, 5, 5) bytes, in the same blocks.
+int32_t *pack_first(const int8_t *weights, int32_t *packed) {
+  for (int block = 0; block < kC1; block += kBlock) {
+    const auto each = [&](int row, int column, int step, int count) {
+      for (int output = block; output < block + kBlock; ++output) {
+        int8_t group[kGroup];
+        for (int k = 0; k < count; ++k)
+          group[k] = weights[(output * kSide + row) * kSide + column + k * step];
+        *packed++ = grouped(group, count);
+      }
+    };
+    for (int row = 0; row < kSide; ++row)
+      for (int column = 0; column < 4; column += kGroup)
+        each(row, column, 1, kGroup);
+    for (int row = 0; row < 4; row += kGroup)
+      each(row, 4, kSide, kGroup);
+    each(4, 4, 1, 1);
+  }
   return packed;
 }
 
@@ -131,15 +153,19 @@ inline const uint8_t *around(const Image &image, int64_t x, int64_t y, uint8_t *
 // v · factor − offset in 16 bits behind the point.
 void normalise(const uint8_t *pixels, int64_t stride, uint8_t *out) {
   constexpr int kCount = kPatchSide * kPatchSide;
-  int32_t sums[kCount], total = 0, squares = 0;
+  int16_t sums[kCount];
   for (int y = 0; y < kPatchSide; ++y) {
-    const uint8_t *upper = pixels + 2 * y * stride, *lower = upper + stride;
-    for (int x = 0; x < kPatchSide; ++x) {
-      const int32_t sum = upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1];
-      sums[y * kPatchSide + x] = sum;
-      total += sum;
-      squares += sum * sum; // ≤ 576 · 1020² < 2³⁰
-    }
+    uint16_t upper[kPatchSide], lower[kPatchSide]; // two pixels each
+    std::memcpy(upper, pixels + 2 * y * stride, sizeof upper);
+    std::memcpy(lower, pixels + (2 * y + 1) * stride, sizeof lower);
+    for (int x = 0; x < kPatchSide; ++x)
+      sums[y * kPatchSide + x] = static_cast<int16_t>((upper[x] & 255) + (upper[x] >> 8) +
+                                                      (lower[x] & 255) + (lower[x] >> 8));
+  }
+  int32_t total = 0, squares = 0;
+  for (const int16_t sum : sums) {
+    total += sum;
+    squares += int32_t{sum} * sum; // ≤ 576 · 1020² < 2³⁰
   }
   const int64_t variance =
       static_cast<int64_t>(kCount) * squares - static_cast<int64_t>(total) * total;
@@ -154,22 +180,28 @@ void normalise(const uint8_t *pixels, int64_t stride, uint8_t *out) {
   }
 }
 
+// At (y, x) the kGroup values of row y from column 2x on; at (y, x) those of column 2x + 4 from row
+// 2y on.
 typedef Lanes Input[kPadded][kColumns];
+typedef Lanes Columns[kSide1 + 1][kSide1];
 
-// Puts one patch into its lane: at (y, x) the kGroup values from column 2x on.
-void place(const uint8_t *patch, int lane, Input &input) {
-  for (int y = 0; y < kPatchSide; ++y) {
-    uint8_t row[kPadded + 2];
-    std::memset(row, kZero, sizeof row);
-    std::memcpy(row + 2, patch + y * kPatchSide, kPatchSide);
-    auto *to = reinterpret_cast<int32_t *>(input[y + 2]) + lane;
-    for (int x = 0; x < kColumns; ++x) {
-      uint32_t word = 0;
-      for (int k = 0; k < kGroup; ++k)
-        word |= static_cast<uint32_t>(row[2 * x + k]) << (kValueBits * k);
-      std::memcpy(to + x * kPatches, &word, 4);
+typedef uint8_t Patch[kPatchSide * kPatchSide];
+
+// Puts patches into their lanes, row by row: the lanes' words of one row are near in memory.
+void place(const Patch *patches, int64_t count, Input &input) {
+  for (int y = 0; y < kPatchSide; ++y)
+    for (int64_t lane = 0; lane < count; ++lane) {
+      uint8_t row[kPadded + 2];
+      std::memset(row, kZero, sizeof row);
+      std::memcpy(row + 2, patches[lane] + y * kPatchSide, kPatchSide);
+      auto *to = reinterpret_cast<int32_t *>(input[y + 2]) + lane;
+      for (int x = 0; x < kColumns; ++x) {
+        uint32_t word = 0;
+        for (int k = 0; k < kGroup; ++k)
+          word |= static_cast<uint32_t>(row[2 * x + k]) << (kValueBits * k);
+        std::memcpy(to + x * kPatches, &word, 4);
+      }
     }
-  }
 }
 
 void clear(Input &input) {
@@ -183,9 +215,29 @@ void clear(Input &input) {
       }
 }
 
+void take_columns(const Input &input, Columns &columns) {
+  constexpr int32_t kOne = (1 << kValueBits) - 1;
+  for (int y = 0; y < kSide1 + (kGroup == 2); ++y) // pairs go on to the row below the last
+    for (int x = 0; x < kSide1; ++x)
+      for (int part = 0; part < kParts; ++part) {
+        Native word{};
+        for (int k = 0; k < kGroup; ++k)
+          word |= (input[2 * y + k][x + 2].part[part] & kOne) << (kValueBits * k);
+        columns[y][x].part[part] = word;
+      }
+}
+
 struct Sums {
   Lanes of[kBlock];
 };
+
+inline Sums starting_at(const int32_t *values) {
+  Sums sums;
+  for (int output = 0; output < kBlock; ++output)
+    for (Native &part : sums.of[output].part)
+      part = Native{} + values[output];
+  return sums;
+}
 
 inline void add_group(Sums &sums, const Lanes &values, const int32_t *weights) {
 #pragma GCC unroll 16
@@ -198,12 +250,28 @@ inline void add_group(Sums &sums, const Lanes &values, const int32_t *weights) {
     }
 }
 
-inline Native rescaled(Native sum, const PatchScaling &scaling, int channel) {
+// value · factor + more, both factors in 0 … 2¹⁵ − 1.
+inline Native scaled(Native value, int32_t factor, int32_t more) {
+#if defined(__AVX512VNNI__)
+  return (Native)_mm512_dpwssd_epi32(_mm512_set1_epi32(more), (__m512i)value,
+                                     _mm512_set1_epi32(factor));
+#elif defined(__AVX512BW__)
+  return (Native)_mm512_madd_epi16((__m512i)value, _mm512_set1_epi32(factor)) + more;
+#elif defined(__AVX2__)
+  return (Native)_mm256_madd_epi16((__m256i)value, _mm256_set1_epi32(factor)) + more;
+#elif defined(__SSE2__)
+  return (Native)_mm_madd_epi16((__m128i)value, _mm_set1_epi32(factor)) + more;
+#else
+  return value * factor + more;
+#endif
+}
+
+// A sum that began at its channel's bias, in 8 bits.
+inline Native rescaled(Native value, const PatchScaling &scaling, int channel) {
   const Native zero{}, most = zero + ((1 << (scaling.drop + 15)) - 1), full = zero + 255;
-  Native value = sum + scaling.bias[channel];
   value = value < zero ? zero : value;
   value = value > most ? most : value;
-  value = ((value >> scaling.drop) * scaling.factor[channel] + (1 << (scaling.shift - 1))) >>
+  value = scaled(value >> scaling.drop, scaling.factor[channel], 1 << (scaling.shift - 1)) >>
           scaling.shift;
   return value > full ? full : value;
 }
@@ -221,17 +289,21 @@ inline void emit(const Sums &sums, const PatchScaling &scaling, int first, Lanes
     }
 }
 
-void first_convolution(const Input &input, const int32_t *weights, const PatchScaling &scaling,
-                       Lanes *out) {
+void first_convolution(const Input &input, const Columns &columns, const int32_t *weights,
+                       const PatchScaling &scaling, Lanes *out) {
   for (int block = 0; block < kC1; block += kBlock, weights += kTaps[0] * kBlock)
     for (int y = 0; y < kSide1; ++y)
       for (int x = 0; x < kSide1; ++x) {
-        Sums sums{};
+        Sums sums = starting_at(scaling.bias + block);
         const int32_t *own = weights;
         for (int row = 0; row < kSide; ++row)
-#pragma GCC unroll 3
-          for (int group = 0; group < kRowGroups; ++group, own += kBlock)
+#pragma GCC unroll 2
+          for (int group = 0; group < kFourths; ++group, own += kBlock)
             add_group(sums, input[2 * y + row][x + group * kGroupStep], own);
+#pragma GCC unroll 2
+        for (int group = 0; group < kFourths; ++group, own += kBlock)
+          add_group(sums, columns[y + group][x], own);
+        add_group(sums, input[2 * y + 4][x + 2], own);
         emit(sums, scaling, block, out + (y * kSide1 + x) * (kC1 / kGroup));
       }
 }
@@ -244,7 +316,7 @@ void convolution(const Lanes *input, const int32_t *weights, const PatchScaling 
   for (int block = 0; block < outputs; block += kBlock, weights += 9 * groups * kBlock)
     for (int y = 0; y < side / 2; ++y)
       for (int x = 0; x < side / 2; ++x) {
-        Sums sums{};
+        Sums sums = starting_at(scaling.bias + block);
         for (int tap = 0; tap < 9; ++tap) {
           const int row = 2 * y + tap / 3 - 1, column = 2 * x + tap % 3 - 1;
           if (row < 0 || column < 0)
@@ -285,8 +357,10 @@ void signs(const Lanes *input, const int32_t *weights, const PatchWeights &net, 
 
 struct Layers {
   Input input;
+  Columns columns;
   Lanes first[kSide1 * kSide1 * kC1 / kGroup], second[kSide2 * kSide2 * kC2 / kGroup],
       third[kSide3 * kSide3 * kC3 / kGroup];
+  Patch patches[kPatches];
 };
 
 } // namespace
@@ -296,7 +370,7 @@ int64_t packed_patch_words(const PatchWeights &weights) {
 }
 
 void pack_patch_weights(const PatchWeights &weights, int32_t *packed) {
-  packed = pack_layer(weights.convolutions[0], kC1, kSide, kSide, packed);
+  packed = pack_first(weights.convolutions[0], packed);
   packed = pack_layer(weights.convolutions[1], kC2, kC1, 9, packed);
   packed = pack_layer(weights.convolutions[2], kC3, kC2, 9, packed);
   pack_layer(weights.linear, weights.bits, kC3, 9, packed);
@@ -315,15 +389,16 @@ void describe_patches(const PatchImages &images, const float *pixels, const uint
     for (int64_t k = 0; k < here; ++k) {
       const int64_t row = first + k;
       const int octave = octaves[row];
-      uint8_t copy[4 * kPatchSide * kPatchSide], patch[kPatchSide * kPatchSide];
+      uint8_t copy[4 * kPatchSide * kPatchSide];
       int64_t stride;
       const uint8_t *cut =
           around(images.levels[octave], at_level(pixels[2 * row], octave),
                  at_level(pixels[2 * row + 1], octave), copy, &stride);
-      normalise(cut, stride, patch);
-      place(patch, static_cast<int>(k), layers.input);
+      normalise(cut, stride, layers.patches[k]);
     }
-    first_convolution(layers.input, packed, weights.scalings[0], layers.first);
+    place(layers.patches, here, layers.input);
+    take_columns(layers.input, layers.columns);
+    first_convolution(layers.input, layers.columns, packed, weights.scalings[0], layers.first);
     convolution<kC1, kC2, kSide1>(layers.first, packed + words_before(1), weights.scalings[1],
                                   layers.second);
     convolution<kC2, kC3, kSide2>(layers.second, packed + words_before(2), weights.scalings[2],
