@@ -58,7 +58,7 @@ class LocaliserConfig:
         followed_gap_m: largest standard deviation of motion, guessed or measured, along which what
             speaks for places of a lost robot is carried on.
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
-            are below both; 0 turns guidance off.
+            are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They make a failed attempt four times cheaper and keep 98.8 % of the matches it would
             accept. Source: `lab/reports/constants.md`.
@@ -74,8 +74,8 @@ class LocaliserConfig:
     lost_after_m: float = 10.0
     greatest_gap_m: float = 3.0
     followed_gap_m: float = 1.0
-    guide_below_m: float = 0.3
-    guide_below_rad: float = float(np.deg2rad(3.0))
+    guide_below_m: float = 0.6
+    guide_below_rad: float = float(np.deg2rad(4.0))
     lost_max_samples: int = 500
     lost_max_hypotheses: int = 100
     neighbourhood: Annotated[

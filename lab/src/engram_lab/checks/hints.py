@@ -5,8 +5,8 @@
     python -m engram_lab.checks.hints --towns 401 --kinds told
 
 Each try counts the 40 frames after a robot is told a place 15 m or more off (σ 0.1, 1 or 3 m), or
-carried there. A fix is false that is more than 1 m or 5° off. The towns are rendered once; tries
-that are in `--out` are not made again.
+carried there, with the budget that robots have by default. A fix is false that is more than 1 m or
+5° off. The towns are rendered once; tries that are in `--out` are not made again.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.localiser import Budget
 from engram.monitor import QUIET
 from engram.robot import Settings
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Street, Try
@@ -84,7 +85,7 @@ def main() -> None:
     parser.add_argument("--towns", type=numbers, default=list(HELD_OUT_TOWNS))
     parser.add_argument("--tries", type=int, default=3000)
     parser.add_argument("--kinds", default="told,carried")
-    parser.add_argument("--lost-rounds", type=int, default=8, help="budget of a lost robot")
+    parser.add_argument("--lost-rounds", type=int, default=Budget().lost_rounds)
     parser.add_argument("--out", type=Path, default=campaigns_folder() / "hints.jsonl")
     asked = parser.parse_args()
     kinds = [KINDS[name] for name in asked.kinds.split(",")]
