@@ -1,6 +1,7 @@
 """The C++ core: arrays in, arrays out. Every function releases the GIL. Sorted by subject."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -309,6 +310,12 @@ class Odometry:
         NDArray[np.float64] | None,
         int,
     ]: ...
+
+# --- rows
+
+def verified_columns(
+    rows: list[tuple[Any, ...]], kinds: list[str]
+) -> tuple[list[Any] | None, int, int]: ...
 
 # --- path memory
 

@@ -59,7 +59,7 @@ def assert_holds(store: Map, *drives: Drive) -> None:
 class TestSessions:
     def test_a_new_map_is_empty(self, store):
         contents = store.load()
-        assert (contents.sessions, contents.nodes, contents.edges) == ((), (), ())
+        assert (contents.sessions, contents.nodes, list(contents.edges)) == ((), (), [])
         assert len(contents.attempts) == 0
         assert store.log() == []
         assert store.revision == 0

@@ -218,13 +218,15 @@ def test_what_is_kept_from_frame_to_frame_changes_no_score(data) -> None:
             n for n in changed[:2] if n not in observed
         ]
         fresh = PathMemory(graph)
-        for number, walk in enumerate(walks):
-            for sequence, node in enumerate(walk):
-                fresh.add(
-                    PathEntry(
-                        path_uuid(number), sequence, graph.node(node).id, PathEntryKind.MATCHED, 0
-                    )
+        fresh.add_all(
+            [
+                PathEntry(
+                    path_uuid(number), sequence, graph.node(node).id, PathEntryKind.MATCHED, 0
                 )
+                for number, walk in enumerate(walks)
+                for sequence, node in enumerate(walk)
+            ]
+        )
         situation = (
             np.arange(nodes, dtype=np.int32),
             np.array(observed, np.int32),

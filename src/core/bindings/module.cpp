@@ -16,12 +16,13 @@ void bind_patch_network(nb::module_ &module);
 void bind_path_scores(nb::module_ &module);
 void bind_places(nb::module_ &module);
 void bind_recall(nb::module_ &module);
+void bind_rows(nb::module_ &module);
 void bind_window_ba(nb::module_ &module);
 
 NB_MODULE(_core, module) {
   // An error's traceback may keep arrays alive until the interpreter is gone; that is no leak.
   nb::set_leak_warnings(false);
-  module.doc() = "The measured hot kernels of Engram. Every function releases the GIL.";
+  module.doc() = "The measured hot kernels of Engram. Every function but verified_columns releases the GIL.";
   module.attr("isa") = engram::name_of(engram::active_isa());
   bind_extraction(module);
   bind_graph_search(module);
@@ -33,5 +34,6 @@ NB_MODULE(_core, module) {
   bind_path_scores(module);
   bind_places(module);
   bind_recall(module);
+  bind_rows(module);
   bind_window_ba(module);
 }

@@ -165,10 +165,12 @@ def count_attempts(
     chain = drives.astype(np.int64) * (int(experiences.max()) + 1) + experiences
     span = int(iterations.max() - iterations.min()) + 1
     when = chain * span + (iterations - iterations.min())
-    matched = np.r_[-1, np.unique(when[accepted])]
-    last = matched[np.searchsorted(matched, when) - 1]
-    compatible = (last >= chain * span) & (when - last <= _COMPATIBLE_ITERATIONS)
-    counted = compatible & (sigma_m <= _GREATEST_SIGMA_M)
+    matched = np.r_[-1, np.sort(when[accepted])]
+    counted = np.asarray(sigma_m <= _GREATEST_SIGMA_M)
+    sure = when[counted]
+    last = matched[np.searchsorted(matched, sure) - 1]
+    recent = sure - last <= _COMPATIBLE_ITERATIONS
+    counted[counted] = (last >= chain[counted] * span) & recent
     along_m, across_m = (np.abs(offset.astype(np.float64)) for offset in offsets_m)
     counts = np.zeros((2, 2, BIN_COUNT), dtype=np.int64)
     for direction, (offset_m, aside_m) in enumerate(((along_m, across_m), (across_m, along_m))):

@@ -96,12 +96,27 @@ def edge_error_rows(edges: Sequence[tuple[SE3, Array]]) -> Array:
         InputError: a covariance has the wrong shape, is not finite or not positive semi-definite.
     """
     stack = _stacked([covariance for _, covariance in edges])
-    rows = np.empty((len(edges), 8))
-    rows[:, :5], definite = _core.pivoted_errors(stack)
-    _check(stack[definite == 0])
-    if len(edges):
-        rotations = np.stack([a_from_b.rotation for a_from_b, _ in edges])
-        translations = np.stack([a_from_b.translation for a_from_b, _ in edges])
+    poses = np.empty((len(edges), 12))
+    for row, (a_from_b, _) in zip(poses, edges, strict=True):
+        row[:9], row[9:] = a_from_b.rotation.ravel(), a_from_b.translation
+    return error_rows_of(poses, stack)
+
+
+def error_rows_of(poses: Array, covariances: Array) -> Array:
+    """`edge_error_rows` of arrays.
+
+    Args:
+        poses: (E, 12) float64, ``a_from_b``: rotation in row-major order, then translation.
+        covariances: (E, 6, 6) float64 of these.
+
+    Raises:
+        InputError: a covariance is not finite or not positive semi-definite.
+    """
+    rows = np.empty((len(poses), 8))
+    rows[:, :5], definite = _core.pivoted_errors(covariances)
+    _check(covariances[definite == 0])
+    if len(poses):
+        rotations, translations = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
         # As a_from_b.inverse() @ pivot has it.
         transposed = rotations.transpose(0, 2, 1)
         moved = (transposed @ translations[:, :, None])[:, :, 0]

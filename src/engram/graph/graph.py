@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -13,13 +14,15 @@ from scipy.sparse.csgraph import connected_components
 from engram import _core
 from engram.errors import InputError
 from engram.geometry import SE3
-from engram.graph.chain_error import ChainError, edge_error_rows
+from engram.graph.chain_error import ChainError, edge_error_rows, error_rows_of
+from engram.graph.edge_table import EDGE_KINDS, EdgeRecords, EdgeTable
 from engram.graph.growing import Column
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.graph.neighbourhood import Neighbourhood, Search
 
 # From so many edges on they are linked by arrays; a mapper adds a few at a time.
 _BULK = 16
+_KIND_NUMBER = {kind: number for number, kind in enumerate(EDGE_KINDS)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +148,10 @@ class ExperienceGraph:
         self._index: dict[NodeId, int] = {}
         self._sessions: list[SessionId] = []
         self._session_index: dict[SessionId, int] = {}
-        self._edges: list[Edge] = []
-        self._edge_index: dict[tuple[int, int, EdgeKind], int] = {}
+        self._edges = EdgeRecords()
+        # Numbers by (a, b, kind); None until one is asked for after a table was read.
+        self._numbers: dict[tuple[int, int, EdgeKind], int] | None = {}
+        self._kinds = Column(np.uint8)
         self._node_sessions = Column(np.int32)
         self._driven_m = Column(np.float64)
         self._uuid_words = Column(np.uint64, (2,))
@@ -187,6 +192,28 @@ class ExperienceGraph:
         self._first_half.append(-1)
         return index
 
+    def add_nodes(self, nodes: Sequence[Node]) -> None:
+        """Add many nodes, in this order; see `add_node`."""
+        index = {node.id: place for place, node in enumerate(nodes)}
+        if len(self) or len(index) < len(nodes):
+            for node in nodes:
+                self.add_node(node)
+            return
+        self._bound = None
+        self._nodes = list(nodes)
+        self._index = index
+        self._sessions = list(dict.fromkeys(node.session for node in nodes))
+        self._session_index = {one: number for number, one in enumerate(self._sessions)}
+        number_of = self._session_index
+        self._node_sessions.extend(np.array([number_of[node.session] for node in nodes], np.int32))
+        self._driven_m.extend(np.array([node.driven_m for node in nodes], np.float64))
+        uuids = np.frombuffer(b"".join(node.id.bytes for node in nodes), ">u8").reshape(-1, 2)
+        self._uuid_words.extend(uuids.astype(np.uint64))
+        count = np.arange(len(nodes), dtype=np.int32)
+        self._experiences.extend(count)
+        self._experience_sizes.extend(np.ones_like(count))
+        self._first_half.extend(np.full_like(count, -1))
+
     def add_edge(self, edge: Edge) -> None:
         """Add an edge, or supersede the one with the same (a, b, kind).
 
@@ -197,18 +224,30 @@ class ExperienceGraph:
         self.add_edges([edge])
 
     def add_edges(self, edges: Sequence[Edge]) -> None:
-        """Add many edges, in this order; see `add_edge`. If one is refused, none is added."""
+        """Add many edges, in this order; see `add_edge`. If one is refused, none is added.
+
+        A table of the nodes of a graph without edges is added without making its records.
+        """
+        if isinstance(edges, EdgeTable) and self._fits(edges):
+            self._add_table(edges)
+            return
         ends = [(self.index(edge.a), self.index(edge.b)) for edge in edges]
         for (a, b), edge in zip(ends, edges, strict=True):
             if a == b:
                 raise InputError(f"an edge joins two nodes; both ends are {edge.a}")
         error_rows = edge_error_rows([(edge.a_from_b, edge.covariance) for edge in edges])
         keys = [(a, b, edge.kind) for (a, b), edge in zip(ends, edges, strict=True)]
-        if len(edges) >= _BULK and len(set(keys).difference(self._edge_index)) == len(keys):
-            self._link_all(keys, edges, error_rows)
+        if len(edges) >= _BULK and len(set(keys).difference(self._edge_numbers())) == len(keys):
+            self._edge_numbers().update(zip(keys, range(len(self._edges), 2**31), strict=False))
+            self._edges.extend(edges)
+            poses = np.empty((len(edges), 12))
+            poses[:, :9] = np.stack([edge.a_from_b.rotation for edge in edges]).reshape(-1, 9)
+            poses[:, 9:] = np.stack([edge.a_from_b.translation for edge in edges])
+            kinds = np.array([_KIND_NUMBER[edge.kind] for edge in edges], np.uint8)
+            self._link_all(np.array(ends, np.int32), kinds, poses, error_rows)
             return
         for (a, b), edge, error_row in zip(ends, edges, error_rows, strict=True):
-            known = self._edge_index.get((a, b, edge.kind))
+            known = self._edge_numbers().get((a, b, edge.kind))
             if known is None:
                 known = self._link(a, b, edge)
             self._edges[known] = edge
@@ -220,7 +259,8 @@ class ExperienceGraph:
         self._bound = None
         number = len(self._edges)
         self._edges.append(edge)
-        self._edge_index[a, b, edge.kind] = number
+        self._edge_numbers()[a, b, edge.kind] = number
+        self._kinds.append(_KIND_NUMBER[edge.kind])
         self._a_from_b.append(0.0)
         self._errors.append(0.0)
         for half, source, target in ((2 * number, a, b), (2 * number + 1, b, a)):
@@ -234,23 +274,52 @@ class ExperienceGraph:
             self._join_experiences(a, b)
         return number
 
+    def _fits(self, table: EdgeTable) -> bool:
+        """Whether a table's nodes are those of this graph, which has no edges yet."""
+        return (
+            not self._edges
+            and len(table.nodes) == len(self)
+            and all(map(operator.is_, table.nodes, self._nodes))
+        )
+
+    def _add_table(self, table: EdgeTable) -> None:
+        selfish = np.flatnonzero(table.ends[:, 0] == table.ends[:, 1])
+        if selfish.size:
+            node = table.nodes[int(table.ends[selfish[0], 0])].id
+            raise InputError(f"an edge joins two nodes; both ends are {node}")
+        error_rows = error_rows_of(table.poses, table.covariances)
+        self._edges.begin_with(table)
+        self._numbers = None
+        self._link_all(table.ends, table.kinds, table.poses, error_rows)
+
+    def _edge_numbers(self) -> dict[tuple[int, int, EdgeKind], int]:
+        """The number of each (a, b, kind)."""
+        if self._numbers is None:
+            b, a = self.edge_ends.T.tolist()
+            kinds = [EDGE_KINDS[number] for number in self._kinds.rows.tolist()]
+            self._numbers = dict(zip(zip(a, b, kinds, strict=True), range(len(a)), strict=True))
+        return self._numbers
+
     def _link_all(
         self,
-        keys: Sequence[tuple[int, int, EdgeKind]],
-        edges: Sequence[Edge],
+        ends: NDArray[np.int32],
+        kinds: NDArray[np.uint8],
+        poses: NDArray[np.float64],
         error_rows: NDArray[np.float64],
     ) -> None:
-        """`_link` for many edges, none of whose keys is known: a map being read."""
+        """`_link` for many edges, none of whose keys is known: a map being read.
+
+        Args:
+            ends: (E, 2), a and b.
+            kinds: (E,), index into `EDGE_KINDS`.
+            poses: (E, 12).
+            error_rows: (E, 8).
+        """
         self._bound = None
-        first = len(self._edges)
-        self._edges += edges
-        self._edge_index.update(zip(keys, range(first, len(self._edges)), strict=True))
-        poses = np.empty((len(edges), 12))
-        poses[:, :9] = np.stack([edge.a_from_b.rotation for edge in edges]).reshape(-1, 9)
-        poses[:, 9:] = np.stack([edge.a_from_b.translation for edge in edges])
+        first = len(self._kinds)
+        self._kinds.extend(kinds)
         self._a_from_b.extend(poses)
         self._errors.extend(error_rows)
-        ends = np.array([(a, b) for a, b, _ in keys], np.int32)
         sources = ends.ravel()  # of half 2e its a, of half 2e + 1 its b
         order = np.argsort(sources, kind="stable")
         halves = (2 * first + order).astype(np.int32)
@@ -264,12 +333,10 @@ class ExperienceGraph:
         self._target.extend(np.ascontiguousarray(ends[:, ::-1]).ravel())
         last = np.roll(new_source, -1)
         self._first_half.rows[sources[order[last]]] = halves[last]
-        for a, b, kind in keys:
-            if (
-                kind is EdgeKind.ODOMETRY
-                and self._node_sessions.rows[a] == (self._node_sessions.rows[b])
-            ):
-                self._join_experiences(a, b)
+        chained = ends[kinds == _KIND_NUMBER[EdgeKind.ODOMETRY]]
+        sessions = self._node_sessions.rows[chained]
+        for a, b in chained[sessions[:, 0] == sessions[:, 1]].tolist():
+            self._join_experiences(a, b)
 
     def _join_experiences(self, a: int, b: int) -> None:
         labels, sizes = self._experiences.rows, self._experience_sizes.rows
@@ -355,7 +422,7 @@ class ExperienceGraph:
         """The edge of this key; None if there is none, or an end is not in the graph."""
         if a not in self._index or b not in self._index:
             return None
-        number = self._edge_index.get((self._index[a], self._index[b], kind))
+        number = self._edge_numbers().get((self._index[a], self._index[b], kind))
         return None if number is None else self._edges[number]
 
     def components(self) -> NDArray[np.int32]:

@@ -77,16 +77,32 @@ class PathMemory:
             InputError: its node is not in the graph.
         """
         node = self._graph.index(entry.node)
-        number = self._number.setdefault(entry.path, len(self._paths))
-        if number == len(self._paths):
-            self._paths.append(entry.path)
-            self._entries.append([])
+        number = self._numbered(entry.path)
         if _insert(self._entries[number], entry) and entry.kind in self.kinds:
             self._make_room()
             self._bits[node, number // 64] |= np.uint64(1 << (number % 64))
             self._observed.add(node, number)
         for other in self._counting.values():
             other.add(entry)
+
+    def add_all(self, entries: Sequence[PathEntry]) -> None:
+        """Add many entries, in this order; see `add`."""
+        if self._counting:
+            for entry in entries:
+                self.add(entry)
+            return
+        nodes, numbers = [], []
+        for entry in entries:
+            node = self._graph.index(entry.node)
+            number = self._numbered(entry.path)
+            if _insert(self._entries[number], entry) and entry.kind in self.kinds:
+                nodes.append(node)
+                numbers.append(number)
+                self._observed.add(node, number)
+        self._make_room()
+        at, bits = np.array(numbers, np.int64), np.uint64(1)
+        words = bits << (at % 64).astype(np.uint64)
+        np.bitwise_or.at(self._bits, (np.array(nodes, np.int64), at // 64), words)
 
     def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(P, N) bool: whether each path holds each node; unknown paths hold none.
@@ -185,6 +201,14 @@ class PathMemory:
         return _core.path_order(
             self._observed, self._bound(), candidates, evidence, basin.rates, BIN_M, level
         )
+
+    def _numbered(self, path: PathId) -> int:
+        """Number of a path, which is new if unknown."""
+        number = self._number.setdefault(path, len(self._paths))
+        if number == len(self._paths):
+            self._paths.append(path)
+            self._entries.append([])
+        return number
 
     def _bound(self) -> _core.PathBits:
         self._make_room()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from engram.graph.graph import ExperienceGraph
@@ -48,10 +48,9 @@ def new_places(store: MapReader, contents: Mapping[str, float]) -> list[Placemen
     return changed(before, graph, lay_out(graph, before))
 
 
-def graph_of(nodes: Iterable[Node], edges: Iterable[Edge]) -> ExperienceGraph:
+def graph_of(nodes: Sequence[Node], edges: Sequence[Edge]) -> ExperienceGraph:
     """A graph of these records."""
     graph = ExperienceGraph()
-    for node in nodes:
-        graph.add_node(node)
-    graph.add_edges(list(edges))
+    graph.add_nodes(nodes)
+    graph.add_edges(edges)
     return graph

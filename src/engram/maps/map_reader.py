@@ -97,8 +97,7 @@ class _Contents:
     def of(contents: MapContents) -> _Contents:
         graph = graph_of(contents.nodes, contents.edges)
         path_memory = PathMemory(graph)
-        for entry in contents.path_entries:
-            path_memory.add(entry)
+        path_memory.add_all(contents.path_entries)
         return _Contents(
             graph,
             path_memory,

@@ -127,20 +127,30 @@ def goal_from_row(row: Row, ids: Mapping[int, NodeId]) -> Goal:
 
 def counting(connection: Connection, view: View, rows: list[Row]) -> list[Row]:
     """The rows of edges without those that were removed."""
+    removed = removed_measurements(connection, view)
+    if not removed:
+        return rows
+    return [row for row in rows if not is_removed(row, removed.get(edge_key(row), []))]
+
+
+def removed_measurements(
+    connection: Connection, view: View
+) -> dict[tuple[frozenset[int], str], list[tuple[int, SE3]]]:
+    """What was removed by `edge_key`: from which end, and the transform to the other."""
     removed: dict[tuple[frozenset[int], str], list[tuple[int, SE3]]] = {}
     for row in view.rows(connection, removals):
         a_from_b = transform_from_bytes(row["a_from_b"], f"removal {row['key']}")
-        removed.setdefault(_edge_key(row), []).append((row["a"], a_from_b))
-    if not removed:
-        return rows
-    return [row for row in rows if not _is_removed(row, removed.get(_edge_key(row), []))]
+        removed.setdefault(edge_key(row), []).append((row["a"], a_from_b))
+    return removed
 
 
-def _edge_key(row: Row) -> tuple[frozenset[int], str]:
+def edge_key(row: Row) -> tuple[frozenset[int], str]:
+    """The two ends of an edge, in any order, and its kind."""
     return frozenset((row["a"], row["b"])), row["kind"]
 
 
-def _is_removed(row: Row, removed: list[tuple[int, SE3]]) -> bool:
+def is_removed(row: Row, removed: list[tuple[int, SE3]]) -> bool:
+    """Whether an edge measures what was removed between its ends."""
     if not removed:
         return False
     a_from_b = transform_from_bytes(row["a_from_b"], f"edge {row['key']}")

@@ -14,30 +14,31 @@ from engram.frontend import DescriptorKind, feature_kind
 from engram.frontend.blobs import content_digest
 from engram.geometry import CameraId, StereoCamera
 from engram.graph.attempts import Attempts
+from engram.graph.edge_table import EDGE_KINDS, EdgeTable
 from engram.graph.model import (
     Amendment,
-    Edge,
     EdgeKind,
     Node,
     NodeId,
     Omission,
     PathEntry,
+    PathEntryKind,
     PathId,
     Session,
     SessionId,
 )
 from engram.maps.attempts import AttemptTable, concatenate, unpack
-from engram.maps.marks import counting
+from engram.maps.columns import Columns, read_columns
+from engram.maps.marks import counting, edge_key, is_removed, removed_measurements
 from engram.maps.records import MapContents, MapInfo, Revision
 from engram.maps.rows import (
     Row,
     amendment_from_row,
     camera_from_row,
-    edges_from_rows,
+    edge_arrays,
     from_json,
+    member,
     node_from_bytes,
-    node_from_row,
-    path_entry_from_row,
     session_from_row,
     transform_from_bytes,
     uuid_from_bytes,
@@ -62,6 +63,9 @@ from engram.maps.schema import (
 )
 from engram.maps.view import View
 
+# Most numbers per key that a table of all of them may span.
+_DENSE = 16
+
 
 def load(connection: Connection, view: View) -> MapContents:
     """All records except landmarks.
@@ -72,17 +76,15 @@ def load(connection: Connection, view: View) -> MapContents:
     known_cameras = load_cameras(connection)
     session_by_key = _sessions(connection, view, known_cameras)
     session_ids = {key: one.id for key, one in session_by_key.items()}
-    node_rows = list(view.rows(connection, nodes))
-    node_list = [_node(row, known_cameras, session_ids) for row in node_rows]
-    node_ids = {row["key"]: one.id for row, one in zip(node_rows, node_list, strict=True)}
+    node_keys, node_list = _nodes(connection, view, known_cameras, session_ids)
     used = {one.camera for one in session_by_key.values()} | {one.camera for one in node_list}
     return MapContents(
         cameras={one.id: one for one in known_cameras.values() if one.id in used},
         sessions=tuple(session_by_key.values()),
         nodes=tuple(node_list),
-        edges=_edges(connection, view, node_ids),
-        path_entries=_path_entries(connection, view, node_ids),
-        attempts=_attempts(connection, view, list(session_ids), list(node_ids)),
+        edges=_edges(connection, view, node_keys, node_list),
+        path_entries=_path_entries(connection, view, node_keys, node_list),
+        attempts=_attempts(connection, view, list(session_ids), node_keys),
     )
 
 
@@ -300,13 +302,29 @@ def attempt_tables(connection: Connection, view: View) -> dict[int, AttemptTable
     return {session: concatenate(tables) for session, tables in found.items()}
 
 
-def _node(
-    row: Row, known_cameras: dict[int, StereoCamera], session_ids: dict[int, SessionId]
-) -> Node:
-    if row["session"] not in session_ids:
-        name = uuid_from_bytes(row["uuid"], "node")
-        raise MapCorruptError(f"node {name}: its session, row {row['session']}, is missing")
-    return node_from_row(row, session_ids[row["session"]], _camera_id(known_cameras, row, "node"))
+def _nodes(
+    connection: Connection,
+    view: View,
+    known_cameras: dict[int, StereoCamera],
+    session_ids: dict[int, SessionId],
+) -> tuple[NDArray[np.int64], tuple[Node, ...]]:
+    """Keys (N,) and records of the nodes."""
+    found = read_columns(connection, view, nodes, {"uuid": 16, "landmark_hash": 16})
+    uuids = found["uuid"].tobytes()
+    columns = [found[name].tolist() for name in ("key", "session", "camera", "stamp_ns")]
+    records = []
+    for at, (key, session, camera, stamp_ns, driven_m) in enumerate(
+        zip(*columns, found["driven_m"].tolist(), strict=True)
+    ):
+        one = node_from_bytes(uuids[16 * at : 16 * at + 16])
+        if session not in session_ids:
+            raise MapCorruptError(f"node {one}: its session, row {session}, is missing")
+        if camera not in known_cameras:
+            raise MapCorruptError(f"node {key}: its camera, row {camera}, is missing")
+        records.append(
+            Node(one, session_ids[session], stamp_ns, known_cameras[camera].id, driven_m)
+        )
+    return found["key"], tuple(records)
 
 
 def _camera_id(known: dict[int, StereoCamera], row: Row, what: str) -> CameraId:
@@ -325,32 +343,65 @@ def _newest_edges(connection: Connection, view: View) -> list[Row]:
     return counting(connection, view, list(newest.values()))
 
 
-def _edges(connection: Connection, view: View, node_ids: dict[int, NodeId]) -> tuple[Edge, ...]:
+def _edges(
+    connection: Connection, view: View, node_keys: NDArray[np.int64], node_list: tuple[Node, ...]
+) -> EdgeTable:
     """Edges between visible nodes: those of hidden nodes are hidden with them."""
-    seen = [
-        row
-        for row in _newest_edges(connection, view)
-        if row["a"] in node_ids and row["b"] in node_ids
-    ]
-    return edges_from_rows(seen, [(node_ids[row["a"]], node_ids[row["b"]]) for row in seen])
+    sizes = {"a_from_b": 96, "covariance": 168}
+    found = read_columns(connection, view, edges, sizes).newest("a", "b", "kind")
+    found = _without_removed(connection, view, found)
+    (a, a_seen), (b, b_seen) = (_dense(found[end], node_keys) for end in ("a", "b"))
+    seen = np.flatnonzero(a_seen & b_seen)
+    found, ends = found.rows(seen), np.column_stack([a, b])[seen]
+    codes, texts = found.texts["kind"]
+    numbers = [EDGE_KINDS.index(member(EdgeKind, text, "edges")) for text in texts]
+    return EdgeTable(
+        node_list,
+        ends,
+        np.array(numbers, np.uint8)[codes],
+        *edge_arrays(found["a_from_b"], found["covariance"], found["key"]),
+    )
+
+
+def _without_removed(connection: Connection, view: View, found: Columns) -> Columns:
+    """The edges without those that were removed; hardly any map has some."""
+    removed = removed_measurements(connection, view)
+    if not removed:
+        return found
+    codes, texts = found.texts["kind"]
+    kept = []
+    for at, (key, a, b, code) in enumerate(
+        zip(*(found[name].tolist() for name in ("key", "a", "b")), codes.tolist(), strict=True)
+    ):
+        row = {"key": key, "a": a, "b": b, "kind": texts[code]}
+        measured = removed.get(edge_key(row))
+        if measured is None or not is_removed(
+            {**row, "a_from_b": found["a_from_b"][at].tobytes()}, measured
+        ):
+            kept.append(at)
+    return found.rows(np.array(kept, np.intp))
 
 
 def _path_entries(
-    connection: Connection, view: View, node_ids: dict[int, NodeId]
+    connection: Connection, view: View, node_keys: NDArray[np.int64], node_list: tuple[Node, ...]
 ) -> tuple[PathEntry, ...]:
-    path_ids = {
-        row["key"]: PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}"))
-        for row in view.rows(connection, paths)
-    }
-    place = {key: at for at, key in enumerate(path_ids)}
-    newest = {
-        (row["path"], row["sequence"]): row
-        for row in view.rows(connection, path_entries)
-        if row["path"] in path_ids and row["node"] in node_ids
-    }
-    rows = sorted(newest.values(), key=lambda row: (place[row["path"]], row["sequence"]))
+    path_rows = list(view.rows(connection, paths))
+    path_keys = np.array([row["key"] for row in path_rows], np.int64)
+    path_ids = [PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}")) for row in path_rows]
+    found = read_columns(connection, view, path_entries)
+    (path, path_seen), (node, node_seen) = (
+        _dense(found[name], keys) for name, keys in (("path", path_keys), ("node", node_keys))
+    )
+    seen = np.flatnonzero(path_seen & node_seen)
+    found = Columns({**found.values, "path": path, "node": node}, found.texts).rows(seen)
+    found = found.newest("path", "sequence")
+    found = found.rows(np.lexsort((found["sequence"], found["path"])))
+    codes, texts = found.texts["kind"]
+    kinds = [member(PathEntryKind, text, "path_entries") for text in texts]
+    columns = [found[name].tolist() for name in ("path", "sequence", "node", "stamp_ns")]
     return tuple(
-        path_entry_from_row(row, path_ids[row["path"]], node_ids[row["node"]]) for row in rows
+        PathEntry(path_ids[path], sequence, node_list[node].id, kinds[code], stamp_ns)
+        for path, sequence, node, stamp_ns, code in zip(*columns, codes.tolist(), strict=True)
     )
 
 
@@ -361,7 +412,7 @@ def _entry_places(view: View) -> Select[Any]:
 
 
 def _attempts(
-    connection: Connection, view: View, session_keys: list[int], node_keys: list[int]
+    connection: Connection, view: View, session_keys: list[int], node_keys: NDArray[np.int64]
 ) -> Attempts:
     """All attempts between visible nodes, with keys converted to dense indices."""
     by_session = attempt_tables(connection, view)
@@ -375,24 +426,34 @@ def _attempts(
     reference, reference_seen = _dense(table.columns["reference"], node_keys)
     node, node_seen = _dense(table.columns["node"], node_keys)
     seen = reference_seen & node_seen
-    columns: dict[str, Any] = {**table.columns, "reference": reference, "node": node}
-    return Attempts(
-        session=session[seen],
-        policy=table.policy[seen],
-        policies=table.policies,
-        **{name: values[seen] for name, values in columns.items()},
-    )
+    columns: dict[str, Any] = {
+        **table.columns,
+        "reference": reference,
+        "node": node,
+        "session": session,
+        "policy": table.policy,
+    }
+    if not seen.all():
+        columns = {name: values[seen] for name, values in columns.items()}
+    return Attempts(policies=table.policies, **columns)
 
 
-def _dense(keys: NDArray[Any], known: list[int]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+def _dense(
+    keys: NDArray[Any], known: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """Index of each key in `known`, and whether it is there."""
-    if not known:
+    if not len(known):
         return np.zeros(len(keys), np.int32), np.zeros(len(keys), np.bool_)
-    known_keys = np.array(known, np.int64)
-    order = np.argsort(known_keys)
-    at = np.minimum(np.searchsorted(known_keys, keys, sorter=order), len(known) - 1)
-    index = order[at].astype(np.int32)
-    return index, known_keys[index] == keys
+    least, greatest = int(known.min()), int(known.max())
+    if greatest - least < _DENSE * len(known):  # as keys are counted up, nearly always
+        index_of = np.zeros(greatest - least + 1, np.int32)
+        index_of[known - least] = np.arange(len(known), dtype=np.int32)
+        index = index_of[np.clip(keys, least, greatest) - least]
+    else:
+        order = np.argsort(known)
+        at = np.minimum(np.searchsorted(known, keys, sorter=order), len(known) - 1)
+        index = order[at].astype(np.int32)
+    return index, known[index] == keys
 
 
 def _count(connection: Connection, rows: Select[Any]) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -146,7 +146,7 @@ class MapContents:
     cameras: Mapping[CameraId, StereoCamera]
     sessions: tuple[Session, ...]
     nodes: tuple[Node, ...]
-    edges: tuple[Edge, ...]
+    edges: Sequence[Edge]
     path_entries: tuple[PathEntry, ...]
     attempts: Attempts
 

@@ -27,9 +27,6 @@ from engram.graph.model import (
     EdgeKind,
     Node,
     NodeId,
-    PathEntry,
-    PathEntryKind,
-    PathId,
     Session,
     SessionId,
 )
@@ -75,11 +72,16 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
     for row in rows:
         values = list(row[:count])
         if checksum(values[:-1]) != values[-1] or tuple(map(type, values)) not in kinds:
-            raise MapCorruptError(
-                f"table {table.name}: {describe(table, values)} does not match its checksum; "
-                "run engram check, and restore a copy"
-            )
+            raise mismatch(table, values)
         yield dict(zip(names, values, strict=True))
+
+
+def mismatch(table: Table, values: Sequence[Any]) -> MapCorruptError:
+    """The error of a row that does not match its checksum."""
+    return MapCorruptError(
+        f"table {table.name}: {describe(table, values)} does not match its checksum; "
+        "run engram check, and restore a copy"
+    )
 
 
 @cache
@@ -241,7 +243,7 @@ def session_from_row(row: Row, camera: CameraId) -> Session:
         robot=row["robot"],
         camera=camera,
         start_ns=row["start_ns"],
-        clock=_member(Clock, row["clock"], "sessions"),
+        clock=member(Clock, row["clock"], "sessions"),
         longitude_deg=row["longitude_deg"],
         zone=row["zone"],
     )
@@ -249,7 +251,7 @@ def session_from_row(row: Row, camera: CameraId) -> Session:
 
 def amendment_from_row(row: Row, session: SessionId) -> Amendment:
     """The amendment of this session."""
-    what = _member(Amendable, row["what"], "amendments")
+    what = member(Amendable, row["what"], "amendments")
     if what is Amendable.START and not START.fullmatch(row["value"]):
         raise MapCorruptError(f"amendment of session {session}: {row['value']!r} is not a time")
     return Amendment(session, what, row["value"], row["amended_ns"])
@@ -285,22 +287,19 @@ def edge_from_row(row: Row, a: NodeId, b: NodeId) -> Edge:
 
 
 def edges_from_rows(rows: Sequence[Row], ends: Sequence[tuple[NodeId, NodeId]]) -> tuple[Edge, ...]:
-    """The edges, each with its ends (a, b); in bulk, since a map has tens of thousands."""
+    """The edges, each with its ends (a, b)."""
 
     def named(at: int) -> str:
         return f"edge {ends[at][0]} {ends[at][1]} {rows[at]['kind']}"
 
     transforms = _arrays([row["a_from_b"] for row in rows], 12, named)
-    halves = _arrays([row["covariance"] for row in rows], 21, named)
-    covariances = np.empty((len(rows), 6, 6))
-    covariances[:, _UPPER[0], _UPPER[1]] = halves
-    covariances[:, _UPPER[1], _UPPER[0]] = halves
+    covariances = _symmetric(_arrays([row["covariance"] for row in rows], 21, named))
     rotations, translations = transforms[:, :9].reshape(-1, 3, 3), transforms[:, 9:]
     return tuple(
         Edge(
             a=a,
             b=b,
-            kind=_member(EdgeKind, row["kind"], "edges"),
+            kind=member(EdgeKind, row["kind"], "edges"),
             a_from_b=SE3(rotations[at], translations[at]),
             covariance=covariances[at],
         )
@@ -308,18 +307,34 @@ def edges_from_rows(rows: Sequence[Row], ends: Sequence[tuple[NodeId, NodeId]]) 
     )
 
 
-def path_entry_from_row(row: Row, path: PathId, node: NodeId) -> PathEntry:
-    """The path entry."""
-    return PathEntry(
-        path=path,
-        sequence=row["sequence"],
-        node=node,
-        kind=_member(PathEntryKind, row["kind"], "path_entries"),
-        stamp_ns=row["stamp_ns"],
-    )
+def edge_arrays(
+    transforms: NDArray[np.uint8], covariances: NDArray[np.uint8], keys: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Transforms (E, 12) and covariances (E, 6, 6) from their bytes.
+
+    Args:
+        transforms: (E, 96) uint8, see `transform_bytes`.
+        covariances: (E, 168) uint8, see `covariance_bytes`.
+        keys: (E,) of the rows, for messages.
+    """
+    parts = [_finite(one, lambda at: f"edge {keys[at]}") for one in (transforms, covariances)]
+    return parts[0], _symmetric(parts[1])
 
 
-def _member(kind: type[_Kind], value: str, table: str) -> _Kind:
+def _symmetric(halves: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 6, 6) of their upper triangles (N, 21)."""
+    whole = np.empty((len(halves), 6, 6))
+    whole[:, _UPPER[0], _UPPER[1]] = halves
+    whole[:, _UPPER[1], _UPPER[0]] = halves
+    return whole
+
+
+def member(kind: type[_Kind], value: str, table: str) -> _Kind:
+    """The member of an enumeration with this text.
+
+    Raises:
+        MapCorruptError: there is none; names the table.
+    """
     found: _Kind | None = _members(kind).get(value)
     if found is None:
         raise MapCorruptError(f"table {table}: {value!r} is not a valid {kind.__name__}")
@@ -343,7 +358,13 @@ def _arrays(parts: Sequence[bytes], count: int, named: Callable[[int], str]) -> 
             raise MapCorruptError(
                 f"{named(at)}: {count} numbers take {8 * count} bytes, not {data!r:.40}"
             )
-    values = np.frombuffer(b"".join(parts), "<f8").astype(np.float64).reshape(-1, count)
+    whole = np.frombuffer(b"".join(parts), np.uint8).reshape(-1, 8 * count)
+    return _finite(whole, named)
+
+
+def _finite(data: NDArray[np.uint8], named: Callable[[int], str]) -> NDArray[np.float64]:
+    """(N, K) float64 of (N, 8 K) bytes."""
+    values = data.view("<f8").astype(np.float64)
     infinite = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if infinite.size:
         raise MapCorruptError(f"{named(int(infinite[0]))}: holds numbers that are not finite")

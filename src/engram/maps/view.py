@@ -42,6 +42,10 @@ class View:
         """
         return _rows_seen(self, table)
 
+    def by_key(self, table: Table) -> Select[tuple[object, ...]]:
+        """All columns of the visible rows, in the order of their keys, which takes no sorting."""
+        return _rows_by_key(self, table)
+
     def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
         """The visible rows, verified, in the order of `select`."""
         return verified(table, connection.execute(self.select(table)))
@@ -68,12 +72,21 @@ class View:
 # Cached, since reading a map needs the same statements again; views are values.
 @lru_cache(maxsize=256)
 def _rows_seen(view: View, table: Table) -> Select[tuple[object, ...]]:
+    whole = _visible(view, table)
+    joined = whole.select_from(table.join(revisions, revisions.c.key == table.c.revision))
+    return joined.order_by(place_in_history(), table.primary_key.columns[0])
+
+
+@lru_cache(maxsize=256)
+def _rows_by_key(view: View, table: Table) -> Select[tuple[object, ...]]:
+    return _visible(view, table).order_by(table.primary_key.columns[0])
+
+
+def _visible(view: View, table: Table) -> Select[tuple[object, ...]]:
     query = (
         select(*table.columns)
-        .select_from(table.join(revisions, revisions.c.key == table.c.revision))
         .where(table.c.revision.in_(view.revision_keys()))
         .where(table.primary_key.columns[0].not_in(view.hidden_keys(table)))
-        .order_by(place_in_history(), table.primary_key.columns[0])
     )
     for end in sorted(_NODE_COLUMNS & set(table.columns.keys())):
         query = query.where(table.c[end].not_in(view.hidden_keys(nodes)))
