@@ -150,15 +150,15 @@ def class_of(row: Row) -> tuple[Weather, bool, bool, int]:
     return weather, alike, int(row["drives"]) < MOST_DRIVES, bin_of
 
 
-def interval(towns: Mapping[str, Sequence[float]]) -> tuple[float, float] | None:
+def interval(towns: Mapping[str, Sequence[float]], *, few: bool) -> tuple[float, float] | None:
     """What four in five missions of one more town miss, by those of some towns.
 
     The spread within a town is that of quantiles; between towns it is that of a normal prediction
-    (Student's t), since a handful of them tells little of how far the next may lie. Missions of one
-    town alone stand for themselves only.
+    (Student's t), since a handful of them tells little of how far the next may lie. Maps of many
+    drives were met in one town only, which stands for itself.
     """
     missed = [np.asarray(one) for one in towns.values()]
-    if sum(map(len, missed)) < _FEWEST:
+    if sum(map(len, missed)) < _FEWEST or (few and len(missed) < 2):
         return None
     tail = (1 - LEVEL) / 2
     means = np.array([one.mean() for one in missed])
@@ -181,7 +181,7 @@ def fit(rows: Sequence[Row]) -> None:
         towns.setdefault(row["town"], []).append(float(row["missed"]))
     for key in sorted(found):
         weather, alike, few, place = key
-        ends = interval(found[key])
+        ends = interval(found[key], few=few)
         count = sum(map(len, found[key].values()))
         told = "None" if ends is None else f"({ends[0]:.3f}, {ends[1]:.3f})"
         lost = f"lost {BINS[place]:g} to {BINS[place + 1]:g}" if weather is Weather.DRY else "all"

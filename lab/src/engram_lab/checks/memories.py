@@ -1,0 +1,90 @@
+"""Robots that only localise: whether their memory, merged, helps `path` on later drives.
+
+    python -m engram_lab.checks.memories SEED SESSION...     # of `longer_trial_town`
+
+Three drives of the town are mapped: by day, by night, and in rain at night. Four more robots each
+take a copy of that map, localise in it, and hand in what they remember. The named drives are then
+localised in the fleet map with and without these memories: by `path` as published, with one attempt
+a frame and with two as in [L15], and by `path-near` and `recall` with two.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from engram.fleet.merge import merge
+from engram.maps import Map, copy_map
+from engram.measures import route_not_localised
+from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive, robot_on
+from engram_lab.intervals import Array, Interval, Resamples
+from engram_lab.town.simulating import campaigns_folder, simulate
+from engram_lab.trial_towns import longer_trial_town
+
+MAPPED = (0, 3, 5)
+REMEMBERED = (1, 2, 4, 6)
+TRIED = (("path", 1), ("path", 2), ("path-near", 2), ("recall", 2))
+
+
+def handed_in(centre: Path, log: Path, folder: Path) -> Path:
+    """The map of a robot that localised one drive in a copy of the fleet map, and remembers it."""
+    robot = folder / f"{log.stem}.engram"
+    copy_map(centre, robot)
+    sequence = open_drive(log)
+    with Map.open(robot) as opened, robot_on(
+        opened, sequence, Settings(), RobotOptions(), remembers=True
+    ) as driving:  # fmt: skip
+        for _ in driving.drive(sequence):
+            pass
+    return robot
+
+
+def missed(centre: Path, log: Path, policy: str, lanes: int) -> float:
+    """Share of a drive's route that is not localised."""
+    options = RobotOptions(policy=policy, lanes=lanes, rounds=1)
+    with Map.open(centre) as opened:
+        return route_not_localised([measure(opened, open_drive(log), Settings(), options)])
+
+
+def interval(shares: Array) -> Interval:
+    """By how much more is missed with memories, (D, 2) without and with, paired over the drives."""
+    more = shares[:, 1] - shares[:, 0]
+    return Resamples.of(len(more)).interval(lambda weights: weights @ more / len(more))
+
+
+def main() -> None:
+    """Prints a line for each policy and number of lanes."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("sessions", type=int, nargs="+")
+    asked = parser.parse_args()
+    town = longer_trial_town(asked.seed)
+    wanted = sorted({*MAPPED, *REMEMBERED, *asked.sessions})
+    files = simulate(town, campaigns_folder(), sessions=wanted).files
+    logs = dict(zip(wanted, map(Path, files), strict=True))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        without, with_them = folder / "without.engram", folder / "with.engram"
+        for number in MAPPED:
+            map_drive(without, open_drive(logs[number]), Settings(), RobotOptions())
+        copy_map(without, with_them)
+        robots = [handed_in(without, logs[number], folder) for number in REMEMBERED]
+        merge(with_them, robots)
+        for policy, lanes in TRIED:
+            shares = np.array(
+                [
+                    [missed(where, logs[number], policy, lanes) for where in (without, with_them)]
+                    for number in asked.sessions
+                ]
+            )
+            more = interval(shares)
+            print(f"{policy}, {lanes} lanes: missed {shares[:, 0].mean():.2%} without memories, "
+                  f"{shares[:, 1].mean():.2%} with: {100 * more.estimate:+.2f} points "
+                  f"({100 * more.low:.2f} … {100 * more.high:.2f})", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

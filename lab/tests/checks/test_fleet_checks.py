@@ -1,0 +1,42 @@
+"""The small checks of a fleet: cameras stand where they are said to, shares add up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from engram_lab.checks.lenses import told
+from engram_lab.checks.mountings import MOUNTED, MountedSequence
+from engram_lab.town.sequence import SimulatedSequence
+from engram_lab.trial_towns import longer_trial_town, trial_town
+
+
+def test_a_mounted_camera_stands_higher_and_aside_and_looks_down():
+    town = longer_trial_town(401)
+    usual, other = SimulatedSequence(town, 6), MountedSequence(town, 6, MOUNTED)
+    for a, b in zip(usual.truth().world_from_cam, other.truth().world_from_cam, strict=True):
+        np.testing.assert_allclose((a.inverse() @ b).matrix(), MOUNTED.matrix(), atol=1e-9)
+    before, after = usual.drive.poses[9].world_from_cam, other.drive.poses[9].world_from_cam
+    assert after.translation[2] - before.translation[2] == pytest.approx(0.5, abs=0.03)
+    down = np.rad2deg(np.arcsin(before.matrix()[2, 2]) - np.arcsin(after.matrix()[2, 2]))
+    assert down == pytest.approx(10.0, abs=0.1)
+    assert other.camera.cam_from_rig is not None
+    np.testing.assert_allclose(
+        (other.camera.cam_from_rig @ MOUNTED).matrix(), np.eye(4), atol=1e-12
+    )
+    assert other.camera.id != usual.camera.id
+
+
+def test_a_longer_trial_town_begins_with_the_shorter_one():
+    short, longer = trial_town(401), longer_trial_town(401)
+    assert longer.sessions[: len(short.sessions)] == short.sessions
+    assert [one.number for one in longer.sessions] == list(range(15))
+    assert len({one.seed for one in longer.sessions}) == 15
+    assert [one.reverse for one in longer.sessions] == [False] * 12 + [True] * 3
+
+
+def test_the_share_of_the_loss_is_paired_over_towns():
+    text = told(np.array([[0.10, 0.04, 0.0], [0.06, 0.02, 0.02]]))
+    assert "8.0% ignored, 3.0% known, 1.0% through" in text
+    assert "spared 5.0 points (4.0 … 6.0)" in text
+    assert "71% of the loss (60% … 100%)" in text
