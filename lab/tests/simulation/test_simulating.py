@@ -101,6 +101,24 @@ def test_odometry_that_has_changed_is_run_over_what_was_rendered(
     assert Path(file).read_bytes() == before
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("landmarks", [100, 3000])
+def test_logs_without_a_second_look_stay_where_none_would_be_taken(
+    landmarks: int, short: Campaign, tmp_path: Path
+) -> None:
+    """Only where a frame lacks landmarks the session is rendered again."""
+    near = replace(short, spacing_m=2.5, sessions=short.sessions[:1])
+    first, both = (
+        Settings(frontend=FrontendConfig(landmarks=landmarks, second_threshold=second))
+        for second in (0, 3)
+    )
+    simulate(near, tmp_path / "old", settings=first)
+    report = simulate(near, tmp_path / "old", settings=both)
+    assert (report.rendered, report.already_there) == ((0, 1) if landmarks == 100 else (1, 0))
+    (wanted,) = simulate(near, tmp_path / "new", settings=both).files
+    assert contents(report.files[0]) == contents(wanted)
+
+
 def contents(file: str) -> list[tuple[object, ...]]:
     """The header of a frame log and all its frames."""
     log = FrameLog(file)

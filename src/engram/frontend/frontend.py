@@ -61,7 +61,7 @@ class FrontendConfig:
     landmarks: Annotated[int, Meta(ge=1, le=100_000)] = 600
     octaves: Annotated[int, Meta(ge=1, le=4)] = 2
     fast_threshold: Annotated[int, Meta(ge=1, le=254)] = 7
-    second_threshold: Annotated[int, Meta(ge=0, le=254)] = 0
+    second_threshold: Annotated[int, Meta(ge=0, le=254)] = 3
     cell_px: Annotated[int, Meta(ge=4, le=4096)] = 32
     max_disparity_px: Annotated[int, Meta(ge=1, le=500)] = 124
     min_disparity_px: Annotated[float, Meta(ge=1 / 64, le=500)] = 0.5
@@ -73,6 +73,11 @@ class FrontendConfig:
     min_landmarks: Annotated[int, Meta(ge=0, le=100_000)] = 40
     dark_mean: Annotated[float, Meta(ge=0, le=255)] = 16.0
     thumbnails: bool = True
+
+    def landmarks_for(self, pixels: int) -> int:
+        """Landmarks wanted of an image of so many pixels; `landmarks` is for 512 × 384."""
+        relative_area = pixels / (512 * 384)
+        return max(1, round(self.landmarks * float(relative_area**0.6)))
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -107,7 +112,7 @@ class Frontend:
         _check_images(pair)
         pair, config = without_body(pair), self.config
         kind = feature_kind(config.descriptor)
-        found = kind.detect(pair, config, _landmarks_for(pair.left, config.landmarks))
+        found = kind.detect(pair, config, config.landmarks_for(pair.left.size))
         if pair.mask is not None:
             found = clear_of_body(found, pair.mask)
         descriptors = found.descriptors
@@ -159,11 +164,6 @@ def _settings_hash(config: FrontendConfig) -> str:
     if not config.second_threshold:
         del settings["second_threshold"]
     return config_hash(settings)
-
-
-def _landmarks_for(image: NDArray[np.uint8], at_512x384: int) -> int:
-    relative_area = image.size / (512 * 384)
-    return max(1, round(at_512x384 * float(relative_area**0.6)))
 
 
 def _check_images(pair: StereoPair) -> None:

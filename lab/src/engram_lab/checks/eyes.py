@@ -66,7 +66,7 @@ class Eyes:
     frontend: Frontend
 
     @staticmethod
-    def of(name: str, second_threshold: int = 0) -> Eyes:
+    def of(name: str, second_threshold: int = FrontendConfig.second_threshold) -> Eyes:
         """A kind by its name, with or without the front-end's second look."""
         kind = feature_kind(name)
         config = FrontendConfig(
@@ -239,7 +239,7 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--kinds", default="brief,net", help="joined by commas")
     parser.add_argument(
-        "--second", type=int, default=0, metavar="LEVELS", help="frontend.second_threshold"
+        "--second", type=int, default=3, metavar="LEVELS", help="frontend.second_threshold"
     )
     parser.add_argument("--out", type=Path, help="OUT.csv and OUT.table.md are written")
     asked = parser.parse_args()

@@ -19,7 +19,7 @@ from engram.sequences import FrameLog, LoggedFrame
 from engram.sequences.trajectories import Trajectory, read_truth, truth_path
 from engram_lab.town import Campaign, Size, campaign_named
 from engram_lab.town.simulating import campaign_folder
-from engram_lab.town.upkeep import bring_up_to_date
+from engram_lab.town.upkeep import Upkeep, bring_up_to_date, first_look
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,9 +150,9 @@ def open_campaign(
             f"{campaign.seed} --size {size.value} --out {quote(str(campaigns))}"
         )
     settings = settings or Settings()
-    drives, frontend = drives_of(paths), Frontend(settings.frontend).hash
-    same = [one.path for one in drives if one.frontend == frontend]
-    if sum(bring_up_to_date(path, settings) for path in same):
+    drives, ours = drives_of(paths), {Frontend(settings.frontend).hash, first_look(settings)}
+    same = [one.path for one in drives if one.frontend in ours]
+    if {bring_up_to_date(path, settings) for path in same} - {Upkeep.KEPT}:
         drives = drives_of(paths)
     return DriveSet(text, drives)
 

@@ -27,7 +27,7 @@ from engram.sequences import FrameLog
 from engram.sequences.trajectories import truth_path, write_tum
 from engram_lab.town import WORLD_VERSION, Campaign
 from engram_lab.town.sequence import SimulatedSequence
-from engram_lab.town.upkeep import bring_up_to_date
+from engram_lab.town.upkeep import Upkeep, bring_up_to_date
 
 
 @dataclass(slots=True)
@@ -92,7 +92,8 @@ def simulate(
 ) -> SimulateReport:
     """Renders a campaign's sessions that are not there yet.
 
-    Odometry that has changed is run anew over the landmarks of sessions that are there.
+    Odometry that has changed is run anew over the landmarks of sessions that are there. Of logs of
+    before the front-end's second look only those are rendered again in which a frame would get one.
 
     Frame logs stand as `NAME.framelog` with `NAME.truth.txt` beside them; images in KITTI's
     odometry layout, `sequences/NN` and `poses/NN.txt`. A killed run is resumed by the same call:
@@ -161,8 +162,18 @@ def _is_done(task: _Task) -> bool:
         return False
     log = FrameLog(task.target)
     log.close()
-    if log.complete:  # a campaign is of one make, or its sessions do not compare
-        bring_up_to_date(task.target, task.settings)
+    if not log.complete:
+        return False
+    # A campaign is of one make, or its sessions do not compare.
+    return bring_up_to_date(task.target, task.settings) is not Upkeep.OUTDATED
+
+
+def _is_outdated(target: Path) -> bool:
+    """Whether a whole log is there, which a session that is rendered anew replaces."""
+    if not target.exists():
+        return False
+    log = FrameLog(target)
+    log.close()
     return log.complete
 
 
@@ -183,6 +194,9 @@ def _render(task: _Task, monitor: Monitor) -> None:
     def count(_: str) -> None:
         monitor.advance(sequence.info.name)
 
+    truth_path(task.target).unlink(missing_ok=True)  # it says that the session is whole
+    if _is_outdated(task.target):
+        task.target.unlink()
     report = extract_log(sequence, task.target, task.settings, Advancing(count))
     if report.interrupted:
         raise KeyboardInterrupt

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from enum import Enum
 from pathlib import Path
 
 from engram.config import config_hash
@@ -12,19 +13,28 @@ from engram.monitor import write_whole
 from engram.odometry import Odometry
 from engram.robot import Settings
 from engram.sequences import FrameLog, FrameLogWriter, LoggedFrame
+from engram.sequences.framelog.header import FrameLogHeader
 
 
-def bring_up_to_date(path: Path, settings: Settings) -> bool:
-    """Runs odometry over a whole log's frames again where it was made by other odometry.
+class Upkeep(Enum):
+    """What became of a log."""
 
-    The log is replaced in one step; frames, hashes of images and the drive's identity stay.
+    KEPT = "kept"
+    REWRITTEN = "rewritten"
+    # Its front-end took no second look, which some of its frames would get now.
+    OUTDATED = "outdated"
+
+
+def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
+    """Rewrites a log of older odometry, or of a front-end that gives the same landmarks.
+
+    Odometry is run over the landmarks again. A log of a front-end without a second look holds what
+    one with it gives, if no frame lacks landmarks; only then it becomes one of the other. The log
+    is replaced in one step; frames, hashes of images and the drive's identity stay.
 
     Args:
         path: NAME.framelog, recorded to its end.
         settings: of front-end and odometry.
-
-    Returns:
-        Whether the log was rewritten.
 
     Raises:
         IncompatibleError: it was made by another front-end: its landmarks are others.
@@ -33,24 +43,39 @@ def bring_up_to_date(path: Path, settings: Settings) -> bool:
     log = FrameLog(path)
     try:
         frontend, odometry = Frontend(settings.frontend).hash, config_hash(settings.odometry)
-        if log.header.frontend != frontend:
+        outdated = False
+        if log.header.frontend not in {frontend, first_look(settings)}:
             raise IncompatibleError(
                 f"{path}: was rendered with another version or other settings of the front-end "
                 f"({log.header.frontend}, now {frontend}); give another --out, or remove the "
                 "folder to render anew"
             )
-        if log.header.odometry == odometry:
-            return False
-        with write_whole(path) as draft:
-            _rewrite(log, draft, odometry, settings)
+        if log.header.frontend != frontend and _lacks_landmarks(log, settings):
+            outdated, frontend = True, log.header.frontend
+        header = replace(log.header, odometry=odometry, frontend=frontend)
+        if header != log.header:
+            with write_whole(path) as draft:
+                _rewrite(log, draft, header, settings)
     finally:
         log.close()
-    return True
+    if outdated:
+        return Upkeep.OUTDATED
+    return Upkeep.KEPT if header == log.header else Upkeep.REWRITTEN
 
 
-def _rewrite(log: FrameLog, draft: Path, odometry: str, settings: Settings) -> None:
+def first_look(settings: Settings) -> str:
+    """Hash of the same front-end without its second look."""
+    return Frontend(replace(settings.frontend, second_threshold=0)).hash
+
+
+def _lacks_landmarks(log: FrameLog, settings: Settings) -> bool:
+    wanted = settings.frontend.landmarks_for(log.camera.width * log.camera.height)
+    return any(len(one.frame.landmarks.pixels) < wanted for one in log)
+
+
+def _rewrite(log: FrameLog, draft: Path, header: FrameLogHeader, settings: Settings) -> None:
     engine = Odometry(settings.odometry)
-    with FrameLogWriter(draft, replace(log.header, odometry=odometry)) as writer:
+    with FrameLogWriter(draft, header) as writer:
         for index, logged in enumerate(log):
-            step = engine.step(logged.frame)
-            writer.append(LoggedFrame(logged.frame, step), log.pair_hash(index))
+            frame = replace(logged.frame, frontend=header.frontend)
+            writer.append(LoggedFrame(frame, engine.step(frame)), log.pair_hash(index))
