@@ -66,7 +66,7 @@ class Eyes:
     frontend: Frontend
 
     @staticmethod
-    def of(name: str, second_threshold: int = FrontendConfig.second_threshold) -> Eyes:
+    def of(name: str, second_threshold: int = FrontendConfig().second_threshold) -> Eyes:
         """A kind by its name, with or without the front-end's second look."""
         kind = feature_kind(name)
         config = FrontendConfig(
