@@ -80,6 +80,15 @@ def test_an_unplugged_camera_is_no_reason_to_jump() -> None:
     assert robot.sigma_m > 50.0
 
 
+def test_a_start_that_was_not_seen_is_not_made_up_for_at_once() -> None:
+    robot = Driven()
+    for _ in range(3):
+        robot.see(FAILED)
+    robot.see(ahead(0.5))
+    assert robot.longest_step_m == pytest.approx(0.5)
+    assert 0.5 + 3 * robot.sigma_m > 2.0
+
+
 def test_what_was_measured_over_a_pause_is_taken() -> None:
     """Wheels, or the same view: the robot did move in between."""
     robot = Driven()

@@ -46,6 +46,10 @@ class Track:
         ahead = motion.ahead
         if motion.prev_from_curr is not None and motion.covariance is not None:
             ahead = motion.prev_from_curr, motion.covariance
+            measured = motion.odometry.prev_from_curr
+            if not motion.guessed_m and measured is not None:
+                # What it makes up for, from before odometry began, would be a jump.
+                ahead = measured, _held(measured, *ahead)
         if ahead is None:
             return replace(self, _usable=None, _stamp_ns=stamp_ns)
         to = base @ ahead[0]
