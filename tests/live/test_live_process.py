@@ -164,6 +164,10 @@ def test_a_person_says_where_it_is_and_a_match_decides(
     yaw_rad = float(np.arctan2(place[1, 2], place[0, 2]))
     said = {"x_m": place[0, 3] + 1.0, "y_m": place[1, 3], "yaw_rad": yaw_rad}
     assert answered(client, "here", **said)["ok"]
+    dark = replace(pairs[4], left=np.zeros_like(pairs[4].left), right=np.zeros_like(pairs[4].left))
+    hinted = seen(client, replace(dark, stamp_ns=pairs[4].stamp_ns - 1))
+    assert "node" not in hinted, "a hint is no pose"
+    assert "map_from_live" not in hinted
     assert seen(client, pairs[4])["status"] == "localised"
     assert "finite" in answered(client, "here", x_m="nan", y_m=0, yaw_rad=0)["text"]
 

@@ -43,6 +43,7 @@ class Peer(Node):
         super().__init__("peer")
         self.pairs, self.places, self.sent, self.sent_at = pairs, 0, 0, {}
         self.odometry, self.status, self.poses, self.ages_s, self.transforms = [], [], [], [], []
+        self.posed_at = []
         self.shows, self.shift_s, self.spoils = False, 0.0, None
         self._compressed = compressed
         kind, ending = (CompressedImage, "/compressed") if compressed else (Image, "")
@@ -128,6 +129,7 @@ class Peer(Node):
         covariance = np.reshape(message.pose.covariance, (6, 6))[:3, :3]
         where = message.pose.pose.position
         spread_m = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        self.posed_at.append(time.monotonic())
         self.poses.append((self._number(message)[1], where.x, where.y, where.z, spread_m))
 
     def _hear_status(self, message) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from engram.errors import EngramError, InputError
 from engram.frontend import DescriptorKind, StereoPair
 from engram.geometry import SE3, StereoCamera
-from engram.localiser import Localisation, Position
+from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
 from engram.robot.front import Arrived, Front
@@ -62,12 +62,23 @@ class Step:
         found: the localisation; None without a robot, or if the frame was not taken.
         trouble: what went wrong; "" if nothing did.
         map_from_live: pose in the map frame; None where it is not known.
+        proposed: whether the position still rests on a hint that no match has confirmed.
     """
 
     motion: Motion | None = None
     found: Localisation | None = None
     trouble: str = ""
     map_from_live: SE3 | None = None
+    proposed: bool = False
+
+    @property
+    def status(self) -> str:
+        """Status of the localisation, `fault` without one; who has but a hint is lost."""
+        if self.found is None:
+            return "fault"
+        if self.proposed and self.found.status is LocalisationStatus.DEAD_RECKONING:
+            return LocalisationStatus.LOST.value
+        return self.found.status.value
 
 
 class Watcher(Protocol):
@@ -106,6 +117,8 @@ class Driving:
         self._robot: Robot | None = None
         self._saved = Saving()
         self._belief: Position | None = None
+        # Whether the robot's position is one that it was only told.
+        self._proposed = False
         self._stamp_ns: int | None = None
         self._wheels_from_live: SE3 | None = None
         self._open_after = -np.inf
@@ -148,8 +161,10 @@ class Driving:
             return Step(trouble=self.trouble)
         self._belief = found.position
         map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
+        if found.status is LocalisationStatus.LOCALISED or found.position is None or found.saved:
+            self._proposed = False
         self.trouble = robot.saving.reason if robot.saving.state in _KEEPS_NO_MORE else ""
-        return Step(found.motion, found, self.trouble, map_from_live)
+        return Step(found.motion, found, self.trouble, map_from_live, self._proposed)
 
     def _driven(self, stamp_ns: int, wheels_from_live: SE3 | None) -> OutsideMotion | None:
         """What the wheels measured since the frame before; None if they did not."""
@@ -209,6 +224,7 @@ class Driving:
             What became of the drive; "" if none was saved.
         """
         robot, self._robot = self._robot, None
+        self._proposed = False
         opened, self._map, self._whereabouts = self._map, None, None
         self._open_after = -np.inf
         if robot is None or opened is None:
@@ -271,6 +287,7 @@ class Driving:
         belief, self._belief = self._belief, None
         if belief is not None and belief.node in self._map.graph:
             self._robot.place_at(_vague(belief))
+            self._proposed = True
 
     @staticmethod
     def _map_of(options: LiveOptions) -> Map:

@@ -103,7 +103,7 @@ class LiveProcess:
         arrived = event.arrived
         stamp_ns = (arrived if isinstance(arrived, StereoPair) else arrived.frame).stamp_ns
         self._track = self._track.after(step, stamp_ns)
-        status = "fault" if step.found is None else step.found.status.value
+        status = step.status
         before = self._health
         self._health = replace(
             before,
@@ -130,7 +130,7 @@ class LiveProcess:
     def _placed(self, step: Step) -> Message:
         """The pose in the map frame, where the belief's node has a place in it."""
         position = None if step.found is None else step.found.position
-        if position is None or step.map_from_live is None:
+        if position is None or step.map_from_live is None or step.proposed:
             return {}
         adjoint = (step.map_from_live @ position.node_from_live.inverse()).adjoint()
         return {
@@ -200,7 +200,7 @@ def _found(step: Step) -> Message:
         "open_loop_m": found.open_loop_m,
         "saved": None if found.saved is None else str(found.saved),
     }
-    if found.position is not None:
+    if found.position is not None and not step.proposed:
         said["node"] = str(found.position.node)
         said["node_from_live"] = _flat(found.position.node_from_live.matrix())
         said["covariance"] = _flat(found.position.covariance)

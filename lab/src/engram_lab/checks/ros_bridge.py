@@ -1,0 +1,200 @@
+"""The ROS 2 bridge under faults, or beside busy loops, with a real ROS 2 from wheels.
+
+    python -m engram_lab.checks.ros_bridge faults DRIVE --ros .venv-ros/bin/python [--times 50]
+    python -m engram_lab.checks.ros_bridge endure DRIVE --ros .venv-ros/bin/python [--minutes 10]
+
+`make test-ros` makes that environment. The first frames of the drive are shown there and back at
+20 Hz, resized to 640×480, in a map of themselves. `faults` injects each fault so many times and
+waits until the robot localises again; `endure` measures frames dropped, the age of the pose when
+another node hears it, and the shares of a core. Ends with 1 if a row misses its limit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from engram.frontend import StereoPair
+from engram.geometry import StereoCamera
+from engram.robot import map_drive, open_drive
+from engram.sequences import SequenceInfo
+
+_BRIDGE = Path(__file__).parents[4] / "ros" / "engram_bridge"
+_LONGEST_SILENCE_S = 1.0
+_MOST_DROPPED, _MEDIAN_MS, _LATE_MS, _CORE = 0.01, 40.0, 100.0, 0.25
+
+
+class Resized:
+    """The first pairs of a drive at another size, as a drive."""
+
+    def __init__(self, path: Path, frames: int, width: int, height: int) -> None:
+        drive = open_drive(path)
+        self.info: SequenceInfo = drive.info
+        self.skipped = 0
+        camera = drive.camera
+        scale = width / camera.width, height / camera.height
+        self.camera = StereoCamera(
+            fx=camera.fx * scale[0],
+            fy=camera.fy * scale[1],
+            cx=(camera.cx + 0.5) * scale[0] - 0.5,
+            cy=(camera.cy + 0.5) * scale[1] - 0.5,
+            baseline_m=camera.baseline_m,
+            width=width,
+            height=height,
+        )
+        self._pairs = [self._resized(pair) for pair, _ in zip(drive, range(frames), strict=False)]
+
+    def _resized(self, pair: Any) -> StereoPair:
+        size = self.camera.width, self.camera.height
+        left, right = (
+            np.asarray(cv2.resize(one, size, interpolation=cv2.INTER_AREA), np.uint8)
+            for one in (pair.left, pair.right)
+        )
+        return StereoPair(pair.stamp_ns, left, right, self.camera)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return iter(self._pairs)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("what", choices=["faults", "endure"])
+    parser.add_argument("drive", type=Path)
+    parser.add_argument("--ros", type=Path, required=True, help="a Python with rclpy")
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--times", type=int, default=50, help="of each fault")
+    parser.add_argument("--only", help="these faults, by comma; without the lost half minutes")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--busy", type=int, default=2, help="busy loops")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="engram-ros-") as folder:
+        town = _prepared(asked.drive, asked.frames, Path(folder))
+        with _bridge(asked.ros, town) as bridge:
+            given = ["--times", str(asked.times), "--faults", asked.only] if asked.only else []
+            if asked.what == "faults" and not asked.only:
+                given = ["--times", str(asked.times), "--lost"]
+            if asked.what == "endure":
+                given = ["--minutes", str(asked.minutes), "--busy", str(asked.busy)]
+            said = _measured(asked.ros, asked.what, town, bridge, given)
+    return _faults(said) if asked.what == "faults" else _endurance(said)
+
+
+def _prepared(path: Path, frames: int, folder: Path) -> Path:
+    """Writes the pairs, and a map of them."""
+    drive = Resized(path, frames, 640, 480)
+    pairs, camera = list(drive), drive.camera
+    np.savez(
+        folder / "pairs.npz",
+        left=[one.left for one in pairs],
+        right=[one.right for one in pairs],
+        camera=[camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m],
+    )
+    town = folder / "town.engram"
+    map_drive(town, drive)
+    live = folder / "engram"
+    live.write_text(
+        f"#!/bin/sh\nPYTHONPATH={os.pathsep.join(sys.path)} LD_LIBRARY_PATH= exec "
+        f"{sys.executable} -c 'from engram.cli import main; main()' \"$@\"\n"
+    )
+    live.chmod(0o755)
+    return town
+
+
+def _of_ros(python: Path) -> dict[str, str]:
+    root = python.absolute().parents[1]  # a virtual environment's Python is a link: not resolved
+    made = root / "messages"
+    paths = [_BRIDGE, *made.glob("lib/*/site-packages")]
+    return {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(map(str, paths)),
+        "AMENT_PREFIX_PATH": f"{made}:{root}",
+        "LD_LIBRARY_PATH": f"{made}/lib:{root}/lib",
+        "ROS_DOMAIN_ID": str(os.getpid() % 100),
+    }
+
+
+@contextmanager
+def _bridge(python: Path, town: Path) -> Iterator[int]:
+    """A bridge that runs; its pid."""
+    parameters = (f"map:={town}", f"command:=[{town.parent / 'engram'}]")
+    given = [part for one in parameters for part in ("-p", one)]
+    command = [str(python), "-m", "engram_bridge.node", "--ros-args", *given]
+    with (
+        (town.parent / "bridge.log").open("w") as log,
+        subprocess.Popen(command, env=_of_ros(python), stdout=log, stderr=log) as process,
+    ):
+        try:
+            yield process.pid
+        finally:
+            process.send_signal(signal.SIGINT)
+
+
+def _measured(python: Path, what: str, town: Path, bridge: int, given: list[str]) -> dict[str, Any]:
+    program = [str(python), str(_BRIDGE / "test" / "measure.py"), what]
+    command = [*program, str(town.parent / "pairs.npz"), str(town), "--bridge", str(bridge), *given]
+    ran = subprocess.run(
+        command, env=_of_ros(python), stdout=subprocess.PIPE, text=True, check=False
+    )
+    if ran.returncode:
+        sys.exit((town.parent / "bridge.log").read_text()[-2000:])
+    said: dict[str, Any] = json.loads(ran.stdout.splitlines()[-1])
+    return said
+
+
+_COLUMNS = (
+    "fault",
+    "times",
+    "longest silence",
+    "poses claimed wrongly",
+    "jumps in odom",
+    "small covariances",
+    "localised again, median",
+)
+
+
+def _faults(said: dict[str, Any]) -> int:
+    print(f"| {' | '.join(_COLUMNS)} |\n|{' --- |' * len(_COLUMNS)}")
+    missed = False
+    for row in said["rows"]:
+        small = row.get("small_covariances", 0)
+        print(
+            f"| {row['fault']} | {row['times']} | {row['longest_silence_s']:.2f} s | "
+            f"{row['wrong_poses']} | {row['jumps']} | {small} | {row['median_recovery_s']:.1f} s |"
+        )
+        silent = row["longest_silence_s"] > _LONGEST_SILENCE_S
+        missed |= silent or bool(row["wrong_poses"] or row["jumps"] or small)
+    return int(missed)
+
+
+def _endurance(said: dict[str, Any]) -> int:
+    age_ms, shares = said["age_ms"], said["share_of_a_core"]
+    print(
+        f"{said['minutes']:g} minutes at {said['rate_hz']:.1f} Hz beside {said['busy_loops']} busy "
+        f"loops, {said['sent']} frames\n"
+        f"dropped: {said['dropped']} ({said['dropped_share']:.2%})\n"
+        f"age when heard, ms: {age_ms['50']:.1f} median, {age_ms['90']:.1f} of 90 %, "
+        f"{age_ms['99']:.1f} of 99 %, {age_ms['100']:.0f} largest\n"
+        f"share of a core: bridge {shares['bridge']:.1%}, live process {shares['live']:.1%}\n"
+        f"localised: {said['localised_share']:.1%} of the reports"
+    )
+    late = age_ms["50"] > _MEDIAN_MS or age_ms["99"] > _LATE_MS
+    return int(late or said["dropped_share"] > _MOST_DROPPED or sum(shares.values()) > _CORE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
