@@ -18,6 +18,7 @@ from engram_lab.town.simulating import campaign_folder, campaigns_folder, simula
 FITTED_TOWNS = (301, 302)
 HELD_OUT_TOWNS = (401,)
 LOOP_M = 200.0
+_NIGHT_FROM_H = 21
 _FIRST_DAY = datetime(2025, 7, 14, tzinfo=UTC)
 # Day, hour (UTC), weather and robot of each drive; two by night, one of them in rain.
 _DRIVES = (
@@ -57,6 +58,11 @@ def trial_town(seed: int) -> Campaign:
         for plan, (day, hour, weather, robot) in zip(hamlet.sessions, _DRIVES, strict=True)
     )
     return replace(hamlet, name="trial", home="trial", length_m=LOOP_M, sessions=sessions)
+
+
+def light_of(plan: SessionPlan) -> str:
+    """Weather of a drive, and whether it is by day."""
+    return f"{plan.weather}, {'night' if plan.start.hour >= _NIGHT_FROM_H else 'day'}"
 
 
 # Each map is built from some drives, and localises another.

@@ -18,7 +18,7 @@ from engram.monitor import QUIET
 from engram.robot import Settings
 from engram_lab.misplaced import Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
-from engram_lab.trial_towns import HELD_OUT_TOWNS, all_streets
+from engram_lab.trial_towns import HELD_OUT_TOWNS, all_streets, light_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +68,10 @@ def compared(towns: Sequence[int]) -> Iterator[Compared]:
     """All drives of some towns."""
     for plan, name, street in all_streets(towns, Settings(), 8, QUIET):
         found = {rule: fixes(street, rule) for rule in Rule}
-        hour = plan.start.hour + plan.start.minute / 60
         street.close()
         yield Compared(
             name,
-            f"{plan.weather}, {'night' if hour > 21 else 'day'}",
+            light_of(plan),
             plan.robot,
             len(street.frames),
             {rule: right for rule, (right, _) in found.items()},
