@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from uuid import uuid5
 
@@ -9,6 +10,7 @@ from engram.graph.basin import MatchBasin
 from engram.graph.clock import Clocked
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import ENGRAM_NAMESPACE, LandmarkSource, SessionId
+from engram.graph.neighbourhood import Neighbourhood
 from engram.graph.paths import PathMemory
 from engram.ranking import Background
 
@@ -25,12 +27,15 @@ class MapParts:
         paths: the path memory.
         frames: where the landmarks of nodes come from.
         background: what policies may know about the map beyond its graph and paths.
+        search: finds the candidates; None for the graph's own `neighbourhood`. Localisers of one
+            drive on a fixed graph may share a search with a cache.
     """
 
     graph: ExperienceGraph
     paths: PathMemory
     frames: LandmarkSource
     background: Background = field(default_factory=Background)
+    search: Callable[..., Neighbourhood] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -72,8 +72,6 @@ class Localiser:
         config: settings.
         matcher: the first half of an attempt; None matches with the landmarks of `known`.
         threads: whether lanes run on threads; a given `matcher` decides this itself.
-        search: finds the candidates; None for the graph's own `neighbourhood`. Localisers of one
-            drive on a fixed graph may share a search with a cache.
     """
 
     def __init__(
@@ -87,7 +85,6 @@ class Localiser:
         config: LocaliserConfig | None = None,
         matcher: Matcher | None = None,
         threads: bool = True,
-        search: Callable[..., Neighbourhood] | None = None,
     ) -> None:
         self.config = config or LocaliserConfig()
         self.live = drive.live
@@ -101,7 +98,7 @@ class Localiser:
         self._policy = policy
         self._budget = budget
         self._relocaliser = relocaliser
-        self._search = search or self._own_search()
+        self._search = known.search or self._own_search()
         self._attempter = Attempter(known.frames, self.config, matcher)
         self._pool = (
             ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")

@@ -43,7 +43,7 @@ from engram.maps.sqlite import SqliteDatabase, map_path
 from engram.maps.tags import Tag, set_tag, take_tag_away
 from engram.maps.view import View, head
 from engram.maps.words import words_row, write_words
-from engram.maps.writer import RevisionWriter
+from engram.maps.writer import Resumable, RevisionWriter
 
 if TYPE_CHECKING:
     from engram.robot.robot import Robot
@@ -233,7 +233,7 @@ class Map(MapReader):
         self._check_none_open()
         self._check_new(session)
         row = new_revision(self._keys, self._holder, author, message, configuration)
-        writer = self._begin(row, session=session)
+        writer = self._begin(row, Resumable(session))
         try:
             writer.add_session(session, camera, descriptor=descriptor, frontend=frontend)
             writer.checkpoint()
@@ -262,7 +262,7 @@ class Map(MapReader):
             )
             stored = stored_session(connection, own, row)
             camera = reading.load_cameras(connection)[row["camera"]]
-        return self._written(own, session=session_from_row(row, camera.id), stored=stored)
+        return self._written(own, Resumable(session_from_row(row, camera.id), stored))
 
     @_writes
     def seal(self, session: SessionId) -> Revision:
@@ -498,7 +498,7 @@ class Map(MapReader):
             self._lock = None
 
     def _begin(
-        self, row: Row, *, session: Session | None = None, committed_ns: int | None = None
+        self, row: Row, drive: Resumable | None = None, committed_ns: int | None = None
     ) -> RevisionWriter:
         """A new, empty revision."""
         with self._database.writing() as connection:
@@ -506,11 +506,13 @@ class Map(MapReader):
             connection.execute(insert(revisions), [sealed(revisions, row)])
         self._keys.forget_nodes()  # some may be hidden since then
         own = View(self._view.at, row["key"])
-        return self._written(own, session=session, committed_ns=committed_ns)
+        return self._written(own, drive, committed_ns)
 
-    def _written(self, own: View, *, session: Session | None, **kind: Any) -> RevisionWriter:
+    def _written(
+        self, own: View, drive: Resumable | None, committed_ns: int | None = None
+    ) -> RevisionWriter:
         """The writer of a revision; until it ends, this map includes its rows."""
-        if session is not None:
+        if drive is not None:
             self.forget()  # later reads include the session
             self._keys.forget_nodes()  # so do later searches for its nodes
         self._see(own)
@@ -520,9 +522,9 @@ class Map(MapReader):
             self.frames,
             own,
             self._writing_ended,
-            session=session,
+            drive=drive,
+            committed_ns=committed_ns,
             places=partial(new_places, self),
-            **kind,
         )
         return self._writing
 

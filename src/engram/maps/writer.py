@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
@@ -74,6 +75,19 @@ from engram.maps.view import View
 _BATCH_BYTES = 8 * 2**20
 
 
+@dataclass(frozen=True, slots=True)
+class Resumable:
+    """The drive of a resumable revision.
+
+    Attributes:
+        session: the drive.
+        stored: its checkpointed part; None for a new revision.
+    """
+
+    session: Session
+    stored: StoredSession | None = None
+
+
 class RevisionWriter:
     """Adds records to a map, in one atomic revision.
 
@@ -94,15 +108,14 @@ class RevisionWriter:
         database, keys, frame_reader: the map's.
         view: the newest revision and this one, which has the state abandoned until a checkpoint.
         on_end: called after commit or abandonment.
-        session: the drive of a resumable revision; None for others.
-        stored: the checkpointed part of a resumed session; None for a new revision.
+        drive: the drive of a resumable revision; None for others.
         committed_ns: time of the commit to store, UTC, ns; None for the actual time.
         places: gives, for the contents of the revision, the places in the map frame that it
             changes; called before the commit.
 
     Attributes:
         resumable: whether it is of one drive.
-        stored: as given; empty for a new revision.
+        stored: the checkpointed part of a resumed session; empty for a new revision.
     """
 
     def __init__(
@@ -113,14 +126,14 @@ class RevisionWriter:
         view: View,
         on_end: Callable[[], None],
         *,
-        session: Session | None = None,
-        stored: StoredSession | None = None,
+        drive: Resumable | None = None,
         committed_ns: int | None = None,
         places: Callable[[Mapping[str, float]], Sequence[Mark]] = lambda _: (),
     ) -> None:
         assert view.own is not None
-        self.resumable = session is not None
-        self._session = session
+        self.resumable = drive is not None
+        self._session = None if drive is None else drive.session
+        stored = None if drive is None else drive.stored
         self.stored = stored or StoredSession()
         self._database = database
         self._keys = keys

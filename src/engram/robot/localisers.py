@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -37,21 +38,35 @@ from engram.ranking import (
 from engram.robot.settings import Settings
 
 
+class LocaliserParts(TypedDict, total=False):
+    """How a localiser differs from the default one.
+
+    Attributes:
+        policy: key of `POLICIES`, or a policy.
+        budget: attempts per frame; None for 2 lanes × 2 rounds.
+        relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
+        live: the live session.
+        saves: whether the session is being mapped.
+        threads: whether lanes run on threads.
+        matcher, search: replace the default ones; see `Localiser` and `MapParts`.
+        clock: time zone and location of its stamps; None if unknown.
+        path_memory: replaces that of the map.
+    """
+
+    policy: str | RankingPolicy
+    budget: Budget | None
+    relocaliser: str | Relocaliser | None
+    live: SessionId
+    saves: bool
+    matcher: Matcher | None
+    threads: bool
+    search: Callable[..., Neighbourhood] | None
+    clock: Clocked | None
+    path_memory: PathMemory | None
+
+
 def localiser_in(
-    opened: Map,
-    camera: StereoCamera,
-    settings: Settings,
-    *,
-    policy: str | RankingPolicy = "recall",
-    budget: Budget | None = None,
-    relocaliser: str | Relocaliser | None = "fabmap",
-    live: SessionId = UNNAMED_LIVE_SESSION,
-    saves: bool = False,
-    matcher: Matcher | None = None,
-    threads: bool = True,
-    search: Callable[..., Neighbourhood] | None = None,
-    clock: Clocked | None = None,
-    path_memory: PathMemory | None = None,
+    opened: Map, camera: StereoCamera, settings: Settings, **parts: Unpack[LocaliserParts]
 ) -> Localiser:
     """A localiser for one session in a map.
 
@@ -59,19 +74,13 @@ def localiser_in(
         opened: the map.
         camera: the live camera; it may differ from those of the map.
         settings: the resolved configuration.
-        policy: key of `POLICIES`, or a policy.
-        budget: attempts per frame; None for 2 lanes × 2 rounds.
-        relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
-        live: the live session.
-        saves: whether the session is being mapped.
-        threads: whether lanes run on threads.
-        matcher, search: replace the default ones; see `Localiser`.
-        clock: time zone and location of its stamps; None if unknown.
-        path_memory: replaces that of the map.
+        **parts: what differs from the default; see `LocaliserParts`.
 
     Raises:
         ConfigError: the policy or the relocaliser is unknown.
     """
+    policy = parts.get("policy", "recall")
+    relocaliser = parts.get("relocaliser", "fabmap")
     ranking = policy_named(policy) if isinstance(policy, str) else policy
     descriptor = settings.frontend.descriptor
     words = opened.derived(words_of, descriptor)
@@ -83,19 +92,23 @@ def localiser_in(
     )
     if uses_words(ranking):
         words.prepare()
-    paths = path_memory or _counted_paths(opened, settings)
+    paths = parts.get("path_memory") or _counted_paths(opened, settings)
     return Localiser(
-        MapParts(opened.graph, paths, opened.frames, background),
-        LiveDrive(MatchBasin.of(camera.fx, opened.basin_counts), live, saves, clock),
+        MapParts(opened.graph, paths, opened.frames, background, parts.get("search")),
+        LiveDrive(
+            MatchBasin.of(camera.fx, opened.basin_counts),
+            parts.get("live", UNNAMED_LIVE_SESSION),
+            parts.get("saves", False),
+            parts.get("clock"),
+        ),
         policy=ranking,
-        budget=budget or Budget(),
+        budget=parts.get("budget") or Budget(),
         relocaliser=relocaliser_in(opened, relocaliser, descriptor)
         if isinstance(relocaliser, str)
         else relocaliser,
         config=settings.localiser,
-        matcher=matcher,
-        threads=threads,
-        search=search,
+        matcher=parts.get("matcher"),
+        threads=parts.get("threads", True),
     )
 
 
