@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property
 
 from engram.fleet.merge.behind_gaps import Ahead, look_along, position_behind_gap
+from engram.fleet.merge.held import Held
 from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.fleet.merge.segments import Segment
@@ -34,7 +34,6 @@ from engram.localiser import (
     Hint,
     Keeper,
     Localisation,
-    LocalisationStatus,
     Localiser,
     Position,
     Relocaliser,
@@ -57,31 +56,6 @@ _MEASURED = frozenset({EdgeKind.ODOMETRY, EdgeKind.MATCH, EdgeKind.TIE, EdgeKind
 _ITERATION_GAP = 100
 # Fixes that a position counts for that the robot itself measured on its drive.
 _AGREED = 5
-
-
-@dataclass(slots=True, eq=False)
-class _Held:
-    """A replayed node, held back while its fix or one before it may still be withdrawn."""
-
-    stored: StoredNode
-    live: Frame
-    found: Localisation
-    outcomes: Sequence[Outcome]
-    attempts: list[Attempt]
-
-    def withdrawn(self, *, is_the_fix: bool) -> None:
-        """The position is unknown; of the disproved fix also the match is none."""
-        self.found = replace(self.found, position=None)
-        if is_the_fix:
-            self.found = replace(
-                self.found,
-                status=LocalisationStatus.LOST,
-                node=None,
-                node_from_live=None,
-                covariance=None,
-            )
-            self.outcomes = ()
-            self.attempts = [replace(one, accepted=False) for one in self.attempts]
 
 
 class Replay(Keeper):
@@ -122,7 +96,7 @@ class Replay(Keeper):
         self._ahead: Ahead | None = None  # found behind a gap, ahead of its turn
         self._run: list[int] = []  # nodes taken in a row, by their dense indices
         self._visited: NodeId | None = None  # matched or taken last
-        self._held: list[_Held] = []
+        self._held: list[Held] = []
         self._kept: list[KeptNode] = []
         # Whether the segment is omitted as a whole; None where each frame decides.
         self._omits: bool | None = None
@@ -179,7 +153,7 @@ class Replay(Keeper):
         outcomes, attempts = self._localiser.outcomes, self._localiser.attempts()
         if self._ahead is not None and self._ahead.found is found:
             outcomes, attempts = self._ahead.outcomes, []
-        self._held.append(_Held(self._stored, live, found, outcomes, attempts))
+        self._held.append(Held(self._stored, live, found, outcomes, attempts))
         if not self._localiser.on_trial:
             self._release()
         report = self._merge.report
@@ -362,7 +336,7 @@ class Replay(Keeper):
             return Reason.NO_MATCH
         return Reason.NO_PLACE if found.attempts else Reason.NOTHING_NEAR
 
-    def _take(self, held: _Held) -> None:
+    def _take(self, held: Held) -> None:
         """Takes a node, with its own edges and the one to its match."""
         node, found = held.stored.node, held.found
         index = self._merge.take(held.stored, held.live)
