@@ -140,31 +140,39 @@ public:
       : blocks_(blocks), here_(blocks.count()), nearest_(blocks.count(), Shorts(kFar)),
         nearest_row_(blocks.count(), Shorts(-1)) {}
 
-  // Returns the least. Out of line, so that the descriptor stays in registers over all blocks.
+  // Returns the least distance to a column that this landmark is the nearest one to so far, which
+  // it has to be of its own nearest column; kFar if that is beyond `limit`. Out of line, so that
+  // the descriptor stays in registers over all blocks.
   template <class Width>
-  [[gnu::noinline]] int16_t measure(const uint64_t *descriptor, int16_t row, double least_m, double most_m,
-                  Width width) {
-    touched_.clear();
-    Shorts smallest(kFar);
-    for (int64_t block = 0; block < blocks_.count(); ++block) {
-      if (blocks_.most_m[block] < least_m || blocks_.least_m[block] > most_m)
+  [[gnu::noinline]] int16_t measure(const uint64_t *descriptor, int16_t row, double least_m,
+                                    double most_m, int16_t limit, Width width) {
+    // Sizes rise from block to block, but for those within a bucket.
+    begin_ = 0, end_ = blocks_.count();
+    while (begin_ < end_ && blocks_.most_m[begin_] < least_m)
+      ++begin_;
+    while (begin_ < end_ && blocks_.least_m[end_ - 1] > most_m)
+      --end_;
+    Shorts claimed(kFar);
+    for (int64_t block = begin_; block < end_; ++block) {
+      if (blocks_.most_m[block] < least_m || blocks_.least_m[block] > most_m) {
+        here_[block] = Shorts(kFar);
         continue;
+      }
       Shorts here = distances_to(descriptor, &blocks_.words[block * width * kColumns], width);
       if (block == blocks_.count() - 1)
         here |= blocks_.beyond;
       const Shorts before = nearest_[block], closer = here < before;
-      smallest = smaller(here, smallest);
+      claimed = smaller(select(closer, here, Shorts(kFar)), claimed);
       here_[block] = here;
       nearest_[block] = select(closer, here, before);
       nearest_row_[block] = select(closer, Shorts(row), nearest_row_[block]);
-      touched_.push_back(static_cast<int32_t>(block));
     }
-    return least_of(smallest);
+    return bits_of(claimed <= limit) != 0 ? least_of(claimed) : kFar;
   }
 
   // Calls visit(column, distance) for those measured last within the limit, until it returns false.
   template <class Visit> void within(int16_t limit, Visit visit) const {
-    for (const int32_t block : touched_)
+    for (int64_t block = begin_; block < end_; ++block)
       for (uint32_t bits = bits_of(here_[block] <= limit); bits != 0; bits &= bits - 1) {
         const int lane = __builtin_ctz(bits);
         if (!visit(static_cast<int32_t>(kColumns * block + lane), here_[block][lane]))
@@ -179,7 +187,7 @@ public:
 private:
   const Blocks &blocks_;
   std::vector<Shorts> here_, nearest_, nearest_row_;
-  std::vector<int32_t> touched_;
+  int64_t begin_ = 0, end_ = 0; // blocks measured last
 };
 
 bool apart(const Blocks &blocks, int32_t a, int32_t b, double limit_px) {
@@ -187,14 +195,19 @@ bool apart(const Blocks &blocks, int32_t a, int32_t b, double limit_px) {
          std::abs(blocks.v[a] - blocks.v[b]) > limit_px;
 }
 
-// The first column at the smallest distance, or -1 where another corner is nearly as close. The
-// same corner found in a second octave is no rival.
+// The first column at the smallest distance, or -1 where that is less than `least`, or another
+// corner is nearly as close. The same corner found in a second octave is no rival.
 int32_t distinct_column(const Distances &distances, int16_t least, const MatchSettings &settings,
                         const Blocks &blocks, std::vector<int32_t> &close) {
   const auto limit = static_cast<int16_t>(std::min(least / settings.ratio, 64.0 * blocks.width));
   close.clear();
   int32_t best = -1;
   distances.within(limit, [&](int32_t column, int16_t distance) {
+    if (distance < least) {
+      best = -1;
+      close.clear();
+      return false;
+    }
     // Two so far apart cannot both be the best one's corner.
     if (!close.empty() && apart(blocks, close.front(), column, 2 * settings.same_corner_px)) {
       best = -1;
@@ -469,13 +482,14 @@ void match_all(const FrameView &reference, const FrameView &live, const MatchSet
   Distances distances(blocks);
   std::vector<RowPair> forward; // `live` is still a column
   std::vector<int32_t> close;
+  const auto limit = static_cast<int16_t>(std::min<int32_t>(settings.max_distance, kFar - 1));
   for (int64_t i = 0; i < reference.count; ++i) {
     const Patch patch = patch_of(reference, i, settings);
     const double reach = settings.patch_ratio * patch.doubt * patch.doubt;
     const Descriptor<Width> descriptor(reference.descriptors + width * i, width);
     const int16_t least = distances.measure(descriptor.words, static_cast<int16_t>(i),
-                                            patch.size_m / reach, patch.size_m * reach, width);
-    if (least > settings.max_distance)
+                                            patch.size_m / reach, patch.size_m * reach, limit, width);
+    if (least == kFar)
       continue;
     const int32_t column = distinct_column(distances, least, settings, blocks, close);
     if (column >= 0)
