@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from engram.frontend import Frontend, MatcherConfig, StereoPair, match_frames
+from engram.frontend import Frontend, StereoPair
 from engram.geometry import StereoCamera
 from engram.odometry import Odometry, OdometryConfig, WindowConfig
+from engram_lab.bench.attempts import attempts_at, hopeless
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.opening import prepare_opening
 from engram_lab.bench.places import prepare_places_query, prepare_vocabulary_train
@@ -64,15 +65,10 @@ def prepare_frontend_odometry(
 def prepare_attempt(data: BenchData, plain: PlainPipeline | None, *, size: str) -> Prepared:
     """One localisation attempt without a prediction, 3 frames apart, features made beforehand."""
     pairs = data.at(size)
-    frontend, matcher = Frontend(), MatcherConfig()
+    frontend = Frontend()
     frames = [frontend.extract(pair) for pair in pairs]
     starts = len(frames) - _ATTEMPT_GAP
-
-    def ours(i: int) -> dict[str, int]:
-        at = i % starts
-        match = match_frames(frames[at], frames[at + _ATTEMPT_GAP], matcher, seed=i)
-        return {"landmarks": len(frames[at].landmarks), "inliers": match.inliers}
-
+    ours = attempts_at(frames[:starts], frames[_ATTEMPT_GAP:])
     if plain is None:
         return Prepared(ours)
     camera = _plain_camera(plain, pairs[0].camera)
@@ -90,6 +86,12 @@ def prepare_attempt(data: BenchData, plain: PlainPipeline | None, *, size: str) 
     return Prepared(ours, reference)
 
 
+def prepare_hopeless(data: BenchData, plain: PlainPipeline | None, *, size: str) -> Prepared:
+    """The same at frames of another place."""
+    del plain
+    return Prepared(hopeless(data, size=size))
+
+
 STAGES: Mapping[str, Stage] = MappingProxyType(
     {
         "frontend_odometry_512": partial(prepare_frontend_odometry, size="512"),
@@ -102,6 +104,8 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         ),
         "attempt_512": partial(prepare_attempt, size="512"),
         "attempt_full": partial(prepare_attempt, size="full"),
+        "attempt_hopeless_512": partial(prepare_hopeless, size="512"),
+        "attempt_hopeless_full": partial(prepare_hopeless, size="full"),
         "open_map_4000": prepare_opening,
         "render_pair_512": prepare_rendering,
         "render_pair_512_rain": partial(prepare_rendering, session=RAIN),
