@@ -156,6 +156,11 @@ class MatchSettings:
     min_consensus: int
     max_samples: int
     max_hypotheses: int
+    min_followers: int
+    glance_share: int
+    glance_samples: int
+    glance_consensus: int
+    glance_inliers: int
     confidence: float
     max_view_angle_cosine: float
     second_pass: bool

@@ -339,3 +339,35 @@ def test_hash_and_seed_follow_their_inputs() -> None:
     assert pair_seed(a, b) == pair_seed(UUID(int=1), UUID(int=2))
     assert len({pair_seed(a, b), pair_seed(b, a), pair_seed(a, a)}) == 3
     assert 0 <= pair_seed(a, b) < 2**64
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_a_glance_at_a_part_of_the_landmarks_gives_what_all_of_them_give(outliers: float) -> None:
+    all_at_once = dataclasses.replace(CONFIG, glance_share=1)
+    for seed in range(5):
+        scene = Scene(800, seed)
+        reference, _ = scene.seen_from(SE3.identity())
+        live, _ = scene.seen_from(REFERENCE_FROM_LIVE, outliers=outliers)
+        glanced, whole = (match_frames(reference, live, one, seed) for one in (CONFIG, all_at_once))
+        assert glanced.reference_from_live is not None
+        assert whole.reference_from_live is not None
+        error = glanced.reference_from_live @ whole.reference_from_live.inverse()
+        assert error.distance_m < 0.02
+        assert abs(glanced.inliers - whole.inliers) < 0.05 * whole.inliers
+        assert (np.diff(glanced.reference_rows) > 0).all()
+
+
+def test_where_a_glance_does_not_suffice_nothing_changes() -> None:
+    never = dataclasses.replace(CONFIG, glance_inliers=10_000)
+    all_at_once = dataclasses.replace(CONFIG, glance_share=1)
+    for seed in range(5):
+        scene = Scene(400, seed)
+        reference, _ = scene.seen_from(SE3.identity())
+        live, _ = scene.seen_from(REFERENCE_FROM_LIVE, outliers=0.5)
+        glanced, whole = (match_frames(reference, live, one, seed) for one in (never, all_at_once))
+        assert glanced.reference_from_live is not None
+        assert whole.reference_from_live is not None
+        np.testing.assert_array_equal(
+            glanced.reference_from_live.matrix(), whole.reference_from_live.matrix()
+        )
+        np.testing.assert_array_equal(glanced.live_rows, whole.live_rows)

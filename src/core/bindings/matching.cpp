@@ -66,7 +66,7 @@ nb::object match_rows(const Features &reference, const Features &live,
     if (prediction)
       ENGRAM_CALL(match_near, a, b, *prediction, settings, pairs);
     else
-      ENGRAM_CALL(match_all, a, b, settings, pairs);
+      ENGRAM_CALL(match_all, a, b, settings, pairs, nullptr);
   }
   return rows_to_numpy(pairs);
 }
@@ -132,6 +132,11 @@ void bind_matching(nb::module_ &module) {
       .def_rw("min_consensus", &MatchSettings::min_consensus)
       .def_rw("max_samples", &MatchSettings::max_samples)
       .def_rw("max_hypotheses", &MatchSettings::max_hypotheses)
+      .def_rw("min_followers", &MatchSettings::min_followers)
+      .def_rw("glance_share", &MatchSettings::glance_share)
+      .def_rw("glance_samples", &MatchSettings::glance_samples)
+      .def_rw("glance_consensus", &MatchSettings::glance_consensus)
+      .def_rw("glance_inliers", &MatchSettings::glance_inliers)
       .def_rw("confidence", &MatchSettings::confidence)
       .def_rw("max_view_angle_cosine", &MatchSettings::max_view_angle_cosine)
       .def_rw("second_pass", &MatchSettings::second_pass)

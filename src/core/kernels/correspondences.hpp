@@ -91,8 +91,9 @@ struct Offsets {
 struct FloatPose {
   float m[9];
   float t[3];
-  float reference_offset, live_offset;
+  float reference_offset = 0, live_offset = 0;
 
+  FloatPose() = default;
   explicit FloatPose(const Pose &reference_from_live, const Offsets &offsets = {})
       : reference_offset(static_cast<float>(offsets.reference)),
         live_offset(static_cast<float>(offsets.live)) {

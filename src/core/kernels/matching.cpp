@@ -143,7 +143,10 @@ public:
   // Returns the least distance to a column that this landmark is the nearest one to so far, which
   // it has to be of its own nearest column; kFar if that is beyond `limit`. Out of line, so that
   // the descriptor stays in registers over all blocks.
-  template <class Width>
+  //
+  // Of landmarks equally near, a column's is the first by its row; `in_order` if no later one was
+  // measured before.
+  template <bool in_order, class Width>
   [[gnu::noinline]] int16_t measure(const uint64_t *descriptor, int16_t row, double least_m,
                                     double most_m, int16_t limit, Width width) {
     // Sizes rise from block to block, but for those within a bucket.
@@ -161,7 +164,10 @@ public:
       Shorts here = distances_to(descriptor, &blocks_.words[block * width * kColumns], width);
       if (block == blocks_.count() - 1)
         here |= blocks_.beyond;
-      const Shorts before = nearest_[block], closer = here < before;
+      const Shorts before = nearest_[block];
+      Shorts closer = here < before;
+      if constexpr (!in_order)
+        closer |= (here == before) & (Shorts(row) < nearest_row_[block]);
       claimed = smaller(select(closer, here, Shorts(kFar)), claimed);
       here_[block] = here;
       nearest_[block] = select(closer, here, before);
@@ -472,32 +478,73 @@ private:
   std::vector<double> pixel_variances_; // by octave
 };
 
+// Compares landmarks of a reference with all of a live frame, some at a time.
+template <class Width> class WholeSearch {
+public:
+  WholeSearch(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
+              Width width)
+      : reference_(reference), settings_(settings), width_(width),
+        blocks_(blocks_of(live, settings, width)), distances_(blocks_) {}
+
+  // Every `step`-th landmark of the reference, from `first` on; `in_order` if none that comes
+  // later in it has been compared.
+  template <bool in_order> void compare(int64_t first, int64_t step) {
+    const auto limit = static_cast<int16_t>(std::min<int32_t>(settings_.max_distance, kFar - 1));
+    for (int64_t i = first; i < reference_.count; i += step) {
+      const Patch patch = patch_of(reference_, i, settings_);
+      const double reach = settings_.patch_ratio * patch.doubt * patch.doubt;
+      const Descriptor<Width> descriptor(reference_.descriptors + width_ * i, width_);
+      const int16_t least =
+          distances_.template measure<in_order>(descriptor.words, static_cast<int16_t>(i),
+                                                patch.size_m / reach, patch.size_m * reach, limit,
+                                                width_);
+      if (least == kFar)
+        continue;
+      const int32_t column = distinct_column(distances_, least, settings_, blocks_, close_);
+      if (column >= 0)
+        forward_.push_back({static_cast<int32_t>(i), column, least});
+    }
+  }
+
+  // Of those compared, the pairs that are each other's nearest, in the order of comparison.
+  void mutual(std::vector<RowPair> &pairs) const {
+    pairs.clear();
+    for (const RowPair &pair : forward_)
+      if (distances_.nearest_row(pair.live) == pair.reference)
+        pairs.push_back({pair.reference, blocks_.rows[pair.live], pair.distance});
+  }
+
+private:
+  const FrameView &reference_;
+  const MatchSettings &settings_;
+  Width width_;
+  Blocks blocks_;
+  Distances distances_;
+  std::vector<RowPair> forward_; // `live` is a column
+  std::vector<int32_t> close_;
+};
+
 template <class Width>
-void match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
-               std::vector<RowPair> &pairs, Width width) {
+bool match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
+               std::vector<RowPair> &pairs, const Glance *glance, Width width) {
   pairs.clear();
   if (reference.count == 0 || live.count == 0)
-    return;
-  const Blocks blocks = blocks_of(live, settings, width);
-  Distances distances(blocks);
-  std::vector<RowPair> forward; // `live` is still a column
-  std::vector<int32_t> close;
-  const auto limit = static_cast<int16_t>(std::min<int32_t>(settings.max_distance, kFar - 1));
-  for (int64_t i = 0; i < reference.count; ++i) {
-    const Patch patch = patch_of(reference, i, settings);
-    const double reach = settings.patch_ratio * patch.doubt * patch.doubt;
-    const Descriptor<Width> descriptor(reference.descriptors + width * i, width);
-    const int16_t least = distances.measure(descriptor.words, static_cast<int16_t>(i),
-                                            patch.size_m / reach, patch.size_m * reach, limit, width);
-    if (least == kFar)
-      continue;
-    const int32_t column = distinct_column(distances, least, settings, blocks, close);
-    if (column >= 0)
-      forward.push_back({static_cast<int32_t>(i), column, least});
+    return false;
+  WholeSearch<Width> search(reference, live, settings, width);
+  const int64_t parts = glance == nullptr ? 1 : settings.glance_share;
+  search.template compare<true>(0, parts);
+  if (parts > 1) {
+    search.mutual(pairs);
+    if (glance->suffices(glance->state, pairs))
+      return true;
+    for (int64_t first = 1; first < parts; ++first)
+      search.template compare<false>(first, parts);
   }
-  for (const RowPair &pair : forward)
-    if (distances.nearest_row(pair.live) == pair.reference)
-      pairs.push_back({pair.reference, blocks.rows[pair.live], pair.distance});
+  search.mutual(pairs);
+  if (parts > 1)
+    std::sort(pairs.begin(), pairs.end(),
+              [](const RowPair &a, const RowPair &b) { return a.reference < b.reference; });
+  return false;
 }
 
 // The greatest distance of a rival: distance · ratio ≤ least.
@@ -547,9 +594,13 @@ void match_near(const FrameView &reference, const FrameView &live, const Predict
 
 } // namespace
 
-void match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
-               std::vector<RowPair> &pairs) {
-  with_width(live.width, [&](auto width) { match_all(reference, live, settings, pairs, width); });
+bool match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
+               std::vector<RowPair> &pairs, const Glance *glance) {
+  bool sufficed = false;
+  with_width(live.width, [&](auto width) {
+    sufficed = match_all(reference, live, settings, pairs, glance, width);
+  });
+  return sufficed;
 }
 
 void match_near(const FrameView &reference, const FrameView &live, const Prediction &prediction,

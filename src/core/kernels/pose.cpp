@@ -4,9 +4,11 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "kernels/correspondences.hpp"
 #include "kernels/matching.hpp"
+#include "kernels/triangles.hpp"
 
 namespace engram::ENGRAM_ISA {
 namespace {
@@ -95,9 +97,9 @@ struct Score {
 };
 
 // MSAC (Torr & Zisserman 2000): the truncated sum of χ². Stops once it is no better than `best`.
-Score score(const Correspondences &matches, const Pose &pose, float chi2, float best) {
+Score score(const Correspondences &matches, const FloatPose &live_from_reference, float chi2,
+            float best) {
   constexpr int64_t kBetweenChecks = 4 * kLanes;
-  const FloatPose live_from_reference(pose);
   Score result{0, 0};
   for (int64_t start = 0; start < matches.padded; start += kBetweenChecks) {
     Floats cost(0);
@@ -342,6 +344,17 @@ NormalEquations<size> refine(const Correspondences &matches, Estimate &estimate,
   return equations;
 }
 
+// Place of the n-th set bit, counted from 0.
+int nth_bit(uint64_t bits, int n) {
+#ifdef __BMI2__
+  return __builtin_ctzll(__builtin_ia32_pdep_di(uint64_t{1} << n, bits));
+#else
+  for (; n > 0; --n)
+    bits &= bits - 1;
+  return __builtin_ctzll(bits);
+#endif
+}
+
 // Which pairs of matches keep their distance: |X_i − X_j| = |Y_i − Y_j| within what the depths
 // allow. Wrong matches rarely do, so triples are drawn from this graph (Leordeanu & Hebert 2005;
 // Chen et al., SC²-PCR, 2022), which leaves few hypotheses to score even at 90 % outliers.
@@ -350,7 +363,7 @@ public:
   DistanceGraph(const FrameView &reference, const FrameView &live,
                 const std::vector<RowPair> &pairs, const MatchSettings &settings)
       : count_(static_cast<int>(pairs.size())), words_((count_ + 63) / 64),
-        bits_(static_cast<size_t>(count_) * words_, 0) {
+        bits_(static_cast<size_t>(count_) * words_, 0), degrees_(count_) {
     Ends x, y;
     for (const RowPair &pair : pairs) {
       x.add(reference, pair.reference, settings);
@@ -366,24 +379,41 @@ public:
       row[i / 64] &= ~(uint64_t{1} << (i % 64));
       if (count_ % 64)
         row[words_ - 1] &= (uint64_t{1} << (count_ % 64)) - 1;
+      degrees_[i] = popcount(row, row);
     }
   }
 
-  int degree(int i) const { return popcount(row(i), row(i)); }
-  int common(int i, int j) const { return popcount(row(i), row(j)); }
+  // A pair of matches that keep their distance, and how many keep theirs from both.
+  struct Edge {
+    int i, j, common;
+  };
+
+  // Those with at least so many in common.
+  std::vector<Edge> edges(int least) const {
+    std::vector<Edge> result;
+    for (int i = 0; i < count_; ++i)
+      for (int word = i / 64; word < words_; ++word) {
+        uint64_t later = row(i)[word];
+        if (word == i / 64)
+          later &= ~uint64_t{0} << (i % 64);
+        for (; later != 0; later &= later - 1) {
+          const int j = 64 * word + __builtin_ctzll(later);
+          const int common = popcount(row(i), row(j));
+          if (common >= least)
+            result.push_back({i, j, common});
+        }
+      }
+    return result;
+  }
 
   // The n-th common neighbour of i and j, counted from 0.
   int nth_common(int i, int j, int n) const {
     for (int word = 0;; ++word) {
-      uint64_t bits = row(i)[word] & row(j)[word];
+      const uint64_t bits = row(i)[word] & row(j)[word];
       const int here = __builtin_popcountll(bits);
-      if (n >= here) {
-        n -= here;
-        continue;
-      }
-      for (; n > 0; --n)
-        bits &= bits - 1;
-      return 64 * word + __builtin_ctzll(bits);
+      if (n < here)
+        return 64 * word + nth_bit(bits, n);
+      n -= here;
     }
   }
 
@@ -392,7 +422,7 @@ public:
     double total = 0;
     for (int i = 0; i < count_; ++i)
       if (members[i / 64] >> (i % 64) & 1) {
-        const int all = degree(i);
+        const int all = degrees_[i];
         const double share =
             all > 0 ? static_cast<double>(popcount(row(i), members.data())) / all : 0;
         total += share * share;
@@ -459,6 +489,7 @@ private:
   const uint64_t *row(int i) const { return bits_.data() + static_cast<size_t>(i) * words_; }
   int count_, words_;
   std::vector<uint64_t> bits_;
+  std::vector<int> degrees_;
 };
 
 // Orthonormal axes spanned by three points; false where they lie nearly on a line.
@@ -544,6 +575,7 @@ PoseEstimate settle(const FrameView &reference, const FrameView &live,
 // Thresholds on χ² with three degrees of freedom, as multiples of the final one: a hypothesis from
 // three points is judged loosely, since its own error adds to that of the matches.
 constexpr float kLoose = 4;
+constexpr float kLooser = 16; // of a triangle that was aligned, but not refined
 
 class Consensus {
 public:
@@ -592,54 +624,76 @@ private:
            2 * best_.inliers > static_cast<int32_t>(pairs_.size());
   }
 
-  struct Edge {
-    int i = 0, j = 0, common = -1;
-  };
-
-  // Every other edge is the one of several with the most common neighbours, which right matches
-  // have; the rest is drawn evenly, since far points have many neighbours too, and fix no pose.
-  static constexpr int kRivals = 4;
-
-  Edge draw_edge(const DistanceGraph &graph, int rivals) {
-    Edge best;
-    for (int rival = 0; rival < rivals; ++rival) {
-      const int i = static_cast<int>(random_.below(static_cast<uint32_t>(order_.size())));
-      const int neighbours = graph.degree(i);
-      if (neighbours == 0)
-        continue;
-      const int j = graph.nth_common(i, i, static_cast<int>(random_.below(neighbours)));
-      const int common = graph.common(i, j);
-      if (common > best.common)
-        best = {i, j, common};
-    }
-    return best;
-  }
-
+  // Every edge of the graph in scattered order, then again with other third matches, until a pose
+  // is good enough or the samples are used up.
   void search() {
     std::vector<RowPair> drawn_from;
     for (const int32_t i : order_)
       drawn_from.push_back(pairs_[i]);
     const DistanceGraph graph(reference_, live_, drawn_from, settings_);
+    // All of a consensus keep their distances from each other.
+    const auto edges = graph.edges(std::max(settings_.min_consensus - 2, 1));
+    if (edges.empty())
+      return;
+    const auto count = static_cast<uint32_t>(edges.size());
+    const uint32_t first = random_.below(count), step = scattering_step(count);
     double chance = chance_of_success(graph);
-    int hypotheses = 0;
-    for (int sample = 0; sample < settings_.max_samples && hypotheses < settings_.max_hypotheses;
-         ++sample) {
-      if (power(1 - chance, sample) < 1 - settings_.confidence)
-        break;
-      const Edge edge = draw_edge(graph, sample % 2 ? kRivals : 1);
-      // All of a consensus keep their distances from each other.
-      if (edge.common < std::max(settings_.min_consensus - 2, 1))
+    uint32_t at = first;
+    for (int sample = 0; sample < settings_.max_samples; sample += kLanes) {
+      if (chance > 0 && power(1 - chance, sample) < 1 - settings_.confidence)
+        return;
+      std::array<int32_t, 3> triples[kLanes];
+      for (auto &triple : triples) {
+        const auto &[i, j, common] = edges[at];
+        const int k = graph.nth_common(i, j, static_cast<int>(random_.below(common)));
+        triple = {order_[i], order_[j], order_[k]};
+        at = at + step < count ? at + step : at + step - count;
+      }
+      if (tried(triples))
+        chance = chance_of_success(graph);
+      if (most_agree() || hypotheses_ >= settings_.max_hypotheses)
+        return;
+    }
+  }
+
+  // A step around a circle of so many places that comes to each before it comes to one again.
+  static uint32_t scattering_step(uint32_t count) {
+    const auto coprime = [count](uint32_t step) {
+      uint32_t a = count, b = step;
+      while (b != 0)
+        b = std::exchange(a, b) % b;
+      return a == 1;
+    };
+    auto step = static_cast<uint32_t>(0.618 * count) | 1;
+    while (step < count && !coprime(step))
+      ++step;
+    return step < count ? step : 1;
+  }
+
+  // Tries sixteen triples. Returns whether one gave the best pose so far.
+  bool tried(const std::array<int32_t, 3> (&triples)[kLanes]) {
+    Triangles x, y;
+    for (int lane = 0; lane < kLanes; ++lane)
+      for (int k = 0; k < 3; ++k) {
+        const RowPair &pair = pairs_[triples[lane][k]];
+        x.set(lane, k, reference_.points_in_cam + 3 * pair.reference);
+        y.set(lane, k, live_.points_in_cam + 3 * pair.live);
+      }
+    const TrianglePoses aligned(x, y, settings_.max_view_angle_cosine);
+    bool better = false;
+    for (uint32_t bits = bits_of(aligned.valid); bits != 0; bits &= bits - 1) {
+      const int lane = __builtin_ctz(bits);
+      if (!is_followed(aligned.pose(lane)))
         continue;
-      const auto [i, j, both] = edge;
-      const int k = graph.nth_common(i, j, static_cast<int>(random_.below(both)));
-      ++hypotheses;
+      ++hypotheses_;
       Pose pose;
-      if (!hypothesis({order_[i], order_[j], order_[k]}, pose) || !consider(pose))
+      if (!hypothesis(triples[lane], pose) || !consider(pose))
         continue;
+      better = true;
       if (most_agree())
         break;
-      chance = chance_of_success(graph);
     }
+    return better;
   }
 
   bool hypothesis(const std::array<int32_t, 3> &triple, Pose &pose) {
@@ -662,16 +716,24 @@ private:
     return true;
   }
 
+  // Whether enough matches follow an aligned triangle, judged more loosely still: its three
+  // always do, and what nobody else follows is not worth refining.
+  bool is_followed(const FloatPose &live_from_reference) const {
+    const auto chi2 = static_cast<float>(kLooser * settings_.chi2);
+    constexpr float kNoEnd = std::numeric_limits<float>::max();
+    return score(matches_, live_from_reference, chi2, kNoEnd).inliers >= settings_.min_followers;
+  }
+
   // Keeps the pose if it is the best so far, after local optimisation (Chum et al. 2003).
   bool consider(Pose pose) {
     const auto loose = static_cast<float>(kLoose * settings_.chi2);
-    Score found = score(matches_, pose, loose, best_.cost);
+    Score found = score(matches_, FloatPose(pose), loose, best_.cost);
     if (found.cost >= best_.cost || found.inliers < 4)
       return false;
     Estimate better{pose, {}};
     refine<kPose>(matches_, better, loose, 3, prior_);
     refine<kPose>(matches_, better, static_cast<float>(settings_.chi2), 3, prior_);
-    const Score optimised = score(matches_, better.pose, loose, found.cost);
+    const Score optimised = score(matches_, FloatPose(better.pose), loose, found.cost);
     if (optimised.cost < found.cost) {
       found = optimised;
       pose = better.pose;
@@ -705,6 +767,7 @@ private:
   std::vector<int32_t> order_;
   Pose pose_;
   Score best_;
+  int hypotheses_ = 0;
 };
 
 } // namespace
@@ -715,21 +778,57 @@ PoseEstimate estimate_pose(const FrameView &reference, const FrameView &live,
   return Consensus(reference, live, pairs, settings, seed).run(first_guess);
 }
 
+namespace {
+
+// All that match near the pose found, and the pose by them.
+PoseEstimate second_pass(const FrameView &reference, const FrameView &live,
+                         const MatchSettings &settings, const PoseEstimate &first) {
+  std::vector<RowPair> pairs;
+  const Prediction found{first.reference_from_live, first.covariance};
+  match_near(reference, live, found, settings, pairs);
+  return settle(reference, live, pairs, settings, {first.reference_from_live, {}});
+}
+
+// An attempt, and what came of a glance at a part of the reference's landmarks.
+struct Glanced {
+  const FrameView &reference, &live;
+  const MatchSettings &settings;
+  uint64_t seed;
+  PoseEstimate whole;
+};
+
+// Where a part of the landmarks agrees clearly, their pose guides the search for all of them.
+bool agree_clearly(void *state, const std::vector<RowPair> &pairs) {
+  auto &glanced = *static_cast<Glanced *>(state);
+  const MatchSettings &settings = glanced.settings;
+  MatchSettings few = settings;
+  few.max_samples = std::min(settings.max_samples, settings.glance_samples);
+  few.min_consensus = std::max(settings.min_consensus, settings.glance_consensus);
+  const PoseEstimate first =
+      estimate_pose(glanced.reference, glanced.live, pairs, few, glanced.seed, nullptr);
+  if (!first.found)
+    return false;
+  glanced.whole = second_pass(glanced.reference, glanced.live, settings, first);
+  return static_cast<int32_t>(glanced.whole.inliers.size()) >= settings.glance_inliers;
+}
+
+} // namespace
+
 PoseEstimate attempt(const FrameView &reference, const FrameView &live,
                      const MatchSettings &settings, uint64_t seed, const Prediction *prediction) {
   std::vector<RowPair> pairs;
+  Glanced glanced{reference, live, settings, seed, {}};
+  const Glance glance{&glanced, agree_clearly};
   if (prediction)
     match_near(reference, live, *prediction, settings, pairs);
-  else
-    match_all(reference, live, settings, pairs);
-  PoseEstimate first = estimate_pose(reference, live, pairs, settings, seed,
-                                     prediction ? &prediction->reference_from_live : nullptr);
+  else if (match_all(reference, live, settings, pairs, settings.second_pass ? &glance : nullptr))
+    return glanced.whole;
+  const PoseEstimate first =
+      estimate_pose(reference, live, pairs, settings, seed,
+                    prediction ? &prediction->reference_from_live : nullptr);
   if (!first.found || !settings.second_pass)
     return first;
-  const Prediction found{first.reference_from_live, first.covariance};
-  match_near(reference, live, found, settings, pairs);
-  PoseEstimate second =
-      settle(reference, live, pairs, settings, {first.reference_from_live, {}});
+  const PoseEstimate second = second_pass(reference, live, settings, first);
   return second.inliers.size() >= first.inliers.size() ? second : first;
 }
 

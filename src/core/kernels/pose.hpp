@@ -12,7 +12,8 @@ ENGRAM_DECLARE_KERNELS(
                                uint64_t seed, const RigidTransform *first_guess);
 
     // Matches two frames and estimates their pose; with a prediction the search is guided by it.
-    // A consensus guides a second pass that gathers what the first one missed.
+    // A consensus guides a second pass that gathers what the first one missed. Without a prediction
+    // a part of the landmarks is looked at first; where it agrees clearly, it guides at once.
     PoseEstimate attempt(const FrameView &reference, const FrameView &live,
                          const MatchSettings &settings, uint64_t seed,
                          const Prediction *prediction);)

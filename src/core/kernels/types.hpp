@@ -54,6 +54,11 @@ struct MatchSettings {
   int32_t min_consensus = 0;
   int32_t max_samples = 0;
   int32_t max_hypotheses = 0;
+  int32_t min_followers = 0;
+  int32_t glance_share = 1;
+  int32_t glance_samples = 0;
+  int32_t glance_consensus = 0;
+  int32_t glance_inliers = 0;
   double confidence = 0;
   double max_view_angle_cosine = -1;
   bool second_pass = true;

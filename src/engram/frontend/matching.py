@@ -24,7 +24,7 @@ from engram.frontend.frame import Frame
 from engram.geometry import SE3
 
 # Part of `matcher_hash`: raise it when the kernels give different results for equal settings.
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ class MatcherConfig:
             further. Source: motion capture of EuRoC.
         min_consensus: fewest landmarks of a pose; any three agree on some pose. The localiser
             accepts a match by a higher threshold.
-        max_samples: most triples drawn from the matches.
-        max_hypotheses: most triples scored.
+        max_samples, max_hypotheses, min_followers: see their descriptions.
+        glance_share, glance_samples, glance_consensus, glance_inliers: see their descriptions.
         confidence: stop drawing once a better pose is less likely than one minus this.
         max_view_angle_rad: largest angle between the optical axes of a valid pose: the view gate of
             SPEC §3.1 with a margin. Beyond it images overlap only at their edges.
@@ -86,8 +86,46 @@ class MatcherConfig:
     chi2: Annotated[float, Meta(gt=0)] = 11.34
     independent_landmarks: Annotated[float, Meta(gt=0)] = 10.0
     min_consensus: Annotated[int, Meta(ge=4)] = 6
-    max_samples: int = 3000
-    max_hypotheses: int = 600
+    max_samples: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="most triples of matches aligned: what an attempt costs of which nothing "
+            "comes. Source: lab/reports/performance.md",
+        ),
+    ] = 512
+    max_hypotheses: Annotated[int, Meta(ge=1, description="most of them refined")] = 250
+    min_followers: Annotated[
+        int,
+        Meta(
+            ge=0,
+            description="matches that must follow an aligned triple, its own three among them, "
+            "for it to be refined",
+        ),
+    ] = 5
+    glance_share: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="without a prediction, one landmark in so many is compared first; 1 "
+            "compares all at once",
+        ),
+    ] = 4
+    glance_samples: Annotated[
+        int, Meta(ge=1, description="as max_samples, among the matches of these")
+    ] = 48
+    glance_consensus: Annotated[
+        int,
+        Meta(ge=4, description="of these must agree on a pose for it to guide the search for all"),
+    ] = 20
+    glance_inliers: Annotated[
+        int,
+        Meta(
+            ge=4,
+            description="and all must find so many inliers, three times what look-alike places "
+            "reach; else the other landmarks are compared, too",
+        ),
+    ] = 96
     confidence: Annotated[float, Meta(gt=0, lt=1)] = 0.999
     max_view_angle_rad: float = 1.2
     second_pass: bool = True

@@ -24,8 +24,8 @@ class Budget:
     Attributes:
         lanes: Np, attempts that run at the same time, each on its own thread.
         rounds: Nr, how often that many attempts start for one frame.
-        lost_rounds: the same for a lost robot. Larger, because most of its attempts fail early
-            and cost a quarter of a match.
+        lost_rounds: the same for a lost robot. Larger, because place recognition only
+            proposes where it may be.
         deadline_ms: latest start of an attempt after the frame arrived; None for no limit. At
             most one attempt per lane overruns it.
     """
@@ -133,8 +133,8 @@ class Localisation:
         confidence: log-odds that the match is right; of the best attempt if none was accepted,
             -inf if none had a pose.
         attempts: match attempts made for this frame.
-        proposed: attempts without a prediction, at nodes proposed to a lost robot. They cost a
-            quarter of the others (`LocaliserConfig.lost_max_samples`).
+        proposed: attempts without a prediction, at nodes proposed to a lost robot. They draw
+            fewer samples (`LocaliserConfig.lost_max_samples`).
         candidates: nodes in reach that could have been attempted.
         open_loop_m: distance driven on odometry alone since the last match, metres.
         motion: motion since the previous usable frame, as far as it is known.

@@ -16,7 +16,7 @@ from engram.ranking import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 7
+METHOD_VERSION = 8
 
 
 class NeighbourhoodSearch(StrEnum):
@@ -60,8 +60,7 @@ class LocaliserConfig:
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
-            They make a failed attempt four times cheaper and keep 98.8 % of the matches it would
-            accept. Source: `lab/reports/constants.md`.
+            They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
         neighbourhood, path_entries, success, lens_depth_m, fix_sigmas: see their descriptions.
         recent: how the ranking weights this session's recent attempts.
         matcher, acceptance: settings of the two halves of an attempt.
@@ -76,7 +75,7 @@ class LocaliserConfig:
     followed_gap_m: float = 1.0
     guide_below_m: float = 0.6
     guide_below_rad: float = float(np.deg2rad(4.0))
-    lost_max_samples: int = 500
+    lost_max_samples: int = 256
     lost_max_hypotheses: int = 100
     neighbourhood: Annotated[
         NeighbourhoodSearch,

@@ -116,7 +116,7 @@ def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Ro
         for scene, seen in zip(scenes, frames, strict=True):
             for place in range(scene.left.shape[1]):
                 match = eyes.match(seen[a, place], seen[b, place])
-                off_m = error_m(match, _between(scene, (a, place), (b, place)))
+                off_m = error_m(match, between(scene, (a, place), (b, place)))
                 places += 1
                 if match.inliers >= LEAST_INLIERS:
                     right, wrong = right + (off_m < WITHIN_M), wrong + (off_m >= WITHIN_M)
@@ -161,7 +161,7 @@ def place_rows(
         yield Row(where, f"recognised at once within 5 m: {name} / morning", right, len(queries))
 
 
-def _between(scene: Scene, a: tuple[str, int], b: tuple[str, int]) -> SE3:
+def between(scene: Scene, a: tuple[str, int], b: tuple[str, int]) -> SE3:
     """True a_from_b."""
     world_from_a, world_from_b = (
         scene.world_from_cam[scene.visits.index(visit), place] for visit, place in (a, b)
@@ -185,7 +185,7 @@ def calibration_rows(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
         a, b = (scene.visits[int(k)] for k in draws.choice(len(scene.visits), 2, replace=False))
         place = int(draws.integers(scene.left.shape[1]))
         match = eyes.match(frames[town][a, place], frames[town][b, place])
-        off_m = error_m(match, _between(scene, (a, place), (b, place)))
+        off_m = error_m(match, between(scene, (a, place), (b, place)))
         right.append(match.inliers if off_m < WITHIN_M else 0)
     falsely = [
         eyes.match(_any(frames[0], draws), _any(frames[1], draws)).inliers for _ in range(_OTHER)

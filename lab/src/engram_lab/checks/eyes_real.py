@@ -19,6 +19,7 @@ from engram_lab.checks.accuracy import segment_errors
 from engram_lab.eyes import clip
 
 Matching = Callable[[Frame, Frame], Match]
+Pair = tuple[Frame, Frame, SE3]
 Judge = Callable[[Frontend, Matching, Path], Iterator[tuple[str, float, float, int]]]
 
 LEAST_INLIERS, WITHIN_M = 20, 0.25
@@ -32,9 +33,7 @@ _SHIFT_PX, _VOTE_PX, _ROW_PX = 35, 15, 60
 _SEASON_CORNERS = 600
 
 
-def _judge(
-    matching: Matching, pairs: list[tuple[Frame, Frame, SE3]], what: str
-) -> tuple[str, float, float, int]:
+def _judge(matching: Matching, pairs: list[Pair], what: str) -> tuple[str, float, float, int]:
     right = wrong = 0
     for a, b, a_from_b in pairs:
         match = matching(a, b)
@@ -46,19 +45,40 @@ def _judge(
     return what, right, len(pairs), wrong
 
 
+def posed_pairs(frontend: Frontend, data: Path) -> Iterator[tuple[str, list[Pair]]]:
+    """Pairs of real frames with the true pose of the second in the first, clip by clip."""
+    room = _Room(frontend, data)
+    yield "EuRoC V1_01, revisits", room.revisits
+    yield from _along_kitti(frontend, data)
+    yield "KITTI raw 0001 from frame 27, grey / colour rig", _of_two_rigs(frontend, data)
+
+
+class _Room:
+    """EuRoC V1_01: frames by their stamps, and true world_from_cam."""
+
+    def __init__(self, frontend: Frontend, data: Path) -> None:
+        folder = data / "euroc/V1_01_easy_sparse"
+        self.frames = {pair.stamp_ns: frontend.extract(pair) for pair in clip(folder)}
+        lines = (folder / "poses_world_from_rectified_cam0.txt").read_text().splitlines()
+        rows = [line.split() for line in lines if not line.startswith("#")]
+        self.poses = {
+            int(row[0]): SE3.from_matrix(np.array(row[1:], float).reshape(3, 4)) for row in rows
+        }
+        with (folder / "revisit_pairs.csv").open() as file:
+            again = [(int(row["earlier_ns"]), int(row["later_ns"])) for row in csv.DictReader(file)]
+        self.revisits = [
+            (self.frames[a], self.frames[b], self.poses[a].inverse() @ self.poses[b])
+            for a, b in again
+        ]
+
+
 def euroc(
     frontend: Frontend, matching: Matching, data: Path
 ) -> Iterator[tuple[str, float, float, int]]:
     """A room seen again, and views of it that share nothing."""
-    folder = data / "euroc/V1_01_easy_sparse"
-    frames = {pair.stamp_ns: frontend.extract(pair) for pair in clip(folder)}
-    lines = (folder / "poses_world_from_rectified_cam0.txt").read_text().splitlines()
-    rows = [line.split() for line in lines if not line.startswith("#")]
-    poses = {int(row[0]): SE3.from_matrix(np.array(row[1:], float).reshape(3, 4)) for row in rows}
-    with (folder / "revisit_pairs.csv").open() as file:
-        pairs = [(int(row["earlier_ns"]), int(row["later_ns"])) for row in csv.DictReader(file)]
-    revisits = [(frames[a], frames[b], poses[a].inverse() @ poses[b]) for a, b in pairs]
-    yield _judge(matching, revisits, "EuRoC V1_01, revisits")
+    room = _Room(frontend, data)
+    frames, poses = room.frames, room.poses
+    yield _judge(matching, room.revisits, "EuRoC V1_01, revisits")
     apart = [
         (a, b)
         for a, b in itertools.combinations(sorted(frames), 2)
@@ -72,15 +92,22 @@ def kitti(
     frontend: Frontend, matching: Matching, data: Path
 ) -> Iterator[tuple[str, float, float, int]]:
     """A street, further and further ahead."""
+    for what, pairs in _along_kitti(frontend, data):
+        yield _judge(matching, pairs, what)
+
+
+def _along_kitti(frontend: Frontend, data: Path) -> Iterator[tuple[str, list[Pair]]]:
     folder = data / "kitti_odometry"
     frames = [frontend.extract(pair) for pair in clip(folder / "sequences/06")]
     poses = [SE3.from_matrix(row.reshape(3, 4)) for row in np.loadtxt(folder / "poses/06.txt")]
     for what, step in _KITTI_STEPS.items():
-        pairs = [
-            (frames[k], frames[k + step], poses[k].inverse() @ poses[k + step])
-            for k in range(len(frames) - step)
-        ]
-        yield _judge(matching, pairs, f"KITTI 06, {what} apart")
+        yield (
+            f"KITTI 06, {what} apart",
+            [
+                (frames[k], frames[k + step], poses[k].inverse() @ poses[k + step])
+                for k in range(len(frames) - step)
+            ],
+        )
 
 
 def odometry(
@@ -102,14 +129,18 @@ def rigs(
     frontend: Frontend, matching: Matching, data: Path
 ) -> Iterator[tuple[str, float, float, int]]:
     """One street at the same time through another stereo camera."""
+    what = "KITTI raw 0001 from frame 27, grey / colour rig"
+    yield _judge(matching, _of_two_rigs(frontend, data), what)
+
+
+def _of_two_rigs(frontend: Frontend, data: Path) -> list[Pair]:
     folder = data / "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
     grey, colour = (
         [frontend.extract(pair) for pair in pairs[_RIGS_FROM:]]
         for pairs in (clip(folder), clip(folder, rig="colour"))
     )
     grey_from_colour = SE3(np.eye(3), _GREY_FROM_COLOUR_M)
-    pairs = [(a, b, grey_from_colour) for a, b in zip(grey, colour, strict=True)]
-    yield _judge(matching, pairs, "KITTI raw 0001 from frame 27, grey / colour rig")
+    return [(a, b, grey_from_colour) for a, b in zip(grey, colour, strict=True)]
 
 
 def seasons(
