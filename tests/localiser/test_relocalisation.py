@@ -11,6 +11,7 @@ from tests.synthetic_world import World, see
 
 from engram.errors import IncompatibleError
 from engram.frontend import BRIEF, TEBLID, Frame, Landmarks
+from engram.frontend.features import NET
 from engram.localiser.relocalisation import (
     RELOCALISERS,
     Exhaustive,
@@ -89,8 +90,9 @@ class _Drive:
 
 
 # One place every 8 m, then the same places again, 1.5 m further on.
-MAPPED = _Drive(np.arange(0, 400, 8.0))
-LIVE = _Drive(np.arange(0, 400, 8.0) + 1.5)
+_PLACES_M = np.arange(0, 400, 8.0)
+MAPPED = _Drive(_PLACES_M)
+LIVE = _Drive(_PLACES_M + 1.5)
 
 
 @pytest.mark.parametrize("name", ["fabmap", "bag-of-words"])
@@ -102,6 +104,17 @@ def test_a_cold_start_is_proposed_the_right_place_first(name: str) -> None:
         first.append(relocaliser.propose(live, 1, anywhere))
     # The vocabulary was not made for this world, whose descriptors are random.
     right = [nodes[0] in (i, i + 1) for i, nodes in enumerate(first)]
+    assert np.mean(right) > 0.7
+
+
+def test_a_cold_start_is_proposed_the_right_place_by_its_signature() -> None:
+    mapped, live = (_Drive(places_m, NET) for places_m in (_PLACES_M, _PLACES_M + 1.5))
+    words = NodeWords(mapped, lambda: default_vocabulary(NET))
+    relocaliser = RELOCALISERS["signature"](_Nodes(len(_PLACES_M)), words)
+    right = []
+    for at, frame in enumerate(live.frames):
+        relocaliser.forget()
+        right.append(relocaliser.propose(frame, 1, anywhere)[0] in (at, at + 1))
     assert np.mean(right) > 0.7
 
 

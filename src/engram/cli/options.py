@@ -70,7 +70,8 @@ Rounds: TypeAlias = Annotated[
 Relocaliser: TypeAlias = Annotated[
     str,
     typer.Option(
-        "--relocaliser", help="Finds a lost robot: fabmap, bag-of-words, exhaustive, none."
+        "--relocaliser",
+        help="Finds a lost robot: fabmap, signature (net), bag-of-words, exhaustive, none.",
     ),
 ]
 Descriptor: TypeAlias = Annotated[

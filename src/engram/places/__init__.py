@@ -8,7 +8,8 @@ from engram.places.bag_of_words import BagOfWords
 from engram.places.chow_liu import WordStatistics
 from engram.places.fabmap import FabMap, FabMapConfig
 from engram.places.observation import DetectorModel, ObservationModel
-from engram.places.recogniser import Comparison, PlaceRecogniser, Recognition
+from engram.places.recogniser import Comparison, PlaceRecogniser, ReadsFrames, Recognition
+from engram.places.signature import Signatures
 from engram.places.training import TrainingConfig, train_vocabulary
 from engram.places.tree import TreeArrays
 from engram.places.vocabulary import (
@@ -23,6 +24,7 @@ from engram.places.vocabulary import (
 RECOGNISERS: dict[str, Callable[[Vocabulary], PlaceRecogniser]] = {
     FabMap.name: FabMap,
     BagOfWords.name: BagOfWords,
+    Signatures.name: Signatures,
 }
 
 __all__ = [
@@ -34,7 +36,9 @@ __all__ = [
     "FabMapConfig",
     "ObservationModel",
     "PlaceRecogniser",
+    "ReadsFrames",
     "Recognition",
+    "Signatures",
     "TrainingConfig",
     "TreeArrays",
     "Vocabulary",

@@ -9,7 +9,8 @@ import numpy as np
 
 from engram.frontend import Frame
 from engram.graph.graph import ExperienceGraph
-from engram.places.recogniser import Comparison, PlaceRecogniser
+from engram.graph.model import NodeId
+from engram.places.recogniser import Comparison, PlaceRecogniser, ReadsFrames
 from engram.places.vocabulary import Vocabulary
 from engram.places.words import NodeWords, Words
 
@@ -21,7 +22,7 @@ class PlaceBook:
 
     Args:
         graph: the experience graph; may grow.
-        words: the words of its nodes.
+        words: the words of its nodes, and their frames.
         recogniser: makes the recogniser for a vocabulary.
 
     Attributes:
@@ -47,22 +48,31 @@ class PlaceBook:
         return len(self._recogniser)
 
     def words_of(self, frame: Frame) -> Words:
-        """The distinct words of a frame, (n,) int32, increasing.
+        """What the recogniser compares of a frame, (n,) int32: its words, or its signature.
 
         Raises:
             IncompatibleError: it has another kind of descriptor.
         """
+        if isinstance(self._recogniser, ReadsFrames):
+            return self._recogniser.signature(frame)
         return self._words.of_frame(frame)
 
     def learn_new_nodes(self) -> None:
         """Adds the new nodes of the graph."""
         for index in range(len(self._recogniser), len(self._graph)):
-            words = self._words.of_node(self._graph.node(index).id)
+            words = self._words_of_node(self._graph.node(index).id)
             if words is None:  # relocalisation works without it
                 self.unreadable.add(index)
                 words = np.zeros(0, np.int32)
             with self._lock:
                 self._recogniser.add(words)
+
+    def _words_of_node(self, node: NodeId) -> Words | None:
+        """As `words_of`; None if its landmarks are damaged."""
+        if not isinstance(self._recogniser, ReadsFrames):
+            return self._words.of_node(node)
+        frame = self._words.frame_of(node)
+        return None if frame is None else self._recogniser.signature(frame)
 
     def compare(self, words: Words) -> Comparison:
         """See `PlaceRecogniser.compare`."""

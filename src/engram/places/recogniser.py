@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from engram.frontend import Frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,5 +79,18 @@ class PlaceRecogniser(Protocol):
         Args:
             words: (n,) int32, the distinct words of the image, increasing; possibly none.
             count: most places to return.
+        """
+        ...
+
+
+@runtime_checkable
+class ReadsFrames(Protocol):
+    """A `PlaceRecogniser` that compares something else of images than their words."""
+
+    def signature(self, frame: Frame) -> NDArray[np.int32]:
+        """What `add`, `compare` and `recognise` take for this image instead of its words.
+
+        Raises:
+            IncompatibleError: its landmarks are of another kind.
         """
         ...

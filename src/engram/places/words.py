@@ -163,9 +163,15 @@ class NodeWords:
         found = {node: words for node in nodes if (words := self.of_node(node)) is not None}
         other.put_words(self.hash, found)
 
-    def _work_out(self, node: NodeId) -> Words | None:
+    def frame_of(self, node: NodeId) -> Frame | None:
+        """The frame of a node; None if its landmarks are damaged."""
         try:
-            frame = self._frames.frame(node)
+            return self._frames.frame(node)
         except MapCorruptError:
+            return None
+
+    def _work_out(self, node: NodeId) -> Words | None:
+        frame = self.frame_of(node)
+        if frame is None:
             return None
         return self.vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)

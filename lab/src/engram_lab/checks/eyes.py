@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.cli.progress import Bars
 from engram.frontend import Frame, Frontend, FrontendConfig, Match, feature_kind, match_frames
-from engram.frontend.features import FeatureKind, fitted_matcher
+from engram.frontend.features import NET, FeatureKind, fitted_matcher
 from engram.frontend.frame import BRIEF
 from engram.frontend.matching import MatcherConfig
 from engram.geometry import SE3
 from engram.monitor import Monitor, write_whole
-from engram.places import FabMap, default_vocabulary
+from engram.places import FabMap, PlaceRecogniser, Signatures, default_vocabulary
 from engram_lab.checks import eyes_real
 from engram_lab.eyes import Scene, judged_scene, training_scene
 from engram_lab.programs import command_line
@@ -44,6 +44,7 @@ PAIRS = (
     ("overcast", "rain"),
     ("rain", "rain again"),
 )
+RECOGNISED = ("late afternoon", "night", "snow", "rain")
 TOWNS = ((1, 4), (2, 301))
 # Two towns that nothing else uses: random visits of a place, and places of different towns.
 CALIBRATION = (207, 208)
@@ -134,31 +135,52 @@ def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Ro
 def place_rows(
     eyes: Eyes, where: str, frames: Sequence[Mapping[tuple[str, int], Frame]]
 ) -> Iterator[Row]:
-    """Of single images of a visit, how many the recogniser finds among the morning's places."""
+    """Of single images of a visit, how many a recogniser finds among the morning's places."""
     vocabulary = default_vocabulary(eyes.kind.name)
+    by_words, by_signature = FabMap(vocabulary), None
+    if eyes.kind.name == NET:
+        by_signature = Signatures(vocabulary)
 
-    def words(seen: Mapping[tuple[str, int], Frame], name: str) -> list[NDArray[np.int32]]:
-        visit = sorted(key for key in seen if key[0] == name)
-        return [
-            vocabulary.words_of(seen[key].landmarks.descriptors, eyes.kind.name) for key in visit
-        ]
+    def words(frame: Frame) -> NDArray[np.int32]:
+        return vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
 
-    recogniser, at = FabMap(vocabulary), []
+    yield from _recognised(by_words, words, f"{where}, by words", frames)
+    if by_signature is not None:
+        yield from _recognised(
+            by_signature, by_signature.signature, f"{where}, by signature", frames
+        )
+    else:
+        for name in RECOGNISED:
+            yield Row(f"{where}, by signature", _title(name), 0, 0)
+
+
+def _recognised(
+    recogniser: PlaceRecogniser,
+    shown: Callable[[Frame], NDArray[np.int32]],
+    where: str,
+    frames: Sequence[Mapping[tuple[str, int], Frame]],
+) -> Iterator[Row]:
+    at = []
     for town, seen in enumerate(frames):
-        for place, one in enumerate(words(seen, "morning")):
-            recogniser.add(one)
+        for place, frame in _visit(seen, "morning"):
+            recogniser.add(shown(frame))
             at.append((town, place))
-    for name in ("late afternoon", "night", "snow", "rain"):
-        queries = [
-            (town, place, query)
-            for town, seen in enumerate(frames)
-            for place, query in enumerate(words(seen, name))
-        ]
-        right = 0
-        for town, place, query in queries:
-            best = recogniser.recognise(query, 1).places
-            right += any(at[k][0] == town and abs(at[k][1] - place) <= 1 for k in best)
-        yield Row(where, f"recognised at once within 5 m: {name} / morning", right, len(queries))
+    for name in RECOGNISED:
+        right = of = 0
+        for town, seen in enumerate(frames):
+            for place, frame in _visit(seen, name):
+                best = recogniser.recognise(shown(frame), 1).places
+                right += any(at[k][0] == town and abs(at[k][1] - place) <= 1 for k in best)
+                of += 1
+        yield Row(where, _title(name), right, of)
+
+
+def _title(visit: str) -> str:
+    return f"recognised at once within 5 m: {visit} / morning"
+
+
+def _visit(seen: Mapping[tuple[str, int], Frame], name: str) -> list[tuple[int, Frame]]:
+    return [(key[1], seen[key]) for key in sorted(seen) if key[0] == name]
 
 
 def between(scene: Scene, a: tuple[str, int], b: tuple[str, int]) -> SE3:

@@ -5,8 +5,8 @@
 
 Trains and writes the package's own data. `brief` and `teblid` learn from drives: what FOLDER does
 not hold yet is rendered (2,442 frames, half an hour on a core). `net` learns from the places that
-its network was trained on, seen under every light (2,052 frames). The towns have seeds of their
-own: no evaluation shares a street with them.
+its network was trained on, seen under every light (2,052 frames); so do its signatures. The towns
+have seeds of their own: no evaluation shares a street with them.
 """
 
 import argparse
@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.numpy import save
 
-from engram import places
+from engram import _core, places
 from engram.frontend import (
     BRIEF,
     TEBLID,
@@ -26,8 +27,10 @@ from engram.frontend import (
     FrontendConfig,
     feature_kind,
 )
-from engram.frontend.features import plain_name
+from engram.frontend.features import NET, plain_name
+from engram.frontend.network import NETWORK_BITS
 from engram.places import TrainingConfig, encode_vocabulary, train_vocabulary
+from engram.places.signature import SHARE, members_of
 from engram_lab.eyes import training_scene
 from engram_lab.town import SimulatedDrive, campaign_named
 
@@ -42,6 +45,8 @@ TOWNS = (201, 202, 203, 204)
 TRAINED_ON_PLACES = "places of simulated towns 201 to 204, 19 visits each; no real image"
 # Two of them take 620 kB together.
 CONFIG = TrainingConfig(words=5000, samples=80)
+# Of signatures; and descriptors that they are found from. Chosen on towns 207 and 208.
+_CENTRES, _DRAWN = 8, 60_000
 
 
 def render(folder: Path) -> list[Path]:
@@ -85,6 +90,25 @@ def frames_of_places(kind: DescriptorKind) -> list[NDArray[np.uint8]]:
     ]
 
 
+def signatures(frames: list[NDArray[np.uint8]], kind: DescriptorKind) -> bytes:
+    """Centres of descriptors of the network, and how often their bits are set near each."""
+    rows = np.concatenate(frames)[:, : NETWORK_BITS // 8]
+    drawn = np.random.default_rng(0).choice(len(rows), _DRAWN, replace=False)
+    rows = np.ascontiguousarray(rows[np.sort(drawn)])
+    centres, nearest = _core.k_majority(rows, _CENTRES, CONFIG.iterations, CONFIG.seed)
+    members = members_of(nearest, _CENTRES)
+    # Sums of up to 60,000 ones: whole in single precision.
+    found = members.astype(np.float32) @ np.unpackbits(rows, axis=1).astype(np.float32)
+    shares = np.rint(SHARE * found.astype(np.float64) / members.sum(1)[:, None])
+    return save(
+        {
+            "centres": centres.view(np.uint8),
+            "shares": shares.astype(np.uint16),
+            "model": np.frombuffer(kind.encode(), np.uint8),
+        }
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -102,6 +126,9 @@ def main() -> None:
         body = encode_vocabulary(vocabulary)
         (data / f"{plain_name(kind)}.safetensors").write_bytes(body)
         print(f"{kind}: {len(vocabulary)} words, {len(body)} bytes")
+        if kind == NET:
+            file = data / f"{plain_name(kind)}.signature.safetensors"
+            file.write_bytes(signatures(frames, kind))
 
 
 if __name__ == "__main__":
