@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -26,6 +26,7 @@ from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch
 from engram.mapper.memory import Memory, match_of
 from engram.mapper.saver import Records, Saver
+from engram.mapper.votes import EdgeVotes, VoteConfig
 from engram.maps import StoredSession
 from engram.odometry import Motion
 
@@ -44,6 +45,7 @@ class MapperConfig:
         checkpoint_every: live frames between two checkpoints of the map.
         memory_bytes: largest memory of a drive that saves no nodes, bytes; later frames are not
             remembered. About a day at 20 frames per second.
+        votes: when an edge is distrusted that fixes contradict.
     """
 
     save_every_m: float = 1.0
@@ -51,6 +53,7 @@ class MapperConfig:
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
     memory_bytes: int = 256_000_000
+    votes: VoteConfig = field(default_factory=VoteConfig)
 
     def __post_init__(self) -> None:
         for name in ("save_every_m", "save_every_rad", "tie_within_m"):
@@ -75,6 +78,9 @@ class Mapper(Memory):
         config: settings.
         loops: closes loops beside the drive; None leaves them to the localiser's relocaliser.
         stored: what an interrupted run had stored of the session; None for a new one.
+
+    Attributes:
+        votes: of the drive's fixes on the edges of the map.
     """
 
     def __init__(
@@ -104,6 +110,7 @@ class Mapper(Memory):
         self._closures: list[Edge] = []
         # Edges that rest on fixes on trial.
         self._waiting: dict[EdgeKey, Edge] = {}
+        self.votes = EdgeVotes(graph, self.config.votes)
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
         """See `Keeper`: closes the loops found so far before the frame is localised."""
@@ -186,6 +193,7 @@ class Mapper(Memory):
                 matched.append(edge_through_live(self._since_saved, found.position, EdgeKind.TIE))
             self._wait_with(matched)
             return []
+        self.votes.count(found.stamp_ns, self._localiser.outcomes)
         self._joined = True
         edges = self._end_experience(found)
         self._graph.add_edges(matched)

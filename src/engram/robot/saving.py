@@ -77,7 +77,9 @@ class SavedDrive:
             self._saver.finish()
 
     def commit(self) -> Revision:
-        """Makes the session a revision of the map."""
+        """Makes the session a revision of the map, without the edges that its fixes disproved."""
+        for removal in self.mapper.votes.removals:
+            self._writer.add_mark(removal)
         return self._writer.commit()
 
 
