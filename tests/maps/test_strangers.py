@@ -22,6 +22,7 @@ from engram.maps.schema import (
     paths,
     revisions,
     sessions,
+    tags,
 )
 
 from .maps import begin, session, write_drive
@@ -153,3 +154,13 @@ def test_a_value_of_another_type_than_its_column_is_refused(tmp_path, sound):
         for node in store.load().nodes:
             with pytest.raises(MapCorruptError):
                 store.frames.frame(node.id)
+
+
+def test_a_key_that_leaves_no_room_is_found_and_nothing_is_written_after_it(tmp_path, sound):
+    path = shutil.copy(sound, tmp_path / "strange.engram")
+    with Map.open(path, writes=True) as store:
+        store.tag("good", author="tests")
+    change(path, tags, key=2**63 - 1)
+    assert any("leaves no room" in str(one) for one in check_file(path).problems)
+    with Map.open(path, writes=True) as store, pytest.raises(MapCorruptError, match="no room"):
+        store.tag("next", author="tests")

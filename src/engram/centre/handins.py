@@ -15,6 +15,7 @@ from typing import Any
 from sqlalchemy import Connection, func, or_, select, update
 
 from engram.centre.errors import ConflictError, MalformedError, QuotaError, UnknownError
+from engram.centre.resident import known_nodes
 from engram.centre.service import Centre
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
@@ -22,7 +23,6 @@ from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.packs import given_by
 from engram.centre.store.schema import artifact_grants, artifacts, handins, usage
 from engram.errors import MapCorruptError, MapError
-from engram.maps import Map
 from engram.maps.schema import frames, nodes, vocabularies
 from engram.transfers import Manifest, PartHash, WireManifest
 from engram.transfers.manifest import decode_manifest, encode_manifest
@@ -356,11 +356,9 @@ class HandIns:
             had = given_by(connection, row["map"], row["robot"], some)
         return [one for one in some if one not in had]
 
-    def _known_nodes(self, name: str) -> set[bytes]:
-        with Map.open(self._centre.map_path(name)) as store:
-            return {one.bytes for one in store.landmark_hashes} | {
-                one.bytes for one in store.omissions
-            }
+    def _known_nodes(self, name: str) -> frozenset[bytes]:
+        with self._centre.reading(name) as store:
+            return known_nodes(store)
 
     def _base(self, name: str, robot: str, manifest: str) -> Manifest | None:
         """A manifest that the robot handed in to this map, or got from it; else None."""

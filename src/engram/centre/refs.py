@@ -8,12 +8,12 @@ from typing import Any
 from sqlalchemy import delete, select
 
 from engram.centre.errors import ChangedError, UnknownError
+from engram.centre.resident import log_of
 from engram.centre.service import Centre
 from engram.centre.store.audit import note
 from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.schema import refs
 from engram.errors import InputError, RevisionError
-from engram.maps import Map
 
 HEAD = "head"
 _NAME = re.compile(r"[a-z][a-z0-9._-]{0,39}")
@@ -55,7 +55,7 @@ class Refs:
         if not followed.isdecimal():
             found: int = self.get(name, followed)["revision"]
             return found
-        with Map.open(self._centre.map_path(name)) as store:
+        with self._centre.reading(name) as store:
             try:
                 return store.resolve(int(followed[:18]))
             except RevisionError as error:
@@ -63,8 +63,8 @@ class Refs:
 
     def version(self, name: str, revision: int) -> str:
         """A name of a revision that no other one ever has, even after a backup was restored."""
-        with Map.open(self._centre.map_path(name), at=revision) as store:
-            log = store.log()
+        with self._centre.reading(name) as store:
+            log = log_of(store)[: store.resolve(revision)]
         return f"{revision}-{log[-1].committed_ns:x}" if log else "0"
 
     def move(self, name: str, ref: str, revision: int, by: str, expected: int | None) -> int:
@@ -86,7 +86,7 @@ class Refs:
         """
         if ref == HEAD or not _NAME.fullmatch(ref):
             raise InputError(f"{ref!r:.60} cannot be moved: a letter, then letters, digits, . _ -")
-        with Map.open(self._centre.map_path(name)) as store:
+        with self._centre.reading(name) as store:
             if not 1 <= revision <= store.revision:
                 raise InputError(f"{name} has revisions 1 to {store.revision}, not {revision}")
         now = self._centre.now_ns()
@@ -118,8 +118,8 @@ class Refs:
             note(connection, self._centre.now_ns(), by, "ref-removed", name, ref=ref)
 
     def _head(self, name: str) -> dict[str, Any]:
-        with Map.open(self._centre.map_path(name)) as store:
-            log = store.log()
+        with self._centre.reading(name) as store:
+            log = log_of(store)
         newest = log[-1] if log else None
         return {
             "map": name,

@@ -6,7 +6,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from sqlalchemy import select
 
 from engram.centre.errors import UnknownError
+from engram.centre.resident import ResidentMaps
 from engram.centre.settings import CentreSettings
 from engram.centre.store.audit import note
 from engram.centre.store.database import ServiceDatabase, first_row, rows_of
@@ -74,6 +75,7 @@ class Centre:
             FolderObjects(folder / "objects") if objects is None else BucketObjects(objects)
         )
         self._packs: dict[str, Packs] = {}
+        self._resident = ResidentMaps()
 
     def __enter__(self) -> Centre:
         return self
@@ -82,7 +84,8 @@ class Centre:
         self.close()
 
     def close(self) -> None:
-        """Closes the database."""
+        """Closes the database and the maps."""
+        self._resident.close()
         self.database.close()
 
     def packs(self, name: str) -> Packs:
@@ -158,6 +161,14 @@ class Centre:
         self.map_row(name)
         return self.folder / "maps" / f"{name}.engram"
 
+    def reading(self, name: str) -> AbstractContextManager[Map]:
+        """A map as of its newest revision, which stays open for the next one who asks.
+
+        Raises:
+            UnknownError: there is none.
+        """
+        return self._resident.reading(self.map_path(name))
+
     def policy(self, name: str) -> MapPolicy:
         """How a map takes hand-ins."""
         return from_dict(json.loads(self.map_row(name)["options"]), MapPolicy)
@@ -175,7 +186,7 @@ class Centre:
         Raises:
             InputError: the map has no such revision.
         """
-        with Map.open(self.map_path(name)) as store:
+        with self.reading(name) as store:
             if not 0 <= revision <= store.revision:
                 raise InputError(f"{name} has revisions 0 to {store.revision}, not {revision}")
         row = {**self.map_row(name), "durable_revision": revision}

@@ -24,6 +24,7 @@ from engram.geometry import StereoCamera
 from engram.graph.model import NodeId, PathEntryKind, SessionId
 from engram.maps.attempts import unpack
 from engram.maps.database import Database
+from engram.maps.keys import LARGEST_KEY
 from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.records import CheckReport, Problem
 from engram.maps.rows import (
@@ -136,6 +137,8 @@ class _Checking:
             name = self._name(table, list(row.values()))
             key = next(iter(row.values()))
             self.revision_of[table][key] = row.get("revision", 0)
+            if not 0 <= key <= LARGEST_KEY:
+                self.report(table, name, f"its key {key} leaves no room for others")
             if "uuid" in row:
                 self.uuids[table, key] = name
             if "revision" in row:

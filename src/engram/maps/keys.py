@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from sqlalchemy import Table, func, select
 
+from engram.errors import MapCorruptError
 from engram.graph.model import NodeId
 from engram.maps.database import Database
 from engram.maps.schema import KEYED, nodes
 from engram.maps.view import View
+
+# Of 64 bits, with room left: no writer comes near it.
+LARGEST_KEY = 2**62
 
 
 class KeyBook:
@@ -27,8 +31,17 @@ class KeyBook:
             }
 
     def next(self, table: Table) -> int:
-        """An unused key of the table."""
+        """An unused key of the table.
+
+        Raises:
+            MapCorruptError: a stranger's row has a key after which there are none.
+        """
         key = self._next[table]
+        if key > LARGEST_KEY:
+            raise MapCorruptError(
+                f"{self._database.name}: table {table.name} has the key {key - 1}, after which "
+                "there is no room; run engram check"
+            )
         self._next[table] = key + 1
         return key
 

@@ -19,6 +19,7 @@ from engram.maps.rows import (
     node_from_bytes,
     transform_bytes,
     transform_from_bytes,
+    transforms_from_bytes,
     verified,
 )
 from engram.maps.schema import anchors, goals, nodes, placements, removals
@@ -86,11 +87,12 @@ def _removals(connection: Connection, rows: list[Row]) -> tuple[Removal, ...]:
 def load_placements(connection: Connection, view: View) -> dict[NodeId, SE3]:
     """The newest ``map_from_node`` of each placed node."""
     ids = _all_node_ids(connection, view)
-    return {
-        ids[row["node"]]: transform_from_bytes(row["map_from_node"], f"placement {row['key']}")
-        for row in view.rows(connection, placements)
-        if row["node"] in ids
-    }
+    newest = {row["node"]: row for row in view.rows(connection, placements) if row["node"] in ids}
+    rows = list(newest.values())
+    poses = transforms_from_bytes(
+        [row["map_from_node"] for row in rows], lambda at: f"placement {rows[at]['key']}"
+    )
+    return {ids[row["node"]]: pose for row, pose in zip(rows, poses, strict=True)}
 
 
 def load_anchors(connection: Connection, view: View) -> tuple[Anchor, ...]:

@@ -168,6 +168,13 @@ def transform_from_bytes(data: bytes, what: str) -> SE3:
     return SE3(values[:9].reshape(3, 3), values[9:])
 
 
+def transforms_from_bytes(parts: Sequence[bytes], named: Callable[[int], str]) -> list[SE3]:
+    """Inverse of `transform_bytes` for many; `named` gives the name of one for messages."""
+    values = _arrays(parts, 12, named)
+    rotations, translations = values[:, :9].reshape(-1, 3, 3), values[:, 9:]
+    return [SE3(*both) for both in zip(rotations, translations, strict=True)]
+
+
 def covariance_bytes(covariance: NDArray[np.float64]) -> bytes:
     """168 bytes: the upper triangle of a (6, 6) matrix row by row, little-endian float64."""
     return _floats(covariance[_UPPER])

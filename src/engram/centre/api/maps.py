@@ -44,8 +44,9 @@ def maps(centre: CentreHere, who: Asking) -> list[dict[str, Any]]:
 @router.get("/maps/{name}", dependencies=READERS)
 def one_map(name: str, centre: CentreHere) -> dict[str, Any]:
     """Counts and sizes of a map."""
-    with Map.open(centre.map_path(name)) as store:
-        return {"name": name, **plain(store.info()), "content_hash": store.content_hash()}
+    with centre.reading(name) as store:
+        counts, content_hash = store.derived(Map.info), store.derived(Map.content_hash)
+        return {"name": name, **plain(counts), "content_hash": content_hash}
 
 
 @router.get("/maps/{name}/revisions", response_model=models.Page, dependencies=READERS)
@@ -64,7 +65,7 @@ def diff(
     centre: CentreHere,
 ) -> Any:
     """What changed between two revisions."""
-    with Map.open(centre.map_path(name)) as store:
+    with centre.reading(name) as store:
         return store.diff(before, after).to_dict()
 
 

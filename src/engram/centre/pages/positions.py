@@ -47,14 +47,13 @@ def drawn(path: Path, version: str, revision: int) -> bytes:
     return json.dumps(body, separators=(",", ":")).encode()
 
 
-def thumbnail(path: Path, node: str) -> bytes | None:
+def thumbnail(store: Map, node: str) -> bytes | None:
     """The small picture of a node, JPEG; None if it was not sent."""
-    with Map.open(path) as store:
-        origin = store.origin(node)
-        if origin.node not in store.graph:
-            return None
-        record = store.graph.node(store.graph.index(origin.node))
-        return next(iter(store.frames.stored([record]))).thumbnail
+    origin = store.origin(node)
+    if origin.node not in store.graph:
+        return None
+    record = store.graph.node(store.graph.index(origin.node))
+    return next(iter(store.frames.stored([record]))).thumbnail
 
 
 def _hour(session: Any, stamp_ns: int) -> float | None:

@@ -128,7 +128,8 @@ def picture(
     centre: CentreHere,
 ) -> Response:
     """The small picture of a node."""
-    body = thumbnail(centre.map_path(name), node)
+    with centre.reading(name) as store:
+        body = thumbnail(store, node)
     if body is None:
         raise UnknownError("the node has no picture")
     return Response(body, media_type="image/jpeg")

@@ -1,0 +1,158 @@
+"""Hostile uploads to a centre, by a robot that may hand in."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from fastapi.testclient import TestClient
+
+from engram.agent import Agent, enrol
+from engram.centre.access.enrolment import new_code
+from engram.centre.api.app import create_app
+from engram.centre.handins import HandIns
+from engram.centre.service import Centre, MapPolicy
+from engram.centre.settings import CentreSettings
+from engram.centre.worker.loop import work_off
+from engram.fleet.merge import MergeOptions
+from engram.maps import Map, check_file
+from engram.transfers import MAX_PART_BYTES, Manifest, PartHash, bundle, part_hash
+from engram.transfers.manifest import encode_manifest
+from engram_lab.mutations import handins
+from engram_lab.mutations.samples import Samples
+
+_MAP = "fleet"
+_JSON = {"Content-Type": "application/json"}
+_TRICKS = ("..%2f..%2fetc%2fpasswd", "..", "fleet%00", "%2e%2e", "a" * 3_000, "~", "fleet.engram")
+
+
+class Site:
+    """A centre, a robot that handed in, and one that is hostile.
+
+    Attributes:
+        answers: how often each status was answered.
+    """
+
+    def __init__(self, folder: Path, samples: Samples) -> None:
+        limits = CentreSettings(admission_bytes=2**30, admission_s=30)
+        self.centre = Centre(folder / "centre", settings=limits)
+        self.centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser=None)))
+        self.http = TestClient(create_app(self.centre), raise_server_exceptions=False)
+        self.answers: Counter[int] = Counter()
+        self._samples = samples
+        self._victim, self._thief = (self._robot(folder / name) for name in ("r1", "r2"))
+        headers = self._victim.link._headers()  # as its own client sends them
+        self._begun(samples.manifest, headers)
+
+    def upload(self, chance: random.Random) -> None:
+        """One upload of any kind."""
+        kinds: tuple[Callable[[random.Random], None], ...] = (
+            self._changed,
+            self._changed,
+            self._wrong_hash,
+            self._stolen,
+            self._path,
+            self._bomb,
+        )
+        chance.choice(kinds)(chance)
+        work_off(self.centre)
+        for row in HandIns(self.centre).listed(_MAP, None, "open", 2**62, 10):
+            if row["robot"] == self._thief.state.fact("robot"):
+                HandIns(self.centre).cancel(row, "lab")
+
+    def states(self) -> Counter[str]:
+        """What became of the hand-ins."""
+        rows = HandIns(self.centre).listed(_MAP, None, None, 2**62, 100_000)
+        return Counter(row["state"] for row in rows)
+
+    def faults(self) -> list[str]:
+        """What is wrong with the map, or was left behind."""
+        found = [str(one) for one in check_file(self.centre.map_path(_MAP)).problems]
+        with Map.open(self.centre.map_path(_MAP)) as store:
+            store.content_hash()
+        return found + [one.name for one in (self.centre.folder / "work").iterdir()]
+
+    def _robot(self, folder: Path) -> Agent:
+        code = new_code(self.centre, _MAP, "head", "lab")
+        enrol(folder, "http://centre", code, folder.name, self.http)
+        return Agent(folder, client=self.http)
+
+    def _ask(self, method: str, url: str, **given: Any) -> Any:
+        headers = {**self._thief.link._headers(), **given.pop("headers", {})}
+        answer = self.http.request(method, url, headers=headers, **given)
+        self.answers[answer.status_code] += 1
+        return answer
+
+    def _begun(self, manifest: Manifest | bytes, headers: dict[str, str] | None = None) -> str:
+        """The hand-in of a manifest; "" if it is refused."""
+        body = manifest if isinstance(manifest, bytes) else encode_manifest(manifest)
+        given = {**_JSON, **(headers or {})}
+        answer = self._ask("POST", f"/v1/maps/{_MAP}/handins", content=body, headers=given)
+        return answer.json()["id"] if answer.status_code == 200 else ""
+
+    def _handed_in(self, manifest: Manifest | bytes, parts: dict[PartHash, bytes]) -> None:
+        key = self._begun(manifest)
+        if key:
+            body = b"".join(bundle(parts.values()))
+            self._ask("POST", f"/v1/handins/{key}/parts", content=body)
+            self._ask("POST", f"/v1/handins/{key}/complete")
+
+    def _changed(self, chance: random.Random) -> None:
+        kind = chance.choice([handins.pages, handins.rows, handins.rows, handins.manifests])
+        case = kind(self._samples, Path(), chance)
+        assert case.manifest is not None
+        assert case.parts is not None
+        self._handed_in(case.manifest, case.parts)
+
+    def _wrong_hash(self, chance: random.Random) -> None:
+        key = self._begun(self._samples.manifest)
+        name = chance.choice(list(self._samples.parts)).hex()
+        self._ask("PUT", f"/v1/handins/{key}/parts/{name}", content=chance.randbytes(100))
+        body = bytearray(b"".join(bundle(self._samples.parts.values())))
+        body[chance.randrange(len(body))] ^= 1
+        self._ask("POST", f"/v1/handins/{key}/parts", content=bytes(body))
+
+    def _stolen(self, chance: random.Random) -> None:
+        """Parts that only their hashes name."""
+        key = self._begun(self._samples.manifest)
+        mine = {} if chance.random() < 0.5 else {part_hash(b"x"): b"x"}
+        self._ask("POST", f"/v1/handins/{key}/parts", content=b"".join(bundle(mine.values())))
+        self._ask("POST", f"/v1/handins/{key}/complete")
+        its = self._victim.state.fact("robot")
+        self._ask("GET", f"/v1/maps/{_MAP}/robots/{its}")
+
+    def _path(self, chance: random.Random) -> None:
+        trick = chance.choice(_TRICKS)
+        for url in (
+            f"/v1/maps/{trick}/handins",
+            f"/v1/handins/{trick}/parts",
+            f"/v1/handins/{trick}/complete",
+            f"/v1/artifacts/{trick}/parts",
+        ):
+            self._ask("POST", url, json={"want": []})
+        self._ask("PUT", f"/v1/handins/{trick}/parts/{trick}", content=b"x")
+        self._ask("GET", f"/static/{trick}")
+
+    def _bomb(self, chance: random.Random) -> None:
+        match chance.randrange(5):
+            case 0:
+                self._begun(b'{"tables":' * 100_000)
+            case 1:
+                tables = {f"t{at}": {"kept": 0, "pages": []} for at in range(20_000)}
+                self._begun(msgspec.json.encode({"format": "engram-parts-1", "tables": tables}))
+            case 2:
+                page = next(self._samples.manifest.hashes())
+                many = Manifest("00" * 16, 1, {"nodes": (page,) * 200_000})
+                self._begun(many)
+            case 3:
+                key = self._begun(self._samples.manifest)
+                url = f"/v1/handins/{key}/parts/{'00' * 32}"
+                self._ask("PUT", url, content=bytes(MAX_PART_BYTES + 1))
+            case _:
+                key = self._begun(self._samples.manifest)
+                promise = (2**40).to_bytes(8, "big") + chance.randbytes(64)
+                self._ask("POST", f"/v1/handins/{key}/parts", content=promise * 100)
