@@ -151,7 +151,8 @@ def place_rows(
         )
     else:
         for name in RECOGNISED:
-            yield Row(f"{where}, by signature", _title(name), 0, 0)
+            of = sum(len(_visit(seen, name)) for seen in frames)
+            yield Row(f"{where}, by signature", _title(name), 0, of)
 
 
 def _recognised(
