@@ -20,6 +20,7 @@ from engram.errors import (
 from engram.graph.model import Clock
 from engram.sequences import BagSequence, open_sequence
 from engram.sequences.bags import Bag, messages
+from engram.sequences.bags.inspecting import describe_bag
 from engram.sequences.bags.pairing import learnt_tolerance
 
 from .bag_maker import (
@@ -218,7 +219,7 @@ def named(folder: Path, *names: str) -> Path:
     with bag(folder / "named", "mcap") as maker:
         infos = set()
         for name in names:
-            right = any(word in name for word in ("right", "infra2", "cam1"))
+            right = any(word in name for word in ("right", "infra2", "cam1", "starboard"))
             maker.image(name, START_NS, picture(0, int(right)))
             info = name.rsplit("/", 1)[0] + "/camera_info"
             if info not in infos:
@@ -235,6 +236,7 @@ class TestTopics:
             ("/left/image_rect", "/right/image_rect"),
             ("/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
             ("/cam0/image_raw", "/cam1/image_raw"),
+            ("/robot7/port/image", "/robot7/starboard/image"),
             ("/zed/zed_node/left/image_rect_color", "/zed/zed_node/right/image_rect_color"),
             ("/zed/zed_node/left_raw/image_raw_color", "/zed/zed_node/right_raw/image_raw_color"),
             ("/stereo/left/image_raw/compressed", "/stereo/right/image_raw/compressed"),
@@ -273,9 +275,23 @@ class TestTopics:
             assert opened(path, **options).topics.right == "/rear/right/image_raw"
 
     def test_no_pair_lists_what_there_is(self, tmp_path) -> None:
-        path = named(tmp_path, "/front/image", "/rear/image")
+        path = named(tmp_path, "/front/image", "/rear/image", "/roof/image")
         with pytest.raises(SequenceError, match=r"(?s)--left TOPIC.*/front/image.*/rear/image"):
             open_sequence(path)
+        assert describe_bag(path).command.endswith("--left TOPIC --right TOPIC")
+
+    def test_two_topics_are_offered_as_the_pair(self, tmp_path) -> None:
+        path = named(tmp_path, "/eye_a/image", "/eye_b/image", "/camera/depth/image")
+        offered = "--left /eye_a/image --right /eye_b/image"
+        with pytest.raises(SequenceError, match=offered):
+            open_sequence(path)
+        assert describe_bag(path).command.endswith(offered)
+
+    def test_one_camera_is_not_enough(self, tmp_path) -> None:
+        path = named(tmp_path, "/camera/color/image_raw", "/camera/depth/image")
+        with pytest.raises(SequenceError, match="one camera only"):
+            open_sequence(path)
+        assert describe_bag(path).command == "", "no option helps"
 
     def test_a_topic_that_is_not_there_or_no_image(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")
@@ -405,6 +421,22 @@ class TestCalibration:
         path = StereoBag(PICTURES, None).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"no CameraInfo.*--calibration FILE"):
             open_sequence(path)
+
+    def test_the_only_two_are_taken_wherever_they_are(self, tmp_path) -> None:
+        left, right = rectified_infos(camera())
+        with bag(tmp_path / "b", "mcap") as maker:
+            for side, (name, info) in enumerate([("b", left), ("a", right)]):
+                maker.image((LEFT, RIGHT)[side], START_NS, picture(0, side))
+                maker.info(f"/calib/{name}", START_NS, info)
+        assert opened(tmp_path / "b").camera.baseline_m == pytest.approx(camera().baseline_m)
+
+    def test_those_of_other_topics_are_named(self, tmp_path) -> None:
+        with bag(tmp_path / "b", "mcap") as maker:
+            for side in (0, 1):
+                maker.image((LEFT, RIGHT)[side], START_NS, picture(0, side))
+            maker.info("/calib/a", START_NS, rectified_infos(camera())[0])
+        with pytest.raises(CalibrationError, match=r"those of /calib/a belong to other topics"):
+            open_sequence(tmp_path / "b")
 
     def test_swapped_topics_are_told(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")

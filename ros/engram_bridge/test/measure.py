@@ -45,19 +45,21 @@ class Faults:
     def __init__(self, driver, town: str) -> None:
         self.driver, self.peer, self.town = driver, driver.peer, town
         self._until_localised()
-        self.driver.drive(2 * len(self.peer.pairs["left"]) / RATE_HZ)
-        poses = np.array(self.peer.poses)
-        places = np.array([self.peer.place(int(number)) for number in poses[:, 0]])
-        seen = np.unique(places)
-        medians = np.array([np.median(poses[places == at, 1:4], axis=0) for at in seen])
-        # (pairs, 3); frames that were dropped lie between their neighbours.
-        every = np.arange(len(self.peer.pairs["left"]))
-        self.expected = np.stack([np.interp(every, seen, axis) for axis in medians.T], axis=1)
+        every = range(len(self.peer.pairs["left"]))
+
+        def places():
+            return [self.peer.place(int(number)) for number, *_ in self.peer.poses]
+
+        self.driver.drive(2 * len(every) / RATE_HZ)
+        self.driver.until(lambda: len(set(places())) == len(every), 120.0, "not all was seen")
+        poses, seen = np.array(self.peer.poses)[:, 1:4], np.array(places())
+        # (pairs, 3): what undisturbed laps say of each place.
+        self.expected = np.array([np.median(poses[seen == at], axis=0) for at in every])
         self.step_m = float(_steps_m(self.peer.odometry).max())
 
     def run(self, name: str, times: int):
         """The row of a fault: injected so many times."""
-        silences_s, recovered_s = [], []
+        silences_s, unheard_s, recovered_s = [], [], []
         odometry, poses = len(self.peer.odometry), len(self.peer.poses)
         for _ in range(times):
             began = time.monotonic()
@@ -65,12 +67,15 @@ class Faults:
             mended = time.monotonic()
             self._until_localised()
             recovered_s.append(time.monotonic() - mended)
-            times_s = [at for at, _ in self.peer.status if at > began - 0.3]
-            silences_s.append(float(np.diff([*times_s, time.monotonic()]).max()))
+            heard = [(at, one.header.stamp) for at, one in self.peer.status if at > began - 0.3]
+            unheard_s.append(float(np.diff([at for at, _ in heard]).max()))
+            said_s = [stamp.sec + 1e-9 * stamp.nanosec for _, stamp in heard]
+            silences_s.append(float(np.diff(said_s).max()))
         return {
             "fault": name,
             "times": times,
             "longest_silence_s": max(silences_s),
+            "longest_unheard_s": max(unheard_s),
             "wrong_poses": self._wrong(self.peer.poses[poses:]),
             "jumps": self._jumps(self.peer.odometry[max(odometry - 1, 0) :]),
             "median_recovery_s": float(np.median(recovered_s)),

@@ -179,7 +179,8 @@ def _bag_text(facts: BagFacts) -> str:
     if facts.question:
         lines.append(f"missing: {facts.question}")
     lines += [f"lost: {loss}" for loss in facts.lost]
-    lines.append(f"next: {facts.command}")
+    if facts.command:
+        lines.append(f"next: {facts.command}")
     return "\n".join(lines)
 
 

@@ -78,18 +78,18 @@ def main() -> int:
     parser.add_argument("--ros", type=Path, required=True, help="a Python with rclpy")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--times", type=int, default=50, help="of each fault")
-    parser.add_argument("--only", help="these faults, by comma; without the lost half minutes")
+    parser.add_argument("--only", help="these faults, by comma")
+    parser.add_argument("--lost", action="store_true", help="and lost for half a minute, twice")
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--busy", type=int, default=2, help="busy loops")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="engram-ros-") as folder:
         town = _prepared(asked.drive, asked.frames, Path(folder))
         with _bridge(asked.ros, town) as bridge:
-            given = ["--times", str(asked.times), "--faults", asked.only] if asked.only else []
-            if asked.what == "faults" and not asked.only:
-                given = ["--times", str(asked.times), "--lost"]
-            if asked.what == "endure":
-                given = ["--minutes", str(asked.minutes), "--busy", str(asked.busy)]
+            given = ["--minutes", str(asked.minutes), "--busy", str(asked.busy)]
+            if asked.what == "faults":
+                given = ["--times", str(asked.times), *(["--lost"] if asked.lost else [])]
+                given += ["--faults", asked.only] if asked.only else []
             said = _measured(asked.ros, asked.what, town, bridge, given)
     return _faults(said) if asked.what == "faults" else _endurance(said)
 
@@ -159,7 +159,7 @@ def _measured(python: Path, what: str, town: Path, bridge: int, given: list[str]
 _COLUMNS = (
     "fault",
     "times",
-    "longest silence",
+    "longest silence, said / heard",
     "poses claimed wrongly",
     "jumps in odom",
     "small covariances",
@@ -173,7 +173,8 @@ def _faults(said: dict[str, Any]) -> int:
     for row in said["rows"]:
         small = row.get("small_covariances", 0)
         print(
-            f"| {row['fault']} | {row['times']} | {row['longest_silence_s']:.2f} s | "
+            f"| {row['fault']} | {row['times']} | {row['longest_silence_s']:.2f} / "
+            f"{row['longest_unheard_s']:.2f} s | "
             f"{row['wrong_poses']} | {row['jumps']} | {small} | {row['median_recovery_s']:.1f} s |"
         )
         silent = row["longest_silence_s"] > _LONGEST_SILENCE_S

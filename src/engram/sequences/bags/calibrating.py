@@ -89,17 +89,24 @@ def read_infos(
 ) -> tuple[CameraInfo, CameraInfo] | None:
     """The first `CameraInfo` of each camera; None if the bag lacks one.
 
+    Those beside the images, or the only two that the bag has: the right one states the baseline.
+
     Raises:
         CalibrationError: one is malformed.
     """
+    beside = [info_topic(image, bag.topics) for image in (stereo.left, stereo.right)]
+    topics = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
+    elsewhere = None in beside and len(topics) == 2
     infos = []
-    for image in (stereo.left, stereo.right):
-        topic = info_topic(image, bag.topics)
+    for topic in topics if elsewhere else beside:
         message = None if topic is None else next(_messages(bag, decoder, topic, _INFO), None)
         if topic is None or message is None:
             return None
-        infos.append(_info(topic, message))
-    return infos[0], infos[1]
+        infos.append((topic, _info(topic, message)))
+    if elsewhere:
+        infos.sort(key=lambda one: -one[1].p[0, 3])
+    (_, left), (_, right) = infos
+    return left, right
 
 
 def read_cameras(
@@ -123,15 +130,17 @@ def read_cameras(
     """
     infos = read_infos(bag, decoder, stereo)
     if infos is None:
+        others = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
+        also = f" (those of {', '.join(others)} belong to other topics)" if others else ""
         raise CalibrationError(
-            f"{bag.path}: has no CameraInfo for {stereo.left} and {stereo.right}; give the "
+            f"{bag.path}: has no CameraInfo for {stereo.left} and {stereo.right}{also}; give the "
             "calibration with --calibration FILE (Kalibr's camchain.yaml, ROS's left.yaml beside "
             "right.yaml, OpenCV's, or calibration.toml)"
         )
     left, right = infos
     if (left.width, left.height) != size:
         raise CalibrationError(
-            f"{bag.path}: {info_topic(stereo.left, bag.topics)} is of {left.width}×{left.height} "
+            f"{bag.path}: the CameraInfo of the left camera is of {left.width}×{left.height} "
             f"px, the images of {stereo.left} are {size[0]}×{size[1]}: give the calibration of "
             "these images with --calibration FILE"
         )
@@ -147,8 +156,8 @@ def read_cameras(
             field_of_view_deg=field_of_view_deg,
         )
     except InputError as error:
-        names = [str(info_topic(one, bag.topics)) for one in (stereo.left, stereo.right)]
-        raise CalibrationError(f"{bag.path}: {' and '.join(names)}: {error}") from error
+        names = f"CameraInfo of {stereo.left} and {stereo.right}"
+        raise CalibrationError(f"{bag.path}: {names}: {error}") from error
 
 
 def _messages(bag: Bag, decoder: Decoder, topic: str, kind: str) -> Iterator[Any]:

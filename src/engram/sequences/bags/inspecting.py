@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import dataclass
 from itertools import pairwise
@@ -110,7 +111,7 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
         question,
         "" if drive is None else _calibration(drive),
         None if frame is None else transforms.base_of(frame),
-        _command(path, options, topics, drive),
+        _command(path, options, topics, drive, question),
         bag.lost,
     )
 
@@ -165,17 +166,28 @@ def _command(
     options: OpenOptions,
     topics: list[TopicFacts],
     drive: BagSequence | None,
+    question: str,
 ) -> str:
-    """`engram map` with every option that this bag needs."""
+    """`engram map` with every option that this bag needs; what is to be filled in is in capitals.
+
+    Empty if no option helps.
+    """
+    asks = "name them" in question or "choose one" in question
+    if drive is None and not asks and "--calibration FILE" not in question:
+        return ""
     motion = [
         topic.name for topic in topics if topic.type in {ODOMETRY, TWIST, IMU} and topic.messages
     ]
     words = ["engram", "map", "MAP.engram", str(path)]
     for option, value in (("--left", options.left), ("--right", options.right)):
         words += [option, value] if value else []
+    if drive is None and asks:
+        given = re.search(r"--left (\S+) --right (\S+)", question)
+        left, right = ("LEFT", "RIGHT") if given is None else given.groups()
+        words += ["--left", left, "--right", right]
     if options.calibration is not None:
         words += ["--calibration", str(options.calibration)]
-    elif drive is None and not any("CameraInfo" in topic.type for topic in topics):
+    elif drive is None and "--calibration FILE" in question:
         words += ["--calibration", "FILE"]
     for name in motion:
         words += ["--motion", name]

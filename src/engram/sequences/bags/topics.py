@@ -14,6 +14,7 @@ from engram.sequences.bags.records import Topic
 _SIDES = (
     ("left", "right"),
     ("Left", "Right"),
+    ("port", "starboard"),
     ("infra1", "infra2"),
     ("infra_1", "infra_2"),
     ("cam0", "cam1"),
@@ -100,9 +101,22 @@ def stereo_topics(
     if best:
         choices = "\n".join(f"  {pair}" for pair in best)
         raise SequenceError(f"the bag has {len(best)} stereo pairs; choose one with\n{choices}")
-    raise SequenceError(
+    raise SequenceError(f"{_no_pair(images)}\n{_list(images)}")
+
+
+def _no_pair(images: Collection[str]) -> str:
+    """Why there is no pair, and what to do."""
+    pictures = [name for name in images if not _NOT_PICTURES.search(name)]
+    if len(pictures) < 2:
+        return "the images of one camera only, and Engram needs both of a stereo camera"
+    if len(pictures) == 2:
+        return (
+            "no pair of image topics is named left and right; if these two are a stereo camera, "
+            f"name them: --left {pictures[0]} --right {pictures[1]}"
+        )
+    return (
         "no pair of image topics is named left and right (or infra1 and infra2, cam0 and cam1); "
-        f"name them with --left TOPIC --right TOPIC\n{_list(images)}"
+        "name them with --left TOPIC --right TOPIC"
     )
 
 
