@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 from engram.frontend import DescriptorKind, StereoPair
@@ -62,7 +63,7 @@ def towns() -> dict[str, list[ClipDrive]]:
     return plans
 
 
-def figures(kind: str) -> Iterator[Figure]:
+def figures(kind: str, relocaliser: str) -> Iterator[Figure]:
     """Route missed of all towns' drives, in per cent, and of each town's."""
     settings = Settings().for_descriptor(DescriptorKind(kind))
     every: dict[str, list[float]] = {name: [] for name in BUDGETS}
@@ -72,7 +73,8 @@ def figures(kind: str) -> Iterator[Figure]:
             for drive in drives[:_MAPPED]:
                 map_drive(path, drive, settings, RobotOptions(force=True))
             with Map.open(path) as opened:
-                for name, options in BUDGETS.items():
+                for name, budget in BUDGETS.items():
+                    options = replace(budget, relocaliser=relocaliser)
                     missed = 100 * route_not_localised(
                         [measure(opened, drive, settings, options) for drive in drives[_MAPPED:]]
                     )
@@ -86,9 +88,10 @@ def figures(kind: str) -> Iterator[Figure]:
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--kinds", default="brief,net", help="joined by commas")
+    parser.add_argument("--relocaliser", default="fabmap", help="finds a lost robot")
     asked = parser.parse_args()
     for kind in asked.kinds.split(","):
-        report(figures(kind), asked.json)
+        report(figures(kind, asked.relocaliser), asked.json)
 
 
 if __name__ == "__main__":
