@@ -27,9 +27,8 @@ _RARE = 0.35
 # Places apart of two views; of real frames.
 _STEPS, _REAL_STEPS = (0, 0, 0, 0, 0, 0, 0, 0, 0, 1), (1, 2, 3, 4, 5, 6, 8, 10)
 _FEWEST, _FEWEST_RARE = 15, 8
-# Share of patches that are turned, stretched and moved; of those with more noise; of blurred ones;
-# of those that another exposure, or a moving camera, took.
-_WARPED, _NOISY, _BLURRED, _EXPOSED, _SMEARED = 0.35, 0.25, 0.1, 0.2, 0.1
+# Share of patches that are turned, stretched and moved; of those with more noise; of blurred ones.
+_WARPED, _NOISY, _BLURRED = 0.35, 0.25, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,32 +197,10 @@ class Drawer:
             )  # fmt: skip
         for row in np.flatnonzero(draws.random(count) < _BLURRED):
             patches[row] = cv2.GaussianBlur(patches[row], (0, 0), draws.uniform(0.6, 2.0))
-        for row in np.flatnonzero(draws.random(count) < _SMEARED):
-            patches[row] = _smeared(patches[row], draws.uniform(2, 9), draws.uniform(0, np.pi))
-        for row in np.flatnonzero(draws.random(count) < _EXPOSED):
-            patches[row] = _exposed(patches[row], draws)
         noisy = np.flatnonzero(draws.random(count) < _NOISY)
         sigma = draws.uniform(0.5, 4, (len(noisy), 1, 1)).astype(np.float32)
         noise = draws.standard_normal((len(noisy), 64, 64), dtype=np.float32) * sigma
         patches[noisy] = np.clip(patches[noisy] + noise + 0.5, 0, 255).astype(np.uint8)
-
-
-def _smeared(patch: NDArray[np.uint8], long_px: float, turned: float) -> NDArray[np.uint8]:
-    """What a camera sees that moves so far while its shutter is open."""
-    kernel = np.zeros((11, 11), np.float32)
-    half = 8 * long_px * np.array([np.cos(turned), np.sin(turned)])
-    (u, v), (x, y) = (np.rint(80 + sign * half).astype(int) for sign in (-1, 1))
-    cv2.line(kernel, (int(u), int(v)), (int(x), int(y)), 1.0, 1, cv2.LINE_AA, 4)
-    return np.asarray(cv2.filter2D(patch, -1, kernel / kernel.sum()), np.uint8)
-
-
-def _exposed(patch: NDArray[np.uint8], draws: np.random.Generator) -> NDArray[np.uint8]:
-    """Another exposure and tone curve: what is bright may be white, what is dark may drown."""
-    tone = np.exp(draws.uniform(-0.5, 0.5))
-    gain, offset = np.exp(draws.uniform(-1.2, 0.5)), draws.uniform(-0.15, 0.05)
-    levels = 255 * (gain * (np.arange(256) / 255) ** tone + offset)
-    curve: NDArray[np.uint8] = np.clip(levels + 0.5, 0, 255).astype(np.uint8)
-    return curve[patch]
 
 
 def _joined(parts: Sequence[Batch]) -> Batch:
