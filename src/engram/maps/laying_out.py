@@ -43,7 +43,8 @@ def new_places(store: MapReader, contents: Mapping[str, float]) -> list[Placemen
     if graph is None:
         found = store.load()
         graph = graph_of(found.nodes, found.edges)
-    before = store.read_placements() if contents["placements"] else store.placements
+    own = contents["placements"] or contents["hidden"]
+    before = store.read_placements() if own else store.placements
     lay_out = replace_after_removal if contents["removals"] else place
     return changed(before, graph, lay_out(graph, before))
 

@@ -23,6 +23,9 @@ from engram.centre.store.schema import artifacts, handins
 _ABOUT = """The fleet's shared map as a service: robots hand in what they saw, and download what the
 next mission needs. Errors are problem details (RFC 9457). Whatever is sent twice is done once."""
 
+# Limits of the histogram of answers' times, s.
+_WITHIN_S = (0.01, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
+
 
 def create_app(centre: Centre) -> FastAPI:
     """The HTTP interface of a centre."""
@@ -35,7 +38,7 @@ def create_app(centre: Centre) -> FastAPI:
     )
     app.state.centre = centre
     app.state.answers = Counter[int]()
-    app.state.seconds = 0.0
+    app.state.seconds, app.state.within = 0.0, Counter[float]()
     add_problems(app)
     for part in (robots, maps, transfers):
         app.include_router(part.router, prefix="/v1")
@@ -62,7 +65,9 @@ class _Counting:
             if message["type"] == "http.response.start":
                 state = scope["app"].state
                 state.answers[message["status"]] += 1
-                state.seconds += time.perf_counter() - started
+                took_s = time.perf_counter() - started
+                state.seconds += took_s
+                state.within.update(limit_s for limit_s in _WITHIN_S if took_s <= limit_s)
                 headers = MutableHeaders(scope=message)
                 headers["X-Content-Type-Options"] = "nosniff"
                 headers.setdefault("Cache-Control", "no-store")
@@ -86,8 +91,15 @@ def _metrics(request: Request, centre: CentreHere) -> str:
         f'engram_answers_total{{status="{code}"}} {count}'
         for code, count in sorted(state.answers.items())
     ]
-    lines += ["# TYPE engram_answer_seconds_total counter"]
-    lines += [f"engram_answer_seconds_total {state.seconds:.6f}"]
+    count = sum(state.answers.values())
+    lines += ["# TYPE engram_answer_seconds histogram"]
+    lines += [
+        f'engram_answer_seconds_bucket{{le="{limit_s}"}} {state.within[limit_s]}'
+        for limit_s in _WITHIN_S
+    ]
+    lines += [f'engram_answer_seconds_bucket{{le="+Inf"}} {count}']
+    lines += [f"engram_answer_seconds_sum {state.seconds:.6f}"]
+    lines += [f"engram_answer_seconds_count {count}"]
     with centre.database.reading() as connection:
         for table in (handins, artifacts):
             query = select(table.c.state, func.count()).group_by(table.c.state)

@@ -1,0 +1,178 @@
+"""A centre with many agents at once over real sockets: failed requests, and how fast it answers.
+
+    python -m engram_lab.checks.centre_load --agents 50 --nodes 20000 --minutes 60
+
+An embedded centre with its worker runs as a program of its own, with a fleet map of synthetic
+places. Each agent is enrolled, and in turn drives past places of its own, hands in, and reports,
+until the time is over; all of them start at random moments. Then a mission's download is asked for
+twice, by two robots. Times of answers are the service's own histogram; downloads are timed from
+asking to the first byte.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+
+from engram.agent import Agent, enrol
+from engram.centre.access.enrolment import new_code
+from engram.centre.service import Centre, MapPolicy
+from engram.fleet.merge import MergeOptions
+from engram.maps import open_map
+from engram_lab.checks.merge_scaling import SESSION_NODES, write_map, write_session
+from engram_lab.programs import Figure, command_line, report
+
+_MAP = "fleet"
+_FORAY_NODES = 20
+_PROGRAM = "import sys; from engram.cli import main; sys.argv[0] = 'engram'; main()"
+_MISSION = {"policy": "budget", "budget_percent": 25.0}
+
+
+def made_centre(folder: Path, nodes: int) -> Centre:
+    """A centre whose map holds drives past so many places."""
+    centre = Centre(folder)
+    if nodes:
+        places = [range(at, at + SESSION_NODES) for at in range(0, nodes, SESSION_NODES)]
+        write_map(folder / "maps" / f"{_MAP}.engram", "fleet", places, None)
+    centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser=None)))
+    return centre
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """The address of a running centre."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-c", _PROGRAM, "centre", "serve", str(folder), "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
+        try:
+            assert service.stdout is not None
+            service.stdout.readline()  # it tells its address as soon as it answers
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            service.terminate()
+
+
+class Day:
+    """Agents that drive and hand in until the day is over.
+
+    Attributes:
+        troubles: what went wrong for an agent, in words; a day without any has none.
+        forays: how many were handed in.
+    """
+
+    def __init__(self, folder: Path, url: str, end_s: float) -> None:
+        self._folder = folder
+        self._url = url
+        self._end_s = end_s
+        self._over = threading.Event()
+        self.troubles: list[str] = []
+        self.forays = 0
+
+    def live(self, number: int, code: str) -> None:
+        """The day of one robot."""
+        folder, name = self._folder / f"r{number}", f"r{number}"
+        chance = random.Random(number)
+        enrol(folder, self._url, code, name)
+        foray = 0
+        with Agent(folder) as agent:
+            while self._waited(chance.expovariate(1 / 20.0)):
+                self._drive(agent.live, name, foray, 1_000_000 + number * 10_000)
+                foray += 1
+                agent.hand_in()
+                while agent.step(fetch=False) == 0:
+                    pass
+                self.forays += 1
+                if agent.trouble is not None:
+                    self.troubles.append(f"{name}: {agent.trouble}")
+
+    def _drive(self, path: Path, name: str, foray: int, first: int) -> None:
+        at = first + foray * _FORAY_NODES
+        with (
+            open_map(path, create=True) as store,
+            store.writing(),
+            store.begin_revision(author=name, message="", configuration={}) as writer,
+        ):
+            write_session(writer, name, foray, range(at, at + _FORAY_NODES), None)
+            writer.commit()
+
+    def _waited(self, seconds: float) -> bool:
+        """Whether the day goes on after some seconds."""
+        left_s = self._end_s - time.monotonic()
+        self._over.wait(min(seconds, max(left_s, 0.0)))
+        return time.monotonic() < self._end_s
+
+
+def answers(url: str) -> list[Figure]:
+    """The service's own counts of answers and of their times."""
+    told = httpx.get(f"{url}/v1/metrics", timeout=60.0).text
+    by_status = re.findall(r'engram_answers_total\{status="(\d+)"\} (\d+)', told)
+    failed = sum(int(count) for status, count in by_status if status >= "500")
+    buckets = dict(re.findall(r'engram_answer_seconds_bucket\{le="([^"]+)"\} (\d+)', told))
+    whole = int(buckets["+Inf"])
+    return [
+        Figure("answers", whole),
+        Figure("server errors", failed),
+        *(
+            Figure(f"answers within {limit} s", 100.0 * int(count) / max(whole, 1), "%")
+            for limit, count in buckets.items()
+            if limit != "+Inf"
+        ),
+    ]
+
+
+def first_byte_s(folder: Path) -> float:
+    """From asking for a mission's download to its first byte, as one robot."""
+    with Agent(folder) as agent:
+        started = time.perf_counter()
+        body = {"ref": "head", "options": _MISSION}
+        asked = agent.link.ask("POST", f"/v1/maps/{_MAP}/downloads", body)
+        while asked["state"] == "asked":
+            asked = agent.link.ask("GET", f"/v1/artifacts/{asked['id']}")
+        agent.link.ask("GET", f"/v1/artifacts/{asked['id']}/manifest")
+        return time.perf_counter() - started
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--agents", type=int, default=50)
+    parser.add_argument("--nodes", type=int, default=20_000, help="of the fleet map, to begin with")
+    parser.add_argument("--minutes", type=float, default=60.0, help="of the day")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        with made_centre(folder / "centre", asked.nodes) as centre:
+            codes = [new_code(centre, _MAP, "head", "lab") for _ in range(asked.agents)]
+        with served(folder / "centre") as url:
+            day = Day(folder, url, time.monotonic() + 60.0 * asked.minutes)
+            with ThreadPoolExecutor(asked.agents) as robots:
+                list(robots.map(day.live, range(asked.agents), codes))
+            figures = answers(url)
+            figures += [
+                Figure("forays handed in", day.forays),
+                Figure("troubles of agents", len(day.troubles)),
+                Figure("first robot's download, first byte", first_byte_s(folder / "r0"), "s"),
+                Figure("second robot's download, first byte", first_byte_s(folder / "r1"), "s"),
+            ]
+    title = f"{asked.agents} agents, {asked.nodes} nodes, {asked.minutes:g} minutes"
+    report(figures, asked.json, title)
+    for trouble in day.troubles[:20]:
+        print(trouble)
+    sys.exit(bool(day.troubles))
+
+
+if __name__ == "__main__":
+    main()
