@@ -8,7 +8,14 @@ from engram.geometry import SE3
 from engram.graph.adjusting import AdjustConfig, Measured, Poses, adjust
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind
-from engram.graph.placing import Anchored, anchor, fit_level, place, replace_after_removal
+from engram.graph.placing import (
+    Anchored,
+    PlacingConfig,
+    anchor,
+    fit_level,
+    place,
+    replace_after_removal,
+)
 
 SIGMA_M, SIGMA_RAD = 0.01, 0.001
 
@@ -159,3 +166,18 @@ def test_half_of_the_loops_may_be_wrong():
     found = adjust(start, measured, free, AdjustConfig())
     assert (found.weights[:90] > 0.25).all()
     assert (found.weights[90:] < 0.01).all()
+
+
+def test_nodes_that_nothing_joins_stand_in_a_row_beside_the_rest():
+    _, nodes, edges = town()
+    alone = [town(session=number)[1][0] for number in (1, 2, 3)]
+    graph = graph_of([*nodes, *alone], edges)
+    poses = place(graph, {})
+    first = len(nodes)
+    right_m = poses.translations[:first, 0].max()
+    apart_m = PlacingConfig().apart_m
+    expected = right_m + apart_m * np.arange(1, 4)
+    np.testing.assert_allclose(poses.translations[first:, 0], expected)
+    assert not poses.translations[first:, 1:].any()
+    # The camera's motion shows that it pitches by a milliradian.
+    np.testing.assert_allclose(poses.rotations[first:, :, 2], [[1.0, 0.0, 0.0]] * 3, atol=0.01)

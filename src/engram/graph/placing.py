@@ -198,10 +198,24 @@ class _Placing:
             poses = self._solved(poses, members, fixed)
             taken[members] = True
         for members in fresh:
-            poses = self._laid_out_alone(poses, members)
-            poses = self.set_beside(poses, members, taken)
-            taken[members] = True
+            if len(members) > 1:
+                poses = self._laid_out_alone(poses, members)
+                poses = self.set_beside(poses, members, taken)
+                taken[members] = True
+        self._line_up(poses, [int(one[0]) for one in fresh if len(one) == 1], taken)
         return poses
+
+    def _line_up(self, poses: Poses, alone: list[int], taken: NDArray[np.bool_]) -> None:
+        """Sets nodes without edges beside all others, in one pass: a map may hold thousands."""
+        if not alone:
+            return
+        apart_m = self._config.apart_m
+        right_m = poses.translations[taken, 0].max() + apart_m if taken.any() else 0.0
+        ups = self._level(len(taken)).ups[alone] @ MAP_FROM_CAMERA.T
+        for node, up in zip(alone, ups, strict=True):
+            levelled = _level_turn(up, MAP_FROM_CAMERA[:, 2])
+            poses.set(node, SE3(levelled @ MAP_FROM_CAMERA, np.array([right_m, 0.0, 0.0])))
+            right_m += apart_m
 
     def adjusted_whole(self, poses: Poses) -> Poses:
         """All components adjusted from where they are, each with its first node fixed."""
