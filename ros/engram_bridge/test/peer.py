@@ -72,8 +72,13 @@ class Peer(Node):
         return subscribed and bool(self.status) and self.status[-1][1].status == "starting"
 
     def place(self, number: int) -> int:
-        """Which pair the camera sees at a step: there and back, so that the drive has no jump."""
+        """Which pair the camera sees at a step: there and back, so that the drive has no jump.
+
+        Pairs with a truth are a lap, which ends where it begins.
+        """
         count = len(self.pairs["left"])
+        if "map_from_camera" in self.pairs:
+            return number % count
         place = number % (2 * count - 2) if count > 1 else 0
         return place if place < count else 2 * count - 2 - place
 
