@@ -103,6 +103,7 @@ def test_a_group_that_kills_every_worker_is_given_up(tmp_path, logs):
     assert not centre.exists()
 
 
+@pytest.mark.long
 def test_an_interrupted_build_goes_on_and_comes_to_the_same_map(tmp_path, logs, built):
     centre = tmp_path / "centre.engram"
     report = build(centre, logs, monitor=Interrupting(25))
@@ -124,6 +125,7 @@ def test_a_centre_that_exists_takes_in_all_groups(tmp_path, logs):
     assert report.left_out == []
 
 
+@pytest.mark.long
 def test_drives_that_the_centre_has_are_not_mapped_again(tmp_path, logs):
     centre = tmp_path / "centre.engram"
     first = build(centre, logs, names="ab", groups=1)

@@ -67,7 +67,14 @@ def year(monkeypatch):
     return at
 
 
-@pytest.mark.parametrize(("true_deg", "found_deg"), [(51.8, 52.5), (-36.0, -37.5), (3.0, 0.0)])
+@pytest.mark.parametrize(
+    ("true_deg", "found_deg"),
+    [
+        (51.8, 52.5),
+        pytest.param(-36.0, -37.5, marks=pytest.mark.long),
+        pytest.param(3.0, 0.0, marks=pytest.mark.long),
+    ],
+)
 def test_the_latitude_is_learnt_from_who_got_on_with_whom(year, true_deg, found_deg):
     assert learnt_latitude(year(true_deg)) == found_deg
 
