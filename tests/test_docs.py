@@ -27,6 +27,8 @@ ROOT = Path(__file__).parent.parent
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
 # Pages whose examples run, in what folder they begin.
+# Pages that start services and run for ten seconds and more: `make test-long`.
+SLOW = {"afternoon", "operate", "budget"}
 EXAMPLES = {
     README: "drives",
     DOCS / "first-map.md": "drives",
@@ -229,7 +231,13 @@ def test_every_page_with_examples_is_run() -> None:
     assert with_some - EXAMPLES.keys() <= {ROOT / "CONTRIBUTING.md"}
 
 
-@pytest.mark.parametrize("page", EXAMPLES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=pytest.mark.long if page.stem in SLOW else (), id=page.name)
+        for page in EXAMPLES
+    ],
+)
 def test_the_examples_of_a_page_run_in_their_order(
     folder: Callable[[str], None],
     page: Path,

@@ -90,6 +90,7 @@ def nodes_of(path: Path) -> set:
         return {node.id for node in store.load().nodes}
 
 
+@pytest.mark.long
 def test_a_better_order_is_found_and_what_it_has_is_added(town, tmp_path):
     centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
     before = nodes_of(centre)

@@ -45,7 +45,10 @@ if sys.argv[3] == "try again":
 """
 
 
-@pytest.mark.parametrize("limit", [100_000, 200_000, 400_000])
+@pytest.mark.parametrize(
+    "limit",
+    [200_000, *(pytest.param(limit, marks=pytest.mark.long) for limit in (100_000, 400_000))],
+)
 @pytest.mark.parametrize("afterwards", ["try again", "give up"])
 def test_a_full_disk_costs_nothing_that_was_checkpointed(tmp_path, limit, afterwards):
     path = tmp_path / "town.engram"

@@ -31,6 +31,8 @@ from engram_lab.studies.fleet.records import read_download
 from engram_lab.studies.fleet.results import ArmResult
 from engram_lab.studies.tasks import run_tasks
 
+pytestmark = pytest.mark.long
+
 OPTIONS = FleetOptions(
     arms=("A",),
     folds=2,

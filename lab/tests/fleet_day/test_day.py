@@ -53,6 +53,7 @@ def town(tmp_path: Path) -> Iterator[Town]:
             yield Town(tmp_path, centre, link)
 
 
+@pytest.mark.long
 def test_a_link_that_breaks_delays_and_loses_nothing(town: Town) -> None:
     first, second = town.robot("r1", 1_000), town.robot("r2", 2_000)
     for robot in (first, second):

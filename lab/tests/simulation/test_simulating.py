@@ -37,6 +37,7 @@ class Each(Monitor):
         self.call(word)
 
 
+@pytest.mark.long
 def test_frame_logs_hold_every_frame_with_its_truth(short: Campaign, tmp_path: Path) -> None:
     words: list[str] = []
     report = simulate(short, tmp_path, workers=2, monitor=Each(words.append))
@@ -62,6 +63,7 @@ def test_what_is_there_is_not_rendered_again(short: Campaign, tmp_path: Path) ->
     assert Path(report.files[0]).read_bytes() == before
 
 
+@pytest.mark.long
 def test_a_session_that_is_named_twice_is_rendered_once(short: Campaign, tmp_path: Path) -> None:
     words: list[str] = []
     report = simulate(short, tmp_path, sessions=[2, 0, 2], monitor=Each(words.append))
@@ -174,6 +176,7 @@ def test_a_worker_that_dies_is_told_and_the_same_call_goes_on(
         log.close()
 
 
+@pytest.mark.long
 def test_images_in_kitti_layout_read_back_as_rendered(short: Campaign, tmp_path: Path) -> None:
     one = replace(short, spacing_m=30.0)
     folder = Path(simulate(one, tmp_path, images=True, sessions=[2]).files[0])
