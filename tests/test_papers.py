@@ -202,6 +202,24 @@ def test_failed_proposals_of_a_lost_robot_never_enter_w(street):
         assert set(failed.tolist()) <= near
 
 
+@pytest.mark.parametrize("paper", [True, False])
+def test_a_robot_that_is_told_a_place_looks_elsewhere_at_once_only_by_our_default(street, paper):
+    live = drive(WORLD, ROAD[-3:], 7, start_ns=10**15, seed=3)  # in light that no node has
+    settings = Settings()
+    config = settings.localiser
+    if paper:
+        doubt_after = load_settings(Path("linegar2015")).localiser.acceptance.doubt_after
+        config = replace(config, acceptance=replace(config.acceptance, doubt_after=doubt_after))
+    settings = replace(settings, localiser=config)
+    with Map.open(street) as opened, localiser_in(
+        opened, live[0].frame.camera, settings, policy="distance", relocaliser="exhaustive",
+    ) as localiser:  # fmt: skip
+        localiser.place_at(Position.at(opened.graph.node(0).id))
+        found = localised(localiser, live)
+    assert all(one.open_loop_m < config.lost_after_m for one in found)
+    assert (sum(one.proposed for one in found) == 0) is paper
+
+
 @pytest.mark.parametrize("success", list(Success))
 def test_the_first_success_ends_the_frame_where_the_papers_settings_say_so(street, success):
     live = drive(WORLD, ROAD, start_ns=10**15, seed=2)

@@ -42,7 +42,7 @@ class AcceptanceConfig:
             metres. Until then a contradicting one withdraws them, and no edge rests on them.
         doubt_after: fixes that should have come since the last one, and did not, after which a
             robot looks for itself all over the map; so does one that was told its place, until its
-            first fix.
+            first fix. 0: neither does, before it is lost.
         min_inliers: fewest inliers of a match with a prediction.
         min_inliers_lost: fewest inliers of a match without a prediction; above every wrong match
             that passes the other tests.

@@ -46,7 +46,8 @@ class Prover:
     @property
     def doubted(self) -> bool:
         """Whether the position may well be wrong: nobody confirmed it, or fixes fail to come."""
-        return self._told or self.standing.missed >= self._accepted.doubt_after
+        after = self._accepted.doubt_after
+        return after > 0 and (self._told or self.standing.missed >= after)
 
     def begin_frame(self) -> None:
         """Begins a frame: nothing is withdrawn yet."""
