@@ -6,6 +6,7 @@ import pytest
 
 from engram.centre.errors import UnknownError
 from engram.centre.resident import known_nodes, log_of
+from engram.errors import EngramError
 
 from .conftest import NAME, drive
 
@@ -31,6 +32,21 @@ def test_a_map_that_nobody_reads_any_more_is_closed(site, monkeypatch):
         with site.centre.reading(NAME):
             assert closed == []
     assert closed == [store]
+
+
+def test_a_map_that_was_put_in_place_of_another_is_the_one_that_is_read(site, tmp_path):
+    path = site.centre.map_path(NAME)
+    with site.centre.reading(NAME) as store:
+        assert store.revision == 0
+    restored = tmp_path / "restored.engram"
+    drive(restored, "r1", 1_000)
+    restored.replace(path)
+    with site.centre.reading(NAME) as store:
+        assert store.revision == 1
+    path.unlink()
+    for _ in range(2):
+        with pytest.raises(EngramError), site.centre.reading(NAME):
+            pass
 
 
 def test_a_map_that_is_not_there_is_not_known(site):

@@ -15,6 +15,7 @@ from engram.maps.map_reader import MapReader
 @dataclass(slots=True)
 class _Held:
     store: Map
+    inode: int
     users: int = 0
     retired: bool = False
 
@@ -55,13 +56,14 @@ class ResidentMaps:
             self._held.clear()
 
     def _newest(self, path: Path) -> _Held:
-        held = self._held.get(path)
-        if held is not None and held.store.resolve(None) == held.store.revision:
-            return held
+        held, inode = self._held.get(path), _inode(path)
         if held is not None:
+            if held.inode == inode and held.store.resolve(None) == held.store.revision:
+                return held
+            del self._held[path]
             held.retired = True
             _close_unused(held)
-        held = self._held[path] = _Held(Map.open(path))
+        held = self._held[path] = _Held(Map.open(path), inode)
         return held
 
 
@@ -81,6 +83,11 @@ def _log(store: MapReader) -> tuple[Revision, ...]:
 
 def _known_nodes(store: MapReader) -> frozenset[bytes]:
     return frozenset(one.bytes for some in (store.landmark_hashes, store.omissions) for one in some)
+
+
+def _inode(path: Path) -> int:
+    """Which file a path names: a restored backup is another one; 0 where there is none."""
+    return path.stat().st_ino if path.exists() else 0
 
 
 def _close_unused(held: _Held) -> None:
