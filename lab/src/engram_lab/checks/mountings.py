@@ -18,10 +18,10 @@ import numpy as np
 
 from engram.frontend import StereoPair
 from engram.geometry import SE3, StereoCamera
-from engram.maps import Map
-from engram.measures import Drive, route_not_localised
-from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive
+from engram.measures import route_not_localised
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram.robot.recording import extract_log
+from engram_lab.checks.both_directions import localised
 from engram_lab.town import Campaign
 from engram_lab.town.sequence import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
@@ -67,12 +67,6 @@ def rendered(campaign: Campaign, session: int) -> tuple[Path, Path]:
         other.parent.mkdir(exist_ok=True)
         extract_log(MountedSequence(campaign, session, MOUNTED), other, Settings())
     return Path(usual), other
-
-
-def localised(centre: Path, log: Path) -> Drive:
-    """What a robot that starts lost makes of a drive."""
-    with Map.open(centre) as opened:
-        return measure(opened, open_drive(log), Settings(), RobotOptions())
 
 
 def main() -> None:
