@@ -12,7 +12,7 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/" + NAME]),
         ("share/" + NAME, ["package.xml"]),
         ("share/" + NAME + "/launch", ["launch/engram.launch.py"]),
-        ("share/" + NAME + "/config", ["config/engram.yaml"]),
+        ("share/" + NAME + "/config", ["config/engram.yaml", "config/fastdds.xml"]),
     ],
     install_requires=["setuptools", "numpy"],
     zip_safe=True,

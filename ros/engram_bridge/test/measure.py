@@ -204,6 +204,7 @@ def endure(driver, given):
         "rate_hz": sent / took_s,
         "dropped": sent - heard,
         "dropped_by_process": peer.status[-1][1].dropped - before.dropped,
+        "taken": peer.status[-1][1].frames - before.frames,
         "dropped_share": (sent - heard) / sent,
         "age_ms": {str(q): float(np.quantile(ages_ms, q / 100)) for q in (50, 90, 99, 100)},
         "share_of_a_core": shares,

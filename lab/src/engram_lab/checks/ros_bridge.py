@@ -154,6 +154,7 @@ def _of_ros(python: Path) -> dict[str, str]:
         "PYTHONPATH": os.pathsep.join(map(str, paths)),
         "AMENT_PREFIX_PATH": f"{made}:{root}",
         "LD_LIBRARY_PATH": f"{made}/lib:{root}/lib",
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(_BRIDGE / "config" / "fastdds.xml"),
         "ROS_DOMAIN_ID": str(os.getpid() % 100),
     }
 
@@ -217,7 +218,8 @@ def _endurance(said: dict[str, Any]) -> int:
     print(
         f"{said['minutes']:g} minutes at {said['rate_hz']:.1f} Hz beside {said['busy_loops']} busy "
         f"loops, {said['sent']} frames\n"
-        f"dropped: {said['dropped']} ({said['dropped_share']:.2%})\n"
+        f"dropped: {said['dropped']} ({said['dropped_share']:.2%}); the live process took "
+        f"{said['taken']} and dropped {said['dropped_by_process']}\n"
         f"age when heard, ms: {age_ms['50']:.1f} median, {age_ms['90']:.1f} of 90 %, "
         f"{age_ms['99']:.1f} of 99 %, {age_ms['100']:.0f} largest\n"
         f"share of a core: bridge {shares['bridge']:.1%}, live process {shares['live']:.1%}\n"
