@@ -329,7 +329,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
 
 def test_the_documents_stay_within_their_length() -> None:
     read = [README, *(page for page in DOCS.glob("*.md") if page.stem != "open-points")]
-    assert sum(len(page.read_text().split()) for page in read) <= 21_000
+    assert sum(len(page.read_text().split()) for page in read) <= 18_300
 
 
 def test_no_text_names_somebody_elses_package() -> None:
