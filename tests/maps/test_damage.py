@@ -470,3 +470,15 @@ def test_a_map_on_a_full_disk_is_read(sound, tmp_path, monkeypatch):
     path.with_name("town.engram-wal").write_bytes(b"something")
     with pytest.raises(StorageFullError, match="cannot grow"):
         Map.open(path)
+
+
+@pytest.mark.parametrize("gone", ["key = 2", "key = 1", "TRUE"])
+def test_tags_that_are_gone_with_their_rows_are_missed(broken, gone):
+    with Map.open(broken, writes=True) as store:
+        for name in ("good", "better"):
+            store.tag(name, 1, author="tests")
+    assert check_file(broken).problems == ()
+    with contextlib.closing(sqlite3.connect(broken)) as connection, connection:
+        connection.execute(f"DELETE FROM tags WHERE {gone}")
+    (problem,) = check_file(broken).problems
+    assert "counts 2 rows of tags" in problem.fact

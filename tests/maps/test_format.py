@@ -202,3 +202,11 @@ def test_format_5_reads_as_it_was_written(tmp_path):
         assert len(store.load().edges) == 2
         assert store.removals == ()
     assert check_file(path).problems == ()
+
+
+def test_format_6_reads_as_it_was_written(tmp_path):
+    path = shutil.copy(DATA / "format-6.engram", tmp_path / "sixth.engram")
+    with Map.open(path) as store:
+        assert list(store.tags()) == ["best"]
+        assert store.revision == 1
+    assert check_file(path).problems == ()

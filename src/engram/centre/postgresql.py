@@ -19,7 +19,6 @@ from sqlalchemy import (
     Table,
     create_engine,
     event,
-    insert,
     inspect,
     make_url,
     text,
@@ -40,8 +39,13 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.files import Holder
-from engram.maps.database import damage_named, raise_tables, reading_rows, replaced
-from engram.maps.rows import sealed
+from engram.maps.database import (
+    damage_named,
+    raise_tables,
+    reading_rows,
+    replaced,
+    write_format,
+)
 from engram.maps.schema import (
     FORMAT_VERSION,
     map_format,
@@ -85,8 +89,7 @@ class PostgresMap:
                     )
                 connection.execute(text(f'CREATE SCHEMA "{schema}"'))
                 metadata.create_all(connection, checkfirst=False)
-                row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
-                connection.execute(insert(map_format), sealed(map_format, row))
+                write_format(connection)
         finally:
             engine.dispose()
 

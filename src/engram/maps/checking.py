@@ -52,6 +52,7 @@ from engram.maps.schema import (
     hidden,
     map_format,
     metadata,
+    missing_in,
     nodes,
     omissions,
     omitted_landmarks,
@@ -62,10 +63,12 @@ from engram.maps.schema import (
     revisions,
     sessions,
     statistics,
+    tag_tally,
     tags,
     vocabularies,
     words,
 )
+from engram.maps.tally import check_tally
 from engram.maps.words import decode_words
 
 _LATER = {table for news in NEWER.values() for table in news}
@@ -79,7 +82,7 @@ _REFERENCES = {
     "b": nodes,
     "path": paths,
 }
-_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, words)
+_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, tag_tally, words)
 assert set(_ORDER) == set(metadata.sorted_tables)
 
 # Rounding of rotations that come from chains of products.
@@ -219,6 +222,15 @@ class _Checking:
         self._check_history()
         if len(self.revision_of[map_format]) != 1:
             self.report(map_format, "", "must have one row")
+        if tag_tally not in missing_in(self.database.format_version):
+            self._check_tally()
+
+    def _check_tally(self) -> None:
+        try:
+            with self.database.reading() as connection:
+                check_tally(connection)
+        except EngramError as error:
+            self.report(tag_tally, "", str(error))
 
     def _check_history(self) -> None:
         committed = [row for row in self.revision_rows.values() if row["status"] == "committed"]

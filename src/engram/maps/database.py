@@ -16,6 +16,7 @@ from engram.errors import EngramError, MapCorruptError
 from engram.files import Holder
 from engram.maps.rows import sealed
 from engram.maps.schema import FORMAT_VERSION, map_format, missing_in, rebuilt_from
+from engram.maps.tally import count_tags
 
 _STUMBLES = (TypeError, ValueError, LookupError, ArithmeticError, NoResultFound)
 
@@ -190,6 +191,12 @@ def raise_tables(
         copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
         connection.execute(text(copied))
         connection.execute(text("DROP TABLE older"))
+    write_format(connection)
+
+
+def write_format(connection: Connection) -> None:
+    """Writes the rows that every map has: its format, and the tally of its tags."""
     connection.execute(delete(map_format))
     row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
     connection.execute(insert(map_format), sealed(map_format, row))
+    count_tags(connection)

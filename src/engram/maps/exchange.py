@@ -18,11 +18,12 @@ from engram.maps.map_files import open_database
 from engram.maps.rows import verified
 from engram.maps.schema import KEYED, VERSIONED, cameras, frontends, nodes, revisions, tags, words
 from engram.maps.sqlite import SqliteDatabase
+from engram.maps.tally import count_tags
 from engram.maps.view import View, head
 
 # In the order in which rows refer to each other.
 EXCHANGED: tuple[Table, ...] = (revisions, cameras, frontends, *VERSIONED, tags, words)
-assert len(EXCHANGED) == len(KEYED) + 1  # all tables but that of the format
+assert len(EXCHANGED) == len(KEYED)  # all tables but those of the format and of the tally
 
 _ROWS_AT_ONCE = 200
 
@@ -98,3 +99,4 @@ def map_of_rows(path: Path) -> Iterator[PutRows]:
                     connection.execute(insert(table), values)
 
             yield put
+            count_tags(connection)

@@ -24,7 +24,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import SchemaItem
 from sqlalchemy.types import TypeEngine
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 
 # SQLite's INTEGER and REAL are 64 bits wide.
 _INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
@@ -243,6 +243,9 @@ tags = _table(
     _int("tagged_ns"),
 )
 
+# One row: what the rows of tags come to, which no revision counts (`engram.maps.tally`).
+tag_tally = _table("tag_tally", _key(), _int("rows"), _bytes("digest"))
+
 # Words of nodes by a vocabulary (`engram.places`), computed from their landmarks. They follow from
 # other rows and belong to no revision.
 words = _table(
@@ -339,6 +342,7 @@ NEWER: dict[int, tuple[Table, ...]] = {
     3: (omitted_landmarks,),
     4: (amendments,),
     5: (removals, placements, anchors, goals),
+    6: (tag_tally,),
 }
 # Tables with the columns of format 1 whose constraints a later format loosened.
 LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}

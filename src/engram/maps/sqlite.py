@@ -16,18 +16,22 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, Select, Table, event, insert
+from sqlalchemy import Connection, Engine, Select, Table, event
 from sqlalchemy.dialects import sqlite as sqlite_dialect
 from sqlalchemy.dialects.sqlite import Insert
 from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.compiler import SQLCompiler
 
-from engram import __version__
 from engram.errors import InputError, MapCorruptError, MapError, NotAMapError, StorageFullError
 from engram.files import Holder, WriterLock, current_holder, naming, new_file, publish
-from engram.maps.database import damage_named, raise_tables, reading_rows, replaced
-from engram.maps.rows import sealed
-from engram.maps.schema import FORMAT_VERSION, map_format, metadata, missing_in
+from engram.maps.database import (
+    damage_named,
+    raise_tables,
+    reading_rows,
+    replaced,
+    write_format,
+)
+from engram.maps.schema import FORMAT_VERSION, metadata, missing_in
 from engram.sqlite import FileKind, SqliteFile
 
 MAP_FILE = FileKind(
@@ -86,8 +90,7 @@ class SqliteDatabase:
             with SqliteFile(path, MAP_FILE).errors():
                 with engine.begin() as connection:
                     metadata.create_all(connection)
-                    row = {"key": 1, "version": FORMAT_VERSION, "tool_version": __version__}
-                    connection.execute(insert(map_format), sealed(map_format, row))
+                    write_format(connection)
                     file.mark(connection.exec_driver_sql)
                 engine.dispose()
                 _keep_log(file)

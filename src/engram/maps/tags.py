@@ -12,6 +12,7 @@ from engram.errors import InputError, RevisionError
 from engram.maps.keys import KeyBook
 from engram.maps.rows import checked_text, sealed, verified
 from engram.maps.schema import tags
+from engram.maps.tally import count_tags
 from engram.maps.view import head
 
 HEAD = "head"
@@ -154,3 +155,4 @@ def _write_tag(
         "tagged_ns": time.time_ns(),
     }
     connection.execute(insert(tags), [sealed(tags, row)])
+    count_tags(connection)
