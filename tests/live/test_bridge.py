@@ -6,6 +6,7 @@ import ast
 import os
 import runpy
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -443,3 +444,26 @@ def test_a_process_that_hangs_is_killed() -> None:
     assert "said nothing for 1.0 s" in watched.said.get(timeout=60)
     assert "ended with -9" in watched.said.get(timeout=60)
     watched.supervisor.close()
+
+
+def test_memory_of_images_is_kept() -> None:
+    """A process that keeps memory asks the kernel for no new pages for each image."""
+    program = (
+        "import resource, sys\nfrom engram_bridge.memory import keep_memory\n"
+        "if len(sys.argv) > 1: assert keep_memory()\n"
+        "def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "def take(): [b'x' * 307_200 for _ in range(4)]\n"
+        "take(); take(); began = faults()\n"
+        "for _ in range(50): take()\n"
+        "print(faults() - began)"
+    )
+    faults = []
+    for given_ in ((), ("keep",)):
+        ran = subprocess.run(
+            [sys.executable, "-c", program, *given_],
+            env={**os.environ, "PYTHONPATH": str(PACKAGE)},
+            capture_output=True,
+            check=True,
+        )
+        faults.append(int(ran.stdout))
+    assert faults[1] < 0.05 * faults[0], faults

@@ -23,6 +23,7 @@ from engram_bridge import images, rigid
 from engram_bridge.asking import Asking
 from engram_bridge.belief import Belief
 from engram_bridge.frames import StaticFrames
+from engram_bridge.memory import keep_memory
 from engram_bridge.output import Poses, StatusReport, TFMessage, Ticking
 from engram_bridge.pairs import Pairs
 from engram_bridge.parameters import PARAMETERS, RUNNING, checked, image_topic, live_command
@@ -335,6 +336,7 @@ def _start(node) -> None:
 
 def main() -> None:
     """Runs the node until it is interrupted."""
+    keep_memory()
     rclpy.init()
     node = Bridge()
     try:

@@ -24,6 +24,7 @@ except ImportError:  # not built: the same is said as JSON
     Status = None
 
 _PATH = 1000  # poses of the path that is shown
+_PATH_EVERY_NS = 1_000_000_000  # between two publications of it, to whoever subscribes
 # After so long without a frame, map -> odom is kept up by itself.
 _NO_FRAME_NS = 250_000_000
 # A stamp that is earlier by more is a clock that was set back, not a message out of order.
@@ -47,7 +48,7 @@ class Poses:
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "pose", queue)
         self._driven = node.create_publisher(Path, "path", queue)
         self._tf = None if TFMessage is None else node.create_publisher(TFMessage, "/tf", queue)
-        self._path = Path()
+        self._path, self._path_ns = Path(), 0
         self._lock = threading.Lock()
         self._map_stamp_ns = None
         self._publishers = [self._odometry, self._pose, self._driven, self._tf]
@@ -76,6 +77,7 @@ class Poses:
         map_pose = belief.map_pose
         if map_pose is not None:
             self._say_pose(stamp, *map_pose)
+            self._say_path(stamp_ns)
 
     def keep_up(self, belief, now_ns: int) -> None:
         """Repeats map -> odom, stamped with now, while no frame comes."""
@@ -110,7 +112,13 @@ class Poses:
         self._path.header = pose.header
         self._path.poses.append(PoseStamped(header=pose.header, pose=pose.pose.pose))
         del self._path.poses[:-_PATH]
-        self._driven.publish(self._path)
+
+    def _say_path(self, stamp_ns: int) -> None:
+        """A thousand poses cost more than all else that a frame brings: not with every one."""
+        late = not 0 <= stamp_ns - self._path_ns < _PATH_EVERY_NS
+        if late and self._driven.get_subscription_count():
+            self._path_ns = stamp_ns
+            self._driven.publish(self._path)
 
 
 class Ticking:
