@@ -35,6 +35,7 @@ from engram_bridge import images, rigid  # noqa: E402
 from engram_bridge.asking import Asking  # noqa: E402
 from engram_bridge.belief import Belief  # noqa: E402
 from engram_bridge.frames import StaticFrames  # noqa: E402
+from engram_bridge.gyro import Gyro  # noqa: E402
 from engram_bridge.pairs import Pairs  # noqa: E402
 from engram_bridge.parameters import PARAMETERS, checked, image_topic, live_command  # noqa: E402
 from engram_bridge.supervisor import Supervisor  # noqa: E402
@@ -169,6 +170,35 @@ def test_the_wheels_pose_at_the_time_of_an_image() -> None:
     assert wheels.at(int(1.2e9)) is None
     wheels.add(0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
     assert wheels.at(10) is None, "the clock went back"
+
+
+def test_the_turn_of_a_gyroscope_at_the_time_of_an_image() -> None:
+    """200 Hz around an axis that turns with the robot; then a pause, and on."""
+    gyro, rates = Gyro(), np.array([0.1, -0.2, 0.6])
+
+    def turned(seconds: float) -> np.ndarray:
+        return SE3.exp(np.r_[np.zeros(3), seconds * rates]).rotation
+
+    def add(first: int, last: int) -> None:
+        for number in range(first, last):
+            gyro.add(number * 5_000_000, rates)
+
+    add(0, 200)
+    for seconds in (0.5, 0.7512, 1.001):
+        matrix = gyro.at(int(seconds * 1e9))
+        np.testing.assert_allclose(matrix[:3, :3], turned(seconds), atol=1e-5)
+    add(240, 300)
+    np.testing.assert_allclose(gyro.at(1_495_000_000)[:3, :3], turned(1.495), atol=1e-5)
+    add(500, 600)
+    assert gyro.at(2_600_000_000) is None, "nobody knows how it turned in the pause"
+    assert gyro.at(2_650_000_000) is not None
+    assert gyro.at(4_000_000_000) is None
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
+def test_a_rotation_vector_is_that_of_engram(vector: list[float]) -> None:
+    wanted = SE3.exp([0.0, 0.0, 0.0, *vector]).matrix()
+    np.testing.assert_allclose(rigid.of_turn(vector), wanted, atol=1e-9)
 
 
 PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEAD_RECKONING}

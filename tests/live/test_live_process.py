@@ -22,6 +22,7 @@ from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.live import InProcess, LiveOptions, LiveProcess, Played, Served
 from engram.live.link import Link, Ring
+from engram.live.outside import Outside
 from engram.maps import open_map
 from engram.robot import RobotOptions, map_drive, open_drive
 
@@ -56,7 +57,7 @@ class Middleware:
         self.folder, self.ring = folder, None
         self.link, self.heard = Link.connect(str(folder / "socket")), []
 
-    def give(self, pair: StereoPair) -> None:
+    def give(self, pair: StereoPair, **moved: list[float]) -> None:
         if self.ring is None:
             camera = pair.camera
             path = str(self.folder / "ring")
@@ -65,7 +66,7 @@ class Middleware:
             said = {name: getattr(camera, name) for name in names}
             self.link.send({"do": "camera", "ring": path, "camera": said})
         ticket = self.ring.write(pair.stamp_ns, pair.left, pair.right)
-        self.link.send({"do": "frame", "ticket": ticket, "stamp_ns": pair.stamp_ns})
+        self.link.send({"do": "frame", "ticket": ticket, "stamp_ns": pair.stamp_ns, **moved})
 
     def ask(self, do: str, **given: Any) -> None:
         self.link.send({"do": do, **given})
@@ -228,10 +229,50 @@ def test_wheels_carry_the_robot_where_the_camera_sees_nothing(
             blind = number in {4, 5, 6}
             given = replace(pair, left=dark, right=dark) if blind else pair
             ahead = SE3(np.eye(3), np.array([0.0, 0.0, 0.8 * number]))
-            one.transport.give(given, ahead)
+            one.transport.give(given, Outside(wheels_from_live=ahead))
             said = until(one, lambda m, at=pair.stamp_ns: m.get("stamp_ns") == at)
     assert said["status"] == "localised"
     assert said["odom_from_live"][11] == pytest.approx(0.8 * (len(pairs) - 1), rel=0.05)
+
+
+def test_a_gyroscope_turns_the_robot_where_the_camera_sees_nothing(
+    town: Path, pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    """It rests for three seconds, in which the bias is learnt, and turns for half a second."""
+    bias, rate = np.array([0.05, -0.1, 0.02]), np.array([0.0, 0.4, 0.0])
+    rng, pair = np.random.default_rng(0), pairs[0]
+    turn, odom = SE3.identity(), []
+    with running("socket", tmp_path, LiveOptions(town, robot=OPTIONS)) as one:
+        assert isinstance(one, Middleware)
+        for number in range(35):
+            dark = number >= 30
+            noise = rng.integers(0, 2, pair.left.shape, np.uint8)
+            left, right = (noise if dark else np.maximum(x, noise) for x in (pair.left, pair.right))
+            stamp_ns = pair.stamp_ns + number * 10**8
+            turn = turn @ SE3.exp(0.1 * np.r_[np.zeros(3), bias + dark * rate])
+            moved = {"gyro_from_live": turn.rotation.ravel().tolist()}
+            one.give(StereoPair(stamp_ns, left, right, pair.camera), **moved)
+            odom.append(until(one, lambda m, at=stamp_ns: m.get("stamp_ns") == at))
+    before, after = (np.reshape(odom[at]["odom_from_live"], (4, 4))[:3, :3] for at in (29, 34))
+    turned_rad = SE3(before.T @ after, np.zeros(3)).log()[3:]
+    np.testing.assert_allclose(turned_rad, 0.5 * rate, atol=0.01)
+
+
+def test_what_only_one_source_measured_is_used() -> None:
+    straight, turned = SE3.exp([0, 0, 1.0, 0, 0.1, 0]), SE3.exp([0, 0, 0, 0, 0.2, 0])
+    still = SE3.identity()
+    both = Outside(straight, turned).since(Outside(still, still), 0.5)
+    assert both is not None
+    assert both.has_way
+    np.testing.assert_allclose(both.prev_from_curr.rotation, turned.rotation)
+    np.testing.assert_allclose(both.rates_rad_s, [0, 0.4, 0], atol=1e-9)
+    gyro = Outside(None, turned).since(Outside(still, still), 0.5)
+    assert gyro is not None
+    assert not gyro.has_way
+    wheels = Outside(straight, turned).since(Outside(still, None), 0.5)
+    assert wheels is not None
+    assert wheels.rates_rad_s is None
+    assert Outside(straight).since(Outside(None, turned), 0.5) is None
 
 
 def test_the_newest_frame_wins(town: Path, pairs: list[StereoPair]) -> None:

@@ -104,9 +104,10 @@ def test_a_camera_drives_past_the_bridge_and_its_process_is_killed(town: Path) -
     assert said["states"] == ["active", "inactive", "active"]
 
 
-def test_compressed_images_and_a_mounting_by_parameter(town: Path) -> None:
+def test_compressed_images_a_gyroscope_and_a_mounting_by_parameter(town: Path) -> None:
     mounted = "base_from_camera:=[0.0, 0.0, 0.0, -1.5707963, 0.0, -1.5707963]"
-    with bridge(town, "compressed:=true", mounted):
+    with bridge(town, "compressed:=true", "gyro:=imu", mounted):
         said = driven_past(town, "--compressed", "--seconds", "2")
     assert said["poses"] > 3
+    assert not any("imu" in one for one in said["troubles"]), said["troubles"]
     assert said["longest_silence_s"] < 1.0

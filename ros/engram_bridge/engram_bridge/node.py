@@ -16,13 +16,14 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_srvs.srv import SetBool, Trigger
 
 from engram_bridge import images, rigid
 from engram_bridge.asking import Asking
 from engram_bridge.belief import Belief
 from engram_bridge.frames import StaticFrames
+from engram_bridge.gyro import Gyro
 from engram_bridge.memory import keep_memory
 from engram_bridge.output import Poses, StatusReport, TFMessage, Ticking
 from engram_bridge.pairs import Pairs
@@ -109,7 +110,8 @@ class Bridge(Base):
         self._base_from_camera = rigid.of_xyz_rpy(mounting) if len(mounting) == 6 else None
         self._belief = Belief(self._base_from_camera)
         self._pairs = Pairs(int(1e6 * given["pair_tolerance_ms"]))
-        self._wheels, self._frames = Wheels(), StaticFrames()
+        self._wheels, self._gyro, self._frames = Wheels(), Gyro(), StaticFrames()
+        self._gyro_frame = None
         self._infos, self._camera_frame = [None, None], given["camera_frame"]
         self._poses = Poses(self, given)
         self._supervisor = Supervisor(live_command(given), self._hear, self._process_said)
@@ -141,6 +143,8 @@ class Bridge(Base):
             self._troubles.expect(side, topic, given[name + "_info"])
         if given["wheels"]:
             self._listen(Odometry, given["wheels"], self._turned)
+        if given["gyro"]:
+            self._listen(Imu, given["gyro"], self._rotated)
         self._listen(PoseWithCovarianceStamped, "initialpose", self._placed, 10)
         if TFMessage is not None:
             kept = QoSProfile(depth=_MANY, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -220,6 +224,33 @@ class Bridge(Base):
         xyzw = [turn.x, turn.y, turn.z, turn.w]
         self._wheels.add(_stamp_ns(message), [at.x, at.y, at.z], xyzw)
 
+    def _rotated(self, message) -> None:
+        """Rates of a gyroscope; its axes on the robot come from /tf_static."""
+        base = self._given["base_frame"]
+        frame = message.header.frame_id or base
+        if self._gyro_frame != frame:
+            self._base_from_gyro = self._frames.between(base, frame)
+            if self._base_from_gyro is None:
+                raise ValueError(f"no transform {base} -> {frame} in /tf_static; left out")
+            self._gyro_frame = frame
+        if message.angular_velocity_covariance[0] == -1.0:
+            raise ValueError("its messages hold no turn rates; left out")
+        rates = message.angular_velocity
+        turned = self._base_from_gyro[:3, :3] @ [rates.x, rates.y, rates.z]
+        if not np.isfinite(turned).all():
+            raise ValueError("a turn rate is not finite; left out")
+        self._gyro.add(_stamp_ns(message), turned)
+
+    def _outside(self, stamp_ns: int):
+        """Where wheels and gyroscope see the camera at a time, by the names of the link."""
+        if not self._belief.mounted:
+            return {}
+        wheels, turn = self._wheels.at(stamp_ns), self._gyro.at(stamp_ns)
+        seen = {} if wheels is None else {"wheels_from_live": wheels @ self._base_from_camera}
+        if turn is not None:
+            seen["gyro_from_live"] = turn[:3, :3] @ self._base_from_camera[:3, :3]
+        return seen
+
     def _fixed(self, message) -> None:
         for one in message.transforms:
             at, turn = one.transform.translation, one.transform.rotation
@@ -260,9 +291,7 @@ class Bridge(Base):
             return
         stamp_ns, *both = pair
         left, right = (decode(one) for one in both)
-        wheels = self._wheels.at(stamp_ns) if self._belief.mounted else None
-        wheels = None if wheels is None else wheels @ self._base_from_camera
-        self._supervisor.show(stamp_ns, left, right, wheels)
+        self._supervisor.show(stamp_ns, left, right, self._outside(stamp_ns))
         self._troubles.saw_pair()
 
     def _placed(self, message) -> None:

@@ -15,6 +15,7 @@ PARAMETERS = {
     "left_info": "left/camera_info",
     "right_info": "right/camera_info",
     "wheels": "",
+    "gyro": "",
     "compressed": False,
     "rectified": True,
     "pair_tolerance_ms": 2.0,

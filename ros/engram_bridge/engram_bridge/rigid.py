@@ -28,6 +28,15 @@ def of_xyz_rpy(values):
     return matrix
 
 
+def of_turn(vector_rad):
+    """A turn around an axis by its length, as a rotation vector (3,) states it; no shift."""
+    x, y, z = vector_rad
+    half = 0.5 * float(np.linalg.norm(vector_rad))
+    # sin(half) / half without its sine: as good at none at all, where a gyroscope rests.
+    share = 0.5 * float(np.sinc(half / np.pi))
+    return of_quaternion([share * x, share * y, share * z, np.cos(half)], [0.0, 0.0, 0.0])
+
+
 def quaternion(a_from_b):
     """x, y, z, w of the rotation, unit length, w not negative."""
     r = a_from_b[:3, :3]

@@ -78,15 +78,18 @@ class Supervisor:
             self._camera = camera
             self._introduce()
 
-    def show(self, stamp_ns: int, left, right, wheels_from_camera=None) -> bool:
-        """Hands over a pair, and where the wheels see the camera; False if nobody is connected."""
+    def show(self, stamp_ns: int, left, right, outside=None) -> bool:
+        """Hands over a pair, and what else saw the camera move: (4, 4) by name.
+
+        False if nobody is connected.
+        """
         with self._lock:
             if self._link is None or self._ring is None:
                 return False
             ticket = self._ring.write(stamp_ns, left, right)
             message = {"do": "frame", "ticket": ticket, "stamp_ns": stamp_ns}
-            if wheels_from_camera is not None:
-                message["wheels_from_live"] = wheels_from_camera.ravel().tolist()
+            for name, matrix in (outside or {}).items():
+                message[name] = matrix.ravel().tolist()
             return self._send(message)
 
     def ask(self, message) -> bool:

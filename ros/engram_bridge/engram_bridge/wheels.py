@@ -14,11 +14,15 @@ _FURTHEST_NS = 100_000_000
 
 
 class Wheels:
-    """The newest poses of wheel odometry, between which the pose at an image's time lies."""
+    """The newest poses of wheel odometry, between which the pose at an image's time lies.
 
-    def __init__(self) -> None:
+    Args:
+        kept: poses that are kept.
+    """
+
+    def __init__(self, kept: int = _KEPT) -> None:
         # (stamp_ns, translation (3,), quaternion xyzw (4,)), in the order of time.
-        self._poses = deque(maxlen=_KEPT)
+        self._poses = deque(maxlen=kept)
 
     def add(self, stamp_ns: int, translation, xyzw) -> None:
         """Takes a pose ``odom_from_base``; one that is not later than the last begins anew."""
@@ -31,8 +35,9 @@ class Wheels:
 
         None if the poses are too far from that time.
         """
-        later = [index for index, pose in enumerate(self._poses) if pose[0] >= stamp_ns]
-        after = later[0] if later else len(self._poses) - 1
+        after = len(self._poses) - 1
+        while after > 0 and self._poses[after - 1][0] >= stamp_ns:
+            after -= 1
         if after < 1:
             return None
         (a_ns, a, a_turn), (b_ns, b, b_turn) = self._poses[after - 1], self._poses[after]

@@ -23,7 +23,7 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from tf2_msgs.msg import TFMessage
 
 # Where the camera is on the robot: optical axes, half a metre ahead and one up.
@@ -56,6 +56,7 @@ class Peer(Node):
             self.create_publisher(CameraInfo, f"{side}/camera_info", quality)
             for side in ("left", "right")
         ]
+        self._gyro = self.create_publisher(Imu, "imu", quality)
         kept = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._static = self.create_publisher(TFMessage, "/tf_static", kept)
         self._static.publish(TFMessage(transforms=_mounting()))
@@ -88,6 +89,9 @@ class Peer(Node):
             return
         now_ns = self.get_clock().now().nanoseconds + int(1e9 * self.shift_s)
         stamp = rclpy.time.Time(nanoseconds=now_ns).to_msg()
+        still = Imu()
+        still.header.stamp, still.header.frame_id = stamp, "mast"
+        self._gyro.publish(still)
         both = [self.pairs[side][self.place(number)] for side in ("left", "right")]
         if self.spoils is not None:
             both = self.spoils(*both)

@@ -14,6 +14,7 @@ import numpy as np
 from engram.errors import EngramError, InputError
 from engram.frontend import DescriptorKind, StereoPair
 from engram.geometry import SE3, StereoCamera
+from engram.live.outside import Outside
 from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
@@ -120,7 +121,7 @@ class Driving:
         # Whether the robot's position is one that it was only told.
         self._proposed = False
         self._stamp_ns: int | None = None
-        self._wheels_from_live: SE3 | None = None
+        self._outside: Outside | None = None
         self._open_after = -np.inf
 
     @property
@@ -132,14 +133,14 @@ class Driving:
         self,
         arrived: Arrived,
         arrived_s: float | None = None,
-        wheels_from_live: SE3 | None = None,
+        outside: Outside | None = None,
     ) -> Step:
         """Takes a frame: opens the map if it is not open, localises, and survives its errors.
 
         Args:
             arrived: the frame.
             arrived_s: `time.perf_counter` when it arrived; None for now.
-            wheels_from_live: pose of the camera by wheel odometry; see `FrameEvent`.
+            outside: what wheels and gyroscope say at its time.
         """
         frame = arrived if isinstance(arrived, StereoPair) else arrived.frame
         if trouble := self._misplaced(frame.stamp_ns):
@@ -149,7 +150,7 @@ class Driving:
             self._front = None
         self._camera = frame.camera
         robot = self._robot or self._begun()
-        motion = self._driven(frame.stamp_ns, wheels_from_live)
+        motion = self._driven(frame.stamp_ns, outside)
         self._stamp_ns = frame.stamp_ns
         if robot is None:
             return Step(self._front_for(None).take(arrived, motion)[1], trouble=self.trouble)
@@ -166,13 +167,12 @@ class Driving:
         self.trouble = robot.saving.reason if robot.saving.state in _KEEPS_NO_MORE else ""
         return Step(found.motion, found, self.trouble, map_from_live, self._proposed)
 
-    def _driven(self, stamp_ns: int, wheels_from_live: SE3 | None) -> OutsideMotion | None:
-        """What the wheels measured since the frame before; None if they did not."""
-        before, self._wheels_from_live = self._wheels_from_live, wheels_from_live
-        if before is None or wheels_from_live is None or self._stamp_ns is None:
+    def _driven(self, stamp_ns: int, outside: Outside | None) -> OutsideMotion | None:
+        """What wheels and gyroscope measured since the frame before; None if they did not."""
+        before, self._outside = self._outside, outside
+        if before is None or outside is None or self._stamp_ns is None:
             return None
-        seconds = (stamp_ns - self._stamp_ns) / 1e9
-        return OutsideMotion(before.inverse() @ wheels_from_live, seconds)
+        return outside.since(before, (stamp_ns - self._stamp_ns) / 1e9)
 
     def map_on(self, on: bool) -> str:
         """Starts or ends mapping; ending commits what was mapped."""
@@ -247,7 +247,7 @@ class Driving:
         if back_ns < _LATE_FRAME_NS:
             return f"a frame is {back_ns / 1e6:.0f} ms older than the one before it; left out"
         self.pause()
-        self._front = self._stamp_ns = self._wheels_from_live = None
+        self._front = self._stamp_ns = self._outside = None
         return f"the camera's clock went back by {back_ns / 1e9:.1f} s; the drive begins anew"
 
     def _begun(self) -> Robot | None:

@@ -14,7 +14,8 @@ The client sends:
   each a ROS ``camera_info`` with the names of its YAML file, and ``rectified``: whether the images
   are.
 * ``{"do": "frame", "ticket": N, "stamp_ns": T}`` for a pair that was written to the ring; with
-  ``"wheels_from_live"``, 16 numbers, where wheel odometry sees the camera at that time.
+  ``"wheels_from_live"``, 16 numbers, where wheel odometry sees the camera at that time; with
+  ``"gyro_from_live"``, 9 numbers, how a gyroscope sees it turned in a frame that stays.
 * ``{"do": "map", "on": true}``, ``{"do": "save"}``, ``{"do": "switch", "map": PATH}``,
   ``{"do": "relocalise"}``, ``{"do": "place", "node": …, "node_from_live": …, "covariance": …}``
   with an older belief as a hint, ``{"do": "here", "x_m": …, "y_m": …, "yaw_rad": …}`` with the

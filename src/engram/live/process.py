@@ -99,7 +99,7 @@ class LiveProcess:
             self._transport.tell({"is": "ended", "text": said, **self._saving()})
 
     def _take(self, event: FrameEvent) -> None:
-        step = self._driving.step(event.arrived, event.arrived_s, event.wheels_from_live)
+        step = self._driving.step(event.arrived, event.arrived_s, event.outside)
         arrived = event.arrived
         stamp_ns = (arrived if isinstance(arrived, StereoPair) else arrived.frame).stamp_ns
         self._track = self._track.after(step, stamp_ns)

@@ -21,6 +21,7 @@ from engram.errors import CalibrationError, InputError
 from engram.frontend import StereoPair
 from engram.geometry import SE3, StereoCamera
 from engram.live.link import Link, LinkError, Ring
+from engram.live.outside import Outside
 from engram.live.transport import Command, FrameEvent, Message
 
 _IDLE_S = 0.1
@@ -167,8 +168,8 @@ class _Images:
                 f"calibration {size[0]} × {size[1]}"
             )
 
-    def taken(self, message: Mapping[str, Any]) -> tuple[StereoPair, SE3 | None] | None:
-        """The rectified pair of a ticket, and what the wheels say; None if it was overwritten."""
+    def taken(self, message: Mapping[str, Any]) -> tuple[StereoPair, Outside | None] | None:
+        """The rectified pair of a ticket, and what else moved; None if it was overwritten."""
         images = self._ring.read(int(message["ticket"]))
         if images is None:
             return None
@@ -182,15 +183,25 @@ class _Images:
                 )
                 for image, table in zip((left, right), tables, strict=True)
             )
-        wheels = message.get("wheels_from_live")
         return (
             StereoPair(int(message["stamp_ns"]), left, right, self._cameras.camera),
-            None if wheels is None else SE3.from_matrix(np.reshape(wheels, (4, 4))),
+            _outside(message),
         )
 
     def close(self) -> None:
         """Lets go of the ring."""
         self._ring.close()
+
+
+def _outside(message: Mapping[str, Any]) -> Outside | None:
+    """What wheels and gyroscope say of a frame; None for nothing."""
+    wheels, gyro = message.get("wheels_from_live"), message.get("gyro_from_live")
+    if wheels is None and gyro is None:
+        return None
+    still = np.zeros(3)
+    turned = None if gyro is None else SE3.from_matrix(np.c_[np.reshape(gyro, (3, 3)), still])
+    moved = None if wheels is None else SE3.from_matrix(np.reshape(wheels, (4, 4)))
+    return Outside(moved, turned)
 
 
 _RECTIFIED = ("fx", "fy", "cx", "cy", "baseline_m", "width", "height")

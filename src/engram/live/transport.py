@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from threading import Condition
 from typing import Any, Protocol, TypeAlias
 
-from engram.geometry import SE3
+from engram.live.outside import Outside
 from engram.robot.front import Arrived, arriving, paced
 from engram.robot.session import DriveSequence
 
@@ -25,13 +25,13 @@ class FrameEvent:
         arrived: a pair of rectified images, or a frame of a log.
         arrived_s: `time.perf_counter` when it did.
         dropped: frames that were dropped for this one since the last.
-        wheels_from_live: pose of the camera by wheel odometry, in a frame that stays; None without.
+        outside: what wheels and gyroscope say at its time; None without them.
     """
 
     arrived: Arrived
     arrived_s: float
     dropped: int = 0
-    wheels_from_live: SE3 | None = None
+    outside: Outside | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +78,11 @@ class InProcess:
         self._frame: FrameEvent | None = None
         self._closed = False
 
-    def give(self, arrived: Arrived, wheels_from_live: SE3 | None = None) -> None:
+    def give(self, arrived: Arrived, outside: Outside | None = None) -> None:
         """Hands over a frame; replaces one that still waits. See `FrameEvent`."""
         with self._changed:
             dropped = 0 if self._frame is None else self._frame.dropped + 1
-            self._frame = FrameEvent(arrived, time.perf_counter(), dropped, wheels_from_live)
+            self._frame = FrameEvent(arrived, time.perf_counter(), dropped, outside)
             self._changed.notify()
 
     def ask(self, do: str, **given: Any) -> None:
