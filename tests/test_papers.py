@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import World, drive
 from tests.worlds import covariance_of, forward, make_edge, make_node
 
+from engram.cli.fleet import _judge, merging_of
+from engram.cli.options import Effort
 from engram.cli.settings import every_setting, read_settings
 from engram.fleet.merge import MergeOptions, Reason
 from engram.fleet.merge.whole_segments import SeedFrom, Unit
@@ -25,8 +28,10 @@ from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
 from engram.graph.neighbourhood import Search
 from engram.graph.paths import MATCHES_ONLY, PathMemory
 from engram.localiser import Budget, LocaliserConfig, Position
+from engram.localiser.acceptance import Rule
 from engram.localiser.settings import NeighbourhoodSearch, PathEntries, Success
 from engram.maps import Map
+from engram.measures import Drive, failure
 from engram.ranking import POLICIES
 from engram.robot import Settings, load_settings
 from engram.robot.localisers import localiser_in
@@ -37,16 +42,60 @@ WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)
 
 
+# What shows of each row that its setting does what the row says, and that our default does not.
+PROOFS = {
+    "drive.ranking": "test_a_drive_attempts_as_its_paper_says",
+    "drive.lanes": "test_a_drive_attempts_as_its_paper_says",
+    "drive.rounds": "test_a_drive_attempts_as_its_paper_says",
+    "localiser.success": "test_the_first_success_ends_the_frame_where_the_papers_settings_say_so",
+    "localiser.neighbourhood": "test_breadth_first_and_paths_of_matches_reach_the_policy",
+    "localiser.path_entries": "test_breadth_first_and_paths_of_matches_reach_the_policy",
+    "localiser.recent.T": "tests.ranking.test_recent:"
+    "test_window_holds_the_last_t_iterations_whatever_the_frame_rate",
+    "localiser.recent.T_unit": "tests.ranking.test_recent:"
+    "test_with_unit_frame_each_frame_is_an_iteration",
+    "none; failed proposals of a lost robot never count": "test_failed_proposals_of_a_lost_robot_"
+    "never_enter_w",
+    "localiser.acceptance.min_inliers": "test_inliers_decide_by_the_papers_rule_and_confidence_by_"
+    "ours",
+    "localiser.acceptance.rule": "test_inliers_decide_by_the_papers_rule_and_confidence_by_ours",
+    "localiser.guide_below_m": "test_no_prediction_guides_a_match_where_the_paper_says_so",
+    "localiser.guide_below_rad": "test_no_prediction_guides_a_match_where_the_paper_says_so",
+    "localiser.lost_after_m": "test_a_robot_relocalises_once_it_drove_as_far_as_is_set",
+    "localiser.acceptance.doubt_after": "test_a_robot_that_is_told_a_place_looks_elsewhere_at_once_"
+    "only_by_our_default",
+    "merge.ranking": "test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper",
+    "merge.relocaliser": "test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper",
+    "merge.sure_inliers": "tests.fleet.test_merging:"
+    "test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match",
+    "merge.unit": "test_a_segment_is_omitted_or_taken_as_a_whole",
+    "merge.seed": "test_segments_are_seeded_by_place_recognition_alone_where_the_paper_says_so",
+    "build.max_gap_m": "test_orders_are_judged_by_the_measure_of_their_paper",
+    "build.estimator": "test_orders_are_judged_by_the_measure_of_their_paper",
+    "download.window_min": "tests.fleet.test_download:"
+    "test_tod_sends_what_was_saved_near_that_hour_over_midnight_too",
+    "download.epoch_min": "tests.fleet.test_path_weights:"
+    "test_epochs_are_those_of_the_clock_minute_by_minute",
+    "download.best_percent": "tests.fleet.test_path_weights:test_best_paths_of_an_epoch",
+    "download.buffer_min": "tests.fleet.test_path_weights:"
+    "test_algorithm_3_finds_the_epochs_of_a_mission",
+}
+
+
+def table() -> list[list[str]]:
+    """The cells of each rule in the page's table."""
+    _, _, text = PAGE.read_text(encoding="utf-8").partition("| rule | setting |")
+    lines = text.split("\n\n")[0].splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
 def rows() -> list[tuple[str, str, str, str]]:
     """Paper, key, its value and our default of each rule on the page that a setting gives."""
     found = []
-    for line in PAGE.read_text(encoding="utf-8").splitlines():
-        cells = [cell.strip() for cell in line.strip("|").split("|")]
-        given = re.fullmatch(r"`([\w.]+) = (.+)`", cells[1]) if len(cells) == 4 else None
-        if given is not None:
-            paper = "gadd2016" if cells[0].startswith("[G16]") else "linegar2015"
-            found.append((paper, given[1], given[2], cells[2].strip("`")))
-    assert len(found) >= 20
+    for rule, setting, default, _ in table():
+        if given := re.fullmatch(r"`([\w.]+) = (.+)`", setting):
+            paper = "gadd2016" if rule.startswith("[G16]") else "linegar2015"
+            found.append((paper, given[1], given[2], default.strip("`")))
     return found
 
 
@@ -59,6 +108,23 @@ def shown(settings, key: str) -> str:
 def test_each_rule_of_the_page_is_what_its_file_sets(paper, key, value, default):
     assert shown(read_settings(Path(paper)), key) == value
     assert shown(read_settings(None), key) == default
+
+
+def test_each_row_of_the_page_has_a_test_that_shows_it():
+    told = {key for _, key, _, _ in rows()}
+    told |= {setting for _, setting, _, _ in table() if setting.startswith("none; ")}
+    assert len(table()) == len(rows()) + 1  # the rule without a setting
+    assert told == PROOFS.keys()
+    for proof in PROOFS.values():
+        module, _, test = proof.rpartition(":")
+        assert callable(getattr(import_module(module or __name__), test)), proof
+
+
+def test_the_page_says_of_each_default_whether_it_is_the_papers():
+    for (_, key, value, default), row in zip(
+        rows(), [one for one in table() if one[1].startswith("`")], strict=True
+    ):
+        assert row[3].startswith("same") is (value == default), key
 
 
 def test_every_setting_of_a_paper_that_departs_stands_on_the_page():
@@ -236,6 +302,108 @@ def test_the_first_success_ends_the_frame_where_the_papers_settings_say_so(stree
             if found.localised and success is Success.FIRST:
                 assert localiser.outcomes[-1].candidate.node == found.node
     assert (max(successes) == 1) is (success is Success.FIRST)
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_a_drive_attempts_as_its_paper_says(street, paper):
+    """In light that no node has, nothing ends a frame but its budget."""
+    published, ours = (Effort().over(read_settings(one)) for one in (Path(paper), None))
+    assert published == {"policy": "path", "lanes": 2, "rounds": 1}
+    assert ours == {"policy": "recall", "lanes": 2, "rounds": 2}
+    live = drive(WORLD, ROAD[-3:], 7, start_ns=10**15, seed=3)
+    for asked in (published, ours):
+        with Map.open(street) as opened, localiser_in(
+            opened, live[0].frame.camera, Settings(), policy=asked["policy"],
+            budget=Budget(asked["lanes"], asked["rounds"]), relocaliser=None,
+        ) as localiser:  # fmt: skip
+            localiser.place_at(Position.at(opened.graph.node(20).id))
+            localised(localiser, live[:1])
+            assert len(localiser.outcomes) == asked["lanes"] * asked["rounds"]
+
+
+def test_inliers_decide_by_the_papers_rule_and_confidence_by_ours(street):
+    live = drive(WORLD, ROAD[:8], start_ns=10**15, seed=2)
+
+    def share(**acceptance) -> float:
+        published = load_settings(Path("linegar2015")).localiser
+        asked = replace(published, acceptance=replace(published.acceptance, **acceptance))
+        found, _ = localise(street, live, asked)
+        return float(np.mean([one.localised for one in found]))
+
+    never = {"min_confidence": 1e9, "min_confidence_lost": 1e9}
+    assert share(**never) == 1.0
+    assert share(**never, rule=Rule.CONFIDENCE) == 0.0  # our default
+    assert share(min_inliers=20_000, min_inliers_lost=20_000, min_inliers_plausible=20_000) == 0.0
+
+
+@pytest.mark.parametrize("paper", [True, False])
+def test_no_prediction_guides_a_match_where_the_paper_says_so(street, paper):
+    live = drive(WORLD, ROAD[:8], start_ns=10**15, seed=2)
+    settings = load_settings(Path("linegar2015")) if paper else Settings()
+    with (
+        Map.open(street) as opened,
+        localiser_in(
+            opened, live[0].frame.camera, settings, policy="distance", relocaliser=None
+        ) as localiser,
+    ):
+        localiser.place_at(Position.at(opened.graph.node(0).id))
+        guided = set()
+        for seen in live:
+            localised(localiser, [seen])
+            guided |= {one.candidate.guided for one in localiser.outcomes}
+    assert (True in guided) is not paper
+
+
+@pytest.mark.parametrize("lost_after_m", [10.0, 5.0])
+def test_a_robot_relocalises_once_it_drove_as_far_as_is_set(street, lost_after_m):
+    live = drive(WORLD, ROAD[-26:], 7, start_ns=10**15, seed=3)  # in light that no node has
+    published = load_settings(Path("linegar2015")).localiser
+    assert published.lost_after_m == 10.0
+    with Map.open(street) as opened, localiser_in(
+        opened, live[0].frame.camera,
+        replace(Settings(), localiser=replace(published, lost_after_m=lost_after_m)),
+        policy="distance", relocaliser="exhaustive",
+    ) as localiser:  # fmt: skip
+        localiser.place_at(Position.at(opened.graph.node(0).id))
+        found = localised(localiser, live)
+    driven_m = np.cumsum([0.7] * len(live))
+    first = next(at for at, one in enumerate(found) if one.proposed)
+    assert driven_m[first] == pytest.approx(lost_after_m, abs=1.5)
+
+
+def test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper(
+    handed_in, tmp_path, monkeypatch
+):
+    asked = []
+
+    def spied(*given, **options):
+        asked.append((options["policy"], options["relocaliser"] is not None))
+        return localiser_in(*given, **options)
+
+    monkeypatch.setattr("engram.fleet.merge.replay.localiser_in", spied)
+    ours = merging_of(read_settings(None))
+    for paper, ranking in ((Path("gadd2016"), "path"), (None, "recall")):
+        merging = merging_of(read_settings(paper))
+        assert merging.relocaliser == ours.relocaliser == "fabmap"
+        centre = tmp_path / f"{ranking}.engram"
+        merged(centre, handed_in / "first.engram")
+        asked.clear()
+        merged(centre, handed_in / "half.engram", asked=merging)
+        assert set(asked) == {(ranking, True)}
+
+
+def test_orders_are_judged_by_the_measure_of_their_paper():
+    """Two losses, of 3 and of 12 m: of the losses half are long, of the route a twenty-fifth is."""
+    published, ours = (
+        _judge("best", [Path("held-out")], read_settings(paper).build)
+        for paper in (Path("gadd2016"), None)
+    )
+    matched = np.ones(50, bool)
+    matched[[10, 11, 12]] = matched[20:32] = False
+    drives = [Drive(np.ones(50), matched)]
+    asked = [failure(drives, one.judge_at_m, one.estimator) for one in (published, ours)]
+    assert published.judge_at_m == ours.judge_at_m == 10.0
+    assert asked == [pytest.approx(0.5), pytest.approx((13 - 10) / 50)]
 
 
 def test_breadth_first_and_paths_of_matches_reach_the_policy(street):
