@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.mapping_rig import map_simulated
 
-from engram.errors import InputError
+from engram.errors import ConfigError, InputError
 from engram.fleet.download import DownloadOptions, download
 from engram.fleet.download.forecast import (
     BINS,
@@ -19,14 +20,37 @@ from engram.fleet.download.forecast import (
     Light,
     Weather,
 )
-from engram.fleet.download.selections import SELECTIONS, along_route, select_region
+from engram.fleet.download.selections import SELECTIONS, along_route, mission_area
 from engram.fleet.download.stock import Stock
 from engram.maps import Map, check_file
 
 from .test_download import DRIVES, steps_of
 
 WITH, WITHOUT = 9.0, 3.5  # an hour with data; one three hours from any
-PLACES = ("anywhere", "route", "region")
+PLACES = ("anywhere", "route", "region", "both")
+BY_TIME = ("tod", "paths", "tod+paths")
+# Half of those of `budget`, the slowest by far, wait for the long tests.
+MISSIONS = [
+    pytest.param(
+        policy, place, hour, marks=[pytest.mark.long] * (policy == "budget" and hour != WITHOUT)
+    )
+    for policy in SELECTIONS
+    for place in PLACES
+    for hour in (None, WITH, WITHOUT)
+]
+
+
+def refusal(policy: str, place: str, hour: float | None) -> str | None:
+    """What a mission is refused with that a policy cannot serve; None if it is served."""
+    if policy in {"copy", "route"} and place in {"region", "both"}:
+        return "does not use --near"
+    if policy in {"copy", "region"} and place in {"route", "both"}:
+        return "does not use --route"
+    if place == "both":
+        return "give only one of them"
+    if policy in {"route", "region"} and place == "anywhere":
+        return f"needs --{'near' if policy == 'region' else policy}"
+    return "needs --depart" if policy in {"tod", "tod+paths"} and hour is None else None
 
 
 @pytest.fixture(scope="module")
@@ -37,75 +61,73 @@ def centre(tmp_path_factory) -> Path:
     return path
 
 
-def options_of(stock: Stock, policy: str, place: str, hour: float, **more) -> DownloadOptions:
+@pytest.fixture(scope="module")
+def stock(centre) -> Iterator[Stock]:
+    with Map.open(centre) as store:
+        yield Stock(store)
+
+
+def options_of(stock: Stock, policy: str, place: str, hour: float | None, **more):
     given: dict = {"start_h": hour, "window_min": 60.0, "radius_m": 2.0} | more
     if policy == "budget":
         given["budget_percent"] = 60.0
-    if place == "route":
+    if place in {"route", "both"}:
         given["route"] = str(stock.sessions[1].id)  # the short evening drive
-    if place == "region":
+    if place in {"region", "both"}:
         given["near"] = (str(stock.nodes[5].id), str(stock.nodes[-1].id))
     return DownloadOptions(policy, **given)
 
 
-@pytest.mark.parametrize("hour", [WITH, WITHOUT])
-@pytest.mark.parametrize("place", PLACES)
-@pytest.mark.parametrize("policy", ["tod", "paths", "tod+paths", "budget"])
+@pytest.mark.parametrize(("policy", "place", "hour"), MISSIONS)
 def test_every_mission_is_as_connected_as_the_fleet_map_and_says_what_it_did(
-    centre, tmp_path, policy, place, hour
+    centre, stock, tmp_path, policy, place, hour
 ):
-    with Map.open(centre) as store:
-        stock = Stock(store)
-        options = options_of(stock, policy, place, hour)
-        report = download(centre, tmp_path / "out.engram", options)
-        labels = dict(zip(stock.node_ids, stock.graph.components().tolist(), strict=True))
-        area = stock.everything()
-        if place == "route":
-            area = along_route(stock, options.route, 2.0)
-        if place == "region":
-            area = select_region(stock, options).sent
-        allowed = {stock.node_ids[at] for at in np.flatnonzero(area)}
-    with Map.open(tmp_path / "out.engram") as sent:
+    options, out = options_of(stock, policy, place, hour), tmp_path / "out.engram"
+    if refused := refusal(policy, place, hour):
+        with pytest.raises(ConfigError, match=refused):
+            download(centre, out, options)
+        assert not out.exists()
+        return
+    report = download(centre, out, options)
+    labels = dict(zip(stock.node_ids, stock.graph.components().tolist(), strict=True))
+    area = mission_area(stock, options)
+    allowed = {stock.node_ids[at] for at in np.flatnonzero(area)}
+    with Map.open(out) as sent:
         nodes = {node.id for node in sent.load().nodes}
         components = int(sent.graph.components().max()) + 1
     assert nodes
     assert components == report.components == len({labels[node] for node in nodes})
-    if policy != "budget":  # fills the rest of its bytes with what is near in time
-        assert nodes <= allowed
-        widened, told = report.why.get("widened"), report.text()
-        if hour == WITHOUT:  # `paths` begins with the first epoch that has data
-            assert widened or (policy == "paths" and f"epochs {report.why['epochs'][0]}" in told)
-        elif place == "anywhere":
-            assert widened is None
-        assert widened is None or widened in told
-    assert check_file(tmp_path / "out.engram").problems == ()
+    assert nodes <= allowed or policy == "budget"  # which fills its bytes with what is near in time
+    assert report.text().startswith(f"{policy}: ")
+    widened, told = report.why.get("widened"), report.text()
+    assert widened is None or (policy in BY_TIME and widened in told)
+    if hour == WITHOUT and policy in BY_TIME:  # `paths` begins with the first epoch with data
+        assert widened or (policy == "paths" and f"epochs {report.why['epochs'][0]}" in told)
+    elif place == "anywhere":
+        assert widened is None
+    assert check_file(out).problems == ()
 
 
-@pytest.mark.parametrize("policy", ["tod", "paths", "tod+paths"])
-def test_strict_refuses_an_hour_without_data(centre, tmp_path, policy):
-    with Map.open(centre) as store:
-        options = options_of(Stock(store), policy, "anywhere", WITHOUT, end_h=4.0, strict=True)
+@pytest.mark.parametrize("policy", BY_TIME)
+def test_strict_refuses_an_hour_without_data(centre, stock, tmp_path, policy):
+    options = options_of(stock, policy, "anywhere", WITHOUT, end_h=4.0, strict=True)
     with pytest.raises(InputError, match=r"window_min|buffer_min"):
         download(centre, tmp_path / "out.engram", options)
 
 
-def test_widening_stops_at_the_nearest_hours(centre):
+def test_widening_stops_at_the_nearest_hours(stock):
     """From 3:30 with an hour's window: 9:00 comes first, the evening's 18:00 does not."""
-    with Map.open(centre) as store:
-        stock = Stock(store)
-        found = SELECTIONS["tod"](stock, options_of(stock, "tod", "anywhere", WITHOUT))
-        hours = stock.hours[found.sent]
+    found = SELECTIONS["tod"](stock, options_of(stock, "tod", "anywhere", WITHOUT))
+    hours = stock.hours[found.sent]
     assert "widened to 360 minutes" in found.why["widened"]
     assert np.abs(hours - 9.25).max() < 0.5
 
 
-def test_without_any_hour_near_everything_of_the_area_goes_along(centre, monkeypatch):
+def test_without_any_hour_near_everything_of_the_area_goes_along(stock, monkeypatch):
     monkeypatch.setattr("engram.fleet.download.by_time._WIDEST_MIN", 100.0)
-    with Map.open(centre) as store:
-        stock = Stock(store)
-        options = options_of(stock, "tod", "route", WITHOUT)
-        found = SELECTIONS["tod"](stock, options)
-        assert (found.sent == along_route(stock, options.route, 2.0)).all()
+    options = options_of(stock, "tod", "route", WITHOUT)
+    found = SELECTIONS["tod"](stock, options)
+    assert (found.sent == along_route(stock, options.route, 2.0)).all()
     assert "all hours are sent" in found.why["widened"]
 
 
@@ -124,16 +146,14 @@ def test_forecasts_are_intervals_or_say_that_they_cannot_know(drives, alike):
     assert (alike is not True) or forecast.missed.keys() == set(Weather)
 
 
-def test_light_is_told_by_the_sun_where_the_latitude_is_known(centre):
+def test_light_is_told_by_the_sun_where_the_latitude_is_known(stock):
     """Drives at 9:00 and 18:00 in January: at 60° north the sun is down by 18:00."""
-    with Map.open(centre) as store:
-        stock = Stock(store)
 
-        def alike(hour: float | None, latitude_deg: float | None) -> bool | None:
-            return Light.of(stock, DownloadOptions(start_h=hour, latitude_deg=latitude_deg)).alike
+    def alike(hour: float | None, latitude_deg: float | None) -> bool | None:
+        return Light.of(stock, DownloadOptions(start_h=hour, latitude_deg=latitude_deg)).alike
 
-        assert alike(23.0, 60.0) is True  # as dark as 18:00
-        assert alike(12.0, 0.0) is True
-        assert alike(10.0, None) is True
-        assert alike(3.5, None) is None  # far from all hours, and the sun is not known
-        assert alike(None, 60.0) is None
+    assert alike(23.0, 60.0) is True  # as dark as 18:00
+    assert alike(12.0, 0.0) is True
+    assert alike(10.0, None) is True
+    assert alike(3.5, None) is None  # far from all hours, and the sun is not known
+    assert alike(None, 60.0) is None
