@@ -67,15 +67,16 @@ def sessions_of(rows: Sequence[Row], arm: str, experiment: str, name: str) -> li
 
 
 def bars(axes: Axes, at: float, found: Interval, colour: str) -> None:
-    """One bar with its interval, and its value beside that."""
+    """One bar with its interval, and its value above that."""
     axes.bar(at, found.estimate, 0.38, color=colour)
     error = [[found.estimate - found.low], [found.high - found.estimate]]
     axes.errorbar(at, found.estimate, error, color="black", capsize=3)
     axes.annotate(
         f"{found.estimate:.1f}",
-        (at, found.estimate),
-        (3, 2),
+        (at, found.high),
+        (0, 3),
         textcoords="offset points",
+        ha="center",
         fontsize=8,
     )
 
@@ -122,15 +123,17 @@ def merging(rows: Sequence[Row]) -> Figure:
 
 
 def downloads(rows: Sequence[Row]) -> Figure:
-    """Held-out drives in downloads ([G16] Fig. 9)."""
+    """Held-out drives in downloads for their hour ([G16] Fig. 9); those that have all four."""
     return _compared(rows, "9", PARTS)
 
 
 def _compared(rows: Sequence[Row], experiment: str, maps: Mapping[str, str]) -> Figure:
     figure, axes = _axes("", "route missed, %")
     for side, (arm, label) in enumerate(ARMS.items()):
+        own = {name: sessions_of(rows, arm, experiment, name) for name in maps}
+        common = set.intersection(*({one["drive"] for one in each} for each in own.values()))
         for place, name in enumerate(maps):
-            found = missed(sessions_of(rows, arm, experiment, name))
+            found = missed([one for one in own[name] if one["drive"] in common])
             bars(axes, place + 0.4 * side - 0.2, found, f"C{side}")
         axes.bar(0, 0, color=f"C{side}", label=label)
     axes.set_xticks(range(len(maps)), maps.values())
