@@ -34,6 +34,7 @@ sys.path.insert(0, str(PACKAGE))
 from engram_bridge import images, rigid  # noqa: E402
 from engram_bridge.asking import Asking  # noqa: E402
 from engram_bridge.belief import Belief  # noqa: E402
+from engram_bridge.fixes import fix_of  # noqa: E402
 from engram_bridge.frames import StaticFrames  # noqa: E402
 from engram_bridge.gyro import Gyro  # noqa: E402
 from engram_bridge.pairs import Pairs  # noqa: E402
@@ -199,6 +200,22 @@ def test_the_turn_of_a_gyroscope_at_the_time_of_an_image() -> None:
 def test_a_rotation_vector_is_that_of_engram(vector: list[float]) -> None:
     wanted = SE3.exp([0.0, 0.0, 0.0, *vector]).matrix()
     np.testing.assert_allclose(rigid.of_turn(vector), wanted, atol=1e-9)
+
+
+def test_fixes_of_satellites() -> None:
+    message = SimpleNamespace(
+        latitude=50.0,
+        longitude=14.0,
+        status=SimpleNamespace(status=0),
+        position_covariance=[4.0, 0, 0, 0, 9.0, 0, 0, 0, 1.0],
+        position_covariance_type=2,
+    )
+    at = {"stamp_ns": 7, "latitude_deg": 50.0, "longitude_deg": 14.0}
+    assert fix_of(message, 7) == {**at, "sigma_m": 3.0}
+    message.position_covariance_type = 0
+    assert fix_of(message, 7) == at
+    message.status.status = -1
+    assert fix_of(message, 7) is None
 
 
 PLACED = {LocalisationStatus.LOCALISED, LocalisationStatus.DEAD_RECKONING}

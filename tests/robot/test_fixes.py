@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.sequences.bag_maker import StereoBag, bag, made, rectified_infos
 
 from engram.frontend import Frame
+from engram.live import Command, FrameEvent, LiveOptions, LiveProcess
 from engram.localiser.relocalisation import Exhaustive, Suggested
 from engram.robot import RobotOptions, Settings, map_drive, open_drive, open_map, robot_on
 from engram.robot.anchoring import anchor_map
@@ -63,6 +67,38 @@ def anchored(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     given.write_text("\n".join(["node,lat,lon", *lines]))
     anchor_map(path, given, author="tests")
     return path
+
+
+class Script:
+    """A transport that brings what it was given."""
+
+    def __init__(self, given: list[FrameEvent | Command | None]) -> None:
+        self.given = given
+        self.heard: list[dict[str, Any]] = []
+
+    def events(self) -> Iterator[FrameEvent | Command | None]:
+        return iter(self.given)
+
+    def tell(self, message: dict[str, Any]) -> None:
+        self.heard.append(message)
+
+
+@pytest.mark.parametrize("east_m", [0.0, 500.0])
+def test_a_live_robot_is_found_by_its_fix(anchored: Path, street: Path, east_m: float) -> None:
+    frames = [
+        FrameEvent(pair, time.perf_counter())
+        for pair in open_drive(street, frames="5::2", start=START_NS)
+    ]
+    with open_map(anchored) as opened:
+        at_m = opened.frame.positions[len(opened.graph) // 2 :, 0].min() + east_m
+    fix = {"stamp_ns": frames[0].arrived.stamp_ns, "latitude_deg": 50.0, "sigma_m": 1.0}
+    told = {**fix, "longitude_deg": 14.0 + at_m / METRES_PER_DEGREE}
+    script = Script([Command("fix", told), Command("fix", {**told, "sigma_m": -1.0}), *frames])
+    options = LiveOptions(anchored, robot=RobotOptions(relocaliser=None, threads=False))
+    LiveProcess(script, options).run()
+    statuses = [one["status"] for one in script.heard if one["is"] == "seen"]
+    assert ("localised" in statuses) == (east_m == 0.0)
+    assert [one["ok"] for one in script.heard if one["is"] == "reply"] == [True, False]
 
 
 @pytest.mark.parametrize("sigmas", [3.0, 0.0])

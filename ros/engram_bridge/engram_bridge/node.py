@@ -16,12 +16,13 @@ from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, NavSatFix
 from std_srvs.srv import SetBool, Trigger
 
 from engram_bridge import images, rigid
 from engram_bridge.asking import Asking
 from engram_bridge.belief import Belief
+from engram_bridge.fixes import fix_of
 from engram_bridge.frames import StaticFrames
 from engram_bridge.gyro import Gyro
 from engram_bridge.memory import keep_memory
@@ -145,6 +146,8 @@ class Bridge(Base):
             self._listen(Odometry, given["wheels"], self._turned)
         if given["gyro"]:
             self._listen(Imu, given["gyro"], self._rotated)
+        if given["gps"]:
+            self._listen(NavSatFix, given["gps"], self._located)
         self._listen(PoseWithCovarianceStamped, "initialpose", self._placed, 10)
         if TFMessage is not None:
             kept = QoSProfile(depth=_MANY, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -240,6 +243,12 @@ class Bridge(Base):
         if not np.isfinite(turned).all():
             raise ValueError("a turn rate is not finite; left out")
         self._gyro.add(_stamp_ns(message), turned)
+
+    def _located(self, message) -> None:
+        """A satellite fix: in a map that is anchored to the earth, a lost robot looks near it."""
+        fix = fix_of(message, _stamp_ns(message))
+        if fix is not None:
+            self._supervisor.ask({"do": "fix", **fix})
 
     def _outside(self, stamp_ns: int):
         """Where wheels and gyroscope see the camera at a time, by the names of the link."""

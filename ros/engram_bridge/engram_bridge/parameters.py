@@ -16,6 +16,7 @@ PARAMETERS = {
     "right_info": "right/camera_info",
     "wheels": "",
     "gyro": "",
+    "gps": "",
     "compressed": False,
     "rectified": True,
     "pair_tolerance_ms": 2.0,

@@ -18,12 +18,14 @@ from engram.live.outside import Outside
 from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
+from engram.robot.fixed import ToldFix
 from engram.robot.front import Arrived, Front
 from engram.robot.live import Saving, SavingState
 from engram.robot.robot import Robot
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
 from engram.robot.whereabouts import Whereabouts
+from engram.sequences.bags.fixes import Fix
 
 # Between attempts to open a map that cannot be opened.
 _AGAIN_AFTER_S = 2.0
@@ -122,6 +124,7 @@ class Driving:
         self._proposed = False
         self._stamp_ns: int | None = None
         self._outside: Outside | None = None
+        self._fix = ToldFix()
         self._open_after = -np.inf
 
     @property
@@ -217,6 +220,11 @@ class Driving:
         self.lose()
         return self.place(Position(goal.node, goal.node_from_goal, np.zeros((6, 6))))
 
+    def fixed(self, fix: Fix) -> str:
+        """Takes a satellite fix: near it a lost robot looks, in a map anchored to the earth."""
+        self._fix.tell(fix)
+        return "the fix is taken"
+
     def pause(self) -> str:
         """Closes robot and map, and so commits what was mapped; the next frame opens them again.
 
@@ -266,6 +274,7 @@ class Driving:
                 name=options.name,
                 maps=options.maps,
                 front=self._front_for(self._map.descriptor),
+                fix=self._fix,
             )
         except EngramError as error:
             if self._map is not None:

@@ -19,8 +19,9 @@ The client sends:
 * ``{"do": "map", "on": true}``, ``{"do": "save"}``, ``{"do": "switch", "map": PATH}``,
   ``{"do": "relocalise"}``, ``{"do": "place", "node": …, "node_from_live": …, "covariance": …}``
   with an older belief as a hint, ``{"do": "here", "x_m": …, "y_m": …, "yaw_rad": …}`` with the
-  camera's place in the map frame, ``{"do": "stop"}``; each may carry an ``"id"``, which the answer
-  ``{"is": "reply", "id": …, "ok": …, "text": …}`` repeats.
+  camera's place in the map frame, ``{"do": "fix", "stamp_ns": …, "latitude_deg": …,
+  "longitude_deg": …, "sigma_m": …}`` with a satellite fix, ``{"do": "stop"}``; each may
+  carry an ``"id"``, which the answer ``{"is": "reply", "id": …, "ok": …, "text": …}`` repeats.
 
 The process sends ``{"is": "seen", …}`` for each frame that it took and ``{"is": "alive", …}`` five
 times a second, even while it opens a map or waits for the camera.

@@ -23,6 +23,7 @@ from engram.live.driving import Driving, LiveOptions, Step, Watcher
 from engram.live.track import Track
 from engram.live.transport import Command, FrameEvent, Message, Transport
 from engram.localiser import Position
+from engram.sequences.bags.fixes import Fix
 
 # Between two messages that the process is alive.
 _HEARTBEAT_S = 0.2
@@ -76,6 +77,7 @@ class LiveProcess:
             "switch": lambda given: self._driving.switch(Path(str(given["map"]))),
             "relocalise": lambda _: self._driving.lose(),
             "place": lambda given: self._driving.place(_position(given)),
+            "fix": lambda given: self._driving.fixed(_fix(given)),
             "here": lambda given: self._driving.here(
                 *(float(given[name]) for name in ("x_m", "y_m", "yaw_rad"))
             ),
@@ -214,6 +216,15 @@ def _position(given: Message) -> Position:
     if not np.isfinite(covariance).all():
         raise InputError("the covariance of a position must be finite")
     return Position(NodeId(UUID(str(given["node"]))), pose, covariance)
+
+
+def _fix(given: Message) -> Fix:
+    """The satellite fix of a message."""
+    at = float(given["latitude_deg"]), float(given["longitude_deg"])
+    sigma_m = None if given.get("sigma_m") is None else float(given["sigma_m"])
+    if not (abs(at[0]) <= 90 and abs(at[1]) <= 180 and 0 < (sigma_m or 1.0) < math.inf):
+        raise InputError(f"a fix at {at} degrees with a deviation of {sigma_m} m cannot be")
+    return Fix(int(given["stamp_ns"]), *at, None, sigma_m)
 
 
 def _flat(array: NDArray[np.float64]) -> list[float]:

@@ -39,7 +39,7 @@ class Command:
     """What somebody asks of the process.
 
     Attributes:
-        do: `map`, `save`, `switch`, `relocalise` or `stop`.
+        do: such as `map` or `stop`; see `engram.live.link`.
         given: its arguments.
         id: repeated in the answer.
     """

@@ -93,6 +93,22 @@ class LatestFix:
         return None if latest is None or time_ns - latest.time_ns > _APART_NS else latest
 
 
+class ToldFix:
+    """The newest fix of a receiver that runs beside a robot."""
+
+    def __init__(self) -> None:
+        self._latest: Fix | None = None
+
+    def tell(self, fix: Fix) -> None:
+        """Takes a newer fix."""
+        self._latest = fix
+
+    def __call__(self, time_ns: int) -> Fix | None:
+        """The newest fix; None if it is more than two seconds from a time."""
+        latest = self._latest
+        return None if latest is None or abs(time_ns - latest.time_ns) > _APART_NS else latest
+
+
 def relocaliser_with_fixes(
     opened: Map, sequence: DriveSequence, settings: Settings, name: str | None
 ) -> str | Relocaliser | None:
@@ -107,12 +123,30 @@ def relocaliser_with_fixes(
     Returns:
         `name`, if there are no fixes to use.
     """
+    uses = isinstance(sequence, BagSequence) and settings.localiser.fix_sigmas
+    fixes = sequence.fixes() if uses else None
+    return name if fixes is None else suggesting(opened, LatestFix(fixes), settings, name)
+
+
+def suggesting(
+    opened: Map, latest: Callable[[int], Fix | None], settings: Settings, name: str | None
+) -> str | Relocaliser | None:
+    """A relocaliser that also proposes nodes near a receiver's newest fix.
+
+    Args:
+        opened: the map; fixes propose nothing in one that is not anchored to the earth.
+        latest: the newest fix at a time, ns; None without one.
+        settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
+        name: key of `RELOCALISERS`; None for none.
+
+    Returns:
+        `name`, if fixes are not to be used.
+    """
     sigmas = settings.localiser.fix_sigmas
-    fixes = sequence.fixes() if isinstance(sequence, BagSequence) and sigmas else None
-    if fixes is None or opened.frame.origin is None:
+    if not sigmas or opened.frame.origin is None:
         return name
     inner = None if name is None else relocaliser_in(opened, name, settings.frontend.descriptor)
-    return Suggested(inner, nodes_near(opened, LatestFix(fixes), sigmas))
+    return Suggested(inner, nodes_near(opened, latest, sigmas))
 
 
 def nodes_near(

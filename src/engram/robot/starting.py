@@ -8,7 +8,7 @@ from engram.errors import ConfigError, RevisionError
 from engram.geometry import StereoCamera
 from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
-from engram.robot.fixed import relocaliser_with_fixes
+from engram.robot.fixed import ToldFix, relocaliser_with_fixes, suggesting
 from engram.robot.front import Front
 from engram.robot.live import Into, IntoMap, IntoMemory, LiveKeeper, Owner
 from engram.robot.localisers import localiser_in
@@ -72,10 +72,15 @@ def robot_in(
     maps: bool = False,
     remembers: bool = False,
     front: Front | None = None,
+    fix: ToldFix | None = None,
 ) -> Robot:
-    """A live robot; see `Map.robot`. A `front` continues the odometry of the robot before it."""
+    """A live robot; see `Map.robot`.
+
+    A `front` continues the odometry of the robot before it; a `fix` of satellites proposes nodes.
+    """
     settings = (settings or Settings()).for_descriptor(opened.descriptor)
-    owner = Owner(name, camera, settings, options)
+    finder = None if fix is None else suggesting(opened, fix, settings, options.relocaliser)
+    owner = Owner(name, camera, settings, options, finder=finder)
     if not (maps or remembers):
         localiser = owner.localiser_in(opened, saves=False)
         return Robot(front or Front(settings), localiser, deadline_ms=options.deadline_ms)
