@@ -27,6 +27,13 @@ LISTEN_S = 0.5
 _WORDS_AT_ONCE = 10
 
 
+def cores() -> int:
+    """Number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class WordsTogether(Monitor):
     """A worker's monitor, which sends the words of `advance` in batches."""
 

@@ -16,8 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
-
-import numpy as np
+from statistics import median
 
 from engram.frontend import BRIEF, DescriptorKind
 from engram.frontend.features import NET
@@ -66,7 +65,7 @@ class Record:
     @property
     def standing(self) -> Standing:
         """The current one."""
-        usual = float(np.median(self._inliers)) if self._inliers else 0.0
+        usual = float(median(self._inliers)) if self._inliers else 0.0
         return Standing(self._agreed, self._missed, usual)
 
     def fixed(self, inliers: int, *, agrees: bool) -> None:

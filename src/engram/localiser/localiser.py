@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -45,6 +45,7 @@ from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, Success
 from engram.localiser.tried import Tried
 from engram.odometry import UNMOVED, Motion, OdometryStatus
+from engram.processes import cores
 from engram.ranking import (
     Foreseen,
     RankingContext,
@@ -100,9 +101,12 @@ class Localiser:
         self._relocaliser = relocaliser
         self._search = known.search or self._own_search()
         self._attempter = Attempter(known.frames, self.config, matcher)
+        # The first lane is the thread of the caller. On one core each hand-over would only cost.
         self._pool = (
-            ThreadPoolExecutor(budget.lanes, thread_name_prefix="engram-lane")
-            if budget.lanes > 1 and (threads if matcher is None else matcher.threads)
+            ThreadPoolExecutor(budget.lanes - 1, thread_name_prefix="engram-lane")
+            if budget.lanes > 1
+            and cores() > 1
+            and (threads if matcher is None else matcher.threads)
             else None
         )
         self._prover = Prover(known.graph, self.config.acceptance)
@@ -281,8 +285,7 @@ class Localiser:
                 if deadline is not None and perf_counter() >= deadline:
                     break
                 lanes = candidates[start : start + self._budget.lanes]
-                at_once = map if self._pool is None or len(lanes) == 1 else self._pool.map
-                outcomes += at_once(attempt, range(start, start + len(lanes)), lanes)
+                outcomes += self._at_once(attempt, start, lanes)
                 if any(outcome.accepted for outcome in outcomes):
                     break
             if self.config.success is Success.FIRST:
@@ -293,6 +296,18 @@ class Localiser:
         success = self._conclude(live, outcomes)
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
+
+    def _at_once(
+        self, attempt: Callable[[int, Candidate], Outcome], rank: int, lanes: Sequence[Candidate]
+    ) -> list[Outcome]:
+        """Attempts of one round, each on its lane, the first one ranked `rank`."""
+        if self._pool is None:
+            return [attempt(rank + lane, one) for lane, one in enumerate(lanes)]
+        others = [
+            self._pool.submit(attempt, rank + lane, one)
+            for lane, one in enumerate(lanes[1:], start=1)
+        ]
+        return [attempt(rank, lanes[0]), *(other.result() for other in others)]
 
     def _conclude(self, live: Frame, outcomes: list[Outcome]) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""

@@ -143,6 +143,8 @@ class FrameReader:
             self._wanted = deque(
                 node for node in nodes if node not in self._cache and node not in self._held
             )
+            if not self._wanted:
+                return  # as nearly always: waking the thread would take the lock of Python away
             if self._thread is None and not self._closed:
                 self._thread = threading.Thread(
                     target=self._read_ahead, name="engram-read-ahead", daemon=True

@@ -125,6 +125,8 @@ class GapFiller:
     def __init__(self) -> None:
         # (3,) m/s each, in the camera that they begin in; the newest last.
         self._velocities: deque[NDArray[np.float64]] = deque(maxlen=_STEPS)
+        # Their median.
+        self._velocity: NDArray[np.float64] = np.zeros(3)
         # Consecutive measurements too uncertain to determine the speed.
         self._unlearnt = 0
         self._turn_per_s = np.zeros(3)
@@ -174,8 +176,8 @@ class GapFiller:
             measured is None
             or covariance is None
             or doubted
-            or self._too_vague(covariance, guess)
-            or self._impossible(measured, covariance, seconds)
+            or self._too_vague(sigma_m := _sigma_m(covariance), guess)
+            or self._impossible(measured, sigma_m, seconds)
         ):
             self._missing.append(True)
             if guess is not outside:
@@ -187,21 +189,24 @@ class GapFiller:
         self._gap_m = 0.0
         self._believed_ns = stamp_ns
         if seconds > 0:
-            self._learn(measured, covariance, seconds)
+            self._learn(measured, covariance, sigma_m, seconds)
         if any(self._missing):
             covariance = covariance + self._doubt(measured, seconds)
         if self._unknown_s and seconds > 0:
             measured, covariance = self._made_up_for(measured, covariance, seconds)
         return Motion(odometry, measured, covariance)
 
-    def _learn(self, measured: SE3, covariance: NDArray[np.float64], seconds: float) -> None:
+    def _learn(
+        self, measured: SE3, covariance: NDArray[np.float64], sigma_m: float, seconds: float
+    ) -> None:
         """Updates speed and turn rate for later guesses, weighted by certainty."""
         twist_per_s, step_m = measured.log() / seconds, measured.distance_m
-        sharp = _sigma_m(covariance) <= max(_SHARP * step_m, 0.5 * _LEAST_SIGMA_M)
+        sharp = sigma_m <= max(_SHARP * step_m, 0.5 * _LEAST_SIGMA_M)
         self._unlearnt = 0 if sharp else self._unlearnt + 1
         # An uncertain speed is better than none, or an old one.
         if sharp or not self._knows_speed or self._unlearnt > _STEPS:
             self._velocities.append(twist_per_s[:3])
+            self._velocity = _median(self._velocities)
         # A Kalman filter; the turn rate changes per step by the error of a guess. The change does
         # not grow over a gap: the next guesses would then rest on the first uncertain step.
         change_rad = max(_SIGMA_RAD_PER_M * step_m, _LEAST_SIGMA_RAD)
@@ -235,8 +240,8 @@ class GapFiller:
         variances = np.repeat([step_m**2, (_SIGMA_RAD_PER_M * step_m) ** 2], 3)
         return np.diag(share * variances)
 
-    def _too_vague(self, covariance: NDArray[np.float64], guess: Guess) -> bool:
-        vague = _sigma_m(covariance) > guess.sigma_m
+    def _too_vague(self, sigma_m: float, guess: Guess) -> bool:
+        vague = sigma_m > guess.sigma_m
         self._vague = self._vague + 1 if vague else 0
         return vague and self._vague <= _STEPS
 
@@ -244,7 +249,7 @@ class GapFiller:
     def _knows_speed(self) -> bool:
         return len(self._velocities) >= _STEPS_TO_KNOW_SPEED
 
-    def _impossible(self, measured: SE3, covariance: NDArray[np.float64], seconds: float) -> bool:
+    def _impossible(self, measured: SE3, sigma_m: float, seconds: float) -> bool:
         """Whether a step needs an impossible acceleration since the last accepted motion.
 
         The reference is the speed of the newest certain step.
@@ -256,7 +261,7 @@ class GapFiller:
         since_s = (self._stamp_ns - self._believed_ns) / _NS_PER_S
         changed_m = np.linalg.norm(measured.log()[:3] - self._velocities[-1] * seconds)
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
-        return bool(changed_m > possible_m + 3 * _sigma_m(covariance))
+        return bool(changed_m > possible_m + 3 * sigma_m)
 
     def _ahead(
         self, stamp_ns: int, outside: Guess | None
@@ -276,8 +281,7 @@ class GapFiller:
             return outside
         if not self._velocities or seconds <= 0:
             return _ANY_MOTION
-        velocity = np.median(self._velocities, axis=0)
-        guess = SE3.exp(np.r_[velocity, self._turn_per_s] * seconds)
+        guess = SE3.exp(np.concatenate([self._velocity, self._turn_per_s]) * seconds)
         # Errors of the steps of one gap are correlated: they add up, not their variances.
         growth_m2 = (self._gap_m + guess.distance_m) ** 2 - self._gap_m**2
         started_m = self._started_m(seconds, stamp_ns)
@@ -294,6 +298,13 @@ class GapFiller:
         gap_s = seconds if self._believed_ns is None else (stamp_ns - self._believed_ns) / _NS_PER_S
         until_s, since_s = (max(one - _STEADY_S, 0.0) for one in (gap_s, gap_s - seconds))
         return 0.5 * _SIGMA_ACCELERATION_M_S2 * float(np.sqrt(max(until_s**4 - since_s**4, 0.0)))
+
+
+def _median(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The median of each column, as `np.median` has it, which takes five times as long."""
+    ordered, middle = np.sort(rows, axis=0), len(rows) // 2
+    median: NDArray[np.float64] = 0.5 * (ordered[(len(rows) - 1) // 2] + ordered[middle])
+    return median
 
 
 def _sigma_m(covariance: NDArray[np.float64]) -> float:

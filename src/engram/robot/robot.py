@@ -56,10 +56,10 @@ class Seen:
 class Robot:
     """One robot on one drive: image pairs in, `Localisation`s out. A context manager.
 
-    One thread at a time calls a robot's methods. A robot runs up to `Budget.lanes` + 3 threads of
-    its own: one for each lane; one that reads ahead in `drive`; and if it keeps its results, one
-    that writes and one that closes loops. Robots in one process share only the map that made them;
-    each may run on its own thread.
+    One thread at a time calls a robot's methods. A robot runs up to `Budget.lanes` + 2 threads of
+    its own: one for each lane but the first; one that reads ahead in `drive`; and if it keeps its
+    results, one that writes and one that closes loops. Robots in one process share only the map
+    that made them; each may run on its own thread.
 
     Args:
         front: front-end and odometry.

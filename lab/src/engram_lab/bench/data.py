@@ -80,6 +80,12 @@ def scale_and_crop(pair: StereoPair) -> StereoPair:
     return StereoPair(pair.stamp_ns, shrink(pair.left), shrink(pair.right), small)
 
 
+def to_and_fro(i: int, count: int) -> int:
+    """0, 1, …, count - 1, count - 2, …, 1, 0, 1, …."""
+    at = i % (2 * count - 2)
+    return min(at, 2 * count - 2 - at)
+
+
 def synthetic_drive(frames: int = 24, step_m: float = 0.8, seed: int = 0) -> tuple[StereoPair, ...]:
     """A straight street: ground, two walls and an end wall, each a textured plane.
 

@@ -14,13 +14,14 @@ from engram.frontend import Frontend, StereoPair
 from engram.geometry import StereoCamera
 from engram.odometry import Odometry, OdometryConfig, WindowConfig
 from engram_lab.bench.attempts import attempts_at, hopeless
-from engram_lab.bench.data import BenchData
+from engram_lab.bench.data import BenchData, to_and_fro
 from engram_lab.bench.opening import prepare_opening
 from engram_lab.bench.places import prepare_places_query, prepare_vocabulary_train
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.ranking import prepare_ranking
 from engram_lab.bench.rendering import NIGHT, RAIN, prepare_rendering
 from engram_lab.bench.stage import Prepared, Run, Stage
+from engram_lab.bench.steps import prepare_step
 from engram_lab.bench.window import prepare_window
 
 # Frames between the two of a localisation attempt: 3 to 4 m on the KITTI clip.
@@ -43,7 +44,7 @@ def prepare_frontend_odometry(
     odometry = Odometry(OdometryConfig(window=window))
 
     def ours(i: int) -> dict[str, int]:
-        pair = pairs[_to_and_fro(i, len(pairs))]
+        pair = pairs[to_and_fro(i, len(pairs))]
         frame = frontend.extract(dataclasses.replace(pair, stamp_ns=i * _FRAME_INTERVAL_NS))
         step = odometry.step(frame)
         return {"landmarks": len(frame.landmarks), "inliers": step.inliers}
@@ -54,7 +55,7 @@ def prepare_frontend_odometry(
     extract = _plain_extract(plain, frontend, pairs)
 
     def reference(i: int) -> dict[str, int]:
-        features = extract(pairs[_to_and_fro(i, len(pairs))])
+        features = extract(pairs[to_and_fro(i, len(pairs))])
         pose = plain_odometry.step(features)
         counts = {"features": features.detected, "landmarks": len(features.points)}
         return counts | {"inliers": 0 if pose is None else len(pose.inliers)}
@@ -106,6 +107,8 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "attempt_full": partial(prepare_attempt, size="full"),
         "attempt_hopeless_512": partial(prepare_hopeless, size="512"),
         "attempt_hopeless_full": partial(prepare_hopeless, size="full"),
+        "robot_step_512": partial(prepare_step, size="512"),
+        "robot_step_full": partial(prepare_step, size="full"),
         "open_map_4000": prepare_opening,
         "render_pair_512": prepare_rendering,
         "render_pair_512_rain": partial(prepare_rendering, session=RAIN),
@@ -120,12 +123,6 @@ STAGES: Mapping[str, Stage] = MappingProxyType(
         "rank_recall_10000": partial(prepare_ranking, policy="recall", paths=10_000),
     }
 )
-
-
-def _to_and_fro(i: int, count: int) -> int:
-    """0, 1, …, count - 1, count - 2, …, 1, 0, 1, …."""
-    at = i % (2 * count - 2)
-    return min(at, 2 * count - 2 - at)
 
 
 def _plain_camera(plain: PlainPipeline, camera: StereoCamera) -> Any:

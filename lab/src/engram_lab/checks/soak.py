@@ -2,6 +2,7 @@
 
     python -m engram_lab.checks.soak localising --frames 7000     # 3 minutes
     python -m engram_lab.checks.soak mapping --nodes 20000        # 5 minutes
+    python -m engram_lab.checks.soak logged --frames 1000000 --nodes 4000 --logs HOME OTHER…
 
 Localising: the bench's clip is driven there and back, image by image, in a map of itself. Then a
 fresh robot takes the same frames, in blocks that alternate with those of the old one.
@@ -10,6 +11,11 @@ Mapping: a road of five lanes, 3 m apart and tied to each other, is a map of so 
 maps another lane, of frames that match none of theirs: every frame has the lanes beside it as
 candidates. A second one does the same on a short road, in blocks that alternate. Place recognition
 is off unless --relocaliser names one: it looks every node up among all places.
+
+Logged: the first eight frame logs of folder HOME, drives of one town, become a map as usual. All
+others are added by robots that cannot relocalise, which save all they see, until the map has so
+many nodes; then it is not changed any more. The third log of HOME is driven there and back, at two
+attempts a frame, and its old robot is compared with a fresh one as above.
 
 Ratios are of processor time, all threads of the process: medians over blocks, with quartiles.
 """
@@ -21,7 +27,8 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +40,7 @@ from engram.graph.model import Edge, EdgeKind, Node, NodeId
 from engram.localiser import Position
 from engram.maps import Map, open_map
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram.robot.robot import Robot
 from engram.sequences import LoggedFrame
 from engram_lab.bench.data import load_bench_data
@@ -51,6 +59,8 @@ _PERIOD_NS = 100_000_000
 _BLOCK = 50  # frames
 _BLOCKS = 16  # of each robot
 _WARM = 100  # frames of a fresh robot before it is timed
+_AT_HOME = 8  # logs of the town whose map is used
+_REPORTED = 50_000  # frames between two reports of memory
 
 _LANES, _APART_M, _TIED_EVERY = 5, 3.0, 4
 _LANDMARKS = 200
@@ -76,23 +86,77 @@ def localising(frames: int) -> Iterator[Figure]:
                 for number in range(len(pairs)):
                     robot.step(pair_at(number))
         with Map.open(path) as opened:
-            old = opened.robot(pairs[0].camera)
-            drive(old, pair_at, range(min(1000, frames)))
-            before_mb = resident_mb()
-            drive(old, pair_at, range(min(1000, frames), frames))
-            yield Figure(f"memory, frames 1,000 to {frames:,}", resident_mb() - before_mb, "MB")
-            fresh = opened.robot(pairs[0].camera)
-            drive(fresh, pair_at, range(frames, frames + _WARM))
-            drive(old, pair_at, range(frames, frames + _WARM))
+            yield from aged(lambda: opened.robot(pairs[0].camera), pair_at, frames)
+
+
+def aged(
+    robot: Callable[[], Robot], frame_at: Callable[[int], StereoPair | LoggedFrame], frames: int
+) -> Iterator[Figure]:
+    """What a robot's memory grew by in so many frames, and its blocks beside a fresh one's."""
+    settled = min(1000, frames)
+    with robot() as old:
+        drive(old, frame_at, range(settled))
+        before_mb = resident_mb()
+        for first in range(settled, frames, _REPORTED):
+            until = min(first + _REPORTED, frames)
+            drive(old, frame_at, range(first, until))
+            yield Figure(f"memory, frames 1,000 to {until:,}", resident_mb() - before_mb, "MB")
+        with robot() as fresh:
+            drive(fresh, frame_at, range(frames, frames + _WARM))
+            drive(old, frame_at, range(frames, frames + _WARM))
             yield from compared(
-                lambda first: drive(old, pair_at, range(first, first + _BLOCK)),
-                lambda first: drive(fresh, pair_at, range(first, first + _BLOCK)),
+                lambda first: drive(old, frame_at, range(first, first + _BLOCK)),
+                lambda first: drive(fresh, frame_at, range(first, first + _BLOCK)),
                 frames + _WARM,
                 f"after {frames:,} frames",
                 "fresh",
             )
-            old.close()
-            fresh.close()
+
+
+def logged(frames: int, nodes: int, home: Path, others: Sequence[Path]) -> Iterator[Figure]:
+    """The same from frame logs, in a map of so many nodes."""
+    logs = sorted(home.glob("*.framelog"))
+    with tempfile.TemporaryDirectory(prefix="engram-soak-") as folder:
+        path = Path(folder) / "fixed.engram"
+        for log in logs[:_AT_HOME]:
+            map_drive(path, open_drive(log), Settings(), RobotOptions())
+        alone = (log for other in others for log in sorted(other.glob("*.framelog")))
+        for log in (*logs[_AT_HOME:], *alone):
+            with Map.open(path) as opened:
+                if len(opened.graph) >= nodes:
+                    break
+            map_drive(path, open_drive(log), Settings(), RobotOptions(relocaliser=None))
+        entries = [one for one in open_drive(logs[2]) if isinstance(one, LoggedFrame)]
+        with Map.open(path) as opened:
+            yield Figure("nodes of the map", len(opened.graph))
+            camera = entries[0].frame.camera
+            robot = partial(opened.robot, camera, lanes=1, rounds=2)
+            yield from aged(robot, there_and_back(entries), frames)
+            with robot() as judge:
+                lap = map(judge.step, map(there_and_back(entries), range(2 * len(entries) - 2)))
+                share = statistics.mean(one.localised for one in lap)
+            yield Figure("share of a lap's frames localised", share)
+
+
+def there_and_back(entries: Sequence[LoggedFrame]) -> Callable[[int], LoggedFrame]:
+    """Frame by its number of a drive along the log and back in reverse, for ever."""
+    last = len(entries) - 1
+
+    def frame_at(number: int) -> LoggedFrame:
+        phase = number % (2 * last)
+        at = min(phase, 2 * last - phase)
+        frame = dataclasses.replace(entries[at].frame, stamp_ns=(number + 1) * _PERIOD_NS)
+        if number == 0:
+            return LoggedFrame(frame, OdometryStep(OdometryStatus.FIRST))
+        if 0 < phase <= last:
+            return LoggedFrame(frame, entries[at].odometry)
+        step = entries[at + 1].odometry
+        if step.prev_from_curr is None:
+            return LoggedFrame(frame, step)
+        back = dataclasses.replace(step, prev_from_curr=step.prev_from_curr.inverse())
+        return LoggedFrame(frame, back)
+
+    return frame_at
 
 
 def mapping(nodes: int, few: int, relocaliser: str | None) -> Iterator[Figure]:
@@ -212,17 +276,21 @@ def resident_mb() -> float:
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("what", choices=("localising", "mapping"))
+    parser.add_argument("what", choices=("localising", "mapping", "logged"))
+    parser.add_argument("--logs", nargs="+", type=Path, help="folders of frame logs, HOME first")
     parser.add_argument("--frames", type=int, default=7000)
     parser.add_argument("--nodes", type=int, default=20_000)
     parser.add_argument("--few", type=int, default=1_000)
     parser.add_argument("--relocaliser", help="of the mapping robots; none if left out")
     given = parser.parse_args()
-    figures = (
-        localising(given.frames)
-        if given.what == "localising"
-        else mapping(given.nodes, given.few, given.relocaliser)
-    )
+    if given.what == "localising":
+        figures = localising(given.frames)
+    elif given.what == "mapping":
+        figures = mapping(given.nodes, given.few, given.relocaliser)
+    elif given.logs:
+        figures = logged(given.frames, given.nodes, given.logs[0], given.logs[1:])
+    else:
+        parser.error("logged: name folders by --logs")
     report(figures, given.json, given.what)
 
 
