@@ -123,8 +123,9 @@ def relocaliser_with_fixes(
     Returns:
         `name`, if there are no fixes to use.
     """
-    uses = isinstance(sequence, BagSequence) and settings.localiser.fix_sigmas
-    fixes = sequence.fixes() if uses else None
+    if not isinstance(sequence, BagSequence) or not settings.localiser.fix_sigmas:
+        return name
+    fixes = sequence.fixes()
     return name if fixes is None else suggesting(opened, LatestFix(fixes), settings, name)
 
 
