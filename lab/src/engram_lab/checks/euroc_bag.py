@@ -40,23 +40,53 @@ _RATE_HZ = 20.0
 Pictures = tuple[int, NDArray[np.uint8], NDArray[np.uint8]]
 
 
-def write_bag(path: Path, pictures: Iterable[Pictures]) -> Path:
-    """An MCAP bag of raw grey pairs: stamp, left and right each."""
+def write_bag(
+    path: Path,
+    pictures: Iterable[Pictures],
+    kind: str = "mcap",
+    *,
+    declared: int | None = None,
+    words: bool = False,
+) -> Path:
+    """A bag of raw grey pairs: stamp, left and right each.
+
+    Args:
+        path: without ending.
+        pictures: the pairs.
+        kind: "ros1", "sqlite3" or "mcap".
+        declared: width and height that the images claim to have; None for their own.
+        words: write texts in place of the images, as images.
+
+    Returns:
+        The file or folder.
+    """
+    from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
-    kind, store = "sensor_msgs/msg/Image", get_typestore(Stores.ROS2_HUMBLE)
-    types = store.types
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        topics = [writer.add_connection(topic, kind, typestore=store) for topic in _TOPICS]
+    is1 = kind == "ros1"
+    store = get_typestore(Stores.ROS1_NOETIC if is1 else Stores.ROS2_HUMBLE)
+    serialise: Any = store.serialize_ros1 if is1 else store.serialize_cdr
+    image_kind, types = "sensor_msgs/msg/Image", store.types
+    made = path.with_suffix(".bag") if is1 else path
+    opened: Any = (
+        Writer1(made)
+        if is1
+        else Writer(made, version=9, storage_plugin=StoragePlugin[kind.upper()])
+    )
+    with opened as writer:
+        topics = [writer.add_connection(topic, image_kind, typestore=store) for topic in _TOPICS]
         for stamp_ns, *both in pictures:
             at = types["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
-            header = types["std_msgs/msg/Header"](stamp=at, frame_id="")
+            header = types["std_msgs/msg/Header"](
+                stamp=at, frame_id="", **({"seq": 0} if is1 else {})
+            )
             for topic, image in zip(topics, both, strict=True):
-                height, width = image.shape
-                message = types[kind](header, height, width, "mono8", 0, width, image.ravel())
-                writer.write(topic, stamp_ns, bytes(store.serialize_cdr(message, kind)))
-    return path
+                height, width = (declared,) * 2 if declared else image.shape
+                message = types[image_kind](header, height, width, "mono8", 0, width, image.ravel())
+                content = bytes(serialise(message, image_kind))
+                writer.write(topic, stamp_ns, b"\1\0\0\0words" if words else content)
+    return made
 
 
 def camchain(cameras: Cameras) -> str:
