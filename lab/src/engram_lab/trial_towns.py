@@ -66,11 +66,17 @@ def light_of(plan: SessionPlan) -> str:
 
 
 # Each map is built from some drives, and localises another.
-_STREETS = (((0, 3), 1), ((2,), 0), ((2,), 4), ((1,), 2))
+STREETS = (((0, 3), 1), ((2,), 0), ((2,), 4), ((1,), 2))
+# The same by night, in maps of the day, and in rain by night.
+BY_NIGHT = (((2,), 3), ((1,), 3), ((0, 3), 5))
 
 
 def streets(
-    towns: Sequence[int], settings: Settings, lost_rounds: int, monitor: Monitor = QUIET
+    towns: Sequence[int],
+    settings: Settings,
+    lost_rounds: int,
+    monitor: Monitor = QUIET,
+    which: Sequence[tuple[tuple[int, ...], int]] = STREETS,
 ) -> Iterator[tuple[str, Street]]:
     """The streets of some towns by name; renders and maps what is not there yet.
 
@@ -79,10 +85,11 @@ def streets(
         settings: the configuration of maps and robots.
         lost_rounds: budget of a lost robot.
         monitor: hears of what is rendered.
+        which: numbers of the drives that are mapped, and of the one that is localised.
     """
     for seed in towns:
         drives = _drives(seed, settings, monitor)
-        for mapped, live in _STREETS:
+        for mapped, live in which:
             yield _street(seed, drives, mapped, seed, drives[live], settings, lost_rounds)
 
 
@@ -96,7 +103,7 @@ def all_streets(
     """
     for seed in towns:
         drives, plans = _drives(seed, settings, monitor), trial_town(seed).sessions
-        for mapped in dict.fromkeys(mapped for mapped, _ in _STREETS):
+        for mapped in dict.fromkeys(mapped for mapped, _ in STREETS):
             for live in range(len(drives)):
                 if live not in mapped:
                     yield (

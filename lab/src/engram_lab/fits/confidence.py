@@ -33,7 +33,14 @@ from engram.robot import Settings
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Looked, Street
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.simulating import campaigns_folder
-from engram_lab.trial_towns import FITTED_TOWNS, HELD_OUT_TOWNS, other_towns, streets
+from engram_lab.trial_towns import (
+    BY_NIGHT,
+    FITTED_TOWNS,
+    HELD_OUT_TOWNS,
+    STREETS,
+    other_towns,
+    streets,
+)
 
 Array = NDArray[np.float64]
 
@@ -99,8 +106,9 @@ def rows_of(street: Street, looked: Looked) -> Iterator[Row]:
 def collected(towns: Sequence[int], folder: Path, monitor: Monitor) -> list[Row]:
     """The rows of some towns; those that an earlier run collected are read."""
     rows: list[Row] = []
-    for name, street in streets(towns, Settings(), _LOST_ROUNDS, monitor):
-        rows += _kept(folder, name, street, TRIES, monitor)
+    for which in (STREETS, BY_NIGHT):
+        for name, street in streets(towns, Settings(), _LOST_ROUNDS, monitor, which):
+            rows += _kept(folder, name, street, TRIES, monitor)
     for name, street in other_towns(towns, Settings(), _LOST_ROUNDS, monitor):
         rows += _kept(folder, name, street, {Kind.LOST: 6}, monitor)
     return rows
