@@ -19,7 +19,9 @@ from engram.localiser import Position, Spread
 from engram.localiser.chain import FixChain
 from engram.localiser.confidence import (
     ANYWHERE_TERMS,
+    DOUBTED_TERMS,
     PREDICTED_TERMS,
+    TOLD_TERMS,
     Evidence,
     Record,
     Standing,
@@ -39,14 +41,21 @@ def evidence(inliers: int = 60, **other: object) -> Evidence:
 
 def test_there_is_a_weight_for_each_term() -> None:
     assert len(PREDICTED_TERMS) == len(MODEL.predicted) == len(evidence().predicted_terms())
+    assert len(DOUBTED_TERMS) == len(MODEL.doubted) == len(evidence().doubted_terms())
+    assert len(TOLD_TERMS) == len(MODEL.told) == len(evidence().told_terms())
     assert len(ANYWHERE_TERMS) == len(MODEL.anywhere) == len(evidence().anywhere_terms())
 
 
 @given(st.integers(12, 500), st.integers(1, 100))
 def test_more_inliers_are_never_less_sure(inliers: int, more: int) -> None:
-    few, many = (evidence(count, spread=WIDE) for count in (inliers, inliers + more))
-    assert MODEL.as_predicted(many) >= MODEL.as_predicted(few)
-    assert MODEL.as_anywhere(many) >= MODEL.as_anywhere(few)
+    for known in (
+        {},
+        {"spread": WIDE},
+        {"spread": WIDE, "standing": Standing()},
+    ):
+        few, many = (evidence(count, **known) for count in (inliers, inliers + more))
+        assert MODEL.as_predicted(many) >= MODEL.as_predicted(few)
+        assert MODEL.as_anywhere(many) >= MODEL.as_anywhere(few)
 
 
 @pytest.mark.parametrize(
@@ -67,6 +76,14 @@ def test_a_match_has_only_the_readings_that_fit_it() -> None:
     assert MODEL.as_predicted(evidence(apart=math.inf)) == -math.inf
     assert MODEL.as_anywhere(evidence()) == -math.inf
     assert math.isfinite(MODEL.as_anywhere(evidence(spread=WIDE)))
+
+
+def test_what_was_only_told_speaks_for_a_match_whose_inliers_spread() -> None:
+    told = evidence(standing=Standing())
+    low = replace(told, spread=Spread(0.5, 0.04, 10.0))
+    assert MODEL.as_predicted(told) == -math.inf
+    assert MODEL.as_predicted(low) < MODEL.as_predicted(replace(told, spread=WIDE))
+    assert MODEL.as_predicted(low) < MODEL.as_predicted(evidence())
 
 
 def test_by_itself_a_match_is_not_surer_than_with_the_fixes_before_it() -> None:
@@ -135,6 +152,6 @@ def test_a_kind_that_needs_more_inliers_is_as_sure_with_so_many_more() -> None:
     usual = replace(evidence().standing, usual_inliers=110.0)
     a, b = evidence(50), evidence(55, standing=usual)
     assert net.as_predicted(b) == pytest.approx(MODEL.as_predicted(a))
-    assert net.as_predicted(a) < MODEL.as_predicted(a)
     a, b = replace(a, spread=WIDE), replace(b, spread=WIDE)
     assert net.as_anywhere(b) == pytest.approx(MODEL.as_anywhere(a))
+    assert net.as_anywhere(a) < MODEL.as_anywhere(a)

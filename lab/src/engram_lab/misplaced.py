@@ -111,7 +111,7 @@ class Street:
         self._budget = Budget(lost_rounds=lost_rounds)
         self.nodes = true_nodes(self.opened, mapped)
         self.frames = live.frames()
-        self._same_town = same_town
+        self.same_town = same_town
 
     def close(self) -> None:
         """Closes the map."""
@@ -131,7 +131,7 @@ class Street:
 
     def error(self, frame: int, node: NodeId, node_from_live: SE3) -> tuple[float, float] | None:
         """Error of a pose, metres and rad; None if the node's truth is unknown."""
-        if not self._same_town:
+        if not self.same_town:
             return np.inf, np.pi
         world_from_node = self.nodes.pose(node)
         if world_from_node is None:

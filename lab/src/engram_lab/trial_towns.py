@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
+from engram.frontend import BRIEF
 from engram.localiser import METHOD_VERSION
 from engram.monitor import QUIET, Monitor
 from engram.robot import Settings
@@ -16,7 +18,7 @@ from engram_lab.town.campaigns import SessionPlan
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 
 FITTED_TOWNS = (301, 302)
-HELD_OUT_TOWNS = (401,)
+HELD_OUT_TOWNS = (403, 404)
 LOOP_M = 200.0
 _NIGHT_FROM_H = 21
 _FIRST_DAY = datetime(2025, 7, 14, tzinfo=UTC)
@@ -123,8 +125,14 @@ def other_towns(
             yield _street(seed, drives, (2,), other, live, settings, lost_rounds)
 
 
+def towns_folder(settings: Settings) -> Path:
+    """Where the towns stand as seen with a kind of features."""
+    kind = settings.frontend.descriptor
+    return campaigns_folder() if kind == BRIEF else campaigns_folder() / kind
+
+
 def _drives(seed: int, settings: Settings, monitor: Monitor) -> Sequence[EvaluatedDrive]:
-    folder, town = campaigns_folder(), trial_town(seed)
+    folder, town = towns_folder(settings), trial_town(seed)
     simulate(town, folder, settings=settings, monitor=monitor)
     return drives_of(campaign_logs(town, folder))
 
@@ -134,7 +142,7 @@ def _street(
     other: int, live: EvaluatedDrive, settings: Settings, lost_rounds: int,
 ) -> tuple[str, Street]:  # fmt: skip
     name = "".join(map(str, mapped))
-    folder = campaign_folder(campaigns_folder(), trial_town(seed))
+    folder = campaign_folder(towns_folder(settings), trial_town(seed))
     path = folder / f"map{name}-{METHOD_VERSION}.engram"
     some, same = [drives[k] for k in mapped], seed == other
     street = Street(path, some, live, settings, lost_rounds, same_town=same)

@@ -35,6 +35,8 @@ class AcceptanceConfig:
             lost robot.
         min_confidence: least log-odds that a match is right which the position predicts; 4.6 is one
             wrong in a hundred at the threshold, far fewer over all.
+        min_confidence_told: the same where no fix has confirmed the position yet: it may have been
+            told wrong, and streets look alike.
         min_confidence_lost: the same of a match that nothing predicts: many such are tried.
         sure_confidence: log-odds of one fix, without those before it, from which it is believed for
             good.
@@ -62,9 +64,10 @@ class AcceptanceConfig:
     """
 
     rule: Rule = Rule.CONFIDENCE
-    min_confidence: float = 4.0
-    min_confidence_lost: float = 6.5
-    sure_confidence: float = 12.0
+    min_confidence: float = 3.5
+    min_confidence_told: float = 5.0
+    min_confidence_lost: float = 5.5
+    sure_confidence: float = 8.5
     settle_after_m: float = 10.0
     doubt_after: float = 3.0
     min_inliers: int = 20

@@ -28,7 +28,6 @@ from engram.localiser.acceptance import (
 )
 from engram.localiser.confidence import (
     UNKNOWN,
-    ConfidenceModel,
     Evidence,
     Standing,
     confidence_of,
@@ -206,7 +205,7 @@ class Attempter:
         model = confidence_of(live.descriptor)
         readings = model.as_predicted(evidence), model.as_anywhere(evidence)
         if self._acceptance.rule is Rule.CONFIDENCE:
-            accepted, waits = self._weighed(match, readings, model)
+            accepted, waits = self._weighed(candidate, match, readings, model.witness)
         else:
             accepted, waits = self._counted(candidate, match, spread)
         return Outcome(
@@ -221,7 +220,7 @@ class Attempter:
         prediction, acceptance = candidate.prediction, self._acceptance
         pose = match.reference_from_live
         in_reach = pose.distance_m <= acceptance.reach_m
-        anywhere = in_reach and (prediction is None or candidate.doubted)
+        unproved = prediction is None or candidate.doubted or not candidate.standing.agreed
         return Evidence(
             match.inliers,
             match.inliers / len(live.landmarks),
@@ -232,19 +231,26 @@ class Attempter:
             apart(pose, prediction, acceptance)
             if prediction is not None and agrees(pose, prediction, acceptance)
             else math.inf,
-            spread() if anywhere and match.inliers >= _LEAST_WEIGHED else None,
+            spread() if in_reach and unproved and match.inliers >= _LEAST_WEIGHED else None,
         )
 
     def _weighed(
-        self, match: Match, readings: tuple[float, float], model: ConfidenceModel
+        self, candidate: Candidate, match: Match, readings: tuple[float, float], witness: float
     ) -> tuple[bool, bool]:
-        """Whether a match is a localisation, and whether it would be one with a second."""
-        acceptance = self._acceptance
+        """Whether a match is a localisation, and whether it would be one with a second.
+
+        Where somebody only said where the robot is, a second match may repeat the error of the
+        first: it confirms what would also be believed without that word.
+        """
+        acceptance, confirmed = self._acceptance, candidate.standing.agreed > 0
         if match.inliers < acceptance.min_inliers or not determined(match, acceptance):
             return False, False
-        needed = acceptance.min_confidence, acceptance.min_confidence_lost
-        over = max(found - least for found, least in zip(readings, needed, strict=True))
-        return over >= 0, over >= -model.witness
+        predicted, anywhere = readings
+        over = anywhere - acceptance.min_confidence_lost
+        if confirmed:
+            over = max(over, predicted - acceptance.min_confidence)
+            return over >= 0, over >= -witness
+        return max(over, predicted - acceptance.min_confidence_told) >= 0, over >= -witness
 
     def _counted(
         self, candidate: Candidate, match: Match, spread: Callable[[], Spread]

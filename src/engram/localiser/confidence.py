@@ -6,9 +6,11 @@ against what is usual for this camera, light and distance, and beside how well t
 was known before: a position that fixes have confirmed again and again supports a weak match, a hint
 that nothing has confirmed yet supports none.
 
-The model is additive. A match has two readings: as what the position predicts, and as that of a
-robot that may be anywhere. `CONFIDENCES` holds the weights for each kind of features, made and
-judged by ``python -m engram_lab.fits.confidence``.
+The model is additive. A match has several readings: as what the position predicts, if fixes have
+confirmed it; the same if later ones failed to come; as what somebody said; and as that of a robot
+that may be anywhere. `CONFIDENCES` holds
+the weights for each kind of features, made and judged by
+``python -m engram_lab.fits.confidence``.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ _MOST_AGREED = 20
 _MOST_MISSED = 10.0
 _LEAST_SIGMA_M, _MOST_SIGMA_M = 0.05, 30.0
 _LEAST_RATIO, _MOST_RATIO = 0.03, 2.0
-_MOST_APART = 4.0
+_MOST_APART = 2.0
+_LEAST_SPREAD = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +105,8 @@ class Evidence:
         sigma_m: standard deviation of the predicted position; infinite without a prediction.
         apart: distance between measured and predicted position over `sigma_m` and a slack;
             infinite if they contradict each other, or without a prediction.
-        spread: extent of the inliers; None if it was not needed.
+        spread: extent of the inliers; None beyond reach, and where fixes have confirmed the
+            position.
     """
 
     inliers: int
@@ -115,44 +119,56 @@ class Evidence:
     spread: Spread | None = None
 
     def match_terms(self) -> tuple[float, ...]:
-        """Terms of the match itself; in both readings."""
-        usual = self.standing.usual_inliers
-        ratio = min(max(self.inliers / usual, _LEAST_RATIO), _MOST_RATIO) if usual else 1.0
+        """Terms of the match itself; in every reading."""
         return (
             1.0,
             math.log(self.inliers / 20.0),
-            math.log(ratio),
-            0.0 if usual else 1.0,
             math.log(max(self.share, 1e-3)),
             min(self.distance_m, 10.0),
             math.log(min(max(self.match_sigma_m, 0.01), 1.0)),
         )
 
-    def predicted_terms(self) -> tuple[float, ...]:
-        """Terms of the reading as what the position predicts."""
+    def expected_terms(self) -> tuple[float, ...]:
+        """Terms of what was expected."""
         return (
-            *self.match_terms(),
-            math.log1p(min(self.standing.agreed, _MOST_AGREED)),
             math.log1p(min(self.standing.missed, _MOST_MISSED)),
             math.log(min(max(self.sigma_m, _LEAST_SIGMA_M), _MOST_SIGMA_M)),
             min(self.apart, _MOST_APART),
         )
 
+    def spread_terms(self) -> tuple[float, ...]:
+        """Terms of how far the inliers spread."""
+        spread = self.spread or Spread(0.0, 0.0, 0.0)
+        height = min(spread.height, 1.0)
+        return math.log(max(spread.image, _LEAST_SPREAD)), math.log(max(height, _LEAST_SPREAD))
+
+    def predicted_terms(self) -> tuple[float, ...]:
+        """Terms of the reading as what a position predicts that fixes have confirmed."""
+        usual = self.standing.usual_inliers
+        ratio = min(max(self.inliers / usual, _LEAST_RATIO), _MOST_RATIO) if usual else 1.0
+        agreed = math.log1p(min(self.standing.agreed, _MOST_AGREED))
+        return *self.match_terms(), *self.expected_terms(), math.log(ratio), agreed
+
+    def doubted_terms(self) -> tuple[float, ...]:
+        """Terms of the same reading where the position is doubted, and the spread known."""
+        return *self.predicted_terms(), *self.spread_terms()
+
+    def told_terms(self) -> tuple[float, ...]:
+        """Terms of the reading as what a position predicts that was only told."""
+        return *self.match_terms(), *self.expected_terms(), *self.spread_terms()
+
     def anywhere_terms(self) -> tuple[float, ...]:
         """Terms of the reading as that of a robot that may be anywhere."""
-        spread = self.spread or Spread(0.0, 0.0, 0.0)
-        return (
-            *self.match_terms(),
-            math.log(max(spread.image, 0.02)),
-            math.log(max(min(spread.height, 1.0), 0.02)),
-        )
+        return *self.match_terms(), *self.spread_terms()
 
 
-PREDICTED_TERMS = (
-    "constant", "inliers", "ratio", "no usual", "share", "distance", "match sigma",
-    "agreed", "missed", "sigma", "apart",
-)  # fmt: skip
-ANYWHERE_TERMS = (*PREDICTED_TERMS[:7], "spread", "height")
+_MATCH_TERMS = ("constant", "inliers", "share", "distance", "match sigma")
+_EXPECTED_TERMS = ("missed", "sigma", "apart")
+_SPREAD_TERMS = ("spread", "height")
+PREDICTED_TERMS = (*_MATCH_TERMS, *_EXPECTED_TERMS, "ratio", "agreed")
+DOUBTED_TERMS = (*PREDICTED_TERMS, *_SPREAD_TERMS)
+TOLD_TERMS = (*_MATCH_TERMS, *_EXPECTED_TERMS, *_SPREAD_TERMS)
+ANYWHERE_TERMS = (*_MATCH_TERMS, *_SPREAD_TERMS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,11 +177,15 @@ class ConfidenceModel:
 
     Attributes:
         predicted: of `Evidence.predicted_terms`.
+        doubted: of `Evidence.doubted_terms`.
+        told: of `Evidence.told_terms`.
         anywhere: of `Evidence.anywhere_terms`.
         witness: what a second match adds that agrees from some way on.
     """
 
     predicted: tuple[float, ...]
+    doubted: tuple[float, ...]
+    told: tuple[float, ...]
     anywhere: tuple[float, ...]
     witness: float
 
@@ -174,18 +194,29 @@ class ConfidenceModel:
         return replace(
             self,
             predicted=_with_less(self.predicted, more),
+            doubted=_with_less(self.doubted, more),
+            told=_with_less(self.told, more),
             anywhere=_with_less(self.anywhere, more),
         )
 
     def as_predicted(self, evidence: Evidence) -> float:
-        """Log-odds of a match that agrees with its prediction; -inf if it does not."""
+        """Log-odds of a match that agrees with its prediction; -inf if it does not.
+
+        A position that no fix has confirmed speaks for a match only if its inliers spread.
+        """
         if not math.isfinite(evidence.apart):
             return -math.inf
-        return _sum(self.predicted, evidence.predicted_terms())
+        if not evidence.standing.agreed:
+            return -math.inf if evidence.spread is None else _sum(self.told, evidence.told_terms())
+        if evidence.spread is None:
+            return _sum(self.predicted, evidence.predicted_terms())
+        return _sum(self.doubted, evidence.doubted_terms())
 
     def alone(self, evidence: Evidence) -> float:
         """Log-odds of a match as if no fix had come before it."""
         unproved = replace(evidence, standing=replace(evidence.standing, agreed=0))
+        if evidence.spread is None and math.isfinite(evidence.apart):
+            return _sum(self.predicted, unproved.predicted_terms())
         return max(self.as_predicted(unproved), self.as_anywhere(evidence))
 
     def as_anywhere(self, evidence: Evidence) -> float:
@@ -207,11 +238,14 @@ def _sum(weights: tuple[float, ...], terms: tuple[float, ...]) -> float:
 
 # Source: python -m engram_lab.fits.confidence
 _BRIEF = ConfidenceModel(
-    # constant, inliers, ratio, no usual, share, distance, match sigma, agreed, missed, sigma, apart
-    predicted=(13.166, 2.09, 0.513, -0.07, 2.88, 0.0, -0.532, 0.036, -0.89, -0.814, -1.426),
-    # constant, inliers, ratio, no usual, share, distance, match sigma, spread, height
-    anywhere=(13.06, 2.575, 0.0, 0.0, 3.933, 0.0, -0.563, 0.568, 1.255),
-    witness=4.0,
+    # constant, inliers, share, distance, match sigma, missed, sigma, apart, ratio, agreed
+    predicted=(6.019, 0.0, 0.0, 0.0, -0.664, -1.634, -1.129, -1.55, 3.362, 0.0),
+    doubted=(9.835, 0.0, 0.135, 0.0, 0.0, -1.169, -0.776, -2.021, 4.676, 0.908, 1.417, 0.571),
+    # constant, inliers, share, distance, match sigma, missed, sigma, apart, spread, height
+    told=(10.864, 0.257, 1.212, -0.124, -0.347, -0.003, -0.174, -2.589, 1.544, 0.77),
+    # constant, inliers, share, distance, match sigma, spread, height
+    anywhere=(13.704, 0.0, 3.055, -0.113, -0.512, 1.509, 0.777),
+    witness=2.0,
 )
 # At 22 inliers `net` has as many false accepts as BRIEF at 20 (`lab/reports/eyes.md`).
 _NET = _BRIEF.needing(1.1)

@@ -16,7 +16,7 @@ from engram.ranking import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 8
+METHOD_VERSION = 9
 
 
 class NeighbourhoodSearch(StrEnum):

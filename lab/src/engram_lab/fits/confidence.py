@@ -2,17 +2,19 @@
 
     python -m engram_lab.fits.confidence              # renders, drives, fits, judges; resumable
 
-Robots drive in small towns: undisturbed, told a wrong place, carried elsewhere, past gaps, lost,
-and lost in another town. Each of their matches is a row: what was known of it, and whether it was
-right, within 1 m and 5°. Two logistic models are fitted, one for each reading of a match. On the
-held-out towns their log loss is compared with that of a logistic in inliers alone, and claimed with
-true log-odds bin by bin.
+Robots drive in small towns by day and night: undisturbed, told a wrong place, carried elsewhere,
+past gaps, lost, and lost in another town. Each of their matches is a row: what was known of it, and
+whether it was right, within 1 m and 5°. Misplaced robots meet look-alikes too rarely to learn from,
+so all of them are searched for (`engram_lab.wrong_places`) and added; the constants are corrected
+for their number. A logistic model is fitted for each reading of a match. On the held-out
+towns, without those look-alikes, log loss is compared with that of a logistic in inliers alone, and
+claimed with true log-odds bin by bin.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 
@@ -20,10 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.cli.progress import Bars
+from engram.frontend import BRIEF, DescriptorKind
 from engram.localiser import METHOD_VERSION, AcceptanceConfig, Spread
 from engram.localiser.confidence import (
     ANYWHERE_TERMS,
+    DOUBTED_TERMS,
     PREDICTED_TERMS,
+    TOLD_TERMS,
     ConfidenceModel,
     Evidence,
     Standing,
@@ -32,7 +37,6 @@ from engram.monitor import Monitor, write_whole
 from engram.robot import Settings
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Looked, Street
 from engram_lab.programs import Figure, command_line, numbers, report
-from engram_lab.town.simulating import campaigns_folder
 from engram_lab.trial_towns import (
     BY_NIGHT,
     FITTED_TOWNS,
@@ -40,24 +44,32 @@ from engram_lab.trial_towns import (
     STREETS,
     other_towns,
     streets,
+    towns_folder,
 )
+from engram_lab.wrong_places import LEAST_INLIERS, WrongPlaces
 
 Array = NDArray[np.float64]
 
 # Tries of each kind on each street.
 TRIES = {Kind.UNDISTURBED: 1, Kind.TOLD: 24, Kind.CARRIED: 24, Kind.GAP: 6, Kind.LOST: 6}
 _LOST_ROUNDS = 8
+# What a second match adds that agrees: two look-alikes agree more often than chance has it.
+WITNESS = 2.0
 # A robot that is told a wrong place is not looked for elsewhere: what it believes there counts.
 _NOT_LOOKED_FOR = frozenset({Kind.TOLD, Kind.CARRIED})
-_LEAST_INLIERS = 12
 # Strength of the prior that weights are 0, in units of standardised terms.
 _RIDGE = 1.0
 _BIN = 1.0
 # What each weight may be, in the order of the terms.
-_MATCH_SIGNS = (0, 1, 1, -1, 1, -1, -1)
-_PREDICTED_SIGNS = (*_MATCH_SIGNS, 1, -1, -1, -1)
+_MATCH_SIGNS = (0, 1, 1, -1, -1)
+_PREDICTED_SIGNS = (*_MATCH_SIGNS, -1, -1, -1, 1, 1)
+_DOUBTED_SIGNS = (*_PREDICTED_SIGNS, 1, 1)
+_TOLD_SIGNS = (*_MATCH_SIGNS, -1, -1, -1, 1, 1)
 _ANYWHERE_SIGNS = (*_MATCH_SIGNS, 1, 1)
+# Each so many frames are matched with all wrong places.
+_EVERY = 2
 _LEAST_IN_BIN = 200
+_POOR = 40.0
 # A second match from this far on, and at most so far, can agree with a first.
 _WITNESS_M = (4.0, 15.0)
 
@@ -96,43 +108,81 @@ def rows_of(street: Street, looked: Looked) -> Iterator[Row]:
     """The matches of one frame."""
     for outcome in looked.outcomes:
         pose, evidence = outcome.match.reference_from_live, outcome.evidence
-        if pose is None or evidence is None or evidence.inliers < _LEAST_INLIERS:
+        if pose is None or evidence is None or evidence.inliers < LEAST_INLIERS:
             continue
         error = street.error(looked.frame, outcome.candidate.node, pose)
         if error is not None:
             yield Row(evidence, *error)
 
 
-def collected(towns: Sequence[int], folder: Path, monitor: Monitor) -> list[Row]:
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Matches of robots, and of places that look like where they are not.
+
+    Attributes:
+        met: matches that robots met.
+        alike: look-alikes, as lost robots would meet them, robots that were told to be there, and
+            robots that were carried from there.
+    """
+
+    met: list[Row]
+    alike: list[Row]
+
+
+def collected(towns: Sequence[int], folder: Path, settings: Settings, monitor: Monitor) -> Rows:
     """The rows of some towns; those that an earlier run collected are read."""
-    rows: list[Row] = []
+    rows = Rows([], [])
     for which in (STREETS, BY_NIGHT):
-        for name, street in streets(towns, Settings(), _LOST_ROUNDS, monitor, which):
-            rows += _kept(folder, name, street, TRIES, monitor)
-    for name, street in other_towns(towns, Settings(), _LOST_ROUNDS, monitor):
-        rows += _kept(folder, name, street, {Kind.LOST: 6}, monitor)
+        for name, street in streets(towns, settings, _LOST_ROUNDS, monitor, which):
+            _collect(rows, folder / name.replace("/", "-"), street, TRIES, monitor)
+    for name, street in other_towns(towns, settings, _LOST_ROUNDS, monitor):
+        _collect(rows, folder / name.replace("/", "-"), street, {Kind.LOST: 6}, monitor)
     return rows
 
 
-def _kept(
-    folder: Path, name: str, street: Street, tries: dict[Kind, int], monitor: Monitor
-) -> list[Row]:
-    path = folder / f"{name.replace('/', '-')}-{METHOD_VERSION}.jsonl"
-    if not path.exists():
-        with monitor.stage(name, sum(tries.values())) as part:
-            rows = []
-            for kind, count in tries.items():
-                for one in street.tries(kind, count, seed=11):
-                    run = street.run(one, relocalises=kind not in _NOT_LOOKED_FOR)
-                    rows += [row for looked in run for row in rows_of(street, looked)]
-                    part.advance()
-        with write_whole(path) as draft:
-            draft.write_text("".join(f"{row.to_json()}\n" for row in rows), encoding="utf-8")
+def _collect(
+    rows: Rows, path: Path, street: Street, tries: dict[Kind, int], monitor: Monitor
+) -> None:
+    """Adds the rows of one street."""
+
+    def met() -> Iterator[Row]:
+        for kind, count in tries.items():
+            for one in street.tries(kind, count, seed=11):
+                for looked in street.run(one, relocalises=kind not in _NOT_LOOKED_FOR):
+                    yield from rows_of(street, looked)
+
+    def look_alikes() -> Iterator[Row]:
+        places = WrongPlaces(street, _EVERY)
+        for there in places.lost():
+            for found in (there, *places.believed(there), *places.believed(there, usual)):
+                assert found.outcome.evidence is not None
+                yield Row(found.outcome.evidence, np.inf, np.pi)
+
+    here = _kept(path.with_name(f"{path.name}-{METHOD_VERSION}.jsonl"), met, monitor)
+    usual = _usual(here)
+    alike = path.with_name(f"{path.name}-alike-{METHOD_VERSION}.jsonl")
+    rows.met.extend(here)
+    rows.alike.extend(_kept(alike, look_alikes, monitor))
     street.close()
+
+
+def _usual(rows: list[Row]) -> float:
+    """Usual inliers of a street's robots; in another town those of a poor session."""
+    usual = [one for row in rows if (one := row.evidence.standing.usual_inliers)]
+    return float(np.median(usual)) if usual else _POOR
+
+
+def _kept(path: Path, make: Callable[[], Iterator[Row]], monitor: Monitor) -> list[Row]:
+    if not path.exists():
+        with monitor.stage(path.name, 1) as part, write_whole(path) as draft:
+            draft.write_text("".join(f"{row.to_json()}\n" for row in make()), encoding="utf-8")
+            part.advance()
     return [Row.of(line) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def logistic(terms: Array, right: Array, signs: Sequence[int], ridge: float = _RIDGE) -> Array:
+def logistic(
+    terms: Array, right: Array, signs: Sequence[int], counts: Array | float = 1.0
+) -> Array:
     """Weights by Newton's method; the first term is constant and not held back.
 
     Args:
@@ -140,28 +190,28 @@ def logistic(terms: Array, right: Array, signs: Sequence[int], ridge: float = _R
         right: (N,) float64, 0 or 1.
         signs: T, what each weight may be: +1, -1, or 0 for both. One that would be of the other
             sign is 0: chance in few rows must not teach that more inliers speak against a match.
-        ridge: strength of the prior.
+        counts: (N,) how many rows each stands for.
     """
     used = np.ones(terms.shape[1], np.bool_)
     while True:
         weights = np.zeros(terms.shape[1])
-        weights[used] = _newton(terms[:, used], right, ridge)
+        weights[used] = _newton(terms[:, used], right, counts * np.ones(len(right)))
         wrong = weights * np.array(signs) < 0
         if not wrong.any():
             return weights
         used &= ~wrong
 
 
-def _newton(terms: Array, right: Array, ridge: float) -> Array:
+def _newton(terms: Array, right: Array, counts: Array) -> Array:
     scale = np.maximum(terms.std(axis=0), 1e-9)
     scale[0] = 1.0
     x, weights = terms / scale, np.zeros(terms.shape[1])
-    prior = np.full(len(weights), ridge)
+    prior = np.full(len(weights), _RIDGE)
     prior[0] = 0.0
     for _ in range(50):
         claimed = 1 / (1 + np.exp(-np.clip(x @ weights, -30, 30)))
-        slope = x.T @ (right - claimed) - prior * weights
-        curve = (x * (claimed * (1 - claimed))[:, None]).T @ x + np.diag(prior + 1e-9)
+        slope = x.T @ (counts * (right - claimed)) - prior * weights
+        curve = (x * (counts * claimed * (1 - claimed))[:, None]).T @ x + np.diag(prior + 1e-9)
         step = np.linalg.solve(curve, slope)
         weights += step
         if np.abs(step).max() < 1e-8:
@@ -174,38 +224,64 @@ def log_loss(log_odds: Array, right: Array) -> float:
     return float(np.mean(np.logaddexp(0, np.where(right > 0, -log_odds, log_odds))))
 
 
-def readings(rows: Sequence[Row]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Terms and truth of the rows that a prediction expects, and of those of lost robots."""
-    expected = [row for row in rows if np.isfinite(row.evidence.apart)]
-    anywhere = [row for row in rows if _is_anywhere(row)]
-    return (
-        _of([row.evidence.predicted_terms() for row in expected], expected),
-        _of([row.evidence.anywhere_terms() for row in anywhere], anywhere),
-    )
+# The readings of a match, by name: terms, their signs, and what one look-alike counts.
+_READINGS: dict[str, tuple[Callable[[Evidence], tuple[float, ...]], tuple[int, ...], float]] = {
+    "predicted": (Evidence.predicted_terms, _PREDICTED_SIGNS, 0.1),
+    "doubted": (Evidence.doubted_terms, _DOUBTED_SIGNS, 0.0),
+    "told": (Evidence.told_terms, _TOLD_SIGNS, 1.0),
+    "anywhere": (Evidence.anywhere_terms, _ANYWHERE_SIGNS, 1.0),
+}
 
 
-def _of(terms: list[tuple[float, ...]], rows: list[Row]) -> tuple[Array, Array]:
-    return np.array(terms), np.array([row.right for row in rows], np.float64)
+def _readings_of(row: Row) -> Iterator[str]:
+    """How a match is read."""
+    found = row.evidence
+    if _is_anywhere(row):
+        yield "anywhere"
+    if not np.isfinite(found.apart):
+        return
+    if found.standing.agreed:
+        yield "predicted" if found.spread is None else "doubted"
+    elif found.spread is not None:
+        yield "told"
 
 
-def fitted(rows: Sequence[Row]) -> ConfidenceModel:
+def fitted(rows: Rows) -> ConfidenceModel:
     """The weights that fit best."""
-    expected, anywhere = readings(rows)
-    return ConfidenceModel(
-        tuple(np.round(logistic(*expected, _PREDICTED_SIGNS), 3).tolist()),
-        tuple(np.round(logistic(*anywhere, _ANYWHERE_SIGNS), 3).tolist()),
-        witness=4.0,
-    )
+    weights = {}
+    for name, (terms, signs, counts) in _READINGS.items():
+        met, alike = (
+            [row for row in some if name in _readings_of(row)] for some in (rows.met, rows.alike)
+        )
+        weights[name] = _weights(terms, signs, (met, alike), counts)
+    return ConfidenceModel(**weights, witness=WITNESS)
+
+
+def _weights(
+    terms: Callable[[Evidence], tuple[float, ...]],
+    signs: Sequence[int],
+    rows: tuple[list[Row], list[Row]],
+    counts: float,
+) -> tuple[float, ...]:
+    """Weights of one reading; look-alikes count for their terms, not for how often wrong is."""
+    met, alike = rows
+    right = np.array([row.right for row in met] + [False] * len(alike), np.float64)
+    share = np.array([1.0] * len(met) + [counts] * len(alike))
+    every = np.array([terms(row.evidence) for row in met + alike])
+    weights = logistic(every, right, signs, share)
+    wrong = sum(not row.right for row in met)
+    weights[0] += np.log((wrong + counts * len(alike)) / max(wrong, 1))
+    return tuple(np.round(weights, 3).tolist())
 
 
 def judged(model: ConfidenceModel, rows: Sequence[Row], fit: Sequence[Row]) -> Iterator[Figure]:
     """Log loss against a logistic in inliers alone, and reliability bin by bin."""
-    readable = [row for row in rows if _has_reading(row)]
+    readable = [row for row in rows if any(_readings_of(row))]
     right = np.array([row.right for row in readable], np.float64)
     claimed = np.array(
-        [max(model.as_predicted(r.evidence), model.as_anywhere(r.evidence)) for r in readable]
+        [max(model.as_predicted(row.evidence), model.as_anywhere(row.evidence)) for row in readable]
     )
-    known = [row for row in fit if _has_reading(row)]
+    known = [row for row in fit if any(_readings_of(row))]
     truth = np.array([row.right for row in known], np.float64)
     plain = logistic(_inliers(known), truth, (0, 0))
     alone, ours = log_loss(_inliers(readable) @ plain, right), log_loss(claimed, right)
@@ -224,10 +300,6 @@ def judged(model: ConfidenceModel, rows: Sequence[Row], fit: Sequence[Row]) -> I
         yield Figure(f"claimed {low:+.0f} to {low + _BIN:+.0f} ({count}): true log-odds", actual)
 
 
-def _has_reading(row: Row) -> bool:
-    return bool(np.isfinite(row.evidence.apart)) or _is_anywhere(row)
-
-
 def _is_anywhere(row: Row) -> bool:
     near = row.evidence.distance_m <= AcceptanceConfig().reach_m
     return near and row.evidence.spread is not None
@@ -240,6 +312,8 @@ def _inliers(rows: Sequence[Row]) -> Array:
 def text_of(model: ConfidenceModel) -> str:
     """The weights as they stand in `engram.localiser.confidence`."""
     lines = [f"    # {', '.join(PREDICTED_TERMS)}", f"    predicted={model.predicted},"]
+    lines += [f"    # {', '.join(DOUBTED_TERMS)}", f"    doubted={model.doubted},"]
+    lines += [f"    # {', '.join(TOLD_TERMS)}", f"    told={model.told},"]
     lines += [f"    # {', '.join(ANYWHERE_TERMS)}", f"    anywhere={model.anywhere},"]
     return "\n".join(["ConfidenceModel(", *lines, f"    witness={model.witness},", ")"])
 
@@ -247,16 +321,18 @@ def text_of(model: ConfidenceModel) -> str:
 def main() -> None:
     """Runs the program."""
     parser = command_line(__doc__)
+    parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(FITTED_TOWNS))
     parser.add_argument("--held-out", type=numbers, default=list(HELD_OUT_TOWNS))
-    parser.add_argument("--out", type=Path, default=campaigns_folder() / "confidence")
     asked = parser.parse_args()
-    asked.out.mkdir(parents=True, exist_ok=True)
-    rows = collected(asked.towns, asked.out, Bars())
+    settings = Settings().for_descriptor(asked.kind)
+    folder = towns_folder(settings) / "confidence"
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = collected(asked.towns, folder, settings, Bars())
     model = fitted(rows)
     print(text_of(model))
-    held_out = collected(asked.held_out, asked.out, Bars())
-    report(judged(model, held_out, rows), asked.json, "confidence, held-out towns")
+    held_out = collected(asked.held_out, folder, settings, Bars())
+    report(judged(model, held_out.met, rows.met), asked.json, "confidence, held-out towns")
 
 
 if __name__ == "__main__":
