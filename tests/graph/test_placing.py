@@ -181,3 +181,21 @@ def test_nodes_that_nothing_joins_stand_in_a_row_beside_the_rest():
     assert not poses.translations[first:, 1:].any()
     # The camera's motion shows that it pitches by a milliradian.
     np.testing.assert_allclose(poses.rotations[first:, :, 2], [[1.0, 0.0, 0.0]] * 3, atol=0.01)
+
+
+def test_of_many_components_each_is_laid_out_as_if_alone():
+    towns = [town(5, session, closes=session % 2 == 0) for session in range(40)]
+    nodes = [node for _, some, _ in towns for node in some]
+    edges = [one for _, _, some in towns for one in some]
+    whole, at = place(graph_of(nodes, edges), {}), 0
+    for _, some, own in towns:
+        alone = place(graph_of(some, own), {})
+        part = whole.some(np.arange(at, at + len(some)))
+        # What is up in a camera follows from all of its drives, to the noise of their motion.
+        np.testing.assert_allclose(part.rotations, alone.rotations, atol=1e-6)
+        shift = part.translations - alone.translations
+        np.testing.assert_allclose(shift, np.tile(shift[0], (len(some), 1)), atol=1e-3)
+        at += len(some)
+    across = whole.translations[:, 0].reshape(40, 5)
+    order = np.argsort(across.min(axis=1))
+    assert (across.min(axis=1)[order][1:] > across.max(axis=1)[order][:-1]).all()

@@ -114,6 +114,14 @@ class Poses:
         """Arrays of its own."""
         return Poses(self.rotations.copy(), self.translations.copy())
 
+    def some(self, rows: NDArray[np.integer]) -> Poses:
+        """Copies of some of them."""
+        return Poses(self.rotations[rows], self.translations[rows])
+
+    def put(self, rows: NDArray[np.integer], poses: Poses) -> None:
+        """Sets some of them."""
+        self.rotations[rows], self.translations[rows] = poses.rotations, poses.translations
+
     def moved(self, step: Array) -> Poses:
         """Each pose times the exponential of its row of an (N, 6) step, in its own frame."""
         turned = self.rotations @ Rotation.from_rotvec(step[:, 3:]).as_matrix()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.graph.components import grouped
 from engram.graph.graph import ExperienceGraph
 
 _APART_M = 20.0
@@ -16,11 +17,9 @@ def lay_out(graph: ExperienceGraph) -> NDArray[np.float64]:
     Each component is placed along the least uncertain chains from its first node. Components stand
     side by side, as their relative pose is unknown.
     """
-    components = graph.components()
     placed = np.zeros((len(graph), 2))
     right_m = 0.0
-    for component in range(int(components.max(initial=-1)) + 1):
-        nodes = np.flatnonzero(components == component)
+    for nodes in grouped(graph.components()):
         tree = graph.chains_from(int(nodes[0]))
         rows = [tree.row_of[int(node)] for node in nodes]
         points = tree.root_from_node[rows][:, [9, 11]]

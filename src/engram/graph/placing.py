@@ -7,7 +7,7 @@ least squares over all edges. Components whose relative pose is unknown stand si
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated
 
@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from engram.config import check_bounds
 from engram.geometry import SE3
 from engram.graph.adjusting import AdjustConfig, Measured, Poses, Priors, adjust
+from engram.graph.components import grouped, labels_of
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, NodeId
 
@@ -117,7 +118,7 @@ def place(
         if node in graph:
             poses.set(graph.index(node), pose)
             fixed[graph.index(node)] = True
-    return _Placing(graph, config).around(poses, fixed)
+    return _Placing.of(graph, config).around(poses, fixed)
 
 
 def replace_after_removal(
@@ -131,7 +132,7 @@ def replace_after_removal(
     `PlacingConfig.moved_m` against the rest are laid out anew around those that stay.
     """
     poses = place(graph, placed, config)
-    placing = _Placing(graph, config)
+    placing = _Placing.of(graph, config)
     adjusted = placing.adjusted_whole(poses)
     stays = np.ones(len(graph), np.bool_)
     for members in placing.components():
@@ -151,7 +152,7 @@ def anchor(
     Other components keep their shape, and stand beside.
     """
     poses = place(graph, placed, config)
-    placing = _Placing(graph, config)
+    placing = _Placing.of(graph, config)
     taken = np.zeros(len(graph), np.bool_)
     for members in placing.components():
         inside = np.isin(anchored.at, members)
@@ -168,98 +169,139 @@ def anchor(
     return poses
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Placing:
-    """The measurements of a graph, and the steps of a layout."""
+    """The measurements of a graph, and the steps of a layout.
 
-    def __init__(self, graph: ExperienceGraph, config: PlacingConfig) -> None:
-        self._graph = graph
-        self._config = config
-        ends = graph.edge_ends.astype(np.int64)[:, ::-1]  # of a and b
-        self._edges, self._ends = _used(graph.edges, ends, len(graph))
-        self._measured = Measured.of(self._edges, self._ends, config.adjust)
-        self._labels = _labels(self._ends, len(graph))
+    Attributes:
+        edges: E edges that are used.
+        ends: (E, 2) int64, dense indices of their ends a and b.
+        measured: what they measure.
+        ups: (N, 3) float64, the direction in each node's camera that is up.
+        labels: (N,) int64, the component of each node.
+        config: settings.
+    """
+
+    edges: list[Edge]
+    ends: Indices
+    measured: Measured
+    ups: Array
+    labels: Indices
+    config: PlacingConfig
+
+    @staticmethod
+    def of(graph: ExperienceGraph, config: PlacingConfig) -> _Placing:
+        """That of a whole graph."""
+        both = graph.edge_ends.astype(np.int64)[:, ::-1]  # of a and b
+        edges, ends = _used(graph.edges, both, len(graph))
+        measured = Measured.of(edges, ends, config.adjust)
+        ups = _ups([node.camera for node in graph.nodes], edges, ends)
+        return _Placing(edges, ends, measured, ups, labels_of(ends, len(graph)), config)
 
     def components(self) -> list[Indices]:
         """Dense indices of each component, the largest first; of equal ones the earlier."""
-        counts = np.bincount(self._labels)
-        order = sorted(range(len(counts)), key=lambda label: (-counts[label], label))
-        return [np.flatnonzero(self._labels == label) for label in order]
+        return sorted(grouped(self.labels), key=lambda members: -len(members))
+
+    def _parts(self) -> Iterator[tuple[Indices, _Placing]]:
+        """The components, as `components` has them, each as a graph of its own.
+
+        A map may fall into thousands: a step on one must not cost a pass over all.
+        """
+        edges_of = {}
+        for rows in grouped(self.labels[self.ends[:, 0]]):
+            edges_of[int(self.labels[self.ends[rows[0], 0]])] = rows
+        nothing = np.zeros(0, np.int64)
+        for members in self.components():
+            rows = edges_of.get(int(self.labels[members[0]]), nothing)
+            ends = np.searchsorted(members, self.ends[rows])
+            measured = replace(self.measured.rows(rows), a=ends[:, 0], b=ends[:, 1])
+            edges, labels = [self.edges[row] for row in rows.tolist()], np.zeros_like(members)
+            yield members, _Placing(edges, ends, measured, self.ups[members], labels, self.config)
 
     def around(self, poses: Poses, fixed: NDArray[np.bool_]) -> Poses:
         """Lays out the nodes that are not fixed."""
         poses, fixed = poses.copy(), fixed.copy()
         taken = fixed.copy()
         fresh = []
-        for members in self.components():
+        for members, part in self._parts():
             if not fixed[members].any():
-                fresh.append(members)
+                fresh.append((members, part))
                 continue
-            self._keep_largest_part(poses, members, fixed)
-            poses = self._solved(poses, members, fixed)
+            inside, placed = poses.some(members), fixed[members]
+            part._keep_largest_part(inside, placed)
+            poses.put(members, part._solved(inside, placed))
             taken[members] = True
-        for members in fresh:
+        right_m = self._right_m(poses, taken)
+        for members, part in fresh:
             if len(members) > 1:
-                poses = self._laid_out_alone(poses, members)
-                poses = self.set_beside(poses, members, taken)
+                alone = part._laid_out_alone(poses.some(members))
+                if right_m is not None:
+                    alone.translations[:, 0] += right_m - alone.translations[:, 0].min()
+                poses.put(members, alone)
+                most_m = float(alone.translations[:, 0].max()) + self.config.apart_m
+                right_m = most_m if right_m is None else max(right_m, most_m)
                 taken[members] = True
-        self._line_up(poses, [int(one[0]) for one in fresh if len(one) == 1], taken)
+        self._line_up(poses, [int(one[0]) for one, _ in fresh if len(one) == 1], taken)
         return poses
 
     def _line_up(self, poses: Poses, alone: list[int], taken: NDArray[np.bool_]) -> None:
         """Sets nodes without edges beside all others, in one pass: a map may hold thousands."""
         if not alone:
             return
-        apart_m = self._config.apart_m
-        right_m = poses.translations[taken, 0].max() + apart_m if taken.any() else 0.0
-        ups = self._level(len(taken)).ups[alone] @ MAP_FROM_CAMERA.T
-        for node, up in zip(alone, ups, strict=True):
+        right_m, apart_m = self._right_m(poses, taken) or 0.0, self.config.apart_m
+        for node, up in zip(alone, self.ups[alone] @ MAP_FROM_CAMERA.T, strict=True):
             levelled = _level_turn(up, MAP_FROM_CAMERA[:, 2])
             poses.set(node, SE3(levelled @ MAP_FROM_CAMERA, np.array([right_m, 0.0, 0.0])))
             right_m += apart_m
 
+    def _right_m(self, poses: Poses, taken: NDArray[np.bool_]) -> float | None:
+        """Where the next component begins; None for the first."""
+        if not taken.any():
+            return None
+        return float(poses.translations[taken, 0].max()) + self.config.apart_m
+
     def adjusted_whole(self, poses: Poses) -> Poses:
         """All components adjusted from where they are, each with its first node fixed."""
-        free = np.ones(len(self._graph), np.bool_)
-        for members in self.components():
+        free = np.ones(len(self.labels), np.bool_)
+        for members in grouped(self.labels):
             free[members[0]] = False
         start = poses.copy()
-        for members in self.components():
-            self._chain(start, members, ~free)
-        priors = self._level(len(free))
-        return adjust(start, self._measured, free, self._config.adjust, priors).poses
+        self._chain(start, ~free)
+        priors = self._level()
+        return adjust(start, self.measured, free, self.config.adjust, priors).poses
 
     def fitted(self, poses: Poses, members: Indices, anchored: Anchored) -> Poses:
         """A component moved to its anchors, then adjusted to them."""
         map_from_old = fit_level(poses.translations[anchored.at], anchored.positions)
         for node in members.tolist():
             poses.set(node, map_from_old @ poses.pose(node))
-        free = np.zeros(len(self._graph), np.bool_)
+        free = np.zeros(len(self.labels), np.bool_)
         free[members] = True
-        level = self._level(len(free))
+        level = self._level()
         priors = replace(
             level, at=anchored.at, positions=anchored.positions, sigmas_m=anchored.sigmas_m
         )
         # From here on it is nearly right, so the kernel may be narrow.
-        config = replace(self._config.adjust, widest=4.0)
-        return adjust(poses, self._measured, free, config, priors).poses
+        config = replace(self.config.adjust, widest=4.0)
+        return adjust(poses, self.measured, free, config, priors).poses
 
     def set_beside(self, poses: Poses, members: Indices, taken: NDArray[np.bool_]) -> Poses:
         """Moves a component to the right of all others; the first one stays at its origin."""
-        if not taken.any():
+        right_m = self._right_m(poses, taken)
+        if right_m is None:
             return poses
-        right_m = poses.translations[taken, 0].max() + self._config.apart_m
         shift = np.array([right_m - poses.translations[members, 0].min(), 0.0, 0.0])
         poses = poses.copy()
         poses.translations[members] += shift
         return poses
 
-    def _keep_largest_part(self, poses: Poses, members: Indices, fixed: NDArray[np.bool_]) -> None:
+    def _keep_largest_part(self, poses: Poses, fixed: NDArray[np.bool_]) -> None:
         """Of placed parts that no fitting edge holds together only the largest stays."""
-        inside = fixed & (self._labels == self._labels[members[0]])
-        both = inside[self._ends].all(axis=1)
-        off_m = np.linalg.norm(self._measured.residuals(poses)[:, :3], axis=1)
+        inside = fixed.copy()
+        both = inside[self.ends].all(axis=1)
+        off_m = np.linalg.norm(self.measured.residuals(poses)[:, :3], axis=1)
         parts = DisjointSet(np.flatnonzero(inside).tolist())
-        for a, b in self._ends[both & (off_m <= self._config.fits_m)].tolist():
+        for a, b in self.ends[both & (off_m <= self.config.fits_m)].tolist():
             parts.merge(a, b)
         # Through nodes that are not placed a part may hang together, too: those between them.
         largest = max(parts.subsets(), key=lambda part: (len(part), -min(part)))
@@ -271,10 +313,10 @@ class _Placing:
 
     def _join_through_new(self, poses: Poses, parts: DisjointSet, fixed: NDArray[np.bool_]) -> None:
         """Joins placed parts whose chain through new nodes fits their places."""
-        new = ~fixed[self._ends].all(axis=1)
+        new = ~fixed[self.ends].all(axis=1)
         trial = poses.copy()
-        reached = self._chain(trial, np.flatnonzero(~fixed), fixed)
-        off_m = np.linalg.norm(self._measured.residuals(trial)[:, :3], axis=1)
+        reached = self._chain(trial, fixed)
+        off_m = np.linalg.norm(self.measured.residuals(trial)[:, :3], axis=1)
         joined: dict[int, int] = {}
 
         def root(node: int) -> int | None:
@@ -282,58 +324,36 @@ class _Placing:
 
         for node in np.flatnonzero(~fixed).tolist():
             joined[node] = int(reached[node])
-        for row in np.flatnonzero(new & (off_m <= self._config.fits_m)).tolist():
-            a, b = (root(int(end)) for end in self._ends[row])
+        for row in np.flatnonzero(new & (off_m <= self.config.fits_m)).tolist():
+            a, b = (root(int(end)) for end in self.ends[row])
             if a in parts and b in parts:
                 parts.merge(a, b)
 
-    def _solved(self, poses: Poses, members: Indices, fixed: NDArray[np.bool_]) -> Poses:
-        free = np.zeros(len(self._graph), np.bool_)
-        free[members] = ~fixed[members]
-        if not free.any():
+    def _solved(self, poses: Poses, fixed: NDArray[np.bool_]) -> Poses:
+        if fixed.all():
             return poses
-        self._chain(poses, members, fixed)
-        return adjust(
-            poses, self._measured, free, self._config.adjust, self._level(len(free))
-        ).poses
+        self._chain(poses, fixed)
+        return adjust(poses, self.measured, ~fixed, self.config.adjust, self._level()).poses
 
-    def _laid_out_alone(self, poses: Poses, members: Indices) -> Poses:
+    def _laid_out_alone(self, poses: Poses) -> Poses:
         """A component by itself: its first node at the origin, level, looking along x."""
-        first = int(members[0])
-        poses.set(first, SE3(MAP_FROM_CAMERA.copy(), np.zeros(3)))
-        fixed = np.zeros(len(self._graph), np.bool_)
-        fixed[first] = True
-        self._chain(poses, members, fixed)
-        free = np.zeros(len(self._graph), np.bool_)
-        free[members] = True
-        free[first] = False
-        poses = adjust(poses, self._measured, free, self._config.adjust).poses
-        ups = self._level(len(free)).ups
-        up = np.einsum("nij,nj->i", poses.rotations[members], ups[members])
-        levelled = _level_turn(up, poses.rotations[first][:, 2])
-        poses = poses.copy()
-        poses.rotations[members] = levelled @ poses.rotations[members]
-        poses.translations[members] = poses.translations[members] @ levelled.T
-        return poses
+        poses.set(0, SE3(MAP_FROM_CAMERA.copy(), np.zeros(3)))
+        free = np.ones(len(self.labels), np.bool_)
+        free[0] = False
+        self._chain(poses, ~free)
+        poses = adjust(poses, self.measured, free, self.config.adjust).poses
+        up = np.einsum("nij,nj->i", poses.rotations, self.ups)
+        levelled = _level_turn(up, poses.rotations[0][:, 2])
+        return Poses(levelled @ poses.rotations, poses.translations @ levelled.T)
 
-    def _chain(self, poses: Poses, members: Indices, fixed: NDArray[np.bool_]) -> Indices:
+    def _chain(self, poses: Poses, fixed: NDArray[np.bool_]) -> Indices:
         """Places nodes along the surest chains from fixed ones; returns the root of each."""
-        wanted = np.zeros(len(self._graph), np.bool_)
-        wanted[members] = True
-        return follow_chains(poses, self._edges, self._ends, (wanted & ~fixed, fixed))
+        return follow_chains(poses, self.edges, self.ends, (~fixed, fixed))
 
-    def _level(self, count: int) -> Priors:
+    def _level(self) -> Priors:
         """That cameras stand upright on the ground, as their motion shows."""
-        ups = np.tile([0.0, -1.0, 0.0], (count, 1))
-        cameras = [node.camera for node in self._graph.nodes]
-        forward: dict[str, Array] = {}
-        for edge, (_, b) in zip(self._edges, self._ends.tolist(), strict=True):
-            if edge.kind is EdgeKind.ODOMETRY:
-                known = forward.setdefault(cameras[b], np.zeros(3))
-                known += edge.a_from_b.translation
-        for node, camera in enumerate(cameras):
-            ups[node] = _up(forward.get(camera, np.zeros(3)))
-        return replace(Priors.none(count), ups=ups, level_rad=self._config.level_rad)
+        nothing = Priors.none(len(self.ups))
+        return replace(nothing, ups=self.ups, level_rad=self.config.level_rad)
 
 
 def follow_chains(
@@ -382,7 +402,7 @@ def follow_chains(
 
 def chain_poses(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[Poses, Indices]:
     """Poses of all nodes along the surest chains, and the first node of each component."""
-    labels = _labels(ends, count)
+    labels = labels_of(ends, count)
     roots = np.unique(labels, return_index=True)[1]
     fixed = np.zeros(count, np.bool_)
     fixed[roots] = True
@@ -434,14 +454,15 @@ def _used(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[list[Edge],
     return [edges[row] for row in rows.tolist()], ends[rows].reshape(-1, 2)
 
 
-def _labels(ends: Indices, count: int) -> Indices:
-    parts = DisjointSet(range(count))
-    for a, b in ends.tolist():
-        parts.merge(a, b)
-    number: dict[int, int] = {}
-    return np.array(
-        [number.setdefault(parts[node], len(number)) for node in range(count)], np.int64
-    )
+def _ups(cameras: Sequence[str], edges: Sequence[Edge], ends: Indices) -> Array:
+    """(N, 3): the direction in each node's camera that is up, as the camera's motion shows."""
+    forward: dict[str, Array] = {}
+    for edge, (_, b) in zip(edges, ends.tolist(), strict=True):
+        if edge.kind is EdgeKind.ODOMETRY:
+            known = forward.setdefault(cameras[b], np.zeros(3))
+            known += edge.a_from_b.translation
+    up_of = {camera: _up(forward.get(camera, np.zeros(3))) for camera in dict.fromkeys(cameras)}
+    return np.array([up_of[camera] for camera in cameras]).reshape(-1, 3)
 
 
 def _misfit_m(before: Poses, after: Poses, members: Indices) -> Array:
