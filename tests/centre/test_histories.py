@@ -12,8 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 from engram.centre.backup import back_up
-from engram.centre.handins import HandIns, HandInState
+from engram.centre.handins import HandIns
+from engram.centre.keeping import HandInState
+from engram.centre.settings import CentreSettings
 from engram.centre.worker import merging
+from engram.centre.worker.sweeping import sweep
 from engram.fleet.merge import merge
 from engram.maps import Map, check_file
 
@@ -34,7 +37,8 @@ class FleetMachine(RuleBasedStateMachine):
         super().__init__()
         self.folder = Path(tempfile.mkdtemp())
         self.admit, merging.admit = merging.admit, admit_here
-        self.site = Site(self.folder)
+        # Nothing that is needed no more is kept for a while.
+        self.site = Site(self.folder, settings=CentreSettings(kept_days=0))
         self.drives: set[tuple[str, int]] = set()
         self.copies: dict[str, Path] = {}
         self.backups: list[Path] = []
@@ -59,6 +63,10 @@ class FleetMachine(RuleBasedStateMachine):
         with Map.open(copy) as store:
             self.copies.setdefault(store.content_hash(), copy)
         self.may_die(lambda: self.site.robot(name).hand_in(), at)
+
+    @rule(at=st.integers(1, 20))
+    def sweep(self, at: int) -> None:
+        self.may_die(lambda: sweep(self.site.centre, NAME), at)
 
     @rule(name=st.sampled_from(ROBOTS), fates=FATES, at=st.integers(1, 60))
     def step(self, name: str, fates: list[str | float], at: int) -> None:

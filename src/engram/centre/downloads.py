@@ -11,6 +11,7 @@ import msgspec
 from sqlalchemy import delete, select, update
 
 from engram.centre.errors import ConflictError, UnknownError
+from engram.centre.keeping import ASKED, FAILED, READY
 from engram.centre.refs import Refs
 from engram.centre.service import Centre
 from engram.centre.settings import DAY_NS
@@ -18,6 +19,7 @@ from engram.centre.store.audit import note
 from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.packs import PACK_BYTES
 from engram.centre.store.schema import artifact_grants, artifacts
+from engram.centre.store.waking import ring
 from engram.config import to_dict
 from engram.errors import ConfigError, EngramError
 from engram.fleet.download import DownloadOptions, download
@@ -26,8 +28,6 @@ from engram.transfers.join import blobs_named
 from engram.transfers.manifest import decode_manifest, encode_manifest
 
 _OPTIONS = TypedDict("_OPTIONS", get_type_hints(DownloadOptions), total=False)  # type: ignore[misc]
-
-READY, ASKED, FAILED = "ready", "asked", "failed"
 
 
 def options_of(values: dict[str, Any]) -> DownloadOptions:
@@ -73,6 +73,7 @@ class Downloads:
         with self._centre.database.writing() as connection:
             if self._centre.database.add(connection, artifacts, [row]):
                 note(connection, now, subject, "download", name, artifact=key, revision=revision)
+                ring(connection)
             grant = {"artifact": key, "subject": subject}
             self._centre.database.add(connection, artifact_grants, [grant])
             connection.execute(update(artifacts).where(artifacts.c.id == key).values(used_ns=now))

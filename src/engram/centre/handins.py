@@ -9,40 +9,25 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import Connection, func, or_, select, update
 
 from engram.centre.errors import ConflictError, MalformedError, QuotaError, UnknownError
+from engram.centre.keeping import ENDED, HandInState, needed_manifests
 from engram.centre.resident import known_nodes
-from engram.centre.service import Centre
+from engram.centre.service import Centre, kept_since_ns
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
 from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.packs import given_by
 from engram.centre.store.schema import artifact_grants, artifacts, handins, usage
+from engram.centre.store.waking import ring
 from engram.errors import MapCorruptError, MapError
 from engram.maps.schema import frames, nodes, vocabularies
 from engram.transfers import Manifest, PartHash, WireManifest
 from engram.transfers.manifest import decode_manifest, encode_manifest
 from engram.transfers.pages import decode_page
-
-
-class HandInState(StrEnum):
-    """Where a hand-in is."""
-
-    OPEN = "open"  # parts are missing
-    COMPLETE = "complete"  # waits for a worker, or is in its hands
-    MERGED = "merged"
-    REFUSED = "refused"  # by the gate; a person may merge it all the same
-    FAILED = "failed"  # it is no map that can be merged here
-    CANCELLED = "cancelled"
-
-
-ENDED = frozenset(
-    {HandInState.MERGED, HandInState.REFUSED, HandInState.FAILED, HandInState.CANCELLED}
-)
 
 
 def handin_id(name: str, robot: str, manifest: str) -> str:
@@ -72,7 +57,7 @@ class HandIns:
             known = first_row(connection, select(handins).where(handins.c.id == key))
         if known is not None:
             return known
-        self._centre.objects.put(_manifest_key(name, manifest.id), encode_manifest(manifest))
+        self._centre.objects.put(manifest_key(name, manifest.id), encode_manifest(manifest))
         row = {
             "id": key,
             "map": name,
@@ -95,6 +80,7 @@ class HandIns:
         }
         with self._centre.database.writing() as connection:
             self._check_open(connection, name, robot)
+            self._check_base(connection, name, sent.base)
             if self._centre.database.add(connection, handins, [row]):
                 note(connection, now, robot, "hand-in", name, handin=key)
         return self.get(key)
@@ -126,14 +112,14 @@ class HandIns:
 
     def manifest(self, row: dict[str, Any]) -> Manifest:
         """The manifest of a hand-in."""
-        key = _manifest_key(row["map"], row["manifest"])
+        key = manifest_key(row["map"], row["manifest"])
         return decode_manifest(self._centre.objects.get(key))
 
     def base_of(self, row: dict[str, Any]) -> Manifest:
         """The manifest that it continues; an empty one without."""
         if row["base"] is None:
             return Manifest("", 0, {})
-        return decode_manifest(self._centre.objects.get(_manifest_key(row["map"], row["base"])))
+        return decode_manifest(self._centre.objects.get(manifest_key(row["map"], row["base"])))
 
     def put_parts(self, row: dict[str, Any], some: Sequence[bytes]) -> None:
         """Stores verified parts of a hand-in; those that are there already cost nothing.
@@ -237,6 +223,7 @@ class HandIns:
             )
             if changed.rowcount:
                 note(connection, now, row["robot"], "complete", row["map"], handin=row["id"])
+                ring(connection)
         return self.get(row["id"])
 
     def cancel(self, row: dict[str, Any], by: str) -> dict[str, Any]:
@@ -274,6 +261,7 @@ class HandIns:
             connection.execute(update(handins).where(handins.c.id == row["id"]).values(**again))
             now = self._centre.now_ns()
             note(connection, now, by, "merge-anyway", row["map"], handin=row["id"])
+            ring(connection)
         return self.get(row["id"])
 
     def end(self, row: dict[str, Any], state: HandInState, **change: Any) -> None:
@@ -383,7 +371,13 @@ class HandIns:
         with self._centre.database.reading() as connection:
             if not (connection.execute(own).first() or connection.execute(got).first()):
                 return None
-        return decode_manifest(self._centre.objects.get(_manifest_key(name, manifest)))
+        return decode_manifest(self._centre.objects.get(manifest_key(name, manifest)))
+
+    def _check_base(self, connection: Connection, name: str, base: str | None) -> None:
+        if base is not None and base not in needed_manifests(
+            connection, name, kept_since_ns(self._centre)
+        ):
+            raise MalformedError(f"manifest {base:.40} is kept no more; send the whole")
 
     def _check_open(self, connection: Connection, name: str, robot: str) -> None:
         query = select(func.count()).where(
@@ -408,5 +402,6 @@ def _used(connection: Connection, robot: str, now_ns: int) -> int:
     return connection.execute(query).scalar() or 0
 
 
-def _manifest_key(name: str, manifest: str) -> str:
+def manifest_key(name: str, manifest: str) -> str:
+    """Where a manifest is kept."""
     return f"manifests/{name}/{manifest}"

@@ -15,7 +15,7 @@ from sqlalchemy import select
 
 from engram.centre.errors import UnknownError
 from engram.centre.resident import ResidentMaps
-from engram.centre.settings import CentreSettings
+from engram.centre.settings import DAY_NS, CentreSettings
 from engram.centre.store.audit import note
 from engram.centre.store.database import ServiceDatabase, first_row, rows_of
 from engram.centre.store.objects import BucketObjects, FolderObjects, Objects
@@ -193,3 +193,8 @@ class Centre:
         with self.database.writing() as connection:
             self.database.put(connection, maps, row)
             note(connection, self.now_ns(), by, "durable", name, revision=revision)
+
+
+def kept_since_ns(centre: Centre) -> int:
+    """What ended since then stays as it is."""
+    return centre.now_ns() - centre.settings.kept_days * DAY_NS

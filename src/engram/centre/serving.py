@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from engram.centre.service import Centre
+from engram.centre.store.waking import Waker
 from engram.centre.worker.loop import work
 from engram.errors import ConfigError, MissingExtraError
 from engram.processes import end_with_parent
@@ -94,8 +95,8 @@ def run_worker(folder: Path, database: str | None, objects: str | None) -> None:
     """Works until SIGTERM or Ctrl-C."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    with Centre(folder, database, objects) as centre:
-        work(centre, stop.wait, stop.is_set)
+    with Centre(folder, database, objects) as centre, Waker(database, stop.wait) as waker:
+        work(centre, waker.wait, stop.is_set)
 
 
 @contextmanager

@@ -28,7 +28,12 @@ class CentreSettings:
     handin_bytes: Annotated[int, Meta(ge=0, description="of one hand-in, bytes")] = 8 * _GIB
     open_handins: Annotated[int, Meta(ge=1, description="incomplete ones of a robot at once")] = 8
     handin_days: Annotated[int, Meta(ge=1, description="life of an incomplete hand-in, days")] = 14
+    kept_days: Annotated[
+        int,
+        Meta(ge=0, description="life of parts that nothing needs, days"),
+    ] = 14
     artifact_days: Annotated[int, Meta(ge=1, description="life of an unused download, days")] = 30
+    sweep_h: Annotated[float, Meta(gt=0, description="time between sweeps, h")] = 24.0
     merge_tries: Annotated[
         int, Meta(ge=1, description="times that a worker may die over one hand-in")
     ] = 3

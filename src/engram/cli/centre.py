@@ -180,6 +180,19 @@ def jobs(
 
 
 @centre_group.command()
+def sweep(folder: Folder, *, database: Database = None, objects: Objects = None) -> None:
+    """Remove parts that no hand-in and no download needs any more.
+
+    Workers do it by themselves, once a day; the next sweep deletes what this one forgets.
+    """
+    from engram.centre.worker.sweeping import sweep as run
+
+    with _open(folder, database, objects) as centre:
+        for name in centre.map_names():
+            typer.echo(f"{name}: {run(centre, name)} bytes")
+
+
+@centre_group.command()
 def backup(
     folder: Folder,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="A new folder.")],

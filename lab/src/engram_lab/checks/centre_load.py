@@ -1,6 +1,6 @@
 """A centre with many agents at once over real sockets: failed requests, and how fast it answers.
 
-    python -m engram_lab.checks.centre_load --agents 50 --nodes 20000 --minutes 60
+    python -m engram_lab.checks.centre_load --agents 50 --nodes 20000 --minutes 60 --forays 24
 
 An embedded centre with its worker runs as a program of its own, with a fleet map of synthetic
 places. Each agent is enrolled, and in turn drives past places of its own, hands in, and reports,
@@ -74,10 +74,11 @@ class Day:
         forays: how many were handed in.
     """
 
-    def __init__(self, folder: Path, url: str, end_s: float) -> None:
+    def __init__(self, folder: Path, url: str, minutes: float, forays: float) -> None:
         self._folder = folder
         self._url = url
-        self._end_s = end_s
+        self._end_s = time.monotonic() + 60.0 * minutes
+        self._pause_s = 60.0 * minutes / forays
         self._over = threading.Event()
         self.troubles: list[str] = []
         self.forays = 0
@@ -89,7 +90,7 @@ class Day:
         enrol(folder, self._url, code, name)
         foray = 0
         with Agent(folder) as agent:
-            while self._waited(chance.expovariate(1 / 20.0)):
+            while self._waited(chance.expovariate(1 / self._pause_s)):
                 self._drive(agent.live, name, foray, 1_000_000 + number * 10_000)
                 foray += 1
                 agent.hand_in()
@@ -151,13 +152,14 @@ def main() -> None:
     parser.add_argument("--agents", type=int, default=50)
     parser.add_argument("--nodes", type=int, default=20_000, help="of the fleet map, to begin with")
     parser.add_argument("--minutes", type=float, default=60.0, help="of the day")
+    parser.add_argument("--forays", type=float, default=24.0, help="of each robot, in the mean")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         with made_centre(folder / "centre", asked.nodes) as centre:
             codes = [new_code(centre, _MAP, "head", "lab") for _ in range(asked.agents)]
         with served(folder / "centre") as url:
-            day = Day(folder, url, time.monotonic() + 60.0 * asked.minutes)
+            day = Day(folder, url, asked.minutes, asked.forays)
             with ThreadPoolExecutor(asked.agents) as robots:
                 list(robots.map(day.live, range(asked.agents), codes))
             figures = answers(url)

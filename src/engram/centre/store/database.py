@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -46,6 +47,8 @@ class ServiceDatabase:
     def __init__(self, url: str) -> None:
         self._engine = _engine(url)
         self._sqlite = self._engine.dialect.name == "sqlite"
+        # Threads queue here: those that SQLite turns away sleep ever longer, and starve.
+        self._turn = threading.Lock()
         with self.writing() as connection:
             self._migrate(connection)
 
@@ -58,7 +61,7 @@ class ServiceDatabase:
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """One durable transaction, alone; rolled back if the block raises."""
-        with _errors(), self._engine.connect() as connection:
+        with self._turn, _errors(), self._engine.connect() as connection:
             if self._sqlite:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:

@@ -8,6 +8,9 @@ from engram.centre.downloads import Downloads
 from engram.centre.handins import HandIns
 from engram.centre.service import Centre
 from engram.centre.worker.merging import merge_hand_in
+from engram.centre.worker.sweeping import sweep_all
+
+_HOUR_NS = 3_600_000_000_000
 
 
 def work_off(centre: Centre) -> int:
@@ -36,9 +39,14 @@ def work(centre: Centre, wait: Callable[[float], object], stopped: Callable[[], 
         wait: returns after some seconds, or sooner when there may be work.
         stopped: whether to end.
     """
+    swept_ns = 0
     while not stopped():
-        if not work_off(centre):
-            wait(centre.settings.poll_s)
+        if work_off(centre):
+            continue
+        if centre.now_ns() - swept_ns >= centre.settings.sweep_h * _HOUR_NS:
+            swept_ns = centre.now_ns()
+            sweep_all(centre)
+        wait(centre.settings.poll_s)
 
 
 def _make_downloads(downloads: Downloads) -> int:

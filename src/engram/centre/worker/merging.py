@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from engram.centre.handins import HandIns, HandInState, MissingPartsError
+from engram.centre.handins import HandIns, MissingPartsError
+from engram.centre.keeping import HandInState
 from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
 from engram.centre.worker.admission import admit

@@ -1,0 +1,75 @@
+"""A worker wakes when there is work, and looks by itself where nobody rings."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+
+import pytest
+
+from engram.centre.store.waking import Waker, ring
+
+from .conftest import drive
+
+# Far longer than an announcement takes.
+_LONG_S = 60.0
+
+
+def test_without_announcements_a_worker_looks_after_a_while(tmp_path):
+    slept: list[float] = []
+    with Waker(f"sqlite:///{tmp_path / 'centre.sqlite'}", slept.append) as waker:
+        waker.wait(3.0)
+    with Waker(None, slept.append) as waker:
+        waker.wait(4.0)
+    assert slept == [3.0, 4.0]
+
+
+def test_where_the_database_is_away_a_worker_looks_after_a_while():
+    pytest.importorskip("psycopg")
+    slept: list[float] = []
+    nowhere = "postgresql+psycopg://engram@/postgres?host=/nowhere"
+    with Waker(nowhere, slept.append) as waker:
+        waker.wait(3.0)
+    assert slept == [3.0]
+
+
+@pytest.mark.skipif(
+    "ENGRAM_TEST_POSTGRES" not in os.environ, reason="no PostgreSQL: make test-services"
+)
+def test_a_complete_hand_in_wakes_a_worker(site):
+    database = site.centre.addresses[0]
+    if database is None:
+        pytest.skip("SQLite announces nothing")
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    with Waker(database, time.sleep) as waker:
+        waker.wait(_LONG_S)  # only begins to listen
+        sender = threading.Thread(target=agent.step, kwargs={"fetch": False})
+        started = time.monotonic()
+        sender.start()
+        waker.wait(_LONG_S)
+        assert time.monotonic() - started < _LONG_S / 2
+        sender.join()
+
+
+@pytest.mark.skipif(
+    "ENGRAM_TEST_POSTGRES" not in os.environ, reason="no PostgreSQL: make test-services"
+)
+def test_a_broken_line_is_taken_up_again(site):
+    database = site.centre.addresses[0]
+    if database is None:
+        pytest.skip("SQLite announces nothing")
+    slept: list[float] = []
+    with Waker(database, slept.append) as waker:
+        waker.wait(_LONG_S)
+        waker._line.close()
+        waker.wait(_LONG_S)
+        assert slept == [_LONG_S]
+        waker.wait(_LONG_S)
+        with site.centre.database.writing() as connection:
+            ring(connection)
+        started = time.monotonic()
+        waker.wait(_LONG_S)
+        assert time.monotonic() - started < _LONG_S / 2
