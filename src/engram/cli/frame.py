@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from engram.cli import options
+from engram.cli.progress import Bars
 
 
 class GoalAction(StrEnum):
@@ -54,7 +55,8 @@ def anchor(
     A line names a node, or a time (UTC) at which one was saved, and where it is: lat,lon or x,y in
     metres, or u,v pixels of an occupancy grid; z and sigma in metres may follow. Of a bag the GPS
     fixes count that were taken while nodes were saved. Goals stay with their nodes. The anchoring
-    is a revision, which revert takes back.
+    is a revision, which revert takes back. Where parts that nothing ties now lie at one place,
+    their nodes are compared; matches that confirm each other join them, in a revision of its own.
 
     \b
     Examples:
@@ -64,9 +66,14 @@ def anchor(
     """
     from engram.cli.history import user
     from engram.robot.anchoring import anchor_map
+    from engram.robot.islands import IslandReport, join_islands
 
     report = anchor_map(map_path, positions, grid=grid, topic=topic, author=user(), dry_run=dry_run)
-    typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
+    islands = IslandReport() if dry_run else join_islands(map_path, user(), monitor=Bars())
+    if as_json:
+        typer.echo(json.dumps({**report.to_dict(), "islands": islands.to_dict()}))
+        return
+    typer.echo("\n".join(filter(None, (report.text(), islands.text()))))
 
 
 def goal(

@@ -185,7 +185,10 @@ class LoopSearch:
         agreeing = [
             one
             for one in self._waiting
-            if passed_m[one] >= self._base_line_m(one) and self._agree(one.edge, match.edge)
+            if passed_m[one] >= self._base_line_m(one)
+            and edges_agree(
+                self._graph, one.edge, match.edge, self._acceptance, self.config.certain_m
+            )
         ]
         if not agreeing:
             self._waiting.append(match)
@@ -201,22 +204,6 @@ class LoopSearch:
     def _driven_m(self, edge: Edge) -> float:
         """Distance driven when the robot saved the new node."""
         return float(self._graph.driven_m[self._graph.index(edge.b)])
-
-    def _agree(self, first: Edge, second: Edge) -> bool:
-        """Whether the motion between two matches agrees with the map."""
-        graph = self._graph
-        driven = graph.predict(graph.index(first.b), graph.index(second.b))
-        known = graph.predict(graph.index(first.a), graph.index(second.a))
-        if driven is None or known is None:
-            return False
-        carried = Position(first.a, first.a_from_b, first.covariance).carried_on(*driven)
-        covariance = carried.covariance + known[1]
-        sigma_m = Position(first.a, carried.node_from_live, covariance).sigma_m
-        sigma_yaw_rad = float(np.sqrt(covariance[4, 4]))
-        prediction = Prediction(carried.node_from_live, sigma_m, sigma_yaw_rad)
-        # A long chain is too uncertain to contradict anything.
-        certain = sigma_m <= self.config.certain_m
-        return certain and agrees(known[0] @ second.a_from_b, prediction, self._acceptance)
 
     def _excluded(self, node: Node) -> NDArray[np.int64]:
         """(K,) int64: nodes known to be near this node, or just saved."""
@@ -268,3 +255,31 @@ class LoopSearch:
             known, question.node, EdgeKind.MATCH, match.reference_from_live, match.covariance
         )
         return _Match(edge, match.inliers, evidence.spread.depth_m)
+
+
+def edges_agree(
+    graph: ExperienceGraph,
+    first: Edge,
+    second: Edge,
+    acceptance: AcceptanceConfig,
+    certain_m: float,
+) -> bool:
+    """Whether the ways on both sides of two edges agree with what they say.
+
+    Args:
+        graph: knows the way from `a` to `a`, and from `b` to `b`.
+        first, second: edges between the same two parts of it.
+        acceptance: disagreement that is allowed.
+        certain_m: largest standard deviation of both ways; a long chain contradicts nothing.
+    """
+    driven = graph.predict(graph.index(first.b), graph.index(second.b))
+    known = graph.predict(graph.index(first.a), graph.index(second.a))
+    if driven is None or known is None:
+        return False
+    carried = Position(first.a, first.a_from_b, first.covariance).carried_on(*driven)
+    covariance = carried.covariance + known[1]
+    sigma_m = Position(first.a, carried.node_from_live, covariance).sigma_m
+    sigma_yaw_rad = float(np.sqrt(covariance[4, 4]))
+    prediction = Prediction(carried.node_from_live, sigma_m, sigma_yaw_rad)
+    certain = sigma_m <= certain_m
+    return certain and agrees(known[0] @ second.a_from_b, prediction, acceptance)
