@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from engram.geometry import SE3
+from engram.graph.model import NodeId
+from engram.localiser import Position
 from engram.robot import Beginning, RobotOptions, map_drive, open_drive, open_map
 from engram.robot.whereabouts import Whereabouts
 
@@ -18,7 +22,7 @@ def test_a_first_drive_lies_where_the_committed_frame_will_have_it(
     seen: list[tuple[object, SE3 | None]] = []
 
     def begin(begun: Beginning) -> None:
-        whereabouts = Whereabouts(begun.opened.frame)
+        whereabouts = Whereabouts(begun.opened.frame, begun.robot.graph)
         begun.robot.watch = lambda _, found: seen.append((found.saved, whereabouts.after(found)))
 
     map_drive(path, open_drive(street, frames="::2"), begin=begin)
@@ -41,7 +45,7 @@ def test_a_second_drive_lies_in_the_frame_of_the_first(street: Path, tmp_path: P
     here = []
 
     def begin(begun: Beginning) -> None:
-        whereabouts = Whereabouts(begun.opened.frame)
+        whereabouts = Whereabouts(begun.opened.frame, begun.robot.graph)
         begun.robot.watch = lambda _, found: here.append((found, whereabouts.after(found)))
 
     map_drive(path, open_drive(street, frames="1::2"), options=RobotOptions(), begin=begin)
@@ -55,3 +59,33 @@ def test_a_second_drive_lies_in_the_frame_of_the_first(street: Path, tmp_path: P
                 )
             elif found.position is None:
                 assert map_from_live is None
+
+
+def test_what_a_lost_robot_saved_lies_where_the_graph_joins_it(
+    street: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "street.engram"
+    map_drive(path, open_drive(street, frames="::2"))
+    with open_map(path) as opened:
+        nodes, frame = opened.graph.nodes, opened.frame
+
+        class Half:
+            """The frame of the nodes that were committed: the first half."""
+
+            positions = frame.positions[: len(nodes) // 2]
+
+            def find(self, node: NodeId) -> SE3 | None:
+                return frame.find(node) if opened.graph.index(node) < len(nodes) // 2 else None
+
+        whereabouts = Whereabouts(Half(), opened.graph)  # type: ignore[arg-type]
+
+        def at(node: NodeId) -> Any:
+            position = Position(node, SE3.identity(), np.eye(6))
+            return SimpleNamespace(position=position, saved=None)
+
+        assert whereabouts.after(at(nodes[-1].id)) is None, "nothing with a place was seen yet"
+        assert whereabouts.after(at(nodes[0].id)) is not None
+        here = whereabouts.after(at(nodes[-1].id))
+        assert here is not None
+        expected = frame.pose(nodes[-1].id).translation
+        np.testing.assert_allclose(here.translation[:2], expected[:2], atol=0.5)

@@ -283,7 +283,7 @@ class Driving:
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
             return None
         self._use_belief()
-        self._whereabouts = Whereabouts(self._map.frame)
+        self._whereabouts = Whereabouts(self._map.frame, self._robot.graph)
         if self._watcher is not None:
             self._watcher.watch(self._robot, self._map)
         self.trouble = ""

@@ -15,6 +15,7 @@ from engram.doctor import Diagnosis
 from engram.errors import ConfigError, InputError
 from engram.frontend import Frame
 from engram.geometry import SE3
+from engram.graph.graph import ExperienceGraph
 from engram.localiser import (
     KEEPS_NOTHING,
     Keeper,
@@ -116,6 +117,11 @@ class Robot:
     def outcomes(self) -> list[Outcome]:
         """Outcomes of the attempts for the last frame, in ranked order."""
         return self._localiser.outcomes
+
+    @property
+    def graph(self) -> ExperienceGraph:
+        """What it localises in, with the nodes that it saved."""
+        return self._localiser.graph
 
     @property
     def diagnosis(self) -> Diagnosis:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError, MissingExtraError
 from engram.frontend import StereoPair
+from engram.graph.graph import ExperienceGraph
 from engram.graph.model import SessionId
 from engram.localiser import Localisation, LocalisationStatus
 from engram.localiser.attempts import best_success
@@ -68,12 +69,18 @@ class Viewer:
 
     def watch(self, robot: Robot, opened: Map) -> None:
         """Shows a map, and from now on each frame of a robot in it."""
-        self.show(opened)
+        self.show(opened, robot.graph)
         robot.watch = self.see
 
-    def show(self, opened: Map) -> None:
-        """Shows a map, in which the next frames are; the one before goes."""
-        self._whereabouts, self._driven = Whereabouts(opened.frame), []
+    def show(self, opened: Map, graph: ExperienceGraph | None = None) -> None:
+        """Shows a map, in which the next frames are; the one before goes.
+
+        Args:
+            opened: the map.
+            graph: with what a robot saves; None for that of the map.
+        """
+        self._whereabouts = Whereabouts(opened.frame, opened.graph if graph is None else graph)
+        self._driven = []
         numbers: dict[SessionId, int] = {}
         for node in opened.graph.nodes:
             numbers.setdefault(node.session, len(numbers))
