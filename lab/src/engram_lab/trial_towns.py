@@ -125,6 +125,18 @@ def other_towns(
             yield _street(seed, drives, (2,), other, live, settings, lost_rounds)
 
 
+def town_pairs(towns: Sequence[int], settings: Settings) -> Iterator[tuple[str, Street]]:
+    """Each map of each town with every drive of every town that it was not built from."""
+    for seed in towns:
+        drives = _drives(seed, settings, QUIET)
+        for other in towns:
+            shown = _drives(other, settings, QUIET)
+            for mapped in dict.fromkeys(mapped for mapped, _ in STREETS):
+                for number, live in enumerate(shown):
+                    if seed != other or number not in mapped:
+                        yield _street(seed, drives, mapped, other, live, settings, 1)
+
+
 def towns_folder(settings: Settings) -> Path:
     """Where the towns stand as seen with a kind of features."""
     kind = settings.frontend.descriptor

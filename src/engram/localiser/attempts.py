@@ -203,7 +203,11 @@ class Attempter:
         spread = cache(partial(self._spread, live, live_id, candidate.node, match))
         evidence = self._evidence(live, candidate, match, spread)
         model = confidence_of(live.descriptor)
-        readings = model.as_predicted(evidence), model.as_anywhere(evidence)
+        anywhere = candidate.prediction is None or candidate.doubted
+        readings = (
+            model.as_predicted(evidence),
+            model.as_anywhere(evidence) if anywhere else -math.inf,
+        )
         if self._acceptance.rule is Rule.CONFIDENCE:
             accepted, waits = self._weighed(candidate, match, readings, model.witness)
         else:
