@@ -228,7 +228,7 @@ class TestPicking:
             rates = context.success_rates()[[pick]]
             away_m = context.neighbourhood.rms_distance_m[[pick]]
             count = 40 if matched else inliers
-            log.add(driven_m, [pick], away_m, rates, [matched], [count], 300)
+            log.add(driven_m, [pick], (away_m, rates), [matched], [count], 300)
             tried.append(pick)
             driven_m += step_m
         # Once found, what matches is not left again.
@@ -263,7 +263,7 @@ class TestPicking:
             nodes = [*picks[:lanes], *(number % count for number in range(elsewhere))]
             rates = np.r_[np.full(lanes, 0.9), np.full(elsewhere, np.nan)]
             failed = [False] * len(nodes)
-            log.add(driven_m, nodes, 5 * (1 - rates), rates, failed, [0] * len(nodes), 300)
+            log.add(driven_m, nodes, (5 * (1 - rates), rates), failed, [0] * len(nodes), 300)
             driven_m += 0.7
         assert (tried == set(range(count))) is all_are_tried
 

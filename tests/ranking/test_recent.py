@@ -65,7 +65,7 @@ def test_run_log_forgets_what_lies_two_hundred_metres_back() -> None:
     log = RunLog()
     for metre in range(500):
         known = np.array([0.5, 0.7])
-        log.add(float(metre), [metre, 7], known, known, [True, False], [30, 0], 90)
+        log.add(float(metre), [metre, 7], (known, known), [True, False], [30, 0], 90)
     run = log.attempts(499.0)
     assert run.nodes[::2].tolist() == list(range(299, 500))
     assert set(run.nodes[1::2].tolist()) == {7}
@@ -76,8 +76,9 @@ def test_run_log_forgets_what_lies_two_hundred_metres_back() -> None:
 
 def test_the_log_of_a_robot_that_stands_still_does_not_grow() -> None:
     log = RunLog()
+    expected = np.array([0.5, np.nan]), np.full(2, 0.5)
     for _ in range(20_000):
-        log.add(3.0, [1, 2], np.array([0.5, np.nan]), np.full(2, 0.5), [False, False], [3, 4], 90)
+        log.add(3.0, [1, 2], expected, [False, False], [3, 4], 90)
     run = log.attempts(3.0)
     assert len(run) == 4096
     assert run.frames == 20_000
@@ -86,8 +87,8 @@ def test_the_log_of_a_robot_that_stands_still_does_not_grow() -> None:
 
 def test_failures_without_a_prediction_push_nothing_out_of_the_log() -> None:
     log = RunLog()
-    log.add(0.0, [5], np.array([0.5]), np.array([0.9]), [True], [80], 90)
+    log.add(0.0, [5], (np.array([0.5]), np.array([0.9])), [True], [80], 90)
     nowhere = np.full(20, np.nan)
     for _ in range(1000):
-        log.add(0.0, list(range(20)), nowhere, nowhere, [False] * 20, [4] * 20, 90)
+        log.add(0.0, list(range(20)), (nowhere, nowhere), [False] * 20, [4] * 20, 90)
     assert log.attempts(0.0).nodes.tolist() == [5]

@@ -64,7 +64,7 @@ def test_a_wrong_edge_is_found_and_nothing_else(road):
 def test_a_repair_is_a_revision_that_can_be_reverted_and_done_again(road):
     with Map.open(road) as store:
         before = store.content_hash()
-    report = check_geometry(road, repair=True, author="tests")
+    report = check_geometry(road, author="tests")
     assert matches(road) == 0
     assert check_geometry(road).findings.wrong == ()
     with Map.open(road) as store:
@@ -74,7 +74,7 @@ def test_a_repair_is_a_revision_that_can_be_reverted_and_done_again(road):
         assert store.content_hash() != before
         store.revert(report.revision, author="tests")
     assert matches(road) == 1
-    check_geometry(road, repair=True, author="tests")
+    check_geometry(road, author="tests")
     assert matches(road) == 0
     assert check_file(road).problems == ()
 
@@ -82,7 +82,7 @@ def test_a_repair_is_a_revision_that_can_be_reverted_and_done_again(road):
 def test_what_was_removed_stays_removed_when_it_is_handed_in_again(road, tmp_path):
     centre = tmp_path / "centre.engram"
     merged(centre, road)
-    check_geometry(centre, repair=True, author="tests")
+    check_geometry(centre, author="tests")
     again = shutil.copy(road, tmp_path / "again.engram")
     assert not merged(centre, again)[0].changed
     assert matches(centre) == 0
@@ -103,7 +103,7 @@ def test_a_robots_repair_reaches_the_fleet(road, tmp_path):
     centre = tmp_path / "centre.engram"
     merged(centre, road)
     assert matches(centre) == 1
-    check_geometry(road, repair=True, author="tests")
+    check_geometry(road, author="tests")
     merged(centre, road)
     assert matches(centre) == 0
     known = check_file(centre)

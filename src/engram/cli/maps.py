@@ -156,9 +156,8 @@ def _check_geometry(map_path: Path, pictures: Path | None, *, as_json: bool, com
     from engram.cli.progress import Bars
     from engram.repair import check_geometry
 
-    report = check_geometry(
-        map_path, repair=commits, author=user(), pictures=pictures, monitor=Bars()
-    )
+    author = user() if commits else None
+    report = check_geometry(map_path, author=author, pictures=pictures, monitor=Bars())
     typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
     if report.findings.wrong and report.revision is None:
         raise typer.Exit(1)

@@ -20,7 +20,7 @@ from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
 from engram.robot.fixed import ToldFix
 from engram.robot.front import Arrived, Front
-from engram.robot.live import Saving, SavingState
+from engram.robot.live import Owner, Saving, SavingState
 from engram.robot.robot import Robot
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
@@ -266,16 +266,9 @@ class Driving:
         options = self.options
         try:
             self._map = self._map_of(options)
-            self._robot = robot_in(
-                self._map,
-                self._camera,
-                options.settings,
-                options.robot,
-                name=options.name,
-                maps=options.maps,
-                front=self._front_for(self._map.descriptor),
-                fix=self._fix,
-            )
+            owner = Owner(options.name, self._camera, options.settings, options.robot)
+            front = self._front_for(self._map.descriptor)
+            self._robot = robot_in(self._map, owner, maps=options.maps, front=front, fix=self._fix)
         except EngramError as error:
             if self._map is not None:
                 self._map.close()

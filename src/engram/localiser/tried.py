@@ -71,12 +71,10 @@ class Tried:
         # A lost robot's failed proposals tell nothing of the appearance here: they are elsewhere.
         here = [one for one in outcomes if one.candidate.row is not None or one.accepted]
         self._recent.add([one.candidate.index for one in here], [one.accepted for one in here])
-        distance_m, rates = self._expected(near, outcomes)
         self._run.add(
             driven_m,
             [one.candidate.index for one in outcomes],
-            distance_m,
-            rates,
+            self._expected(near, outcomes),
             [one.accepted for one in outcomes],
             [one.match.inliers for one in outcomes],
             len(live.landmarks),

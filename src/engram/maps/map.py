@@ -40,7 +40,7 @@ from engram.maps.revisions import (
 from engram.maps.rows import Row, sealed, session_from_row
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, map_path
-from engram.maps.tags import Tag, set_tag, take_tag_away
+from engram.maps.tags import Tag, TagWriter
 from engram.maps.view import View, head
 from engram.maps.words import words_row, write_words
 from engram.maps.writer import Resumable, RevisionWriter
@@ -166,11 +166,13 @@ class Map(MapReader):
             rounds: rounds of attempts per frame (Nr).
             relocaliser: key of `RELOCALISERS`, for lost robots; None for none.
         """
-        from engram.robot.settings import RobotOptions
+        from engram.robot.live import Owner
+        from engram.robot.settings import RobotOptions, Settings
         from engram.robot.starting import robot_in
 
         asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser)
-        return robot_in(self, camera, settings, asked, name=name, maps=maps, remembers=remembers)
+        owner = Owner(name, camera, settings or Settings(), asked)
+        return robot_in(self, owner, maps=maps, remembers=remembers)
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -450,9 +452,8 @@ class Map(MapReader):
             RevisionError: there is no such revision, or another one has the name.
         """
         with self._database.writing() as connection:
-            return set_tag(
-                connection, self._keys, self.location, name, named, author, message, move=move
-            )
+            tags = TagWriter(connection, self._keys, self.location)
+            return tags.set(name, named, author, message, move=move)
 
     @_writes
     def untag(self, name: str, *, author: str) -> Tag:
@@ -462,7 +463,7 @@ class Map(MapReader):
             RevisionError: there is no such tag.
         """
         with self._database.writing() as connection:
-            return take_tag_away(connection, self._keys, self.location, name, author)
+            return TagWriter(connection, self._keys, self.location).remove(name, author)
 
     @_writes
     def clean(self) -> int:

@@ -93,45 +93,66 @@ def _number(connection: Connection, named: str, newest: int, where: str) -> int:
     return known[base].number - back
 
 
-def set_tag(
-    connection: Connection,
-    keys: KeyBook,
-    where: str,
-    name: str,
-    named: int | str | None,
-    author: str,
-    message: str,
-    *,
-    move: bool,
-) -> Tag:
-    """See `Map.tag`; `where` is the map's name, for messages."""
-    _check_tag(name)
-    number = resolve(connection, named, where)
-    if number == 0:
-        newest = head(connection)
-        raise RevisionError(
-            f"{where} has revisions 1 to {newest}; 0 is before the first and cannot be tagged"
-            if newest
-            else f"{where} has no revision yet to tag"
-        )
-    known = load_tags(connection).get(name)
-    if known is not None and known.number != number and not move:
-        raise RevisionError(
-            f"revision {known.number} of {where} is tagged {name!r} already; choose another name, "
-            "or move the tag"
-        )
-    if known is None or known.number != number:
-        _write_tag(connection, keys, name, number, author, message)
-    return load_tags(connection)[name]
+@dataclass(frozen=True, slots=True)
+class TagWriter:
+    """Sets and removes tags of a map.
 
+    Attributes:
+        connection: of the map, open for writing.
+        keys: the map's.
+        where: the map's name, for messages.
+    """
 
-def take_tag_away(connection: Connection, keys: KeyBook, where: str, name: str, author: str) -> Tag:
-    """See `Map.untag`; `where` is the map's name, for messages."""
-    known = load_tags(connection)
-    if name not in known:
-        raise RevisionError(f"{where} has no tag {name!r}; its tags: {', '.join(known) or 'none'}")
-    _write_tag(connection, keys, name, None, author, "")
-    return known[name]
+    connection: Connection
+    keys: KeyBook
+    where: str
+
+    def set(
+        self, name: str, named: int | str | None, author: str, message: str, *, move: bool
+    ) -> Tag:
+        """See `Map.tag`."""
+        _check_tag(name)
+        number = resolve(self.connection, named, self.where)
+        if number == 0:
+            newest = head(self.connection)
+            raise RevisionError(
+                f"{self.where} has revisions 1 to {newest}; 0 is before the first and cannot be "
+                "tagged"
+                if newest
+                else f"{self.where} has no revision yet to tag"
+            )
+        known = load_tags(self.connection).get(name)
+        if known is not None and known.number != number and not move:
+            raise RevisionError(
+                f"revision {known.number} of {self.where} is tagged {name!r} already; choose "
+                "another name, or move the tag"
+            )
+        if known is None or known.number != number:
+            self._write(name, number, author, message)
+        return load_tags(self.connection)[name]
+
+    def remove(self, name: str, author: str) -> Tag:
+        """See `Map.untag`."""
+        known = load_tags(self.connection)
+        if name not in known:
+            raise RevisionError(
+                f"{self.where} has no tag {name!r}; its tags: {', '.join(known) or 'none'}"
+            )
+        self._write(name, None, author, "")
+        return known[name]
+
+    def _write(self, name: str, number: int | None, author: str, message: str) -> None:
+        """Writes a tag; None as the number removes it."""
+        row = {
+            "key": self.keys.next(tags),
+            "name": name,
+            "number": number,
+            "author": checked_text(author, "author"),
+            "message": checked_text(message, "message"),
+            "tagged_ns": time.time_ns(),
+        }
+        self.connection.execute(insert(tags), [sealed(tags, row)])
+        count_tags(self.connection)
 
 
 def _check_tag(name: str) -> None:
@@ -140,19 +161,3 @@ def _check_tag(name: str) -> None:
             f"{name!r} cannot be a tag: a letter, then letters, digits and . _ / + -, 100 at "
             f"most, and not {HEAD!r}"
         )
-
-
-def _write_tag(
-    connection: Connection, keys: KeyBook, name: str, number: int | None, author: str, message: str
-) -> None:
-    """Writes a tag; None as the number removes it."""
-    row = {
-        "key": keys.next(tags),
-        "name": name,
-        "number": number,
-        "author": checked_text(author, "author"),
-        "message": checked_text(message, "message"),
-        "tagged_ns": time.time_ns(),
-    }
-    connection.execute(insert(tags), [sealed(tags, row)])
-    count_tags(connection)

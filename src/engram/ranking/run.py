@@ -99,13 +99,16 @@ class RunLog:
         self,
         driven_m: float,
         nodes: Sequence[int],
-        distance_m: NDArray[np.float64],
-        rates: NDArray[np.float64],
+        expected: tuple[NDArray[np.float64], NDArray[np.float64]],
         accepted: Sequence[bool],
         inliers: Sequence[int],
         landmarks: int,
     ) -> None:
-        """Add the R attempts of one frame; see `RunAttempts` for the arguments."""
+        """Adds the R attempts of one frame.
+
+        See `RunAttempts` for the arguments; `expected` holds `distance_m` and `rates`.
+        """
+        distance_m, rates = expected
         self._frames += len(nodes) > 0
         telling = np.array(accepted, np.bool_) | ~np.isnan(distance_m)
         count = int(telling.sum())

@@ -80,8 +80,7 @@ def check_geometry(
     path: Path,
     config: RepairConfig | None = None,
     *,
-    repair: bool = False,
-    author: str = "",
+    author: str | None = None,
     pictures: Path | None = None,
     at: int | str | None = None,
     monitor: Monitor = QUIET,
@@ -91,8 +90,8 @@ def check_geometry(
     Args:
         path: the map.
         config: settings.
-        repair: commit a revision in which the wrong edges no longer count.
-        author: of that revision.
+        author: commits a revision of this author in which the wrong edges no longer count; None
+            changes nothing.
         pictures: folder for a picture of both sides of each edge; None for none.
         at: revision to look at; None for the newest.
         monitor: receives progress, and may stop the search.
@@ -108,7 +107,7 @@ def check_geometry(
         )
         written = 0 if pictures is None else write_pictures(store.frames, found, pictures)
         components = _components(store, found)
-        if not (repair and found.wrong):
+        if author is None or not found.wrong:
             return GeometryReport(found, components, pictures=written)
         revision, moved = remove_edges(store, found.wrong, config, author)
     return GeometryReport(found, components, revision, moved, written)

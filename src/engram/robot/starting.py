@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from engram.errors import ConfigError, RevisionError
-from engram.geometry import StereoCamera
 from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
 from engram.robot.fixed import ToldFix, relocaliser_with_fixes, suggesting
@@ -64,11 +64,8 @@ def robot_on(
 
 def robot_in(
     opened: Map,
-    camera: StereoCamera,
-    settings: Settings | None,
-    options: RobotOptions,
+    owner: Owner,
     *,
-    name: str | None = None,
     maps: bool = False,
     remembers: bool = False,
     front: Front | None = None,
@@ -78,13 +75,14 @@ def robot_in(
 
     A `front` continues the odometry of the robot before it; a `fix` of satellites proposes nodes.
     """
-    settings = (settings or Settings()).for_descriptor(opened.descriptor)
-    finder = None if fix is None else suggesting(opened, fix, settings, options.relocaliser)
-    owner = Owner(name, camera, settings, options, finder=finder)
+    owner = replace(owner, settings=owner.settings.for_descriptor(opened.descriptor))
+    if fix is not None:
+        finder = suggesting(opened, fix, owner.settings, owner.options.relocaliser)
+        owner = replace(owner, finder=finder)
     if not (maps or remembers):
-        localiser = owner.localiser_in(opened, saves=False)
-        return Robot(front or Front(settings), localiser, deadline_ms=options.deadline_ms)
-    if name is None:
+        localiser, deadline_ms = owner.localiser_in(opened, saves=False), owner.options.deadline_ms
+        return Robot(front or Front(owner.settings), localiser, deadline_ms=deadline_ms)
+    if owner.name is None:
         raise ConfigError("a robot that keeps its drives needs a name: give name=")
     _check_newest(opened)
     if not maps:

@@ -20,6 +20,7 @@ import numpy as np
 from engram.maps import open_map
 from engram.monitor import QUIET
 from engram.robot import RobotOptions, Settings, open_drive
+from engram.robot.live import Owner
 from engram.robot.starting import robot_in
 from engram.sequences import FrameLog
 from engram_lab.there_and_back import ThereAndBack
@@ -37,13 +38,11 @@ def main() -> int:
         parser.error("a frame log leaves out what a live robot does with its images; give a folder")
     sequence = ThereAndBack(drive, asked.frames)
     options = RobotOptions(deadline_ms=asked.deadline)
+    owner = Owner("live", sequence.camera, Settings(), options)
     found = []
     with tempfile.TemporaryDirectory(prefix="engram-live-") as folder:
         town = open_map(Path(folder) / "live.engram", create=True)
-        with (
-            town,
-            robot_in(town, sequence.camera, Settings(), options, name="live", maps=True) as robot,
-        ):
+        with town, robot_in(town, owner, maps=True) as robot:
             found = list(robot.drive(sequence, QUIET, asked.rate))
     late = sum(one.late for one in found)
     took_ms = np.array([one.ms for one in found])

@@ -164,7 +164,7 @@ def replay(
         rates = context.success_rates()[picks]
         recent.add(nodes, accepted.tolist())
         away_m = np.where(accepted, near.distance_m[picks], near.rms_distance_m[picks])
-        run.add(seen.driven_m, nodes, away_m, rates, accepted.tolist(), list(inliers), 0)
+        run.add(seen.driven_m, nodes, (away_m, rates), accepted.tolist(), list(inliers), 0)
         if accepted.any():
             reference = nodes[int(np.argmax(np.where(accepted, inliers, -1)))]
         yield seen, context, picks

@@ -170,14 +170,15 @@ def dream(
         orders=Orders.ALL if len(handed) <= _ALL_ORDERS else Orders.FIRST,
         estimator=options.estimator,
     )
-    folder = _folder(centre, handed, judge, settings, options)
+    asked = _Dream(centre, handed, judge, settings, options)
+    folder = asked.folder()
     folder.mkdir(parents=True, exist_ok=True)
-    report.complete = _try(report, folder, handed, judge, settings, options, monitor)
+    report.complete = asked.try_behaviours(report, folder, monitor)
     results = [(one.rank, name, one) for name, found in report.tried.items() for one in found]
     if results:
         _, report.behaviour, best = min(results, key=lambda one: one[:2])
         report.order = best.order
-        _add(report, centre, [handed[at] for at in best.order], drives, settings, options, monitor)
+        asked.add_best(report, monitor)
     if report.complete:
         shutil.rmtree(folder.parent, ignore_errors=True)
     report.seconds = time.perf_counter() - started
@@ -197,80 +198,70 @@ def _check(centre: Path, handed: Sequence[Path], drives: Sequence[Path]) -> None
         check_held_out(named, store.sessions.values(), centre, "--validate")
 
 
-def _folder(
-    centre: Path,
-    handed: Sequence[Path],
-    judge: JudgeOptions,
-    settings: Settings,
-    options: DreamOptions,
-) -> Path:
-    """Where results of exactly these inputs are kept."""
-    hashes = []
-    for path in handed:
+@dataclass(frozen=True, slots=True)
+class _Dream:
+    """What is dreamt of; see `dream`, and `find_best_order` for `judge`."""
+
+    centre: Path
+    handed: Sequence[Path]
+    judge: JudgeOptions
+    settings: Settings
+    options: DreamOptions
+
+    def folder(self) -> Path:
+        """Where results of exactly these inputs are kept."""
+        hashes = []
+        for path in self.handed:
+            with Map.open(path) as store:
+                hashes.append(store.content_hash())
+        settings, merging = to_dict(self.settings), to_dict(self.options.merging)
+        inputs = config_hash([hashes, self.judge.hash(), settings, merging])
+        return self.centre.with_name(f"{self.centre.name}.dream") / inputs
+
+    def try_behaviours(self, report: DreamReport, folder: Path, monitor: Monitor) -> bool:
+        """Tries behaviours, until the time is over; whether all were tried."""
+        options = self.options
+        end_s = None if options.minutes is None else time.time() + 60 * options.minutes
+        places = {name: folder / name.replace(" ", "-") for name in BEHAVIOURS}
+        asked = {
+            name: Try(place, self.handed, self.judge, self.settings, self._merging(name), end_s)
+            for name, place in places.items()
+        }
+        complete = try_all(asked, options.workers, options.scheduler, monitor)
+        for name, place in places.items():
+            if found := results_in(place):
+                report.tried[name] = found
+        return complete
+
+    def add_best(self, report: DreamReport, monitor: Monitor) -> None:
+        """Makes the best map again, and adds what it has if that is better."""
+        centre, merging = self.centre, self._merging(report.behaviour)
+        first, *others = (self.handed[at] for at in report.order)
+        with draft_folder(centre) as folder:
+            dreamt, joined = folder / "dreamt.engram", folder / "joined.engram"
+            copy_map(first, dreamt)
+            for robot in others:
+                (merged,) = merge(dreamt, [robot], merging, monitor, settings=self.settings)
+                if merged.interrupted:
+                    raise KeyboardInterrupt
+            copy_map(centre, joined)
+            about = f"dream: {report.behaviour}, order {' '.join(map(str, report.order))}"
+            update(dreamt, joined, monitor=monitor, message=about)
+            before, after = self._localised(centre), self._localised(joined)
+            report.missed_before, report.missed_after = map(route_not_localised, (before, after))
+            report.better_by = gain(before, after, self.options)
+            if report.better_by[1] > 0:
+                report.added = update(dreamt, centre, monitor=monitor, message=about)
+
+    def _merging(self, behaviour: str) -> MergeOptions:
+        return replace(self.options.merging, **BEHAVIOURS[behaviour])
+
+    def _localised(self, path: Path) -> list[Drive]:
         with Map.open(path) as store:
-            hashes.append(store.content_hash())
-    inputs = config_hash([hashes, judge.hash(), to_dict(settings), to_dict(options.merging)])
-    return centre.with_name(f"{centre.name}.dream") / inputs
-
-
-def _try(
-    report: DreamReport,
-    folder: Path,
-    handed: Sequence[Path],
-    judge: JudgeOptions,
-    settings: Settings,
-    options: DreamOptions,
-    monitor: Monitor,
-) -> bool:
-    """Tries behaviours, until the time is over; whether all were tried."""
-    end_s = None if options.minutes is None else time.time() + 60 * options.minutes
-    places = {name: folder / name.replace(" ", "-") for name in BEHAVIOURS}
-    asked = {
-        name: Try(
-            place, handed, judge, settings, replace(options.merging, **BEHAVIOURS[name]), end_s
-        )
-        for name, place in places.items()
-    }
-    complete = try_all(asked, options.workers, options.scheduler, monitor)
-    for name, place in places.items():
-        if found := results_in(place):
-            report.tried[name] = found
-    return complete
-
-
-def _add(
-    report: DreamReport,
-    centre: Path,
-    handed: Sequence[Path],
-    drives: Sequence[Path],
-    settings: Settings,
-    options: DreamOptions,
-    monitor: Monitor,
-) -> None:
-    """Makes the best map again, and adds what it has if that is better."""
-    merging = replace(options.merging, **BEHAVIOURS[report.behaviour])
-    with draft_folder(centre) as folder:
-        dreamt, joined = folder / "dreamt.engram", folder / "joined.engram"
-        copy_map(handed[0], dreamt)
-        for robot in handed[1:]:
-            (merged,) = merge(dreamt, [robot], merging, monitor, settings=settings)
-            if merged.interrupted:
-                raise KeyboardInterrupt
-        copy_map(centre, joined)
-        about = f"dream: {report.behaviour}, order {' '.join(map(str, report.order))}"
-        update(dreamt, joined, monitor=monitor, message=about)
-        before, after = (_localised(one, drives, settings, options) for one in (centre, joined))
-        report.missed_before, report.missed_after = map(route_not_localised, (before, after))
-        report.better_by = gain(before, after, options)
-        if report.better_by[1] > 0:
-            report.added = update(dreamt, centre, monitor=monitor, message=about)
-
-
-def _localised(
-    path: Path, drives: Sequence[Path], settings: Settings, options: DreamOptions
-) -> list[Drive]:
-    with Map.open(path) as store:
-        return [measure(store, open_drive(one), settings, options.localising) for one in drives]
+            return [
+                measure(store, open_drive(one), self.settings, self.options.localising)
+                for one in self.judge.drives
+            ]
 
 
 def gain(
