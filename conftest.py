@@ -12,7 +12,11 @@ import pytest
 from engram_lab.bench.data import synthetic_drive
 
 # A busy machine is no failure: no test has a time limit.
-hypothesis.settings.register_profile("engram", deadline=None, print_blob=True)
+hypothesis.settings.register_profile("engram", deadline=None, print_blob=True, max_examples=30)
+# `make test-long` tries ten times as many.
+hypothesis.settings.register_profile(
+    "thorough", hypothesis.settings.get_profile("engram"), max_examples=300
+)
 hypothesis.settings.load_profile("engram")
 
 

@@ -28,7 +28,7 @@ README, DOCS = ROOT / "README.md", ROOT / "docs"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
 # Pages whose examples run, in what folder they begin.
 # Pages that start services and run for ten seconds and more: `make test-long`.
-SLOW = {"afternoon", "operate", "budget"}
+SLOW = {"afternoon", "operate", "budget", "fleet-tutorial", "trouble"}
 EXAMPLES = {
     README: "drives",
     DOCS / "first-map.md": "drives",

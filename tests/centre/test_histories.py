@@ -155,7 +155,7 @@ class FleetMachine(RuleBasedStateMachine):
 
 TestFleet = FleetMachine.TestCase
 TestFleet.settings = settings(
-    max_examples=4, stateful_step_count=12, suppress_health_check=list(HealthCheck)
+    max_examples=2, stateful_step_count=12, suppress_health_check=list(HealthCheck)
 )
 
 

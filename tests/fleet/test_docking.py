@@ -626,7 +626,7 @@ def kill_and_look(tmp_path: Path, fleet: dict, kills: int, seed: int) -> None:
 
 
 def test_killed_at_any_moment_the_centre_is_as_before_or_complete(tmp_path, fleet):
-    kill_and_look(tmp_path, fleet, kills=3, seed=1)
+    kill_and_look(tmp_path, fleet, kills=2, seed=1)
 
 
 @pytest.mark.long

@@ -6,7 +6,7 @@ import random
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.worlds import CAMERA, session_uuid
 
@@ -66,7 +66,6 @@ def brute_force(nodes: list[Node], edges: list[Edge]) -> set[tuple]:
     return chains
 
 
-@settings(max_examples=200)
 @given(small_graphs(), st.randoms(use_true_random=False))
 def test_segments_are_those_of_the_brute_force_in_any_order_of_edges(graph, rng: random.Random):
     nodes, edges = graph

@@ -58,7 +58,6 @@ def random_graph(seed: int, nodes: int = 60, extra: int = 60) -> ExperienceGraph
     st.floats(0, 2),
     st.floats(0, 10),
 )
-@settings(max_examples=60)
 def test_neighbourhood_equals_plain_python(
     seed, radius_m, gate_rad, margin_m, vague_m, detour_m
 ) -> None:

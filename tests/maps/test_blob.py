@@ -90,7 +90,6 @@ def test_arrays_of_another_length_are_refused_when_writing(field):
 
 
 @given(at=st.integers(0, len(BLOB) - 1), bit=st.integers(0, 7))
-@settings(max_examples=200)
 def test_any_flipped_bit_is_found(at, bit):
     broken = bytearray(BLOB)
     broken[at] ^= 1 << bit
@@ -106,14 +105,12 @@ def test_a_cut_blob_is_found(length):
 
 
 @given(body=st.binary(max_size=400))
-@settings(max_examples=200)
 def test_random_bytes_with_a_right_hash_are_refused(body):
     with pytest.raises(MapCorruptError):
         decode_landmarks(sealed(body), CAMERA, BRIEF)
 
 
 @given(at=st.integers(0, len(BLOB) - 17), value=st.integers(0, 255))
-@settings(max_examples=300)
 def test_hostile_bytes_with_a_right_hash_give_landmarks_or_a_clear_error(at, value):
     body = bytearray(BLOB[16:])
     body[at] = value
@@ -190,7 +187,6 @@ JPEG = encode_thumbnail(np.arange(1200, dtype=np.uint8).reshape(30, 40))
 
 
 @given(junk=st.binary(max_size=100), keep=st.integers(0, len(JPEG)))
-@settings(max_examples=200)
 def test_hostile_thumbnails_give_a_picture_or_a_clear_error(junk, keep):
     try:
         picture = decode_thumbnail(JPEG[:keep] + junk)

@@ -92,7 +92,7 @@ def assert_found_or_harmless(path, drives: list[Drive]) -> None:
 
 
 @given(where=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_flipped_bit_anywhere_is_found_or_harmless(sound, tmp_path, where, bit):
     original, drives = sound
     content = bytearray(original.read_bytes())
@@ -117,7 +117,7 @@ def test_a_truncated_file_is_found(sound, tmp_path, share):
 
 
 @given(content=st.binary(max_size=300), head=st.sampled_from([0, 16, 100, 4096]))
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_bytes_are_no_map(sound, tmp_path, content, head):
     path = tmp_path / "random.engram"
     path.write_bytes(sound[0].read_bytes()[:head] + content)

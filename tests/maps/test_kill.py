@@ -98,7 +98,7 @@ def kill_and_resume(path: Path, seed: int, kills: int) -> None:
 
 
 def test_killed_at_any_moment_the_map_holds_what_was_checkpointed(tmp_path):
-    kill_and_resume(tmp_path / "town.engram", seed=1, kills=6)
+    kill_and_resume(tmp_path / "town.engram", seed=1, kills=4)
 
 
 @pytest.mark.long

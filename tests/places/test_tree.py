@@ -1,13 +1,10 @@
 """Clustering of binary descriptors, and the search for the nearest word."""
 
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.instruction_sets import printed
 
 from engram import _core
 from engram.errors import InputError
@@ -95,28 +92,16 @@ def test_equal_seeds_give_equal_trees() -> None:
     assert not np.array_equal(first.centres, grown(descriptors, 30, 2, seed=2).centres)
 
 
-@pytest.mark.parametrize("isa", ["generic", "v3"])
-def test_all_instruction_sets_give_the_same_words(isa: str) -> None:
+def test_all_instruction_sets_give_the_same_words() -> None:
     program = (
-        "import sys, hashlib; sys.path[:0] = ['tests/places']; import test_tree as t;"
+        "import sys, hashlib; sys.path.insert(0, sys.argv[1]);"
+        "from tests.places import test_tree as t;"
         "d, _ = t.clustered(6); tree = t.grown(d, 50, 2);"
         "print(hashlib.sha256(tree.centres.tobytes() + tree.searchable().quantise(d, 2)"
         ".tobytes()).hexdigest())"
     )
-    digests = []
-    for name in (isa, ""):
-        ran = subprocess.run(
-            [sys.executable, "-c", program],
-            env={**os.environ, "ENGRAM_ISA": name},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if "this machine has no more than" in ran.stderr:
-            pytest.skip(f"this machine has no {isa}")
-        assert ran.returncode == 0, ran.stderr
-        digests.append(ran.stdout)
-    assert digests[0] == digests[1]
+    assert len(printed(program)) == 1
+
 
 
 @pytest.mark.parametrize(

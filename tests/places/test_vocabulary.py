@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.places.worlds import THINGS, appearances, look, small_vocabulary
 
@@ -64,7 +64,6 @@ def test_the_hash_tells_vocabularies_apart() -> None:
 
 
 @given(st.data())
-@settings(max_examples=200)
 def test_damage_is_refused_or_harmless(data) -> None:
     damaged = bytearray(BODY)
     for _ in range(data.draw(st.integers(1, 4))):

@@ -26,7 +26,7 @@ def digest() -> str:
     from tests.graph.test_graph import random_graph
 
     parts = []
-    for path_count in (0, 1, 150, 700):
+    for path_count in (0, 1, 150, 300):
         context = SyntheticPlace(path_count).context()
         parts.append(RecallPolicy().judge(context).chances.tobytes())
         parts.append(PathPolicy().scores(context, context.neighbourhood.nodes).tobytes())

@@ -75,7 +75,6 @@ def situations(draw):
 
 
 @given(situations())
-@settings(max_examples=150)
 def test_posterior_equals_the_equations_in_exact_fractions(situation) -> None:
     nodes, paths, candidates, observed, outcomes, reference = situation
     sets = [set(path) for path in paths]
@@ -91,7 +90,6 @@ def test_posterior_equals_the_equations_in_exact_fractions(situation) -> None:
 
 
 @given(situations())
-@settings(max_examples=150)
 def test_candidates_stand_by_exact_posteriors_and_equal_ones_by_distance(situation) -> None:
     _, paths, candidates, observed, outcomes, reference = situation
     sets = [set(path) for path in paths]

@@ -196,7 +196,7 @@ def test_path_near_ranks_by_distance_beyond_the_basin_and_the_published_formula_
 
 
 @given(context=contexts())
-@settings(max_examples=60, deadline=None)
+@settings(deadline=None)
 def test_path_near_is_the_formula_within_the_basin_and_distance_beyond(context) -> None:
     near = context.neighbourhood
     beyond = context.success_rates() < BASIN_LEVEL

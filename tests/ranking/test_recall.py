@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tests.reference import recall as reference
 from tests.worlds import (
@@ -59,7 +59,6 @@ def situations(draw):
 
 
 @given(situations())
-@settings(max_examples=80)
 def test_order_is_that_of_the_formulas(situation) -> None:
     context, lessons = situation
     rates = reference.base(context.graph, lessons, range(len(context.graph)))

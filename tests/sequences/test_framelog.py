@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from engram.errors import (
@@ -387,7 +387,6 @@ def test_a_gap_in_the_numbers_is_told(tmp_path: Path) -> None:
         open_sequence(path)
 
 
-@settings(max_examples=60)
 @given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
 @example(place=0.0859375, flip=128)  # reached the schema, where the driver's own message broke
 def test_a_flipped_byte_gives_our_errors_or_the_same_frames(

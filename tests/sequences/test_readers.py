@@ -517,7 +517,6 @@ def test_an_unknown_key_of_a_calibration_is_refused(tmp_path: Path) -> None:
 
 # Mangled files: nothing but our own errors, whatever the bytes.
 mangling = settings(
-    max_examples=60,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 

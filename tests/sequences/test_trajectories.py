@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import InputError, SequenceError
@@ -79,7 +79,6 @@ def test_malformed_tum_is_told_with_the_line(tmp_path: Path, text: str) -> None:
         read_tum(path)
 
 
-@settings(max_examples=80)
 @given(content=st.one_of(st.binary(max_size=80), st.text(max_size=60).map(str.encode)))
 def test_any_bytes_give_our_errors_or_a_trajectory(tmp_path_factory, content: bytes) -> None:
     path = tmp_path_factory.mktemp("any") / "a.txt"

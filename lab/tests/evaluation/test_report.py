@@ -178,6 +178,7 @@ def test_every_figure_is_drawn(out: Path) -> None:
     }
 
 
+@pytest.mark.long
 def test_a_policy_has_one_colour_in_all_figures(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -391,6 +392,7 @@ def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(
         make_plan(plan.drives, plan.settings, plan.options, tmp_path / "file" / "work")
 
 
+@pytest.mark.long
 def test_more_rounds_alone_are_reported_too(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / "work"
     work.mkdir()

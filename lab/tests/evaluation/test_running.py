@@ -225,6 +225,7 @@ def test_folds_may_be_run_one_after_another(campaign, plan: Plan, tmp_path: Path
         few_options(only_folds=(9,))
 
 
+@pytest.mark.long
 def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)
