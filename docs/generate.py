@@ -13,6 +13,7 @@ from engram.cli.app import app
 from engram.cli.settings import AllSettings, every_setting
 from engram.cli.verbs import GROUPS, NESTED
 from engram.doctor import CHECKS, DoctorConfig
+from engram.maps.schema import metadata
 
 
 def write_references(folder: Path) -> None:
@@ -23,6 +24,7 @@ def write_references(folder: Path) -> None:
         ("settings", settings()),
         ("python", public_names()),
         ("findings", findings()),
+        ("tables", tables()),
     ):
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
 
@@ -92,3 +94,16 @@ def public_names() -> str:
                 continue
             parts.append(f"```text\n{method}{signature}\n\n{documented}\n```")
     return "\n\n".join(parts) + "\n"
+
+
+def tables() -> str:
+    """The tables of a map, each with its columns."""
+    rows = ["| table | columns after `key`, before `checksum` |", "| --- | --- |"]
+    for table in metadata.tables.values():
+        columns = (
+            f"`{one.name}`" + (f" ({one.info['note']})" if one.info.get("note") else "")
+            for one in table.columns
+            if one.name not in {"key", "checksum"}
+        )
+        rows.append(f"| `{table.name}` | {', '.join(columns)} |")
+    return "\n".join(rows) + "\n"

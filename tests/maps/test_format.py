@@ -15,7 +15,7 @@ from engram.frontend import BRIEF, TEBLID
 from engram.geometry import SE3
 from engram.graph.model import EdgeKind, NodeId, Omission
 from engram.maps import Map, SessionState, check_file
-from engram.maps.schema import FORMAT_VERSION, metadata
+from engram.maps.schema import FORMAT_VERSION
 
 from .maps import begin, node, session
 
@@ -81,16 +81,10 @@ def test_format_1_is_sound_and_can_be_written_on(old):
     assert check_file(old).problems == ()
 
 
-def test_the_page_on_the_format_names_every_table_and_column():
+def test_the_page_on_the_format_is_of_this_format_and_includes_its_tables():
     page = PAGE.read_text()
     assert f"format {FORMAT_VERSION}" in page
-    rows = {
-        line.split("|")[1].strip(" `"): line for line in page.splitlines() if line.startswith("| `")
-    }
-    for table in metadata.sorted_tables:
-        for column in table.columns:
-            if column.name not in {"key", "checksum"}:
-                assert f"`{column.name}`" in rows[table.name], f"{table.name}.{column.name}"
+    assert "generated/tables.md" in page
 
 
 @pytest.mark.parametrize("version", range(1, FORMAT_VERSION))

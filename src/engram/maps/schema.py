@@ -37,20 +37,20 @@ def _key() -> Column[int]:
     return Column("key", _INT64, primary_key=True, autoincrement=False)
 
 
-def _int(name: str, *, nullable: bool = False) -> Column[int]:
-    return Column(name, _INT64, nullable=nullable)
+def _int(name: str, note: str = "", *, nullable: bool = False) -> Column[int]:
+    return Column(name, _INT64, nullable=nullable, info={"note": note})
 
 
-def _float(name: str, *, nullable: bool = False) -> Column[float]:
-    return Column(name, _FLOAT64, nullable=nullable)
+def _float(name: str, note: str = "", *, nullable: bool = False) -> Column[float]:
+    return Column(name, _FLOAT64, nullable=nullable, info={"note": note})
 
 
-def _text(name: str, *, nullable: bool = False) -> Column[str]:
-    return Column(name, Text(), nullable=nullable)
+def _text(name: str, note: str = "", *, nullable: bool = False) -> Column[str]:
+    return Column(name, Text(), nullable=nullable, info={"note": note})
 
 
-def _bytes(name: str, *, nullable: bool = False) -> Column[bytes]:
-    return Column(name, LargeBinary(), nullable=nullable)
+def _bytes(name: str, note: str = "", *, nullable: bool = False) -> Column[bytes]:
+    return Column(name, LargeBinary(), nullable=nullable, info={"note": note})
 
 
 def _table(name: str, *items: SchemaItem) -> Table:
@@ -62,34 +62,34 @@ map_format = _table("map_format", _key(), _int("version"), _text("tool_version")
 revisions = _table(
     "revisions",
     _key(),
-    _int("number", nullable=True),  # given at commit: the number that users see
-    _text("status"),
-    _int("parent", nullable=True),
+    _int("number", "NULL until committed; 1, 2, 3 …", nullable=True),
+    _text("status", "`open`, `committed`, `abandoned`"),
+    _int("parent", "number", nullable=True),
     _text("author"),
     _text("message"),
     _text("tool_version"),
-    _text("configuration"),
-    _text("contents"),
+    _text("configuration", "JSON"),
+    _text("contents", "JSON: rows brought, by table, and `mapped_m`"),
     _int("opened_ns"),
     _int("committed_ns", nullable=True),
     _text("host"),
     _int("pid"),
-    _text("writer"),  # token of its writer's lock
+    _text("writer", "token of its lock"),
     UniqueConstraint("number"),
 )
 
 cameras = _table(
     "cameras",
     _key(),
-    _text("id"),
-    _float("fx"),
-    _float("fy"),
-    _float("cx"),
-    _float("cy"),
+    _text("id", "hash of the rest"),
+    _float("fx", "px"),
+    _float("fy", "px"),
+    _float("cx", "px"),
+    _float("cy", "px"),
     _float("baseline_m"),
     _int("width"),
     _int("height"),
-    _bytes("cam_from_rig", nullable=True),
+    _bytes("cam_from_rig", "transform or NULL", nullable=True),
     _text("rectification"),
     UniqueConstraint("id"),
 )
@@ -97,8 +97,8 @@ cameras = _table(
 frontends = _table(
     "frontends",
     _key(),
-    _text("descriptor"),
-    _text("hash"),
+    _text("descriptor", "`brief`, `teblid`, `net@` and the start of its weights' SHA-256"),
+    _text("hash", "of version and settings"),
     UniqueConstraint("descriptor", "hash"),
 )
 
@@ -111,7 +111,7 @@ sessions = _table(
     _int("camera"),
     _int("frontend"),
     _int("start_ns"),
-    _text("clock"),
+    _text("clock", "`utc`, `relative`, `unknown`"),
     _float("longitude_deg", nullable=True),
     _text("zone", nullable=True),
     UniqueConstraint("uuid"),
@@ -127,7 +127,7 @@ nodes = _table(
     _int("frontend"),
     _int("stamp_ns"),
     _float("driven_m"),
-    _text("status"),
+    _text("status", "of the frame"),
     _bytes("landmark_hash"),
     UniqueConstraint("uuid"),
 )
@@ -137,8 +137,8 @@ frames = _table(
     "frames",
     Column("node", _INT64, primary_key=True, autoincrement=False),
     _int("revision"),
-    _bytes("landmarks"),
-    _bytes("thumbnail", nullable=True),
+    _bytes("landmarks", "blob"),
+    _bytes("thumbnail", "JPEG, grey, or NULL", nullable=True),
 )
 
 edges = _table(
@@ -148,8 +148,8 @@ edges = _table(
     _int("a"),
     _int("b"),
     _text("kind"),
-    _bytes("a_from_b"),
-    _bytes("covariance"),
+    _bytes("a_from_b", "transform"),
+    _bytes("covariance", "168 bytes: upper triangle of the 6×6 row by row, float64"),
     UniqueConstraint("a", "b", "kind", "revision"),
 )
 
@@ -159,7 +159,7 @@ paths = _table(
     _bytes("uuid"),
     _int("revision"),
     _int("session"),
-    _int("partial"),
+    _int("partial", "1 if some entries stayed elsewhere"),
     UniqueConstraint("uuid"),
 )
 
@@ -178,10 +178,10 @@ path_entries = _table(
 omissions = _table(
     "omissions",
     _key(),
-    _bytes("uuid"),
+    _bytes("uuid", "of a node that was not taken"),
     _int("revision"),
-    _int("node"),
-    _bytes("node_from_omitted"),
+    _int("node", "its equivalent"),
+    _bytes("node_from_omitted", "transform"),
     UniqueConstraint("uuid", "revision"),  # format 1: uuid
 )
 
@@ -189,7 +189,7 @@ omissions = _table(
 omitted_landmarks = _table(
     "omitted_landmarks",
     _key(),
-    _bytes("uuid"),
+    _bytes("uuid", "of such a node"),
     _int("revision"),
     _bytes("landmark_hash"),
     UniqueConstraint("uuid", "revision"),
@@ -201,7 +201,7 @@ attempts = _table(
     _int("revision"),
     _int("session"),
     _int("count"),
-    _bytes("body"),
+    _bytes("body", "packed, below"),
     Index("attempts_by_session", "session"),
 )
 
@@ -210,7 +210,7 @@ statistics = _table(
     _key(),
     _int("revision"),
     _text("name"),
-    _text("body"),
+    _text("body", "JSON"),
     UniqueConstraint("name", "revision"),
 )
 
@@ -218,17 +218,17 @@ vocabularies = _table(
     "vocabularies",
     _key(),
     _int("revision"),
-    _bytes("hash"),
-    _bytes("body"),
+    _bytes("hash", "16 bytes"),
+    _bytes("body", "below; the newest counts"),
 )
 
 hidden = _table(
     "hidden",
     _key(),
     _int("revision"),
-    _text("record"),  # name of the table
-    _int("target"),  # key of the row
-    _int("hidden"),  # 1 hides it, 0 shows it again
+    _text("record", "table"),
+    _int("target", "key"),
+    _int("hidden", "1 hides, 0 shows again"),
 )
 
 # Names of revisions. They belong to no revision: setting, moving or removing a tag changes neither
@@ -236,23 +236,28 @@ hidden = _table(
 tags = _table(
     "tags",
     _key(),
-    _text("name"),
-    _int("number", nullable=True),  # of the revision; NULL removes the name
+    _text("name", "of its rows the newest counts"),
+    _int("number", "of a revision; NULL removes the name", nullable=True),
     _text("author"),
     _text("message"),
     _int("tagged_ns"),
 )
 
 # One row: what the rows of tags come to, which no revision counts (`engram.maps.tally`).
-tag_tally = _table("tag_tally", _key(), _int("rows"), _bytes("digest"))
+tag_tally = _table(
+    "tag_tally",
+    _key(),
+    _int("rows", "of `tags`"),
+    _bytes("digest", "16 bytes of the SHA-256 over their keys and checksums, int64 each"),
+)
 
 # Words of nodes by a vocabulary (`engram.places`), computed from their landmarks. They follow from
 # other rows and belong to no revision.
 words = _table(
     "words",
     Column("node", _INT64, primary_key=True, autoincrement=False),
-    _bytes("vocabulary"),  # its hash
-    _bytes("body"),
+    _bytes("vocabulary", "its hash"),
+    _bytes("body", "the distinct words that the node shows, rising, little-endian u16"),
 )
 
 # What people set right about sessions: whose record stays. Of one session's rows for the same
@@ -262,8 +267,8 @@ amendments = _table(
     _key(),
     _int("revision"),
     _int("session"),
-    _text("what"),
-    _text("value"),
+    _text("what", "`robot`, `zone`, `start`"),
+    _text("value", "text; a start in ns, UTC"),
     _int("amended_ns"),
 )
 
@@ -275,7 +280,7 @@ removals = _table(
     _int("a"),
     _int("b"),
     _text("kind"),
-    _bytes("a_from_b"),
+    _bytes("a_from_b", "transform"),
     _text("reason"),
     _int("removed_ns"),
 )
@@ -286,7 +291,7 @@ placements = _table(
     _key(),
     _int("revision"),
     _int("node"),
-    _bytes("map_from_node"),
+    _bytes("map_from_node", "transform"),
     Index("placements_by_node", "node"),
 )
 
@@ -298,7 +303,7 @@ anchors = _table(
     _int("node"),
     _float("x_m"),
     _float("y_m"),
-    _float("z_m", nullable=True),
+    _float("z_m", "NULL if unknown", nullable=True),
     _float("sigma_m"),
     _text("source"),
 )
@@ -310,7 +315,7 @@ goals = _table(
     _int("revision"),
     _text("name"),
     _int("node"),
-    _bytes("node_from_goal"),
+    _bytes("node_from_goal", "transform"),
 )
 
 # Rows refer to earlier tables only.
