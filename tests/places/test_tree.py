@@ -103,7 +103,6 @@ def test_all_instruction_sets_give_the_same_words() -> None:
     assert len(printed(program)) == 1
 
 
-
 @pytest.mark.parametrize(
     "bounds", [[1, 3, 3], [1, 1, 3, 3], [1, 3, 2, 3], [0, 3, 3, 3], [1, 3, 4, 3], [1, 2, 3, 4]]
 )
