@@ -200,7 +200,7 @@ class World:
         had = {(e.path, e.sequence) for e in held.path_entries}
         replayed = {(e.path, e.node, e.stamp_ns) for e in held.path_entries}
         last: Counter[Any] = Counter()
-        for one in held.path_entries:
+        for one in (*held.path_entries, *theirs.path_entries):
             last[one.path] = max(last[one.path], one.sequence + 1)
         for one in theirs.path_entries:
             if (one.path, one.sequence) in had:

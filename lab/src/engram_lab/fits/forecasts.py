@@ -2,11 +2,11 @@
 
     python -m engram_lab.fits.forecasts collect TOWN... --out rows.csv    # resumable
     python -m engram_lab.fits.forecasts fit rows.csv…                     # the table that ships
-    python -m engram_lab.fits.forecasts judge rows.csv…                   # coverage and width
+    python -m engram_lab.fits.forecasts judge rows.csv…                   # each town by the others
 
-A town is a folder of frame logs. Its drives are mapped one after another; after each, every later
-drive is a mission: a download for its date and hour is made, and the drive is localised there. The
-fit also reads `lab/reports/fleet_sessions.csv`. Towns of the fit are never judged.
+A town is a folder of frame logs. Its drives are mapped one after another; after each, the next five
+are missions: a download for date and hour is made, and the drive is localised there. The fit also
+reads `lab/reports/fleet_sessions.csv`. Towns of the fit are never judged.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
-from scipy import stats
+from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.fleet.download import DownloadOptions
@@ -29,8 +30,6 @@ from engram.fleet.download.forecast import (
     BINS,
     LEVEL,
     MOST_DRIVES,
-    Forecast,
-    Light,
     Weather,
 )
 from engram.graph.sun import sun_height_deg
@@ -42,26 +41,32 @@ from engram_lab.trial import try_downloads
 NAMES = (
     "town", "drives", "mission", "weather", "apart_deg", "policy", "expected", "lost", "missed",
 )  # fmt: skip
-# Wider intervals promise nothing.
+# Wider intervals promise nothing; ends are whole steps, a frame or two of a short route.
 _WIDEST = 0.5
+_STEP = 0.005
 _FEWEST = 5
+# Drives after the newest of a map that are missions there.
+_AHEAD = 5
 POLICIES = {
     "copy": DownloadOptions(),
     "tod": DownloadOptions("tod"),
     "budget": DownloadOptions("budget", budget_percent=50.0),
 }
 Row = dict[str, str]
+Shares: TypeAlias = NDArray[np.float64]
+# Weather, whether the light is known, whether the map has few drives, and the bin of what is lost.
+Class: TypeAlias = tuple[Weather, bool, bool, int]
 
 
 def collect(town: Path, out: Path) -> None:
     """Missions of one town, appended to a table; known ones are not made again."""
-    logs = sorted(town.glob("*.framelog"))
+    logs = [one for one in sorted(town.glob("*.framelog")) if "reverse" not in one.stem]
     done = {(one["town"], one["drives"], one["mission"]) for one in read([out])}
     with tempfile.TemporaryDirectory() as folder:
         centre = Path(folder) / "centre.engram"
         for count, log in enumerate(logs[:-1], start=1):
             map_drive(centre, open_drive(log), Settings(), RobotOptions())
-            for mission in logs[count:]:
+            for mission in logs[count : count + _AHEAD]:
                 if (town.name, str(count), mission.stem) not in done:
                     apart = min(abs(sun_deg(one) - sun_deg(mission)) for one in logs[:count])
                     append(out, list(missions(town, centre, count, mission, apart)))
@@ -142,7 +147,7 @@ def of_study(rows: Sequence[Row]) -> list[Row]:
     return made
 
 
-def class_of(row: Row) -> tuple[Weather, bool, bool, int]:
+def class_of(row: Row) -> Class:
     """Which missions a mission is alike: a key of `INTERVALS`, and a bin; all are one if wet."""
     weather = Weather(row["weather"]) if row["weather"] in set(Weather) else Weather.DRY
     alike = float(row["apart_deg"]) <= ALIKE_DEG
@@ -153,58 +158,104 @@ def class_of(row: Row) -> tuple[Weather, bool, bool, int]:
 def interval(towns: Mapping[str, Sequence[float]], *, few: bool) -> tuple[float, float] | None:
     """What four in five missions of one more town miss, by those of some towns.
 
-    The spread within a town is that of quantiles; between towns it is that of a normal prediction
-    (Student's t), since a handful of them tells little of how far the next may lie. Maps of many
-    drives were met in one town only, which stands for itself.
+    The narrowest interval that holds four in five, widened by what towns ask that were left out of
+    it: split conformal prediction, with each town in turn as the part that calibrates. All towns
+    count alike. Maps of many drives were met in one town only, which stands for itself.
+
+    Source: Romano, Patterson and Candès, "Conformalized Quantile Regression", NeurIPS 2019.
     """
     missed = [np.asarray(one) for one in towns.values()]
     if sum(map(len, missed)) < _FEWEST or (few and len(missed) < 2):
         return None
-    tail = (1 - LEVEL) / 2
-    means = np.array([one.mean() for one in missed])
-    within = np.concatenate([one - one.mean() for one in missed])
-    low, high = np.quantile(within, [tail, 1 - tail])
-    between = 0.0
-    if len(means) > 1:
-        quantile = stats.t.ppf(1 - tail, len(means) - 1)
-        between = quantile * means.std(ddof=1) * np.sqrt(1 + 1 / len(means))
-    middle = means.mean()
-    ends = np.clip([middle - np.hypot(low, between), middle + np.hypot(high, between)], 0, 1)
+    low, high = narrowest(missed)
+    if len(missed) > 1:
+        beyond = []
+        for at, one in enumerate(missed):
+            least, most = narrowest(missed[:at] + missed[at + 1 :])
+            beyond.append(np.maximum(least - one, one - most))
+        more = quantile(beyond)
+        low, high = low - more, high + more
+    low, high = min(low, high) / _STEP, max(low, high) / _STEP
+    ends = np.clip(_STEP * np.array([np.floor(low + 1e-9), np.ceil(high - 1e-9)]), 0, 1)
+    if ends[0] == ends[1]:  # all missed alike: a step to the side where there is room
+        ends += (0, _STEP) if ends[0] < _STEP else (-_STEP, 0)
     return (float(ends[0]), float(ends[1])) if np.ptp(ends) <= _WIDEST else None
+
+
+def narrowest(towns: Sequence[Shares]) -> tuple[float, float]:
+    """Ends of the narrowest interval that holds `LEVEL` of the missions, each town as heavy."""
+    values, weights = _weighed(towns)
+    below = np.concatenate([[0.0], np.cumsum(weights)])
+    last = np.searchsorted(below, below[:-1] + LEVEL - 1e-9) - 1
+    firsts = np.flatnonzero(last < len(values))
+    widths = values[last[firsts]] - values[firsts]
+    first = firsts[np.argmin(widths)]
+    return float(values[first]), float(values[last[first]])
+
+
+def quantile(towns: Sequence[Shares]) -> float:
+    """What `LEVEL` of the missions do not exceed, each town as heavy."""
+    values, weights = _weighed(towns)
+    place = int(np.searchsorted(np.cumsum(weights), LEVEL - 1e-9))
+    return float(values[min(place, len(values) - 1)])
+
+
+def _weighed(towns: Sequence[Shares]) -> tuple[Shares, Shares]:
+    values = np.concatenate(towns)
+    weights = np.concatenate([np.full(len(one), 1 / len(one) / len(towns)) for one in towns])
+    order = np.argsort(values, kind="stable")
+    return values[order], weights[order]
+
+
+def classes(rows: Sequence[Row]) -> dict[Class, dict[str, list[float]]]:
+    """What missions missed, by their class and town."""
+    found: dict[Class, dict[str, list[float]]] = {}
+    for row in rows:
+        towns = found.setdefault(class_of(row), {})
+        towns.setdefault(row["town"], []).append(float(row["missed"]))
+    return found
 
 
 def fit(rows: Sequence[Row]) -> None:
     """Prints the table that ships, and how many missions and towns each interval rests on."""
-    found: dict[tuple[Weather, bool, bool, int], dict[str, list[float]]] = {}
-    for row in rows:
-        towns = found.setdefault(class_of(row), {})
-        towns.setdefault(row["town"], []).append(float(row["missed"]))
-    for key in sorted(found):
-        weather, alike, few, place = key
-        ends = interval(found[key], few=few)
-        count = sum(map(len, found[key].values()))
+    for key, towns in sorted(classes(rows).items()):
+        ends = interval(towns, few=key[2])
         told = "None" if ends is None else f"({ends[0]:.3f}, {ends[1]:.3f})"
-        lost = f"lost {BINS[place]:g} to {BINS[place + 1]:g}" if weather is Weather.DRY else "all"
-        print(f"{weather}, {'light known' if alike else 'other light'}, "
-              f"{'few' if few else 'many'} drives, {lost}: "
-              f"{told}  # {count} missions of {len(found[key])} towns")  # fmt: skip
+        print(f"{_named(key)}: {told}  # {sum(map(len, towns.values()))} missions of "
+              f"{len(towns)} towns")  # fmt: skip
 
 
 def judge(rows: Sequence[Row]) -> None:
-    """Prints how many missions lie within their interval, and the median width."""
-    inside, widths = [], []
-    for row in rows:
-        weather, alike, _, _ = class_of(row)
-        forecast = Forecast.of(
-            float(row["expected"]), float(row["lost"]), int(row["drives"]), Light(alike)
-        )
-        ends = forecast.missed[weather]
-        if ends is None:
-            continue
-        inside.append(ends[0] <= float(row["missed"]) <= ends[1])
-        widths.append(100 * (ends[1] - ends[0]))
-    print(f"{len(rows)} missions, {len(inside)} with a promise; {np.mean(inside):.1%} within the "
-          f"{LEVEL:.0%} interval; median width {np.median(widths):.1f} points")  # fmt: skip
+    """Prints how many missions lie within intervals that were fitted on the other towns."""
+    found: dict[Class, list[tuple[bool, float]]] = {}
+    for town in sorted({row["town"] for row in rows}):
+        others = classes([row for row in rows if row["town"] != town])
+        for row in (row for row in rows if row["town"] == town):
+            key, missed = class_of(row), float(row["missed"])
+            ends = interval(others.get(key, {}), few=key[2])
+            if ends is not None:
+                found.setdefault(key, []).append((ends[0] <= missed <= ends[1], np.ptp(ends)))
+    for key, told in sorted(found.items()):
+        print(f"{_named(key)}: {_summary(told)}")
+    every = [one for told in found.values() for one in told]
+    print(f"{len(rows)} missions, {len(every)} with a promise: {_summary(every)}")
+
+
+def _named(key: Class) -> str:
+    weather, alike, few, place = key
+    lost = f"lost {BINS[place]:g} to {BINS[place + 1]:g}" if weather is Weather.DRY else "all"
+    return (
+        f"{weather}, {'light known' if alike else 'other light'}, {'few' if few else 'many'} "
+        f"drives, {lost}"
+    )
+
+
+def _summary(told: Sequence[tuple[bool, float]]) -> str:
+    inside, widths = zip(*told, strict=True)
+    return (
+        f"{sum(inside)} of {len(inside)} within ({np.mean(inside):.1%}; {LEVEL:.0%} promised), "
+        f"median width {100 * np.median(widths):.1f} points"
+    )
 
 
 def main() -> None:

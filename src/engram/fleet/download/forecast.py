@@ -68,18 +68,19 @@ def _few(*known: Interval | None) -> tuple[Interval | None, ...]:
 # (low, high) of each bin, by weather, by whether a drive of the map had the mission's light, and by
 # whether the map has few drives. Source: `engram_lab.fits.forecasts fit`, lab/reports/forecasts.md.
 INTERVALS: dict[tuple[Weather, bool, bool], tuple[Interval | None, ...]] = {
-    (Weather.DRY, True, True): _few((0.0, 0.02), (0.0, 0.17)),
+    (Weather.DRY, True, True): _few((0.0, 0.01), (0.0, 0.08)),
     (Weather.DRY, True, False): (
-        (0.0, 0.01),
-        (0.0, 0.01),
-        (0.0, 0.15),
-        (0.0, 0.24),
-        (0.19, 0.52),
-        (0.51, 0.88),
-        (0.63, 0.99),
+        (0.0, 0.005),
+        (0.0, 0.005),
+        (0.0, 0.09),
+        (0.0, 0.145),
+        (0.195, 0.515),
+        (0.725, 0.905),
+        (0.705, 1.0),
     ),
-    (Weather.SHOWERS, True, True): ((0.40, 0.65),) * (len(BINS) - 1),
-    (Weather.RAIN, False, True): ((0.99, 1.0),) * (len(BINS) - 1),
+    (Weather.DRY, False, True): _few((0.165, 0.605), (0.435, 0.885)),
+    (Weather.SHOWERS, True, True): ((0.315, 0.535),) * (len(BINS) - 1),
+    (Weather.RAIN, False, True): ((0.995, 1.0),) * (len(BINS) - 1),
 }
 
 
