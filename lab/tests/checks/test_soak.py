@@ -43,3 +43,17 @@ def test_a_robot_beside_the_road_has_its_lanes_as_candidates_and_saves_nodes(
     assert not any(one.localised for one in steps)
     assert sum(one.saved is not None for one in steps) == 6
     assert steps[-1].candidates > 20
+
+
+def test_there_and_back_ends_where_it_began() -> None:
+    entries = [soak.lane_frame(number) for number in range(4)]
+    frame_at = soak.there_and_back(entries)
+    lap = [frame_at(number) for number in range(1, 7)]  # 1 2 3 2 1 0
+    pose = SE3.identity()
+    for one in lap:
+        assert one.odometry.prev_from_curr is not None
+        pose = pose @ one.odometry.prev_from_curr
+    assert pose.distance_m < 1e-12
+    assert lap[-1].frame.landmarks is entries[0].frame.landmarks
+    stamps_ns = [one.frame.stamp_ns for one in lap]
+    assert stamps_ns == sorted(set(stamps_ns))

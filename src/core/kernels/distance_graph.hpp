@@ -56,18 +56,21 @@ public:
   // Those with at least so many in common.
   std::vector<Edge> edges(int least) const {
     std::vector<Edge> result;
-    for (int i = 0; i < count_; ++i)
+    for (int i = 0; i < count_; ++i) {
+      if (degrees_[i] <= least) // the other end is none of what they have in common
+        continue;
       for (int word = i / 64; word < words_; ++word) {
         uint64_t later = row(i)[word];
         if (word == i / 64)
           later &= ~uint64_t{0} << (i % 64);
         for (; later != 0; later &= later - 1) {
           const int j = 64 * word + __builtin_ctzll(later);
-          const int common = popcount(row(i), row(j));
+          const int common = degrees_[j] <= least ? 0 : popcount(row(i), row(j));
           if (common >= least)
             result.push_back({i, j, common});
         }
       }
+    }
     return result;
   }
 
@@ -80,6 +83,14 @@ public:
         return 64 * word + nth_bit(bits, n);
       n -= here;
     }
+  }
+
+  // How many keep their distance from all three.
+  int common(int i, int j, int k) const {
+    int bits = 0;
+    for (int word = 0; word < words_; ++word)
+      bits += __builtin_popcountll(row(i)[word] & row(j)[word] & row(k)[word]);
+    return bits;
   }
 
   // The chance that a triple drawn by `draw` consists of members only.

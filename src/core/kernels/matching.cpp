@@ -28,6 +28,14 @@ template <class Width> struct Descriptor {
   }
 };
 
+// Asks for memory that is read soon, and not from front to back.
+template <class T> void fetch(const T *values, int64_t count) {
+  constexpr int64_t kLine = 64;
+  const auto *bytes = reinterpret_cast<const char *>(values);
+  for (int64_t at = 0; at < count * static_cast<int64_t>(sizeof(T)); at += kLine)
+    __builtin_prefetch(bytes + at);
+}
+
 double power(double base, int exponent) {
   double result = 1;
   for (int i = 0; i < exponent; ++i)
@@ -84,6 +92,8 @@ std::vector<int32_t> rows_by_size(const std::vector<double> &sizes) {
 
 template <class Width>
 Blocks blocks_of(const FrameView &frame, const MatchSettings &settings, Width width) {
+  fetch(frame.descriptors, width * frame.count);
+  fetch(frame.pixels, 2 * frame.count);
   Blocks blocks;
   blocks.width = width;
   std::vector<double> sizes(frame.count);
@@ -489,6 +499,8 @@ public:
   // Every `step`-th landmark of the reference, from `first` on; `in_order` if none that comes
   // later in it has been compared.
   template <bool in_order> void compare(int64_t first, int64_t step) {
+    if (first == 0)
+      fetch(reference_.descriptors, width_ * reference_.count);
     const auto limit = static_cast<int16_t>(std::min<int32_t>(settings_.max_distance, kFar - 1));
     for (int64_t i = first; i < reference_.count; i += step) {
       const Patch patch = patch_of(reference_, i, settings_);

@@ -86,6 +86,23 @@ Score score(const Correspondences &matches, const FloatPose &live_from_reference
   return result;
 }
 
+// Whether so many matches have a χ² below this.
+bool agree(const Correspondences &matches, const FloatPose &live_from_reference, float chi2,
+           int32_t wanted) {
+  constexpr int64_t kBetweenChecks = 4 * kLanes;
+  int32_t found = 0;
+  for (int64_t start = 0; start < matches.padded && found < wanted; start += kBetweenChecks) {
+    Ints inliers(0);
+    const int64_t end = std::min(start + kBetweenChecks, matches.padded);
+    for (int64_t i = start; i < end; i += kLanes) {
+      const Block<kLanes> block(matches, i, live_from_reference);
+      inliers -= block.usable & (block.chi2 < chi2);
+    }
+    found += sum(inliers);
+  }
+  return found >= wanted;
+}
+
 // What is estimated: the left perturbation of reference_from_live, and where asked for the offsets.
 constexpr int kPose = 6, kPoseAndOffsets = 8;
 
@@ -462,13 +479,16 @@ private:
       if (chance > 0 && power(1 - chance, sample) < 1 - settings_.confidence)
         return;
       std::array<int32_t, 3> triples[kLanes];
-      for (auto &triple : triples) {
+      uint32_t worth = 0;
+      for (int lane = 0; lane < kLanes; ++lane) {
         const auto &[i, j, common] = edges[at];
         const int k = graph.nth_common(i, j, static_cast<int>(random_.below(common)));
-        triple = {order_[i], order_[j], order_[k]};
+        triples[lane] = {order_[i], order_[j], order_[k]};
+        // Who follows a triple keeps the distance from all of it.
+        worth |= static_cast<uint32_t>(3 + graph.common(i, j, k) >= settings_.min_followers) << lane;
         at = at + step < count ? at + step : at + step - count;
       }
-      if (tried(triples))
+      if (worth != 0 && tried(triples, worth))
         chance = chance_of_success(graph);
       if (most_agree() || hypotheses_ >= settings_.max_hypotheses)
         return;
@@ -489,8 +509,8 @@ private:
     return step < count ? step : 1;
   }
 
-  // Tries sixteen triples. Returns whether one gave the best pose so far.
-  bool tried(const std::array<int32_t, 3> (&triples)[kLanes]) {
+  // Tries those of sixteen triples that are worth it. Returns whether one gave the best pose so far.
+  bool tried(const std::array<int32_t, 3> (&triples)[kLanes], uint32_t worth) {
     Triangles x, y;
     for (int lane = 0; lane < kLanes; ++lane)
       for (int k = 0; k < 3; ++k) {
@@ -500,7 +520,7 @@ private:
       }
     const TrianglePoses aligned(x, y, settings_.max_view_angle_cosine);
     bool better = false;
-    for (uint32_t bits = bits_of(aligned.valid); bits != 0; bits &= bits - 1) {
+    for (uint32_t bits = bits_of(aligned.valid) & worth; bits != 0; bits &= bits - 1) {
       const int lane = __builtin_ctz(bits);
       if (!is_followed(aligned.pose(lane)))
         continue;
@@ -539,8 +559,7 @@ private:
   // always do, and what nobody else follows is not worth refining.
   bool is_followed(const FloatPose &live_from_reference) const {
     const auto chi2 = static_cast<float>(kLooser * settings_.chi2);
-    constexpr float kNoEnd = std::numeric_limits<float>::max();
-    return score(matches_, live_from_reference, chi2, kNoEnd).inliers >= settings_.min_followers;
+    return agree(matches_, live_from_reference, chi2, settings_.min_followers);
   }
 
   // Keeps the pose if it is the best so far, after local optimisation (Chum et al. 2003).
@@ -623,6 +642,8 @@ bool agree_clearly(void *state, const std::vector<RowPair> &pairs) {
   MatchSettings few = settings;
   few.max_samples = std::min(settings.max_samples, settings.glance_samples);
   few.min_consensus = std::max(settings.min_consensus, settings.glance_consensus);
+  // An aligned triple is imprecise; of those that will agree, half follow it at once.
+  few.min_followers = std::max(settings.min_followers, few.min_consensus / 2);
   const PoseEstimate first =
       estimate_pose(glanced.reference, glanced.live, pairs, few, glanced.seed, nullptr);
   if (!first.found)

@@ -29,8 +29,9 @@ if __name__ == "__main__":
         if name not in runs:
             if name in STAGES:
                 runs[name] = STAGES[name](data, None).ours
-            else:  # younger than that checkout: by the module beside this file
-                runs[name] = import_module("attempts").STAGES[name](data)
+            else:  # younger than that checkout: by the modules beside this file
+                younger = {**import_module("attempts").STAGES, **import_module("steps").STAGES}
+                runs[name] = younger[name](data)
         started = time.process_time()
         for _ in range(int(count)):
             runs[name](done[name])

@@ -25,6 +25,7 @@ struct Hash {
 
   void print(const char *what) const {
     std::printf("%s %016llx\n", what, static_cast<unsigned long long>(value));
+    std::fflush(stdout);
   }
 };
 
@@ -70,6 +71,7 @@ int main(int count, char **arguments) {
 #include "settings.inc"
 
   Hash hash;
+  hash.print("read");
   std::vector<Landmarks> kept(static_cast<size_t>(frames));
   std::vector<FrameView> views;
   for (Landmarks &marks : kept) {

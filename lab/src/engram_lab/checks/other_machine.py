@@ -4,14 +4,21 @@
     python -m engram_lab.checks.other_machine --compiler aarch64-linux-gnu-g++ \
         --emulator qemu-aarch64-static
 
+    apt install qemu-user
+    python -m engram_lab.checks.other_machine --compiler aarch64-linux-gnu-g++ \
+        --emulator qemu-aarch64 --counting qemu-x86_64
+
 Front-end, odometry and attempts are compiled without Python for both machines, and run on the first
-frames of the bench's clip; a hash of all that they find is compared after each. Needs a checkout.
+frames of the bench's clip; a hash of all that they find is compared after each. With --counting, an
+emulator of this machine, the instructions of each are counted on both, with the portable vectors.
+Needs a checkout.
 """
 
 from __future__ import annotations
 
 import subprocess
 import tempfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -89,29 +96,53 @@ def _assigned(name: str, settings: object) -> list[str]:
     ]
 
 
-def hashes(folder: Path, compiler: str, emulator: str | None) -> list[str]:
-    """What the program prints if compiled so."""
+def compiled(folder: Path, compiler: str) -> Path:
+    """The program for the machine of a compiler."""
     program = folder / f"program-{compiler}"
     sources = [Path(__file__).with_suffix(".cpp")]
     sources += [_CORE / "kernels" / f"{name}.cpp" for name in _KERNELS]
     includes = [f"-I{_CORE}", f"-I{folder}"]
     subprocess.run([compiler, *_FLAGS, *includes, *sources, "-o", program], check=True)
+    return program
+
+
+def hashes(program: Path, folder: Path, emulator: str | None) -> list[str]:
+    """What the program prints."""
     run = [*([emulator] if emulator else []), str(program), str(folder / "frames")]
     return subprocess.run(run, check=True, capture_output=True, text=True).stdout.splitlines()
+
+
+def instructions(program: Path, folder: Path, emulator: str) -> list[int]:
+    """Of front-end, odometry and attempts, as an emulator executes them."""
+    counter = folder / "counter.so"
+    source = Path(__file__).with_name("other_machine_counter.c")
+    subprocess.run(["cc", "-O2", "-shared", "-fPIC", source, "-o", counter], check=True)
+    run = [emulator, "-plugin", str(counter), str(program), str(folder / "frames")]
+    printed = subprocess.run(run, check=True, capture_output=True, text=True).stderr
+    sums = [int(line) for line in printed.splitlines()]
+    return [b - a for a, b in pairwise(sums)]
 
 
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--compiler", required=True, help="for the other machine")
     parser.add_argument("--emulator", help="runs its programs here")
+    parser.add_argument("--counting", help="emulator of this machine: counts instructions, too")
     parser.add_argument("--frames", type=int, default=14)
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix="engram-machine-") as folder:
-        write_inputs(Path(folder), given.frames)
-        here = hashes(Path(folder), "g++", None)
-        there = hashes(Path(folder), given.compiler, given.emulator)
-    for a, b in zip(here, there, strict=True):
-        print(f"{a}   there {b.rsplit(' ', 1)[1]}   {'equal' if a == b else 'DIFFERENT'}")
+    with tempfile.TemporaryDirectory(prefix="engram-machine-") as name:
+        folder = Path(name)
+        write_inputs(folder, given.frames)
+        ours, theirs = compiled(folder, "g++"), compiled(folder, given.compiler)
+        here, there = hashes(ours, folder, None), hashes(theirs, folder, given.emulator)
+        for a, b in zip(here, there, strict=True):
+            print(f"{a}   there {b.rsplit(' ', 1)[1]}   {'equal' if a == b else 'DIFFERENT'}")
+        if given.counting:
+            own = instructions(ours, folder, given.counting)
+            other = instructions(theirs, folder, given.emulator)
+            for line, a, b in zip(here[1:], own, other, strict=True):
+                print(f"{line.split()[0]}: {a:,} instructions, there {b:,}: {b / a:.2f}")
+            print(f"all: {sum(other) / sum(own):.2f}")
     raise SystemExit(here != there)
 
 
