@@ -642,8 +642,6 @@ bool agree_clearly(void *state, const std::vector<RowPair> &pairs) {
   MatchSettings few = settings;
   few.max_samples = std::min(settings.max_samples, settings.glance_samples);
   few.min_consensus = std::max(settings.min_consensus, settings.glance_consensus);
-  // An aligned triple is imprecise; of those that will agree, half follow it at once.
-  few.min_followers = std::max(settings.min_followers, few.min_consensus / 2);
   const PoseEstimate first =
       estimate_pose(glanced.reference, glanced.live, pairs, few, glanced.seed, nullptr);
   if (!first.found)
