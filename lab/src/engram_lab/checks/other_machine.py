@@ -140,8 +140,9 @@ def main() -> None:
         if given.counting:
             own = instructions(ours, folder, given.counting)
             other = instructions(theirs, folder, given.emulator)
-            for line, a, b in zip(here[1:], own, other, strict=True):
-                print(f"{line.split()[0]}: {a:,} instructions, there {b:,}: {b / a:.2f}")
+            for line, ran, ran_there in zip(here[1:], own, other, strict=True):
+                share = ran_there / ran
+                print(f"{line.split()[0]}: {ran:,} instructions, there {ran_there:,}: {share:.2f}")
             print(f"all: {sum(other) / sum(own):.2f}")
     raise SystemExit(here != there)
 
