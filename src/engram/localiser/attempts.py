@@ -292,3 +292,10 @@ def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:
     """The outcomes in ranked order up to the first success: what one lane would have attempted."""
     first = next((at for at, one in enumerate(outcomes) if one.accepted), len(outcomes))
     return list(outcomes[: first + 1])
+
+
+def alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:
+    """first[0], second[0], first[1], … and the rest of the longer one."""
+    shorter = min(len(first), len(second))
+    paired = [item for pair in zip(first, second, strict=False) for item in pair]
+    return paired + first[shorter:] + second[shorter:]

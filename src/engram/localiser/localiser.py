@@ -25,6 +25,7 @@ from engram.localiser.attempts import (
     Candidate,
     Matcher,
     Outcome,
+    alternate,
     best_success,
     up_to_first_success,
 )
@@ -366,14 +367,9 @@ class Localiser:
         return self._lost or self._prover.doubted
 
     def _lenses_of_map(self) -> Lenses:
-        told = self._background
-        return Lenses(
-            self._graph,
-            told.sessions,
-            told.cameras,
-            self._basin.focal_px,
-            self.config.lens_depth_m,
-        )
+        sessions, cameras = self._background.sessions, self._background.cameras
+        depth_m = self.config.lens_depth_m
+        return Lenses(self._graph, sessions, cameras, self._basin.focal_px, depth_m)
 
     def _own_search(self) -> Callable[..., Neighbourhood]:
         if self.config.neighbourhood is NeighbourhoodSearch.BREADTH_FIRST:
@@ -482,7 +478,7 @@ class Localiser:
             if index not in known | self._damaged
         ]
         clock.lap("places")
-        return _alternate(proposed, ranked)[:budget]
+        return alternate(proposed, ranked)[:budget]
 
     def _proposals(self, live: Frame, count: int, keeper: Keeper) -> list[int]:
         """The relocaliser's nodes, without known ones of this session."""
@@ -600,10 +596,3 @@ class Localiser:
         if self._motion.odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:
             return LocalisationStatus.NO_ODOMETRY
         return LocalisationStatus.LOST if self._lost else LocalisationStatus.DEAD_RECKONING
-
-
-def _alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:
-    """first[0], second[0], first[1], … and the rest of the longer one."""
-    shorter = min(len(first), len(second))
-    paired = [item for pair in zip(first, second, strict=False) for item in pair]
-    return paired + first[shorter:] + second[shorter:]
