@@ -15,7 +15,6 @@ from sqlalchemy import Connection, func, or_, select, update
 
 from engram.centre.errors import ConflictError, MalformedError, QuotaError, UnknownError
 from engram.centre.keeping import ENDED, HandInState, needed_manifests
-from engram.centre.resident import known_nodes
 from engram.centre.service import Centre, kept_since_ns
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
@@ -346,7 +345,7 @@ class HandIns:
 
     def _known_nodes(self, name: str) -> frozenset[bytes]:
         with self._centre.reading(name) as store:
-            return known_nodes(store)
+            return store.known_uuids
 
     def _base(self, name: str, robot: str, manifest: str) -> Manifest | None:
         """A manifest that the robot handed in to this map, or got from it; else None."""

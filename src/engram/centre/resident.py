@@ -72,17 +72,8 @@ def log_of(store: MapReader) -> tuple[Revision, ...]:
     return store.derived(_log)
 
 
-def known_nodes(store: MapReader) -> frozenset[bytes]:
-    """UUIDs of the nodes that a map holds or left out, read once."""
-    return store.derived(_known_nodes)
-
-
 def _log(store: MapReader) -> tuple[Revision, ...]:
     return tuple(store.log())
-
-
-def _known_nodes(store: MapReader) -> frozenset[bytes]:
-    return frozenset(one.bytes for some in (store.landmark_hashes, store.omissions) for one in some)
 
 
 def _inode(path: Path) -> int:

@@ -293,6 +293,11 @@ class MapReader:
         return self._read(reading.landmark_hashes)
 
     @cached_property
+    def known_uuids(self) -> frozenset[bytes]:
+        """UUIDs of nodes that are held or were omitted: what a hand-in need not bring."""
+        return self._read(reading.known_uuids)
+
+    @cached_property
     def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
         """Size in bytes of each node's landmarks and of its thumbnail."""
         return self._read(reading.blob_sizes)

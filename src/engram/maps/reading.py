@@ -271,6 +271,15 @@ def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
     return found
 
 
+def known_uuids(connection: Connection, view: View) -> frozenset[bytes]:
+    """UUIDs of nodes that are held or were omitted, as stored."""
+    queries = (
+        view.select(table).with_only_columns(table.c.uuid)
+        for table in (nodes, omissions, omitted_landmarks)
+    )
+    return frozenset(row[0] for query in queries for row in connection.execute(query))
+
+
 def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:
     """Size in bytes of each node's landmarks and of its thumbnail."""
     seen = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)

@@ -4,9 +4,9 @@
 
 An embedded centre with its worker runs as a program of its own, with a fleet map of synthetic
 places. Each agent is enrolled, and in turn drives past places of its own, hands in, and reports,
-until the time is over; all of them start at random moments. Then a mission's download is asked for
-twice, by two robots. Times of answers are the service's own histogram; downloads are timed from
-asking to the first byte.
+until the time is over; all of them start at random moments. Then one hands in 50 nodes by itself,
+and a mission's download is asked for twice, by two robots. Times of answers are the service's own
+histogram; downloads are timed from asking to the first byte.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ from engram_lab.programs import Figure, command_line, report
 
 _MAP = "fleet"
 _FORAY_NODES = 20
+_NEW_NODES = 50
+_ASK_S = 0.05
 _PROGRAM = "import sys; from engram.cli import main; sys.argv[0] = 'engram'; main()"
 _MISSION = {"policy": "budget", "budget_percent": 25.0}
 
@@ -91,7 +93,8 @@ class Day:
         foray = 0
         with Agent(folder) as agent:
             while self._waited(chance.expovariate(1 / self._pause_s)):
-                self._drive(agent.live, name, foray, 1_000_000 + number * 10_000)
+                at = 1_000_000 + number * 10_000 + foray * _FORAY_NODES
+                drive(agent.live, name, foray, range(at, at + _FORAY_NODES))
                 foray += 1
                 agent.hand_in()
                 while agent.step(fetch=False) == 0:
@@ -100,21 +103,22 @@ class Day:
                 if agent.trouble is not None:
                     self.troubles.append(f"{name}: {agent.trouble}")
 
-    def _drive(self, path: Path, name: str, foray: int, first: int) -> None:
-        at = first + foray * _FORAY_NODES
-        with (
-            open_map(path, create=True) as store,
-            store.writing(),
-            store.begin_revision(author=name, message="", configuration={}) as writer,
-        ):
-            write_session(writer, name, foray, range(at, at + _FORAY_NODES), None)
-            writer.commit()
-
     def _waited(self, seconds: float) -> bool:
         """Whether the day goes on after some seconds."""
         left_s = self._end_s - time.monotonic()
         self._over.wait(min(seconds, max(left_s, 0.0)))
         return time.monotonic() < self._end_s
+
+
+def drive(path: Path, robot: str, number: int, places: range) -> None:
+    """One more drive in a robot's map, past some places."""
+    with (
+        open_map(path, create=True) as store,
+        store.writing(),
+        store.begin_revision(author=robot, message="", configuration={}) as writer,
+    ):
+        write_session(writer, robot, number, places, None)
+        writer.commit()
 
 
 def answers(url: str) -> list[Figure]:
@@ -147,6 +151,20 @@ def first_byte_s(folder: Path) -> float:
         return time.perf_counter() - started
 
 
+def visible_s(folder: Path, number: int) -> float:
+    """From handing in 50 new nodes, when the centre has nothing else to do, until they are seen."""
+    with Agent(folder) as agent:
+        drive(agent.live, f"r{number}", 10**6, range(9_000_000, 9_000_000 + _NEW_NODES))
+        entry = agent.hand_in()
+        started = time.perf_counter()
+        while agent.step(fetch=False) == 0:
+            pass
+        key = agent.state.fact("handin")[entry]
+        while agent.link.ask("GET", f"/v1/handins/{key}")["state"] == "complete":
+            time.sleep(_ASK_S)
+        return time.perf_counter() - started
+
+
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--agents", type=int, default=50)
@@ -166,6 +184,7 @@ def main() -> None:
             figures += [
                 Figure("forays handed in", day.forays),
                 Figure("troubles of agents", len(day.troubles)),
+                Figure("50 nodes handed in, until visible", visible_s(folder / "r0", 0), "s"),
                 Figure("first robot's download, first byte", first_byte_s(folder / "r0"), "s"),
                 Figure("second robot's download, first byte", first_byte_s(folder / "r1"), "s"),
             ]
