@@ -248,18 +248,22 @@ def moves(
 
 def changed(before: Mapping[NodeId, SE3], graph: ExperienceGraph, poses: Poses) -> list[Placement]:
     """The placements that a revision has to write: of new nodes, and of those that moved."""
-    written = []
-    for at, node in enumerate(graph.nodes):
-        pose = poses.pose(at)
-        known = before.get(node.id)
-        if known is None or _moved(known, pose):
-            written.append(Placement(node.id, pose))
-    return written
+    known = [before.get(node.id) for node in graph.nodes]
+    stays = np.array([pose is not None for pose in known], np.bool_)
+    placed = [pose for pose in known if pose is not None]
+    if placed:
+        turns = np.array([pose.rotation for pose in placed]) - poses.rotations[stays]
+        shifts = np.array([pose.translation for pose in placed]) - poses.translations[stays]
+        stays[stays] = ~_moved(turns, shifts)
+    return [Placement(graph.nodes[at].id, poses.pose(at)) for at in np.flatnonzero(~stays).tolist()]
 
 
-def _moved(one: SE3, other: SE3) -> bool:
-    apart = one.inverse() @ other
-    return apart.distance_m > DEFAULT_CONFIG.same_m or apart.angle_rad > DEFAULT_CONFIG.same_m
+def _moved(turns: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,): whether the differences (N, 3, 3) of rotations and (N, 3) of positions are large."""
+    chords = np.linalg.norm(turns.reshape(-1, 9), axis=1) / np.sqrt(8)
+    angles_rad = 2 * np.arcsin(np.minimum(chords, 1.0))
+    same = DEFAULT_CONFIG.same_m
+    return np.asarray((np.linalg.norm(shifts, axis=1) > same) | (angles_rad > same))
 
 
 def _apart_m(one: SE3, other: SE3) -> float:

@@ -146,9 +146,16 @@ def first_byte_s(folder: Path) -> float:
         body = {"ref": "head", "options": _MISSION}
         asked = agent.link.ask("POST", f"/v1/maps/{_MAP}/downloads", body)
         while asked["state"] == "asked":
+            time.sleep(_ASK_S)
             asked = agent.link.ask("GET", f"/v1/artifacts/{asked['id']}")
         agent.link.ask("GET", f"/v1/artifacts/{asked['id']}/manifest")
         return time.perf_counter() - started
+
+
+def settle(url: str) -> None:
+    """Until the centre has nothing left to merge."""
+    while 'engram_handins{state="complete"}' in httpx.get(f"{url}/v1/metrics", timeout=60.0).text:
+        time.sleep(_ASK_S)
 
 
 def visible_s(folder: Path, number: int) -> float:
@@ -181,6 +188,7 @@ def main() -> None:
             with ThreadPoolExecutor(asked.agents) as robots:
                 list(robots.map(day.live, range(asked.agents), codes))
             figures = answers(url)
+            settle(url)
             figures += [
                 Figure("forays handed in", day.forays),
                 Figure("troubles of agents", len(day.troubles)),
