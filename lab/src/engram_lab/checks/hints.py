@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.frontend import BRIEF, DescriptorKind
 from engram.localiser import Budget
 from engram.monitor import QUIET
 from engram.robot import Settings
@@ -82,15 +83,17 @@ def _is_false(error: tuple[float, float]) -> bool:
 def main() -> None:
     """Runs the program."""
     parser = command_line(__doc__)
+    parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(HELD_OUT_TOWNS))
     parser.add_argument("--tries", type=int, default=3000)
     parser.add_argument("--kinds", default="told,carried")
     parser.add_argument("--lost-rounds", type=int, default=Budget().lost_rounds)
     parser.add_argument("--out", type=Path, default=campaigns_folder() / "hints.jsonl")
     asked = parser.parse_args()
+    settings = Settings().for_descriptor(asked.kind)
     kinds = [KINDS[name] for name in asked.kinds.split(",")]
     known = _known(asked.out)
-    places = list(streets(asked.towns, Settings(), asked.lost_rounds, QUIET))
+    places = list(streets(asked.towns, settings, asked.lost_rounds, QUIET))
     per_street = -(-asked.tries // (len(places) * len(kinds)))
     done: list[Came] = []
     with asked.out.open("a", encoding="utf-8") as lines:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from engram.frontend import BRIEF, DescriptorKind
 from engram.localiser import Rule
 from engram.monitor import QUIET
 from engram.robot import Settings
@@ -64,9 +65,9 @@ def fixes(street: Street, rule: Rule) -> tuple[frozenset[int], int]:
     return frozenset(right), false
 
 
-def compared(towns: Sequence[int]) -> Iterator[Compared]:
+def compared(towns: Sequence[int], settings: Settings) -> Iterator[Compared]:
     """All drives of some towns."""
-    for plan, name, street in all_streets(towns, Settings(), 8, QUIET):
+    for plan, name, street in all_streets(towns, settings, 8, QUIET):
         found = {rule: fixes(street, rule) for rule in Rule}
         street.close()
         yield Compared(
@@ -99,10 +100,11 @@ def figures(rows: Sequence[Compared]) -> Iterator[Figure]:
 def main() -> None:
     """Runs the program."""
     parser = command_line(__doc__)
+    parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(HELD_OUT_TOWNS))
     asked = parser.parse_args()
     rows = []
-    for row in compared(asked.towns):
+    for row in compared(asked.towns, Settings().for_descriptor(asked.kind)):
         rows.append(row)
         counts = ", ".join(f"{rule.value} {len(row.right[rule])}" for rule in Rule)
         print(f"{row.street} {row.weather} {row.robot}: {counts} of {row.frames}", flush=True)
