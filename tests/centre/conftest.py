@@ -6,6 +6,7 @@ import os
 import uuid
 from pathlib import Path
 
+import httpx
 import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import create_engine, make_url, text
@@ -115,14 +116,30 @@ def drive(path: Path, robot: str, start_ns: int, nodes: int = 3) -> None:
 KINDS = ["embedded", *(["services"] if os.environ.get("ENGRAM_TEST_POSTGRES") else [])]
 
 
+@pytest.fixture(scope="session")
+def s3():
+    """Address of a bucket that moto's server keeps, for the length of the session."""
+    server = pytest.importorskip("moto.server", reason="no moto: make test-services")
+    running = server.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    running.start()
+    host, port = running.get_host_and_port()
+    address = f"http://{host}:{port}"
+    httpx.put(f"{address}/engram").raise_for_status()
+    known = {"ENDPOINT_URL": address, "ALLOW_HTTP": "true", "REGION": "us-east-1"}
+    keys = {"ACCESS_KEY_ID": "tests", "SECRET_ACCESS_KEY": "tests"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {**known, **keys}.items():
+            patch.setenv(f"AWS_{name}", value)
+        yield "s3://engram"
+    running.stop()
+
+
 @pytest.fixture(params=KINDS)
 def site(request, tmp_path):
     """A centre in a folder; and one on PostgreSQL and a bucket where ENGRAM_TEST_POSTGRES says."""
     options = {}
     if request.param == "services":
-        bucket = os.environ.get("ENGRAM_TEST_BUCKET")
-        (tmp_path / "bucket").mkdir()
-        options["objects"] = bucket or (tmp_path / "bucket").as_uri()
+        options["objects"] = f"{request.getfixturevalue('s3')}/{uuid.uuid4().hex}"
         options["database"] = new_database()
     found = Site(tmp_path, **options)
     yield found

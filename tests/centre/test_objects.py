@@ -8,10 +8,12 @@ from engram.centre.store.objects import BucketObjects, FolderObjects
 from engram.errors import MapError
 
 
-@pytest.fixture(params=["folder", "bucket"])
+@pytest.fixture(params=["folder", "bucket", "s3"])
 def objects(request, tmp_path):
     if request.param == "folder":
         return FolderObjects(tmp_path / "objects")
+    if request.param == "s3":
+        return BucketObjects(f"{request.getfixturevalue('s3')}/{tmp_path.name}")
     (tmp_path / "bucket").mkdir()
     return BucketObjects((tmp_path / "bucket").as_uri())
 
