@@ -217,6 +217,8 @@ class World:
 
     def amend(self) -> None:
         with Map.open(self.rng.choice((self.centre, self.robot)), writes=True) as store:
+            if not store.sessions:  # all that was written is reverted
+                return
             drive = self.rng.choice(list(store.sessions))
             store.amend(drive, {Amendable.ROBOT: f"name-{self.count}"}, author="t")
             self.count += 1
