@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from time import perf_counter
 from typing import Self
 
@@ -286,7 +287,9 @@ class Localiser:
                 if deadline is not None and perf_counter() >= deadline:
                     break
                 lanes = candidates[start : start + self._budget.lanes]
-                outcomes += self._at_once(attempt, start, lanes)
+                others = self._handed_out(attempt, start + 1, lanes[1:])
+                outcomes += map(attempt, count(start), lanes[: len(lanes) - len(others)])
+                outcomes += (other.result() for other in others)
                 if any(outcome.accepted for outcome in outcomes):
                     break
             if self.config.success is Success.FIRST:
@@ -298,17 +301,13 @@ class Localiser:
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
 
-    def _at_once(
+    def _handed_out(
         self, attempt: Callable[[int, Candidate], Outcome], rank: int, lanes: Sequence[Candidate]
-    ) -> list[Outcome]:
-        """Attempts of one round, each on its lane, the first one ranked `rank`."""
+    ) -> list[Future[Outcome]]:
+        """Attempts on the threads of lanes, the first one ranked `rank`; none without threads."""
         if self._pool is None:
-            return [attempt(rank + lane, one) for lane, one in enumerate(lanes)]
-        others = [
-            self._pool.submit(attempt, rank + lane, one)
-            for lane, one in enumerate(lanes[1:], start=1)
-        ]
-        return [attempt(rank, lanes[0]), *(other.result() for other in others)]
+            return []
+        return [self._pool.submit(attempt, rank + lane, one) for lane, one in enumerate(lanes)]
 
     def _conclude(self, live: Frame, outcomes: list[Outcome]) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""
