@@ -20,7 +20,7 @@ import pytest
 from engram.errors import InputError
 from engram.frontend import StereoPair
 from engram.geometry import SE3
-from engram.live import InProcess, LiveOptions, LiveProcess, Played, Served
+from engram.live import InProcess, LiveOptions, LiveProcess, Played, Served, process
 from engram.live.link import Link, Ring
 from engram.live.outside import Outside
 from engram.maps import open_map
@@ -273,6 +273,15 @@ def test_what_only_one_source_measured_is_used() -> None:
     assert wheels is not None
     assert wheels.rates_rad_s is None
     assert Outside(straight).since(Outside(None, turned), 0.5) is None
+    assert Outside(straight, turned).since(Outside(still, still), 0.0) is None
+
+
+@pytest.mark.parametrize("sigma_m", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_fix_without_a_possible_deviation_is_refused(sigma_m: float) -> None:
+    told = {"stamp_ns": 1, "latitude_deg": 51.7, "longitude_deg": -1.2, "sigma_m": sigma_m}
+    with pytest.raises(InputError, match="cannot be"):
+        process._fix(told)
+    assert process._fix({**told, "sigma_m": None}).sigma_m is None
 
 
 def test_the_newest_frame_wins(town: Path, pairs: list[StereoPair]) -> None:

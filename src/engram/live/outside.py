@@ -26,9 +26,13 @@ class Outside:
     def since(self, before: Outside, seconds: float) -> OutsideMotion | None:
         """The motion since an earlier frame by what was there at both; None for nothing.
 
+        Frames that repeat a stamp, or go back, measure nothing: there is no rate without time.
+
         The bias is still in it. What wheels measure at the camera holds the turn of its mounting
         by the wheels: the error is the length of the mounting times that of the turn.
         """
+        if seconds <= 0:
+            return None
         wheels = _between(before.wheels_from_live, self.wheels_from_live)
         gyro = _between(before.gyro_from_live, self.gyro_from_live)
         if gyro is None:

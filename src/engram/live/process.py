@@ -222,7 +222,8 @@ def _fix(given: Message) -> Fix:
     """The satellite fix of a message."""
     at = float(given["latitude_deg"]), float(given["longitude_deg"])
     sigma_m = None if given.get("sigma_m") is None else float(given["sigma_m"])
-    if not (abs(at[0]) <= 90 and abs(at[1]) <= 180 and 0 < (sigma_m or 1.0) < math.inf):
+    known = sigma_m is None or 0 < sigma_m < math.inf
+    if not (abs(at[0]) <= 90 and abs(at[1]) <= 180 and known):
         raise InputError(f"a fix at {at} degrees with a deviation of {sigma_m} m cannot be")
     return Fix(int(given["stamp_ns"]), *at, None, sigma_m)
 
