@@ -16,6 +16,19 @@ from .conftest import drive
 _LONG_S = 60.0
 
 
+needs_postgresql = pytest.mark.skipif(
+    "ENGRAM_TEST_POSTGRES" not in os.environ, reason="no PostgreSQL: make test-services"
+)
+
+
+@pytest.fixture
+def database(site) -> str:
+    address = site.centre.addresses[0]
+    if address is None:
+        pytest.skip("SQLite announces nothing")
+    return address
+
+
 def test_without_announcements_a_worker_looks_after_a_while(tmp_path):
     slept: list[float] = []
     with Waker(f"sqlite:///{tmp_path / 'centre.sqlite'}", slept.append) as waker:
@@ -34,13 +47,8 @@ def test_where_the_database_is_away_a_worker_looks_after_a_while():
     assert slept == [3.0]
 
 
-@pytest.mark.skipif(
-    "ENGRAM_TEST_POSTGRES" not in os.environ, reason="no PostgreSQL: make test-services"
-)
-def test_a_complete_hand_in_wakes_a_worker(site):
-    database = site.centre.addresses[0]
-    if database is None:
-        pytest.skip("SQLite announces nothing")
+@needs_postgresql
+def test_a_complete_hand_in_wakes_a_worker(site, database):
     agent = site.robot("r1")
     drive(agent.live, "r1", 1_000)
     agent.hand_in()
@@ -54,13 +62,8 @@ def test_a_complete_hand_in_wakes_a_worker(site):
         sender.join()
 
 
-@pytest.mark.skipif(
-    "ENGRAM_TEST_POSTGRES" not in os.environ, reason="no PostgreSQL: make test-services"
-)
-def test_a_broken_line_is_taken_up_again(site):
-    database = site.centre.addresses[0]
-    if database is None:
-        pytest.skip("SQLite announces nothing")
+@needs_postgresql
+def test_a_broken_line_is_taken_up_again(site, database):
     slept: list[float] = []
     with Waker(database, slept.append) as waker:
         waker.wait(_LONG_S)

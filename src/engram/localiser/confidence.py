@@ -8,8 +8,7 @@ that nothing has confirmed yet supports none.
 
 The model is additive. A match has several readings: as what the position predicts, if fixes have
 confirmed it; the same if later ones failed to come; as what somebody said; and as that of a robot
-that may be anywhere. `CONFIDENCES` holds
-the weights for each kind of features, made and judged by
+that may be anywhere. `CONFIDENCES` holds the weights for each kind of features, made and judged by
 ``python -m engram_lab.fits.confidence``.
 """
 
