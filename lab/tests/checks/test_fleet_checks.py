@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from engram_lab.checks.both_directions import Missed, apart, by_drive, pair_of, town_of
 from engram_lab.checks.lenses import told
 from engram_lab.checks.mountings import MOUNTED, MountedSequence
 from engram_lab.town.sequence import SimulatedSequence
@@ -40,3 +41,16 @@ def test_the_share_of_the_loss_is_paired_over_towns():
     assert "8.0% ignored, 3.0% known, 1.0% through" in text
     assert "spared 5.0 points (4.0 … 6.0)" in text
     assert "71% of the loss (60% … 100%)" in text
+
+
+def test_directions_are_compared_over_drives_however_many_maps_each_was_tried_in():
+    found = [Missed(8, False, 0.0, None), Missed(9, True, 0.1, None), Missed(8, False, 0.2, None),
+             Missed(7, True, 0.2, None), Missed(9, True, 0.3, None)]  # fmt: skip
+    usual, against = by_drive(found, reverse=False), by_drive(found, reverse=True)
+    np.testing.assert_allclose((usual, against[:1]), [[0.1], [0.2]])
+    assert len(against) == 2
+    more = apart(usual, np.array([0.1, 0.3]))
+    assert more.estimate == pytest.approx(0.1)
+    assert (more.low, more.high) == (pytest.approx(0.0), pytest.approx(0.2))
+    assert pair_of("8,9") == [8, 9]
+    assert [town_of(name).name for name in ("oxford", "401")] == ["oxford", "trial"]
