@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -14,6 +18,26 @@ from engram.cli.settings import AllSettings, every_setting
 from engram.cli.verbs import GROUPS, VERBS
 
 COMMANDS = typer.main.get_command(app).commands
+# The longest help that a person takes in at once.
+SCREEN = 60
+
+
+def every_verb(commands: dict, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """The words of each verb, those in groups and of the laboratory included."""
+    for name, command in commands.items():
+        inner = getattr(command, "commands", None)
+        yield from [(*words, name)] if inner is None else every_verb(inner, (*words, name))
+
+
+EVERY_VERB = sorted(every_verb(COMMANDS))
+
+
+def command_of(words: tuple[str, ...]) -> Any:
+    """The command that these words name."""
+    command = COMMANDS[words[0]]
+    for word in words[1:]:
+        command = command.commands[word]
+    return command
 
 
 def test_help_lists_the_verbs_in_their_groups(engram) -> None:
@@ -22,7 +46,7 @@ def test_help_lists_the_verbs_in_their_groups(engram) -> None:
     for title, verbs in GROUPS.items():
         for verb in verbs:
             assert places[f"{title}:"] < places[verb]
-    assert len(lines) <= 60, "one screen"
+    assert len(lines) <= SCREEN
 
 
 def test_verbs_take_few_arguments_and_options() -> None:
@@ -34,13 +58,31 @@ def test_verbs_take_few_arguments_and_options() -> None:
     assert sum(taken.values()) <= 12 * len(taken), taken
 
 
-@pytest.mark.parametrize("verb", sorted(VERBS))
-def test_help_fits_a_screen_and_begins_with_a_short_summary(engram, verb: str) -> None:
-    ran = engram(verb, "--help")
-    assert len(ran.out.splitlines()) <= 80
-    summary = COMMANDS[verb].get_short_help_str(200)
-    assert len(summary) <= 50, summary
+@pytest.mark.parametrize("words", EVERY_VERB, ids=" ".join)
+def test_help_fits_a_screen_and_has_examples_that_the_verb_takes(
+    engram, words: tuple[str, ...]
+) -> None:
+    lines = engram(*words, "--help").out.splitlines()
+    assert len(lines) <= SCREEN
+    assert [line for line in lines if re.search(r" <[a-z]", line)] == [], "names of types"
+    command = command_of(words)
+    summary = command.get_short_help_str(200)
+    assert len(summary) <= 55, summary
     assert summary.endswith(".")
+    first = lines.index("  Examples:") + 1
+    examples = [shlex.split(line) for line in lines[first : lines.index("", first)]]
+    assert examples
+    for example in examples:
+        assert tuple(example[1 : len(words) + 1]) == words
+        line = example[len(words) + 1 :]
+        given = line[: line.index(">")] if ">" in line else line
+        command.make_context(" ".join(words), given)  # refuses what the verb does not take
+
+
+def test_every_option_is_explained_by_some_help(engram) -> None:
+    explained = engram("drive", "info", "--help").out
+    for option in engram("map", "--help").out.partition("drive info --help:")[2].split("--")[1:]:
+        assert f"--{option.split()[0]} " in explained
 
 
 def test_no_verb_takes_an_option_that_meant_two_things() -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.cli.verbs import VERBS
 from engram.localiser import Localiser
 
 FRAME_KEYS = {
@@ -26,14 +25,6 @@ def town(engram, street: Path, tmp_path: Path) -> Path:
     path = tmp_path / "town.engram"
     assert engram("map", path, street).status == 0
     return path
-
-
-@pytest.mark.parametrize("verb", sorted(VERBS))
-def test_every_verb_has_help_with_an_example_to_paste(engram, verb: str) -> None:
-    ran = engram(verb, "--help")
-    assert ran.status == 0
-    assert "Examples:" in ran.out
-    assert f"engram {verb}" in ran.out
 
 
 def test_mapping_reports_what_it_saved(engram, street: Path, tmp_path: Path) -> None:

@@ -16,12 +16,16 @@ if TYPE_CHECKING:
     from engram.agent import Agent
 
 agent_group = typer.Typer(
-    help="The robot's side of the centre.", no_args_is_help=True, rich_markup_mode=None
+    help="The robot's side of the centre.",
+    epilog="Start with: engram agent enrol FOLDER URL CODE --name r1",
+    no_args_is_help=True,
+    rich_markup_mode=None,
 )
 
 Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The agent's folder.")]
 Config: TypeAlias = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Limits and download, in TOML.")
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="The agent's settings in TOML: link, download."),
 ]
 _LOOK_S = 0.5
 
@@ -37,12 +41,19 @@ def _open(folder: Path, config: Path | None = None) -> Agent:
 @agent_group.command()
 def enrol(
     folder: Folder,
-    url: Annotated[str, typer.Argument(metavar="URL", help="Of the centre.")],
-    code: Annotated[str, typer.Argument(metavar="CODE", help="From engram centre code.")],
+    url: Annotated[str, typer.Argument(metavar="URL", help="Address of the centre.")],
+    code: Annotated[str, typer.Argument(metavar="CODE", help="What engram centre code printed.")],
     *,
-    name: Annotated[str, typer.Option("--name", help="Of the robot.")],
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the robot.")],
 ) -> None:
-    """Enrol this robot with a centre; its key never leaves FOLDER."""
+    """Enrol this robot with a centre.
+
+    The robot makes a key, which never leaves FOLDER.
+
+    \b
+    Examples:
+      engram agent enrol r1 https://town.example:8440 CODE --name r1
+    """
     from engram.agent import enrol as enrol_robot
 
     typer.echo(f"{name} is a robot of {enrol_robot(folder, url, code, name)}")
@@ -50,7 +61,15 @@ def enrol(
 
 @agent_group.command()
 def run(folder: Folder, *, config: Config = None) -> None:
-    """Send what is queued and fetch what is wanted, until it is stopped."""
+    """Send and fetch maps until stopped.
+
+    Sends what is queued and fetches the version that the centre wants on this robot.
+
+    \b
+    Examples:
+      engram agent run r1
+      engram agent run r1 --config agent.toml
+    """
     waiting = threading.Event()
     with _open(folder, config) as agent:
         while True:
@@ -62,12 +81,21 @@ def sync(
     folder: Folder,
     *,
     wait_s: Annotated[
-        float, typer.Option("--wait", metavar="S", min=0, help="For what the centre still makes.")
+        float,
+        typer.Option(
+            "--wait", metavar="S", min=0, help="Seconds to wait for what the centre is making."
+        ),
     ] = 0.0,
     config: Config = None,
     as_json: options.Json = False,
 ) -> None:
-    """Send and fetch, as far as the link allows."""
+    """Send and fetch maps once, as far as the link allows.
+
+    \b
+    Examples:
+      engram agent sync r1
+      engram agent sync r1 --wait 60 --json
+    """
     waiting = threading.Event()
     with _open(folder, config) as agent:
         until_s = time.monotonic() + wait_s
@@ -78,22 +106,41 @@ def sync(
 
 @agent_group.command("hand-in")
 def hand_in(folder: Folder, *, config: Config = None) -> None:
-    """Queue what the live map holds; no link is needed."""
+    """Queue what the robot has mapped.
+
+    Needs no link: the next sync or run sends it.
+
+    \b
+    Examples:
+      engram agent hand-in r1
+    """
     with _open(folder, config) as agent:
         key = agent.hand_in()
-    typer.echo("nothing new" if key is None else f"queued {key[:12]}")
+    typer.echo("nothing new to hand in" if key is None else f"queued {key[:12]}")
 
 
 @agent_group.command()
 def switch(folder: Folder) -> None:
-    """Switch to the version that was fetched; the robot must be parked."""
+    """Switch to the fetched version of the map.
+
+    The robot must be parked.
+
+    \b
+    Examples:
+      engram agent switch r1
+    """
     with _open(folder) as agent:
         typer.echo("switched" if agent.switch() else "nothing to switch to")
 
 
 @agent_group.command("fall-back")
 def fall_back(folder: Folder) -> None:
-    """Go back to the last good map."""
+    """Go back to the last good map.
+
+    \b
+    Examples:
+      engram agent fall-back r1
+    """
     with _open(folder) as agent:
         agent.fall_back()
 
@@ -102,18 +149,38 @@ def fall_back(folder: Folder) -> None:
 def drove(
     folder: Folder,
     *,
-    share: Annotated[float, typer.Option("--share", min=0, max=1, help="Of frames localised.")],
-    driven_m: Annotated[float, typer.Option("--metres", min=0, help="Driven.")],
+    share: Annotated[
+        float,
+        typer.Option(
+            "--share", metavar="SHARE", min=0, max=1, help="Share of frames that were localised."
+        ),
+    ],
+    driven_m: Annotated[
+        float, typer.Option("--metres", metavar="M", min=0, help="Distance driven.")
+    ],
     config: Config = None,
 ) -> None:
-    """Note how the live map served; one that does not serve is taken back."""
+    """Report how well the map served on a drive.
+
+    A map that served badly is replaced by the last good one.
+
+    \b
+    Examples:
+      engram agent drove r1 --share 0.97 --metres 1200
+    """
     with _open(folder, config) as agent:
         typer.echo("fell back" if agent.drove(share, driven_m) else "noted")
 
 
 @agent_group.command()
 def status(folder: Folder, *, as_json: options.Json = False) -> None:
-    """What this robot runs, wants, has queued."""
+    """Show which map this robot runs, wants and has queued.
+
+    \b
+    Examples:
+      engram agent status r1
+      engram agent status r1 --json
+    """
     with _open(folder) as agent:
         _print(agent, as_json=as_json)
 

@@ -14,18 +14,25 @@ if TYPE_CHECKING:
     from engram.centre.service import Centre
 
 centre_group = typer.Typer(
-    help="The fleet's shared map as a service.", no_args_is_help=True, rich_markup_mode=None
+    help="The fleet's shared map as a service.",
+    epilog="Start with: engram centre serve FOLDER",
+    no_args_is_help=True,
+    rich_markup_mode=None,
 )
 
 Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The centre's folder.")]
-MapName: TypeAlias = Annotated[str, typer.Option("--map", metavar="NAME", help="A map.")]
+MapName: TypeAlias = Annotated[
+    str, typer.Option("--map", metavar="NAME", help="Which of the centre's maps.")
+]
 Database: TypeAlias = Annotated[
     str | None,
-    typer.Option("--database", metavar="URL", help="postgresql+psycopg://… [default: SQLite]."),
+    typer.Option(
+        "--database", metavar="URL", help="postgresql+psycopg://… [default: SQLite in FOLDER]."
+    ),
 ]
 Objects: TypeAlias = Annotated[
     str | None,
-    typer.Option("--objects", metavar="URL", help="s3://bucket/prefix [default: a folder]."),
+    typer.Option("--objects", metavar="URL", help="s3://bucket/prefix [default: files in FOLDER]."),
 ]
 _BY = "shell"
 
@@ -40,15 +47,22 @@ def _open(folder: Path, database: str | None = None, objects: str | None = None)
 def serve(
     folder: Folder,
     *,
-    host: Annotated[str, typer.Option("--host", help="Address to listen at.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", min=0, max=65535)] = 8440,
+    host: Annotated[
+        str, typer.Option("--host", metavar="HOST", help="Address to listen at.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", metavar="N", min=0, max=65535, help="Port to listen at.")
+    ] = 8440,
     map_name: MapName = "fleet",
     certificate: Annotated[
-        Path | None, typer.Option("--tls-certificate", metavar="FILE", help="PEM.")
+        Path | None, typer.Option("--tls-certificate", metavar="FILE", help="TLS certificate, PEM.")
     ] = None,
-    key: Annotated[Path | None, typer.Option("--tls-key", metavar="FILE", help="PEM.")] = None,
+    key: Annotated[
+        Path | None, typer.Option("--tls-key", metavar="FILE", help="Its private key, PEM.")
+    ] = None,
     insecure: Annotated[
-        bool, typer.Option("--insecure", help="Listen elsewhere than here without TLS.")
+        bool,
+        typer.Option("--insecure", help="Listen on other addresses than 127.0.0.1 without TLS."),
     ] = False,
     database: Database = None,
     objects: Objects = None,
@@ -58,7 +72,7 @@ def serve(
 ) -> None:
     """Serve maps to robots and people.
 
-    Everything is in FOLDER: no other server is needed. The first start makes the map.
+    FOLDER holds everything; no other server is needed. The first start makes the map.
 
     \b
     Examples:
@@ -76,9 +90,13 @@ def serve(
 
 @centre_group.command()
 def worker(folder: Folder, *, database: Database = None, objects: Objects = None) -> None:
-    """Merge hand-ins and make downloads until it is stopped.
+    """Merge hand-ins and make downloads until stopped.
 
-    Any number of workers may run; each takes a map that has work and that no other one has.
+    Any number of workers may run. Each takes a map that has work and no other worker.
+
+    \b
+    Examples:
+      engram centre worker town
     """
     from engram.centre.serving import run_worker
 
@@ -91,11 +109,20 @@ def code(
     *,
     map_name: MapName = "fleet",
     follows: Annotated[
-        str, typer.Option("--follows", metavar="REF", help="What the robot is to run.")
+        str,
+        typer.Option(
+            "--follows", metavar="REF", help="Which version the robot follows: head or a name."
+        ),
     ] = "head",
     database: Database = None,
 ) -> None:
-    """Print a code with which one robot enrols."""
+    """Print a code with which one robot enrols.
+
+    \b
+    Examples:
+      engram centre code town
+      engram centre code town --follows stable
+    """
     from engram.centre.access.enrolment import new_code
 
     with _open(folder, database) as centre:
@@ -106,12 +133,23 @@ def code(
 def token(
     folder: Folder,
     *,
-    name: Annotated[str, typer.Option("--name", help="Whose.")],
-    role: Annotated[str, typer.Option("--role", help="viewer, operator or admin.")] = "viewer",
-    map_name: Annotated[str, typer.Option("--map", metavar="NAME", help="* for all.")] = "*",
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the person.")],
+    role: Annotated[
+        str, typer.Option("--role", metavar="ROLE", help="viewer, operator or admin.")
+    ] = "viewer",
+    map_name: Annotated[
+        str, typer.Option("--map", metavar="NAME", help="Which map; * for all.")
+    ] = "*",
     database: Database = None,
 ) -> None:
-    """Print a token for a person; it opens the pages, too."""
+    """Print a token for a person.
+
+    It signs in to the centre's pages and to its HTTP interface.
+
+    \b
+    Examples:
+      engram centre token town --name alice --role operator
+    """
     from engram.centre.access.enrolment import add_person
     from engram.centre.access.roles import Role
     from engram.errors import ConfigError
@@ -130,16 +168,30 @@ def map_(
     *,
     gate: Annotated[
         list[Path] | None,
-        typer.Option("--gate", metavar="DRIVE", help="Must not localise worse; repeatable."),
+        typer.Option(
+            "--gate",
+            metavar="DRIVE",
+            help="Held-out drive that must not localise worse; repeatable.",
+        ),
     ] = None,
     moves: Annotated[
         str | None,
-        typer.Option("--moves", metavar="REF", help="Follows every merge that the gate passed."),
+        typer.Option(
+            "--moves",
+            metavar="REF",
+            help="Version that is moved to each merge that passed the gate.",
+        ),
     ] = None,
     settings: options.SettingsGiven,
     database: Database = None,
 ) -> None:
-    """Make a map, or change how one takes hand-ins."""
+    """Make a map, or change how its hand-ins are merged.
+
+    \b
+    Examples:
+      engram centre map town campus --gate held-out.framelog --moves stable
+      engram centre map town fleet --set merge.rounds=8
+    """
     from engram.centre.service import MapPolicy
     from engram.cli.fleet import merging_of
 
@@ -157,12 +209,19 @@ def jobs(
     *,
     map_name: MapName = "fleet",
     cancel: Annotated[
-        str | None, typer.Option("--cancel", metavar="JOB", help="End this one.")
+        str | None,
+        typer.Option("--cancel", metavar="JOB", help="Cancel this hand-in: its id as listed."),
     ] = None,
     as_json: options.Json = False,
     database: Database = None,
 ) -> None:
-    """List hand-ins, newest last, with what became of them."""
+    """List hand-ins and their state, newest last.
+
+    \b
+    Examples:
+      engram centre jobs town
+      engram centre jobs town --map campus --json
+    """
     from engram.centre.handins import HandIns
 
     with _open(folder, database) as centre:
@@ -181,15 +240,20 @@ def jobs(
 
 @centre_group.command()
 def sweep(folder: Folder, *, database: Database = None, objects: Objects = None) -> None:
-    """Remove parts that no hand-in and no download needs any more.
+    """Remove parts that nothing needs any more.
 
-    Workers do it by themselves, once a day; the next sweep deletes what this one forgets.
+    Parts that no hand-in and no download refers to are marked, and deleted by the next sweep.
+    Workers sweep once a day by themselves.
+
+    \b
+    Examples:
+      engram centre sweep town
     """
     from engram.centre.worker.sweeping import sweep as run
 
     with _open(folder, database, objects) as centre:
         for name in centre.map_names():
-            typer.echo(f"{name}: {run(centre, name)} bytes")
+            typer.echo(f"{name}: {run(centre, name)} bytes removed")
 
 
 @centre_group.command()
@@ -197,9 +261,16 @@ def backup(
     folder: Folder,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="A new folder.")],
 ) -> None:
-    """Copy a centre while it runs, and let robots forget what the copy holds."""
+    """Copy a centre while it runs.
+
+    Robots may then delete what the copy holds.
+
+    \b
+    Examples:
+      engram centre backup town town-backup
+    """
     from engram.centre.backup import back_up
 
     with _open(folder) as centre:
         for name, revision in back_up(centre, target).items():
-            typer.echo(f"{name}: revision {revision}")
+            typer.echo(f"{name}: revision {revision} copied")

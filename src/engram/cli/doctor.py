@@ -24,20 +24,22 @@ def doctor(
     *,
     drive: options.Drive,
     hours: Annotated[
-        bool, typer.Option("--hours", help="Missions by hour need the drive's clock: check it.")
+        bool, typer.Option("--hours", help="Check the clock, which missions by hour need.")
     ] = False,
     pictures: Annotated[
         Path | None,
-        typer.Option("--pictures", metavar="DIR", help="Draw four pairs and what both sides show."),
+        typer.Option(
+            "--pictures", metavar="DIR", help="Draw four pairs with what both sides show."
+        ),
     ] = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Find out what is wrong with a drive.
 
-    Looks at up to 200 frames: whether left and right are in place, in line and of one instant, at
-    stamps, odometry, images and optics. Each finding has a value, its limit and a cure. Exit
-    status 4 if one is fatal: engram map refuses such a drive.
+    Checks up to 200 frames: whether left and right are swapped, misaligned or unsynchronised; time
+    stamps, odometry, images and optics. Each finding states a value, its limit and a cure. The exit
+    status is 4 if a finding is fatal; engram map refuses such a drive.
 
     \b
     Examples:

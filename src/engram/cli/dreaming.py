@@ -18,7 +18,7 @@ def dream(
     handed: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[ROBOT...]",
+            metavar="ROBOT",
             help="Robots' maps as handed in [default: those kept by merge --keep].",
             parser=options.map_file,
         ),
@@ -26,14 +26,18 @@ def dream(
     *,
     validate: Annotated[
         list[Path],
-        typer.Option("--validate", metavar="DRIVE", help="Held-out drive, three or more of them."),
+        typer.Option(
+            "--validate", metavar="DRIVE", help="Held-out drive; give three or more. Required."
+        ),
     ],
     minutes: Annotated[
         float | None,
-        typer.Option("--minutes", help="Stop trying after so long [default: try everything]."),
+        typer.Option(
+            "--minutes", metavar="MIN", help="Stop after this long [default: try everything]."
+        ),
     ] = None,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, help="Processes that try side by side.")
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
     ] = 1,
     scheduler: Annotated[
         str | None,
@@ -44,15 +48,15 @@ def dream(
 ) -> None:
     """Look for a better fleet map.
 
-    Merges what robots handed in anew, in other orders and with other behaviours, and judges the
-    results by held-out drives. What the best one has and the fleet map lacks is added as one
-    revision, if the drives then localise better, beyond chance. Nothing is removed. The same
-    command goes on where the last one stopped.
+    Merges the robots' maps again, in other orders and with other settings, and compares the results
+    on held-out drives. If the drives then localise significantly better, what the best result has
+    and the fleet map lacks is added as one revision. Nothing is removed. The same command resumes
+    an interrupted search.
 
     \b
     Examples:
-      engram dream fleet.engram --validate a.framelog --validate b.framelog --validate c.framelog
-      engram dream fleet.engram r1.engram r2.engram --validate … --minutes 30 --workers 2
+      engram dream fleet.engram r1.engram --validate mon --validate tue --validate wed
+      engram dream fleet.engram --validate mon --validate tue --validate wed --minutes 30
     """
     from engram.cli.fleet import merging_of
     from engram.cli.progress import Bars

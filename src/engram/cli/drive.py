@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engram.cli import options
+from engram.cli.help import VerbInFull
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,12 +21,13 @@ if TYPE_CHECKING:
 
 drive_group = typer.Typer(
     help="Look at a drive: topics, calibration.",
+    epilog="Start with: engram drive info DRIVE",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 
-@drive_group.command("info")
+@drive_group.command("info", cls=VerbInFull)
 def info(
     path: options.DrivePath,
     *,
@@ -34,8 +36,8 @@ def info(
 ) -> None:
     """Show what a drive holds, and how to map it.
 
-    Of a bag: its topics with type, rate, size and gaps, the calibration and the transforms found,
-    and the command that maps it.
+    For a bag this lists topics (type, rate, size, gaps), calibration and transforms, and prints the
+    command that maps it.
 
     \b
     Examples:
@@ -56,21 +58,23 @@ def info(
     typer.echo(json.dumps(found) if as_json else _drive_text(found))
 
 
-@drive_group.command("calibration")
+@drive_group.command("calibration", cls=VerbInFull)
 def calibration(
     path: options.DrivePath,
     *,
     opening: options.Drive,
     picture: Annotated[
         Path | None,
-        typer.Option("--picture", metavar="PNG", help="[default: DRIVE-calibration.png here]"),
+        typer.Option(
+            "--picture", metavar="PNG", help="The picture [default: DRIVE-calibration.png]."
+        ),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Show a drive's calibration, and draw a rectified pair.
 
-    Prints a table, as comments, and TOML: save it as calibration.toml, edit it, and give it back
-    with --calibration. The picture shows one rectified pair; the same point lies on the same line
+    Prints TOML with a table as comments. Save it as calibration.toml, edit it and pass it with
+    --calibration. The picture shows one rectified pair: the same point should lie on the same line
     in both images.
 
     \b

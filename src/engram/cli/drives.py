@@ -26,7 +26,7 @@ def map_(
     descriptor: options.Descriptor = None,
     no_thumbnails: options.NoThumbnails = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Map a drive that the doctor finds unfit, too.")
+        bool, typer.Option("--force", help="Map the drive even if the doctor finds it unfit.")
     ] = False,
     view: options.View = None,
     settings: options.SettingsGiven,
@@ -36,7 +36,7 @@ def map_(
 
     Creates the map if it does not exist. Where the drive localises in the map, nothing is saved;
     elsewhere it becomes a new experience. The same command resumes an interrupted drive. A drive
-    with a fatal fault is refused before anything is written, with exit status 4: engram doctor.
+    with a fatal fault (see engram doctor) is refused with exit status 4; nothing is written.
 
     \b
     Examples:
@@ -96,7 +96,7 @@ def localise(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", help="Replay in real time; count late frames."),
+        typer.Option("--rate", metavar="HZ", help="Replay in real time and count late frames."),
     ] = None,
     remember: Annotated[
         bool,
@@ -104,24 +104,27 @@ def localise(
     ] = False,
     recorder: Annotated[
         Path | None,
-        typer.Option("--recorder", metavar="DIR", help="Write the last 30 s as a file when lost."),
+        typer.Option("--recorder", metavar="DIR", help="When lost, write the last 30 s to a file."),
     ] = None,
-    no_images: Annotated[
-        bool, typer.Option("--no-images", help="Such files hold no images.")
-    ] = False,
+    no_images: Annotated[bool, typer.Option("--no-images", help="Record no images.")] = False,
     view: options.View = None,
     explain: Annotated[
         int | None,
-        typer.Option("--explain", metavar="FRAME", min=0, help="Explain this frame's candidates."),
+        typer.Option(
+            "--explain",
+            metavar="FRAME",
+            min=0,
+            help="Explain the candidates of this frame, from 0.",
+        ),
     ] = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Find a drive in a map.
 
-    The map is not changed, unless --remember keeps the drive's path and match attempts, by which
-    later drives are ranked. --explain lists why the candidates of one frame have their order and
-    which of them match; the drive is localised up to that frame first.
+    The map is not changed, unless --remember keeps the drive's path and match attempts, which rank
+    candidates for later drives. --explain localises the drive up to one frame, then lists that
+    frame's candidates: why they are in this order, and which of them match.
 
     \b
     Examples:
@@ -170,8 +173,8 @@ def record(
 ) -> None:
     """Store a drive compactly, as a frame log.
 
-    A frame log keeps what the front-end and odometry found, in a sixteenth of the space of the
-    images. Every verb reads it like the drive. The same command resumes an interrupted recording.
+    A frame log keeps features and odometry in a sixteenth of the space of the images. Every verb
+    reads it like the drive itself. The same command resumes an interrupted recording.
 
     \b
     Examples:

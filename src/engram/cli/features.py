@@ -19,18 +19,20 @@ class FeaturesAction(StrEnum):
 
 
 def features(
-    action: Annotated[FeaturesAction, typer.Argument(help="list or check.")] = FeaturesAction.LIST,
+    action: Annotated[
+        FeaturesAction, typer.Argument(metavar="ACTION", help="list or check.")
+    ] = FeaturesAction.LIST,
     kinds: Annotated[
-        list[str] | None, typer.Argument(metavar="[KIND]...", help="[default: all].")
+        list[str] | None, typer.Argument(metavar="KIND", help="Kinds of features [default: all].")
     ] = None,
     *,
     as_json: options.Json = False,
 ) -> None:
     """List the kinds of features, or check them.
 
-    A map and a frame log name the kind that made them, and match no other. A kind that is learned
-    names its model, too. An installed package may add kinds; `check` shows whether one does what
-    every kind must.
+    Every map and frame log uses one kind, and only the same kind matches; a learned kind also names
+    its model. Installed packages may add kinds; `check` tests whether a kind does what every kind
+    must.
 
     \b
     Examples:

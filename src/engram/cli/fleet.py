@@ -26,7 +26,7 @@ def merge(
     robots: Annotated[
         list[Path],
         typer.Argument(
-            metavar="ROBOT...", help="Robots' maps, merged in this order.", parser=options.map_file
+            metavar="ROBOT", help="Robots' maps, merged in this order.", parser=options.map_file
         ),
     ],
     *,
@@ -43,7 +43,7 @@ def merge(
     ] = None,
     keep: Annotated[
         bool,
-        typer.Option("--keep", help="Keep the robots' maps in FLEET.handed, for engram dream."),
+        typer.Option("--keep", help="Keep the robots' maps in FLEET.handed for engram dream."),
     ] = False,
     picture: Annotated[
         Path | None,
@@ -53,7 +53,7 @@ def merge(
         bool, typer.Option("--geometry", help="Count the wrong edges of each result.")
     ] = False,
     require_geometry: Annotated[
-        bool, typer.Option("--require-geometry", help="Refuse a merge that brings wrong edges.")
+        bool, typer.Option("--require-geometry", help="Refuse a merge that adds wrong edges.")
     ] = False,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
@@ -61,8 +61,8 @@ def merge(
     """Add robots' maps to the fleet map.
 
     Each map becomes one revision, complete or not at all. Nodes that the fleet map has are not
-    added again. The others are replayed like a live drive. Those that localise are already covered
-    and dropped; the rest are added. Merging the same map again changes nothing. If a later map
+    added again. The others are replayed like a live drive: those that localise are already covered
+    and are dropped, the rest are added. Merging the same map again changes nothing. If a later map
     fails, earlier merges are kept and reported.
 
     \b
@@ -154,12 +154,16 @@ def download(
     update: Annotated[
         bool,
         typer.Option(
-            "--update", help="Take the download into OUT, which keeps its own nodes and history."
+            "--update", help="Add the download to OUT, which keeps its own nodes and history."
         ),
     ] = False,
     select: Annotated[
         str,
-        typer.Option("--select", help="copy, tod, paths, tod+paths, region, route or budget."),
+        typer.Option(
+            "--select",
+            metavar="NAME",
+            help="copy, tod, paths, tod+paths, region, route or budget.",
+        ),
     ] = "copy",
     depart: Annotated[
         str | None, typer.Option("--depart", metavar="H:MM", help="When the mission begins.")
@@ -169,7 +173,11 @@ def download(
     ] = None,
     date: Annotated[
         str | None,
-        typer.Option("--date", metavar="DAY", help="2026-11-17 [default: the newest drive's]."),
+        typer.Option(
+            "--date",
+            metavar="DAY",
+            help="Day of the mission: 2026-11-17 [default: the newest drive's].",
+        ),
     ] = None,
     budget: Annotated[
         str | None,
@@ -178,17 +186,21 @@ def download(
     near: Annotated[
         list[str] | None,
         typer.Option(
-            "--near", "--region", metavar="NODE", help="Only around a node; repeatable. Not copy."
+            "--near",
+            "--region",
+            metavar="NODE",
+            help="Only around this node; repeatable; not for copy.",
         ),
     ] = None,
     route: Annotated[
         str | None,
-        typer.Option("--route", metavar="SESSION", help="Only along this session. Not copy."),
+        typer.Option("--route", metavar="SESSION", help="Only along this session; not for copy."),
     ] = None,
     thumbnails: Annotated[
         bool | None,
         typer.Option(
-            "--thumbnails/--no-thumbnails", help="Pictures for people [default: not with budget]."
+            "--thumbnails/--no-thumbnails",
+            help="Include the nodes' small pictures [default: not with budget].",
         ),
     ] = None,
     strict: Annotated[
@@ -201,9 +213,9 @@ def download(
 ) -> None:
     """Write what one mission needs.
 
-    The download is a map of its own: the robot drives with it, adds to it, and hands it back to
-    merge. Times are hours of day at the place: mean solar time if longitudes are known, else civil
-    time.
+    The download is a map of its own: the robot drives with it, adds to it and hands it in for the
+    next merge. Times are hours of the day at the place: mean solar time if longitudes are known,
+    otherwise civil time.
 
     \b
     Examples:
@@ -256,19 +268,21 @@ def download(
 def build(
     centre: options.FleetMap,
     drives: Annotated[
-        list[str], typer.Argument(metavar="DRIVE...", help="Frame logs or drives; paths or URLs.")
+        list[str], typer.Argument(metavar="DRIVE", help="Frame logs or drives: paths or URLs.")
     ],
     *,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, help="Processes on this machine.")
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
     ] = 2,
-    groups: Annotated[int, typer.Option("--groups", min=1, help="Groups of drives.")] = 2,
+    groups: Annotated[
+        int, typer.Option("--groups", metavar="N", min=1, help="Groups of drives.")
+    ] = 2,
     grouping: Annotated[
         str,
         typer.Option(
             "--grouping",
             metavar="HOW",
-            help="chronological, random:SEED, by-condition, or a file with one group a line.",
+            help="chronological, random:SEED, by-condition, or a file with one group per line.",
         ),
     ] = "chronological",
     scheduler: Annotated[
@@ -278,7 +292,9 @@ def build(
     order: Annotated[
         str | None,
         typer.Option(
-            "--order", help="Order of merging to search for: best (all), best-first (each first)."
+            "--order",
+            metavar="NAME",
+            help="Search for a good order of merging: best (all), best-first (each first).",
         ),
     ] = None,
     validate: Annotated[
@@ -297,7 +313,7 @@ def build(
     """Map many drives in parallel.
 
     Groups of drives are mapped side by side, then merged. Progress is kept in FLEET.build until
-    the build is complete; the same command continues after an interruption. The same drives and
+    the build is complete; the same command resumes an interrupted build. The same drives and
     options give the same map. Drives that FLEET already contains are left out.
 
     \b

@@ -34,16 +34,19 @@ def anchor(
     positions: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="CSV or GeoJSON: node or time, and a position; or a bag with GPS."
+            metavar="FILE", help="CSV or GeoJSON (node or time, position), or a bag with GPS."
         ),
     ],
     *,
     topic: Annotated[
-        str | None, typer.Option("--topic", metavar="TOPIC", help="Of a bag's NavSatFix.")
+        str | None,
+        typer.Option("--topic", metavar="TOPIC", help="Topic of a bag's NavSatFix messages."),
     ] = None,
     grid: Annotated[
         Path | None,
-        typer.Option("--grid", metavar="MAP.YAML", help="Positions are pixels u,v of this grid."),
+        typer.Option(
+            "--grid", metavar="MAP.YAML", help="Positions are pixels of this occupancy grid."
+        ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Report residuals and moves; write nothing.")
@@ -52,11 +55,11 @@ def anchor(
 ) -> None:
     """Fit a map's frame to known positions.
 
-    A line names a node, or a time (UTC) at which one was saved, and where it is: lat,lon or x,y in
-    metres, or u,v pixels of an occupancy grid; z and sigma in metres may follow. Of a bag the GPS
-    fixes count that were taken while nodes were saved. Goals stay with their nodes. The anchoring
-    is a revision, which revert takes back. Where parts that nothing ties now lie at one place,
-    their nodes are compared; matches that confirm each other join them, in a revision of its own.
+    Each line names a node, or the time (UTC) at which one was saved, and its position: lat,lon, or
+    x,y in metres, or u,v in pixels of an occupancy grid; z and sigma in metres may follow. From a
+    bag, the GPS fixes that were taken while nodes were saved are used. Goals stay with their nodes.
+    The anchoring is a revision that engram revert can undo. Unconnected parts of the map that now
+    lie at one place are matched, and joined by matches that confirm each other.
 
     \b
     Examples:
@@ -77,24 +80,31 @@ def anchor(
 
 
 def goal(
-    action: Annotated[GoalAction, typer.Argument(help="add or list.")],
+    action: Annotated[GoalAction, typer.Argument(metavar="ACTION", help="add or list.")],
     map_path: options.MapPath,
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="add: its name.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="add: name of the goal.")
+    ] = None,
     *,
-    x_m: Annotated[float | None, typer.Option("--x", help="add: position, metres.")] = None,
-    y_m: Annotated[float | None, typer.Option("--y", help="add: position, metres.")] = None,
+    x_m: Annotated[
+        float | None, typer.Option("--x", metavar="M", help="add: position in metres.")
+    ] = None,
+    y_m: Annotated[
+        float | None, typer.Option("--y", metavar="M", help="add: position in metres.")
+    ] = None,
     yaw_deg: Annotated[
-        float, typer.Option("--yaw", help="add: direction, degrees from x towards y.")
+        float,
+        typer.Option("--yaw", metavar="DEG", help="add: direction in degrees, from x towards y."),
     ] = 0.0,
     at: Annotated[
-        str | None, typer.Option("--at", metavar="REV", help="list: as of this revision.")
+        str | None, typer.Option("--at", metavar="REV", help="list: read this revision.")
     ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Store poses in a map, or list where they are.
 
-    A goal is stored relative to the nearest node, so it survives merges, downloads and another
-    anchoring. A goal of a name that is there already replaces it.
+    A goal is stored relative to the nearest node, so it survives merges, downloads and new anchors.
+    Adding a goal under an existing name replaces it.
 
     \b
     Examples:
@@ -130,17 +140,24 @@ def _goal_text(one: dict[str, object]) -> str:
 
 def export(
     map_path: options.MapPath,
-    out: Annotated[Path, typer.Argument(metavar="FILE", help="NAME.tum, .kitti, .csv, .geojson.")],
+    out: Annotated[
+        Path, typer.Argument(metavar="FILE", help="NAME.tum, .kitti, .csv or .geojson.")
+    ],
     *,
     form: Annotated[
-        ExportFormat | None, typer.Option("--format", help="Format [default: by FILE's suffix].")
+        ExportFormat | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="tum, kitti, csv or geojson [default: by FILE's suffix].",
+        ),
     ] = None,
     at: options.At = None,
     as_json: options.Json = False,
 ) -> None:
-    """Write where the nodes of a map lie in its frame.
+    """Write the poses of a map's nodes in its frame.
 
-    CSV and GeoJSON hold the goals, too. GeoJSON needs anchors with latitudes and longitudes.
+    CSV and GeoJSON include the goals. GeoJSON needs anchors with latitudes and longitudes.
 
     \b
     Examples:

@@ -15,7 +15,9 @@ from engram.cli import options
 from engram.errors import ConfigError
 
 Revision = Annotated[str, typer.Argument(metavar="REV", help="A revision: 7, a tag, head, head~2.")]
-Message = Annotated[str, typer.Option("--message", "-m", help="Why, for the log.")]
+Message = Annotated[
+    str, typer.Option("--message", "-m", metavar="TEXT", help="The reason, for engram log.")
+]
 # Takes the place of the user's name, or of the robots', as the author of revisions.
 AUTHOR = "ENGRAM_AUTHOR"
 # What a revision is called; all else is the beginning of a node's UUID.
@@ -27,7 +29,7 @@ def log(
     *,
     oneline: Annotated[bool, typer.Option("--oneline", help="Print one line each.")] = False,
     limit: Annotated[
-        int | None, typer.Option("--limit", "-n", min=1, help="Only the newest.")
+        int | None, typer.Option("--limit", "-n", metavar="N", min=1, help="Only the newest N.")
     ] = None,
     at: options.At = None,
     as_json: options.Json = False,
@@ -53,15 +55,15 @@ def log(
 def show(
     map_path: options.MapPath,
     what: Annotated[
-        str, typer.Argument(metavar="[REV|NODE]", help="A revision, or the id of a node.")
+        str, typer.Argument(metavar="REV|NODE", help="A revision, or the id of a node.")
     ] = "head",
     *,
     as_json: options.Json = False,
 ) -> None:
     """Show a revision or a node.
 
-    A revision: who made it, when, with which settings, and what it changed. A node: which robot,
-    session and revision it comes from. The first characters of its id suffice.
+    For a revision: who made it, when, with which settings, and what it changed. For a node: the
+    robot, session and revision it comes from; the first characters of its id are enough.
 
     \b
     Examples:
@@ -104,7 +106,8 @@ def diff(
 ) -> None:
     """Compare two revisions.
 
-    Lists nodes, sessions, metres and hours of day, then every stretch of road that changed.
+    Lists differences in nodes, sessions, metres and hours of day, then every stretch of road that
+    changed.
 
     \b
     Examples:
@@ -123,18 +126,18 @@ def diff(
 def tag(
     map_path: options.MapPath,
     name: Annotated[
-        str | None, typer.Argument(metavar="[NAME]", help="The tag; lists all if omitted.")
+        str | None, typer.Argument(metavar="NAME", help="The tag; without it all tags are listed.")
     ] = None,
     revision: Revision = "head",
     *,
-    move: Annotated[bool, typer.Option("--move", help="Move the tag here.")] = False,
+    move: Annotated[bool, typer.Option("--move", help="Move an existing tag.")] = False,
     delete: Annotated[bool, typer.Option("--delete", help="Delete the tag.")] = False,
     message: Message = "",
     as_json: options.Json = False,
 ) -> None:
     """Name a revision.
 
-    Every --at takes the name.
+    Wherever a revision is expected, as in --at, its tag may be given.
 
     \b
     Examples:

@@ -22,18 +22,24 @@ def live(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", help="Play in real time [default: at once]."),
+        typer.Option(
+            "--rate", metavar="HZ", help="Play at this rate [default: as fast as it goes]."
+        ),
     ] = None,
     socket: Annotated[
         Path | None,
-        typer.Option("--socket", metavar="PATH", help="Listen for a robot's middleware here."),
+        typer.Option(
+            "--socket", metavar="PATH", help="Listen for a robot's middleware at this socket."
+        ),
     ] = None,
     once: Annotated[
-        bool, typer.Option("--once", help="End when the middleware goes away.")
+        bool, typer.Option("--once", help="End when the middleware disconnects.")
     ] = False,
-    name: Annotated[str, typer.Option("--robot", help="Name of the robot.")] = "robot",
+    name: Annotated[
+        str, typer.Option("--robot", metavar="NAME", help="Name of the robot.")
+    ] = "robot",
     maps: Annotated[
-        bool, typer.Option("--map", help="Save what the robot does not recognise.")
+        bool, typer.Option("--map", help="Map what the robot does not recognise.")
     ] = False,
     ranking: options.Ranking = "recall",
     lanes: options.Lanes = 2,
@@ -49,9 +55,9 @@ def live(
 ) -> None:
     """Localise while a robot drives.
 
-    Takes frames from a robot's middleware, such as the ROS 2 bridge, or from a drive that it
-    plays, and prints what it finds as JSON, a line each: where the robot is, whether it is lost,
-    and five times a second that it is alive. The newest frame counts; older ones are dropped.
+    Takes frames from a robot's middleware, such as the ROS 2 bridge, or plays a drive. Prints one
+    line of JSON for each result (where the robot is, or that it is lost) and a status five times a
+    second. The newest frame is used; older ones are dropped.
 
     \b
     Examples:
@@ -63,12 +69,12 @@ def live(
     from engram.robot import RobotOptions, open_drive
     from engram.viewing.viewer import viewer_for
 
-    # Who is told to end commits what it mapped, as after Ctrl-C.
+    # A process that is asked to end commits what it mapped, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if (play is None) == (socket is None):
-        raise ConfigError("give --socket PATH to serve a robot, or --play DRIVE, one of them")
+        raise ConfigError("give either --socket PATH, to serve a robot, or --play DRIVE")
     if rate is not None and (play is None or not rate > 0):
-        raise ConfigError(f"--rate is {rate}: it takes --play DRIVE, and must be > 0 Hz")
+        raise ConfigError(f"--rate {rate}: must be > 0 Hz, and goes with --play DRIVE only")
     asked = RobotOptions(policy=ranking, lanes=lanes, rounds=rounds, deadline_ms=deadline)
     resolved = LiveOptions(map_path, name, maps, settings.read().of_robot(), asked)
     with ExitStack() as stack:

@@ -39,8 +39,8 @@ def info(
 ) -> None:
     """Summarise a map.
 
-    The ids that --sessions and --nodes list are what --near, --route, show and amend take; their
-    first characters suffice.
+    --sessions and --nodes list the ids that --near, --route, show and amend take; the first
+    characters of an id are enough.
 
     \b
     Examples:
@@ -75,7 +75,12 @@ def plot(
     map_path: options.MapPath,
     out: Annotated[Path, typer.Argument(metavar="FILE", help="The picture: .png, .svg, .pdf.")],
     *,
-    by: Annotated[PlotBy, typer.Option("--by", help="What colours mean.")] = PlotBy.EXPERIENCE,
+    by: Annotated[
+        PlotBy,
+        typer.Option(
+            "--by", metavar="WHAT", help="Colours show experience, hour, revision or robot."
+        ),
+    ] = PlotBy.EXPERIENCE,
     at: options.At = None,
 ) -> None:
     """Draw a map from above.
@@ -99,7 +104,7 @@ def check(
     map_path: options.MapPath,
     *,
     clean: Annotated[
-        bool, typer.Option("--clean", help="Remove what abandoned revisions left.")
+        bool, typer.Option("--clean", help="Remove rows that abandoned revisions left behind.")
     ] = False,
     seal: Annotated[
         bool, typer.Option("--seal", help="Commit what interrupted sessions had saved.")
@@ -108,20 +113,20 @@ def check(
         bool, typer.Option("--geometry", help="Look for edges that join different places.")
     ] = False,
     repair: Annotated[
-        bool, typer.Option("--repair", help="Preview their removal; with --yes remove them.")
+        bool, typer.Option("--repair", help="Preview the removal of those edges; --yes commits.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Commit the repair.")] = False,
     pictures: Annotated[
         Path | None,
-        typer.Option("--pictures", metavar="FOLDER", help="Draw both sides of such edges."),
+        typer.Option("--pictures", metavar="DIR", help="Draw both sides of those edges."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Verify a map.
 
-    Compares every byte with its hash, and every edge and path with its nodes. Exits with status 1
-    if anything is wrong. With --geometry it looks for wrong edges instead; a repair is a revision,
-    which revert takes back.
+    Checks every record against its hash, and every edge and path against its nodes. The exit status
+    is 1 if anything is wrong. --geometry looks for wrong edges instead. A repair is a revision that
+    engram revert can undo.
 
     \b
     Examples:
@@ -168,8 +173,8 @@ def _print_check(report: dict[str, Any]) -> None:
         typer.echo(f"{problem['table']} {problem['record']}: {problem['fact']}")
     for session in report["interrupted"]:
         typer.echo(
-            f"session {session} was interrupted: map its drive again to resume it, or keep what "
-            "it has with --seal"
+            f"session {session} was interrupted: map its drive again to resume it, or commit "
+            "what it saved with --seal"
         )
     typer.echo(
         f"{len(report['problems'])} problems in {report['rows']} rows and {report['blobs']} blobs; "
@@ -181,23 +186,28 @@ def amend(
     map_path: options.MapPath,
     session: Annotated[
         str,
-        typer.Argument(metavar="SESSION", help="Its id, or the beginning; see info --sessions."),
+        typer.Argument(
+            metavar="SESSION", help="Its id, or the beginning of it; see info --sessions."
+        ),
     ],
     *,
-    robot: Annotated[str | None, typer.Option("--robot", help="Name of the robot.")] = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="NAME", help="Name of the robot.")
+    ] = None,
     recorded_at: Annotated[
         str | None,
-        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive, ISO 8601, UTC."),
+        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive in ISO 8601, UTC."),
     ] = None,
     zone: Annotated[
-        str | None, typer.Option("--zone", help="Time zone of the drive: Europe/London.")
+        str | None,
+        typer.Option("--zone", metavar="ZONE", help="Time zone of the drive: Europe/London."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Correct a session's robot, start or zone.
 
-    The session's record and all ids stay as they are: the correction is a revision of its own,
-    which revert takes back. The latest one counts.
+    The session's record and all ids stay as they are. The correction is a revision of its own that
+    engram revert can undo; the latest correction counts.
 
     \b
     Examples:
@@ -218,7 +228,7 @@ def amend(
     }
     changes = {what: value for what, value in given.items() if value is not None}
     if not changes:
-        raise InputError("say what is wrong: give --robot, --recorded-at or --zone")
+        raise InputError("nothing to correct: give --robot, --recorded-at or --zone")
     done = amend_session(map_path, session, changes, author=user())
     if as_json:
         print(json.dumps(done))
@@ -230,17 +240,21 @@ def amend(
 
 
 def vocabulary(
-    action: Annotated[VocabularyAction, typer.Argument(help="train, use or show.")],
+    action: Annotated[
+        VocabularyAction, typer.Argument(metavar="ACTION", help="train, use or show.")
+    ],
     map_path: options.MapPath,
     sources: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[SOURCE]...",
+            metavar="SOURCE",
             help="train: maps and drives [default: MAP]; use: the map to copy from.",
         ),
     ] = None,
     *,
-    words: Annotated[int, typer.Option("--words", help="train: number of words.")] = 10_000,
+    words: Annotated[
+        int, typer.Option("--words", metavar="N", help="train: number of words.")
+    ] = 10_000,
     at: Annotated[
         str | None, typer.Option("--at", metavar="REV", help="show: read this revision.")
     ] = None,
@@ -248,8 +262,8 @@ def vocabulary(
 ) -> None:
     """Train, copy or show a map's visual words.
 
-    Visual words find lost robots. A map without its own uses the small vocabulary that Engram
-    ships, which was trained on simulated drives.
+    Visual words find lost robots. A map without its own uses a small vocabulary that comes with
+    Engram and was trained on simulated drives.
 
     \b
     Examples:

@@ -50,7 +50,7 @@ FleetMap: TypeAlias = Annotated[
 ]
 DrivePath: TypeAlias = Annotated[
     Path,
-    typer.Argument(metavar="DRIVE", help="A folder of stereo images, a ROS bag, or a frame log."),
+    typer.Argument(metavar="DRIVE", help="A folder of stereo images, a ROS bag or a frame log."),
 ]
 Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 At: TypeAlias = Annotated[
@@ -59,19 +59,25 @@ At: TypeAlias = Annotated[
 ]
 Ranking: TypeAlias = Annotated[
     str,
-    typer.Option("--ranking", help="Which nodes to try first: recall, path, distance, …"),
+    typer.Option(
+        "--ranking", metavar="NAME", help="Which nodes to try first: recall, path, distance, …"
+    ),
 ]
 Lanes: TypeAlias = Annotated[
-    int, typer.Option("--lanes", min=1, help="Match attempts in parallel (Np).")
+    int, typer.Option("--lanes", metavar="N", min=1, help="Match attempts in parallel (Np).")
 ]
 Rounds: TypeAlias = Annotated[
-    int, typer.Option("--rounds", min=1, help="Rounds of attempts per frame (Nr); 32 when lost.")
+    int,
+    typer.Option(
+        "--rounds", metavar="N", min=1, help="Rounds of attempts per frame (Nr); 32 when lost."
+    ),
 ]
 Relocaliser: TypeAlias = Annotated[
     str,
     typer.Option(
         "--relocaliser",
-        help="Finds a lost robot: fabmap, signature (net), bag-of-words, exhaustive, none.",
+        metavar="NAME",
+        help="How a lost robot is found: fabmap, signature (net), bag-of-words, exhaustive, none",
     ),
 ]
 Descriptor: TypeAlias = Annotated[
@@ -80,20 +86,22 @@ Descriptor: TypeAlias = Annotated[
         "--features",
         "--descriptor",
         metavar="KIND",
-        help="Of a new map or log: engram features list [default: brief].",
+        help="Features of a new map or log; engram features list [default: brief].",
     ),
 ]
 NoThumbnails: TypeAlias = Annotated[
-    bool, typer.Option("--no-thumbnails", help="Store no small pictures for people.")
+    bool, typer.Option("--no-thumbnails", help="Store no small pictures with the nodes.")
 ]
 View: TypeAlias = Annotated[
     str | None,
-    typer.Option("--view", metavar="window|FILE.rrd", help="Watch it in Rerun, or record that."),
+    typer.Option(
+        "--view", metavar="window|FILE.rrd", help="Watch it in Rerun, or write a recording."
+    ),
 ]
 Settings: TypeAlias = Annotated[
     Path | None,
     typer.Option(
-        "--config", metavar="FILE", help="Settings in TOML, or linegar2015, gadd2016 (the papers')."
+        "--config", metavar="FILE", help="A TOML file, or linegar2015 or gadd2016 (the papers')."
     ),
 ]
 
@@ -106,68 +114,109 @@ class Drive:
         str | None,
         typer.Option(
             "--format",
+            metavar="NAME",
             help="kitti, kitti-raw, euroc, tum-vi, robotcar, folder, bag, framelog "
             "[default: detected].",
         ),
     ] = None
     rig: Annotated[
-        str, typer.Option("--rig", metavar="RIG", help="grey or colour cameras.", parser=_british)
+        str,
+        typer.Option(
+            "--rig",
+            metavar="RIG",
+            help="KITTI's cameras: grey or colour.",
+            parser=_british,
+            hidden=True,
+        ),
     ] = "grey"
     channel: Annotated[
         str,
         typer.Option(
             "--channel",
             metavar="CHANNEL",
-            help="Of colour images: grey, red, green, blue.",
+            help="What is taken of colour images: grey, red, green or blue.",
             parser=_british,
+            hidden=True,
         ),
     ] = "grey"
     frames: Annotated[
         str | None,
-        typer.Option("--frames", metavar="START:STOP:STEP", help="Use only these, as in 0:100:2."),
+        typer.Option("--frames", metavar="START:STOP:STEP", help="Only these frames: 0:100:2."),
     ] = None
     skip_bad: Annotated[
-        bool, typer.Option("--skip-bad", help="Skip and count images that cannot be used.")
+        bool,
+        typer.Option("--skip-bad", help="Skip and count unreadable images.", hidden=True),
     ] = False
     robot: Annotated[
-        str | None, typer.Option("--robot", help="Name of the robot [default: the drive's].")
+        str | None,
+        typer.Option("--robot", metavar="NAME", help="Name of the robot [default: the drive's]."),
     ] = None
     recorded_at: Annotated[
         str | None,
-        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive, ISO 8601, UTC."),
+        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive in ISO 8601, UTC."),
     ] = None
     longitude: Annotated[
-        float | None, typer.Option("--longitude", help="Of the drive, degrees east.")
+        float | None,
+        typer.Option(
+            "--longitude", metavar="DEG", help="Degrees east, for solar time.", hidden=True
+        ),
     ] = None
     zone: Annotated[
-        str | None, typer.Option("--zone", help="Time zone of the drive: Europe/London.")
+        str | None,
+        typer.Option("--zone", metavar="ZONE", help="Time zone of the drive: Europe/London."),
     ] = None
     from_: Annotated[
         str | None,
-        typer.Option("--from", metavar="TIME", help="Begin here: seconds, or ISO 8601, UTC."),
+        typer.Option(
+            "--from",
+            metavar="TIME",
+            help="Begin here: seconds into the drive, or ISO 8601, UTC.",
+            hidden=True,
+        ),
     ] = None
-    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="End here.")] = None
+    to: Annotated[
+        str | None, typer.Option("--to", metavar="TIME", help="End here.", hidden=True)
+    ] = None
     calibration: Annotated[
         Path | None,
-        typer.Option("--calibration", metavar="FILE", help="TOML, Kalibr, ROS or OpenCV."),
+        typer.Option("--calibration", metavar="FILE", help="TOML, Kalibr, ROS or OpenCV file."),
     ] = None
     fov: Annotated[
         float | None,
-        typer.Option("--fov", metavar="DEG", help="Width of rectified images [default: largest]."),
+        typer.Option(
+            "--fov",
+            metavar="DEG",
+            help="Field of view of the rectified images [default: the widest].",
+            hidden=True,
+        ),
     ] = None
     mask: Annotated[
         Path | None,
-        typer.Option("--mask", metavar="PNG", help="Black where the robot sees itself."),
+        typer.Option(
+            "--mask",
+            metavar="PNG",
+            help="Image that is black where the robot sees itself.",
+            hidden=True,
+        ),
     ] = None
     left: Annotated[
-        str | None, typer.Option("--left", metavar="TOPIC", help="Of a bag's left images.")
+        str | None,
+        typer.Option("--left", metavar="TOPIC", help="Topic of a bag's left images.", hidden=True),
     ] = None
     right: Annotated[
-        str | None, typer.Option("--right", metavar="TOPIC", help="Of a bag's right images.")
+        str | None,
+        typer.Option(
+            "--right", metavar="TOPIC", help="Topic of a bag's right images.", hidden=True
+        ),
     ] = None
     motion: Annotated[
         list[str] | None,
-        typer.Option("--motion", metavar="TOPIC|FILE", help="Wheels or gyroscope; repeatable."),
+        typer.Option(
+            "--motion",
+            metavar="TOPIC|FILE",
+            help="Wheel odometry or gyroscope; repeatable.",
+            hidden=True,
+        ),
     ] = None
 
     def open(self, path: Path) -> OpenDrive:
@@ -213,17 +262,23 @@ class Effort:
         str | None,
         typer.Option(
             "--ranking",
+            metavar="NAME",
             help="Which nodes to try first: recall, path, distance, … [default: recall].",
         ),
     ] = None
     lanes: Annotated[
         int | None,
-        typer.Option("--lanes", min=1, help="Match attempts in parallel (Np) [default: 2]."),
+        typer.Option(
+            "--lanes", metavar="N", min=1, help="Match attempts in parallel (Np) [default: 2]."
+        ),
     ] = None
     rounds: Annotated[
         int | None,
         typer.Option(
-            "--rounds", min=1, help="Rounds of attempts per frame (Nr); 32 when lost [default: 2]."
+            "--rounds",
+            metavar="N",
+            min=1,
+            help="Rounds of attempts per frame (Nr); 32 when lost [default: 2].",
         ),
     ] = None
 

@@ -18,7 +18,9 @@ class SettingsAction(StrEnum):
 
 
 def settings(
-    action: Annotated[SettingsAction, typer.Argument(help="show.")] = SettingsAction.SHOW,
+    action: Annotated[
+        SettingsAction, typer.Argument(metavar="ACTION", help="show.")
+    ] = SettingsAction.SHOW,
     *,
     given: options.SettingsGiven,
     toml: Annotated[bool, typer.Option("--toml", help="Print a file that --config reads.")] = False,
@@ -26,8 +28,8 @@ def settings(
 ) -> None:
     """Show every setting: value, bounds, meaning.
 
-    Every verb with --config and --set takes these settings. The resolved ones are stored with
-    each revision of a map.
+    Verbs with --config or --set take these settings. The resolved settings are stored with each
+    revision of a map.
 
     \b
     Examples:

@@ -8,7 +8,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from engram.cli import moved
 from engram.cli.agent import agent_group
@@ -21,6 +21,7 @@ from engram.cli.endings import VerbInterruptedError
 from engram.cli.features import features
 from engram.cli.fleet import build, download, merge
 from engram.cli.frame import anchor, export, goal
+from engram.cli.help import Verb
 from engram.cli.history import diff, log, revert, show, tag
 from engram.cli.live import live
 from engram.cli.maps import amend, check, info, plot, vocabulary
@@ -65,7 +66,7 @@ ENTRY_POINTS = "engram.verbs"
 _BROUGHT = "Lab"
 # Characters of a summary: a line of 80 holds it beside the name.
 _SUMMARY = 62
-_RESUMABLE = "interrupted; finished parts are kept, and the same command continues"
+_RESUMABLE = "interrupted; finished parts are kept, and the same command resumes"
 
 
 class Program(TyperGroup):
@@ -108,29 +109,30 @@ def register(app: typer.Typer) -> None:
     """Gives the program its verbs, and those that other installed packages bring."""
     for title, verbs in GROUPS.items():
         for name, verb in verbs.items():
-            app.command(name, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
+            app.command(name, cls=Verb, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
     for title, groups in NESTED.items():
         for name, group in groups.items():
-            _all_tell_of_interruption(group)
+            _prepare(group)
             app.add_typer(group, name=name, rich_help_panel=title)
     for entry in sorted(entry_points(group=ENTRY_POINTS)):
         brought = entry.load()
         if not isinstance(brought, typer.Typer):
             verb = _tells_of_interruption(spread(brought))
-            app.command(entry.name, rich_help_panel=_BROUGHT)(verb)
+            app.command(entry.name, cls=Verb, rich_help_panel=_BROUGHT)(verb)
             continue
-        _all_tell_of_interruption(brought)
+        _prepare(brought)
         app.add_typer(brought, name=entry.name, rich_help_panel=_BROUGHT)
 
 
-def _all_tell_of_interruption(group: typer.Typer) -> None:
+def _prepare(group: typer.Typer) -> None:
     """The same for every verb of a group, and of the groups in it."""
     for command in group.registered_commands:
         assert command.callback is not None
         command.callback = _tells_of_interruption(spread(command.callback), _RESUMABLE)
+        command.cls = command.cls if issubclass(command.cls or TyperCommand, Verb) else Verb
     for inner in group.registered_groups:
         assert inner.typer_instance is not None
-        _all_tell_of_interruption(inner.typer_instance)
+        _prepare(inner.typer_instance)
 
 
 def _tells_of_interruption(

@@ -13,12 +13,14 @@ from engram.cli import options
 def view(
     map_path: options.MapPath,
     path: Annotated[
-        Path | None, typer.Argument(metavar="[DRIVE]", help="A drive to localise in it.")
+        Path | None, typer.Argument(metavar="DRIVE", help="A drive to localise in the map.")
     ] = None,
     *,
     save: Annotated[
         Path | None,
-        typer.Option("--save", metavar="FILE.rrd", help="Write a recording; open no window."),
+        typer.Option(
+            "--save", metavar="FILE.rrd", help="Write a recording instead of opening a window."
+        ),
     ] = None,
     at: options.At = None,
     drive: options.Drive,
@@ -26,9 +28,9 @@ def view(
 ) -> None:
     """Look at a map, and at a drive in it.
 
-    Shows the map from above by experience. With a drive, or a file of the flight recorder: its
-    images with the inliers, the nodes that were tried, where the robot is and how sure. Needs the
-    extra view.
+    Shows the map from above, coloured by experience. With a drive, or a file of the flight
+    recorder, it also shows the images with their inliers, the nodes that were tried, and the
+    robot's position and uncertainty. Needs the extra `view`.
 
     \b
     Examples:
@@ -53,4 +55,4 @@ def view(
                 for _ in robot.drive(sequence, monitor):
                     pass
     if save is not None:
-        typer.echo(f"{save} is written; look at it with rerun {save}")
+        typer.echo(f"wrote {save}; open it with: rerun {save}")

@@ -9,7 +9,8 @@ from engram_lab.cli.town import bench, demo, simulate
 
 lab = typer.Typer(
     name="lab",
-    help="Simulated drives, the papers' experiments, and measurements of maps and speed.",
+    help="Simulated drives, the papers' experiments, measurements.",
+    epilog="Start with: engram lab simulate hamlet",
     no_args_is_help=True,
 )
 lab.command("simulate")(simulate)

@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 def fleet_day(
     *,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where centre, robots and logs go.")
+        Path, typer.Option("--out", metavar="DIR", help="Folder for centre, robots and logs.")
     ] = Path("centre-demo"),
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes that render.")] = 2,
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes that render.")
+    ] = 2,
     serve: Annotated[
-        bool, typer.Option("--serve", help="Leave the centre's pages open afterwards.")
+        bool, typer.Option("--serve", help="Serve the centre's pages afterwards.")
     ] = False,
     as_json: options.Json = False,
 ) -> None:

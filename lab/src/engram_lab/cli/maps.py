@@ -18,7 +18,12 @@ def relocalise(
     path: options.DrivePath,
     *,
     relocaliser: Annotated[
-        str, typer.Option("--relocaliser", help="fabmap, bag-of-words or exhaustive.")
+        str,
+        typer.Option(
+            "--relocaliser",
+            metavar="NAME",
+            help="How a frame is found: fabmap, bag-of-words or exhaustive.",
+        ),
     ] = "fabmap",
     drive: options.Drive,
     lanes: options.Lanes = 2,
@@ -29,7 +34,7 @@ def relocalise(
 ) -> None:
     """Find each frame of a drive by itself.
 
-    Every frame is treated as that of a robot that was just switched on.
+    Every frame is treated as the first one after the robot was switched on.
 
     \b
     Examples:
@@ -67,7 +72,9 @@ def relocalise(
 def places(
     map_path: options.MapPath,
     *,
-    top: Annotated[int, typer.Option("--top", min=1, help="How many pairs to list.")] = 10,
+    top: Annotated[
+        int, typer.Option("--top", metavar="N", min=1, help="How many pairs to list.")
+    ] = 10,
     picture: Annotated[
         Path | None,
         typer.Option("--picture", metavar="FILE", help="Draw how similar all places look."),
@@ -107,11 +114,13 @@ def try_(
         Path, typer.Argument(metavar="FLEET", help="The fleet map.", parser=options.map_file)
     ],
     drives: Annotated[
-        list[Path], typer.Argument(metavar="DRIVE...", help="Drives that the map does not hold.")
+        list[Path],
+        typer.Argument(metavar="DRIVE", help="Held-out drives, which the map does not contain."),
     ],
     *,
     policy: Annotated[
-        str, typer.Option("--select", help="copy, tod, paths, tod+paths or budget.")
+        str,
+        typer.Option("--select", metavar="NAME", help="copy, tod, paths, tod+paths or budget."),
     ] = "copy",
     start: Annotated[
         str | None, typer.Option("--depart", metavar="H:MM", help="When the mission begins.")
@@ -120,10 +129,12 @@ def try_(
         str | None, typer.Option("--arrive", metavar="H:MM", help="When the mission ends.")
     ] = None,
     window: Annotated[
-        float, typer.Option("--window", metavar="MIN", help="tod: how far from the start.")
+        float,
+        typer.Option("--window", metavar="MIN", help="tod: minutes before and after departure."),
     ] = 180.0,
     budget: Annotated[
-        str | None, typer.Option("--budget", metavar="SIZE", help="budget: 200MB or 25%.")
+        str | None,
+        typer.Option("--budget", metavar="SIZE", help="budget: 200MB, or 25% of a full download."),
     ] = None,
     lanes: options.Lanes = 2,
     rounds: options.Rounds = 2,
@@ -131,9 +142,9 @@ def try_(
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
-    """Hold downloads against held-out drives.
+    """Try downloads on held-out drives.
 
-    Each drive is localised in a mission's download and in a full one, beside the forecast.
+    Localises each drive in a mission's download and in a full one, and compares with the forecast.
 
     \b
     Examples:

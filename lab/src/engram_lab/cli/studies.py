@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 evaluate = typer.Typer(
     name="evaluate",
-    help="Redo the papers' experiments on simulated campaigns or your own frame logs.",
+    help="Repeat the papers' experiments on drives.",
+    epilog="Start with: engram lab evaluate ranking hamlet --folds 3",
     no_args_is_help=True,
 )
 
@@ -34,31 +35,45 @@ class _Study:
     drives: Annotated[
         list[str],
         typer.Argument(
-            metavar="CAMPAIGN|LOG…",
+            metavar="CAMPAIGN|LOG",
             help="Rendered campaigns (begbroke, or village@2 for another town seed), or frame "
             "logs of your own, which form one campaign.",
         ),
     ]
-    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard"
-    folds: Annotated[int, typer.Option("--folds", min=2, help="Of the cross-validation.")] = 5
+    size: Annotated[
+        str, typer.Option("--size", metavar="SIZE", help="Of campaigns: standard or full.")
+    ] = "standard"
+    folds: Annotated[
+        int, typer.Option("--folds", metavar="N", min=2, help="Folds of the cross-validation.")
+    ] = 5
     only_folds: Annotated[
         str | None,
-        typer.Option("--only-folds", metavar="N,N…", help="Run these now, numbered from 0 [all]."),
+        typer.Option(
+            "--only-folds", metavar="N,N…", help="Run these folds now, from 0 [default: all]."
+        ),
     ] = None
     seed: Annotated[
-        int, typer.Option("--seed", min=0, help="Of the shuffle of sessions and the bootstrap.")
+        int, typer.Option("--seed", metavar="N", min=0, help="Seed of shuffling and bootstrap.")
     ] = 0
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
+    ] = 2
     report_only: Annotated[
-        bool, typer.Option("--report-only", help="Run nothing; report what was run.")
+        bool, typer.Option("--report-only", help="Report what was run before; run nothing.")
     ] = False
     campaigns: Annotated[
         Path | None,
-        typer.Option("--campaigns", metavar="DIR", help="Where campaigns are rendered."),
+        typer.Option(
+            "--campaigns",
+            metavar="DIR",
+            help="Folder of the campaigns [default: the user's cache].",
+        ),
     ] = None
     work: Annotated[
         Path | None,
-        typer.Option("--work", metavar="DIR", help="Maps and results [default: user's cache]."),
+        typer.Option(
+            "--work", metavar="DIR", help="Folder of maps and results [default: the user's cache]."
+        ),
     ] = None
     config: options.Settings = None
     as_json: options.Json = False
@@ -134,39 +149,49 @@ def ranking(
     study: _Study,
     policies: Annotated[
         str | None,
-        typer.Option("--policies", metavar="NAME,NAME…", help="Only these [default: all]."),
+        typer.Option("--policies", metavar="NAME,NAME…", help="Ranking policies [default: all]."),
     ] = None,
     lanes: Annotated[
         str | None,
         typer.Option(
             "--lanes",
             metavar="N,N…",
-            help="Np; 0 for as many as there are candidates [default: 1,2,3,4,6,8,12,16,0].",
+            help="Values of Np; 0: all candidates [default: 1,2,3,4,6,8,12,16,0].",
         ),
     ] = None,
     rounds: Annotated[
-        str, typer.Option("--rounds", metavar="N,N…", help="Nr; the first for all policies.")
+        str,
+        typer.Option("--rounds", metavar="N,N…", help="Values of Nr; the first for all policies."),
     ] = "1,2",
     map_sizes: Annotated[
         bool,
-        typer.Option("--map-sizes/--no-map-sizes", help="Run earlier revisions too (Fig. 9)."),
+        typer.Option(
+            "--map-sizes/--no-map-sizes", help="Also localise in earlier revisions (Fig. 9)."
+        ),
     ] = True,
     live_folds: Annotated[
         int,
-        typer.Option("--live-folds", min=0, help="Folds also run as on a robot, timed."),
+        typer.Option(
+            "--live-folds",
+            metavar="N",
+            min=0,
+            help="Folds that are also run in real time, and timed.",
+        ),
     ] = 1,
-    relocaliser: Annotated[str, typer.Option("--relocaliser", help="For lost robots.")] = "none",
+    relocaliser: Annotated[
+        str, typer.Option("--relocaliser", metavar="NAME", help="How lost robots are found.")
+    ] = "none",
     redo: Annotated[
         str | None,
         typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again."),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
-        "results/ranking"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for tables and figures.")
+    ] = Path("results/ranking"),
 ) -> None:
     """Compare ranking policies by cross-validation.
 
-    The same command resumes a run that was stopped; adding policies or lanes runs only those.
+    The same command resumes a run that was stopped; added policies or lanes are run alone.
 
     \b
     Examples:
@@ -218,34 +243,42 @@ def fleet(
         typer.Option(
             "--arms",
             metavar="X,X…",
-            help="A: distance, 8 attempts a frame; B: recall, 8 attempts; C: all candidates; "
-            "P: A, but every match omits, as in the paper.",
+            help="A: distance, 8 attempts per frame; B: recall, 8 attempts; C: all candidates; "
+            "P: A, but every match omits its node, as in the paper.",
         ),
     ] = "A,B,C",
     experiments: Annotated[
-        str, typer.Option("--experiments", metavar="N,N…", help="Figures of Checkout My Map.")
+        str,
+        typer.Option("--experiments", metavar="N,N…", help="Figures of Gadd and Newman (2016)."),
     ] = "7,8,9,10",
     groups: Annotated[
         str,
         typer.Option(
-            "--groups", metavar="N,N…", help="Of the parallel build; further ones on one fold."
+            "--groups",
+            metavar="N,N…",
+            help="Groups of the parallel build; all but the first on one fold.",
         ),
     ] = "4,2,8",
     tried: Annotated[
         int | None,
         typer.Option(
-            "--tried", min=1, metavar="N", help="Held-out drives a fold for downloads [all]."
+            "--tried",
+            min=1,
+            metavar="N",
+            help="Held-out drives per fold for downloads [default: all].",
         ),
     ] = None,
-    relocaliser: Annotated[str, typer.Option("--relocaliser", help="For lost robots.")] = "fabmap",
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Tables and figures.")] = Path(
-        "results/fleet"
-    ),
+    relocaliser: Annotated[
+        str, typer.Option("--relocaliser", metavar="NAME", help="How lost robots are found.")
+    ] = "fabmap",
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for tables and figures.")
+    ] = Path("results/fleet"),
 ) -> None:
     """Measure merging, sharing and downloads.
 
-    The experiments of Gadd and Newman by cross-validation. The same command resumes a run that was
-    stopped, map by map and drive by drive.
+    Runs the experiments of Gadd and Newman (2016) with cross-validation. The same command resumes
+    a run that was stopped.
 
     \b
     Examples:
@@ -304,7 +337,7 @@ def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -
     for name in again:
         if name not in policies:
             raise ConfigError(
-                f"--redo {name!r}: is not among the policies of this run ({', '.join(policies)})"
+                f"--redo {name!r}: not among the policies of this run ({', '.join(policies)})"
             )
     return again
 
@@ -312,23 +345,27 @@ def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -
 @evaluate.command("faults")
 def faults(
     *,
-    trials: Annotated[int, typer.Option("--trials", min=1, help="How many in all.")] = 1000,
+    trials: Annotated[
+        int, typer.Option("--trials", metavar="N", min=1, help="How many trials in all.")
+    ] = 1000,
     report_only: Annotated[
-        bool, typer.Option("--report-only", help="Run nothing; report what was run.")
+        bool, typer.Option("--report-only", help="Report what was run before; run nothing.")
     ] = False,
     work: Annotated[
         Path | None,
-        typer.Option("--work", metavar="FILE", help="Results [default: in the user's cache]."),
+        typer.Option(
+            "--work", metavar="FILE", help="File of the results [default: in the user's cache]."
+        ),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The matrix, Markdown.")
+        Path, typer.Option("--out", metavar="FILE", help="The table, in Markdown.")
     ] = Path("results/faults.md"),
     as_json: options.Json = False,
 ) -> None:
     """Inject faults into drives; count false fixes.
 
-    Drives of rendered clips (python -m engram_lab.studies.faults.clips) are localised in maps of
-    other days. The same command resumes a run that was stopped.
+    Localises rendered clips (python -m engram_lab.studies.faults.clips) in maps of other
+    days. The same command resumes a run that was stopped.
 
     \b
     Examples:

@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 def demo(
     *,
     out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="Where logs, map and pictures go.")
+        Path, typer.Option("--out", metavar="DIR", help="Folder for logs, map and pictures.")
     ] = Path("demo"),
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes that render.")] = 2,
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes that render.")
+    ] = 2,
     as_json: options.Json = False,
 ) -> None:
     """Drive a small simulated town with two robots.
@@ -81,28 +83,36 @@ def _show(report: DemoReport) -> None:
 def simulate(
     campaign: Annotated[
         str,
-        typer.Argument(help="hamlet, village, begbroke, keble, oxford or begbroke24h."),
+        typer.Argument(
+            metavar="CAMPAIGN", help="hamlet, village, begbroke, keble, oxford or begbroke24h."
+        ),
     ],
     *,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Where to [default: the user's cache]."),
+        typer.Option(
+            "--out", metavar="DIR", help="Folder to write to [default: the user's cache]."
+        ),
     ] = None,
-    size: Annotated[str, typer.Option("--size", help="standard or full.")] = "standard",
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the town.")] = 1,
+    size: Annotated[
+        str, typer.Option("--size", metavar="SIZE", help="standard or full.")
+    ] = "standard",
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the town.")] = 1,
     images: Annotated[
-        bool, typer.Option("--images", help="Images in KITTI's layout instead of frame logs.")
+        bool, typer.Option("--images", help="Write images in KITTI's layout instead of frame logs.")
     ] = False,
     sessions: Annotated[
         str | None, typer.Option("--sessions", metavar="N,N…", help="Only these drives.")
     ] = None,
-    workers: Annotated[int, typer.Option("--workers", min=1, help="Processes.")] = 2,
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
+    ] = 2,
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
     """Render drives through a simulated town.
 
-    Exact truth is written beside each drive. The same command resumes a run that was stopped.
+    The exact poses are written beside each drive. The same command resumes a run that was stopped.
 
     \b
     Examples:
@@ -135,17 +145,21 @@ def bench(
     only: Annotated[
         str | None, typer.Option("--only", metavar="STAGES", help="Stages, joined by commas.")
     ] = None,
-    repeats: Annotated[int, typer.Option("--repeats", min=1, help="Runs of each stage.")] = 200,
+    repeats: Annotated[
+        int, typer.Option("--repeats", metavar="N", min=1, help="Runs of each stage.")
+    ] = 200,
     against: Annotated[
         Path | None,
-        typer.Option("--against", metavar="CHECKOUT", help="Another checkout, built in place."),
+        typer.Option(
+            "--against", metavar="CHECKOUT", help="Compare with this checkout, built in place."
+        ),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Time each stage beside plain OpenCV, or beside another checkout.
+    """Time each stage beside plain OpenCV.
 
     Everything runs on one core, in memory, each stage interleaved with its reference. With
-    --against both checkouts run in blocks that alternate between two processes.
+    --against, another checkout is the reference: both run in alternating blocks, in two processes.
 
     \b
     Examples:
