@@ -43,7 +43,7 @@ ROS := .venv-ros
 test-ros: setup
 	test -x $(ROS)/bin/python || $(PYTHON) -m venv $(ROS)
 	$(ROS)/bin/python -m pip install --quiet -r ros/test-requirements.txt
-	ros/build_messages $(ROS)
+	PATH=$(abspath $(BIN)):$$PATH ros/build_messages $(ROS)
 	ENGRAM_ROS_PYTHON=$(abspath $(ROS))/bin/python $(BIN)/python -m pytest tests/live/test_ros.py
 
 # PostgreSQL of this machine, in a folder of its own, for the length of the run.
