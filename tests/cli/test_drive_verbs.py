@@ -11,6 +11,7 @@ import pytest
 from tests.sequences.bag_maker import StereoBag, bag, rectified_infos
 
 from engram.calibration import read_calibration
+from engram.geometry import StereoCamera
 from engram.sequences import open_sequence
 
 
@@ -92,3 +93,18 @@ def test_a_damaged_bag_is_used_and_told_by_the_exit_status(engram, street_bag, t
     assert ran.status == 3
     assert "the bag is damaged; what could be read was used" in ran.err
     assert "nodes saved" in ran.out
+
+
+def test_a_damaged_bag_that_cannot_be_mapped_says_what_was_lost(engram, tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    pairs = [
+        (10**18 + number * 10**8, *rng.integers(0, 256, (2, 120, 160), np.uint8))
+        for number in range(40)
+    ]
+    infos = rectified_infos(StereoCamera(100.0, 100.0, 80.0, 60.0, 0.1, 160, 120))
+    StereoBag(pairs, infos).write(tmp_path / "noise", "ros1")
+    os.truncate(tmp_path / "noise.bag", 1_000_000)
+    ran = engram("map", tmp_path / "town.engram", tmp_path / "noise.bag")
+    assert ran.status == 4, ran.err
+    assert "the bag is damaged:" in ran.err
+    assert "is lost: the file is cut short" in ran.err

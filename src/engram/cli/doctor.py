@@ -47,7 +47,7 @@ def doctor(
       engram doctor drives/monday --json --pictures looks
       engram doctor drives/monday --hours --zone Europe/London
     """
-    from engram.cli.losses import tell_losses
+    from engram.cli.losses import losses_told
     from engram.cli.progress import Bars
     from engram.robot import examine_drive
     from engram.sequences import LoggedFrame
@@ -55,21 +55,21 @@ def doctor(
     sequence = dataclasses.replace(drive, skip_bad=True).open(path)
     resolved = settings.read().of_robot()
     most = min(len(sequence), resolved.doctor.frames)
-    with Bars().stage("doctor", most) as monitor:
-        pairs: list[StereoPair] = []
+    with losses_told(sequence):
+        with Bars().stage("doctor", most) as monitor:
+            pairs: list[StereoPair] = []
 
-        def keep(number: int, arrived: Arrived) -> None:
-            wanted = number * _PICTURES // max(most, 1) == len(pairs)
-            if pictures is not None and wanted and not isinstance(arrived, LoggedFrame):
-                pairs.append(arrived)
+            def keep(number: int, arrived: Arrived) -> None:
+                wanted = number * _PICTURES // max(most, 1) == len(pairs)
+                if pictures is not None and wanted and not isinstance(arrived, LoggedFrame):
+                    pairs.append(arrived)
 
-        diagnosis = examine_drive(sequence, resolved, monitor, by_hour=hours, seen=keep)
-    if pictures is not None:
-        _draw(pictures, pairs)
-    print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
-    if diagnosis.fatal:
-        raise typer.Exit(EXIT_UNFIT_DRIVE)
-    tell_losses(sequence)
+            diagnosis = examine_drive(sequence, resolved, monitor, by_hour=hours, seen=keep)
+        if pictures is not None:
+            _draw(pictures, pairs)
+        print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
+        if diagnosis.fatal:
+            raise typer.Exit(EXIT_UNFIT_DRIVE)
 
 
 def _draw(folder: Path, pairs: list[StereoPair]) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engram.cli import options
-from engram.cli.losses import tell_losses
+from engram.cli.losses import losses_told
 from engram.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -54,22 +54,22 @@ def map_(
     given = settings.read()
     asked = RobotOptions(**effort.over(given), force=force)
     resolved = _for_people(given.of_robot(descriptor), no_thumbnails)
-    with viewer_for(view) as viewer, Bars().stage("map", len(sequence)) as monitor:
+    with losses_told(sequence):
+        with viewer_for(view) as viewer, Bars().stage("map", len(sequence)) as monitor:
 
-        def begin(begun: Beginning) -> None:
-            if viewer is not None:
-                viewer.watch(begun.robot, begun.opened)
+            def begin(begun: Beginning) -> None:
+                if viewer is not None:
+                    viewer.watch(begun.robot, begun.opened)
 
-        report = map_drive(map_path, sequence, resolved, asked, monitor, begin, descriptor)
-    if as_json:
-        print(json.dumps(report.to_dict()))
-    else:
-        for warning in warnings(report.to_dict()):
-            typer.echo(warning, err=True)
-        typer.echo(mapped_text(report.to_dict(), map_path))
-    if report.interrupted:
-        raise typer.Exit(130)
-    tell_losses(sequence)
+            report = map_drive(map_path, sequence, resolved, asked, monitor, begin, descriptor)
+        if as_json:
+            print(json.dumps(report.to_dict()))
+        else:
+            for warning in warnings(report.to_dict()):
+                typer.echo(warning, err=True)
+            typer.echo(mapped_text(report.to_dict(), map_path))
+        if report.interrupted:
+            raise typer.Exit(130)
 
 
 def localise(
@@ -148,9 +148,8 @@ def localise(
         outputs = Outputs(
             trajectory, pictures, rate, as_json, remember, recorder, not no_images, view
         )
-        with open_map(map_path, at) as opened:
+        with losses_told(sequence), open_map(map_path, at) as opened:
             localise_and_print(opened, sequence, resolved, asked, outputs)
-        tell_losses(sequence)
         return
     refused = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
@@ -185,15 +184,15 @@ def record(
     from engram.robot import extract_log
 
     sequence, resolved = drive.open(path), settings.read().of_robot(descriptor)
-    with Bars().stage("record", len(sequence)) as monitor:
-        report = extract_log(sequence, out, resolved, monitor)
-    if as_json:
-        print(json.dumps(report.to_dict()))
-    else:
-        typer.echo(report.text())
-    if report.interrupted:
-        raise typer.Exit(130)
-    tell_losses(sequence)
+    with losses_told(sequence):
+        with Bars().stage("record", len(sequence)) as monitor:
+            report = extract_log(sequence, out, resolved, monitor)
+        if as_json:
+            print(json.dumps(report.to_dict()))
+        else:
+            typer.echo(report.text())
+        if report.interrupted:
+            raise typer.Exit(130)
 
 
 def _for_people(settings: Settings, no_thumbnails: bool) -> Settings:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import typer
+
+from engram.cli.endings import VerbInterruptedError
+from engram.errors import EngramError
 
 if TYPE_CHECKING:
     from engram.sequences import Drive
@@ -12,20 +17,34 @@ if TYPE_CHECKING:
 EXIT_DAMAGED = 3
 
 
-def tell_losses(sequence: Drive) -> None:
-    """Says on stderr how a bag's images were paired, and what could not be read.
+@contextmanager
+def losses_told(sequence: Drive) -> Iterator[None]:
+    """Around what a verb does with a drive: says on stderr what of a bag could not be read.
+
+    A verb that fails keeps its exit status: a loss may be the reason.
 
     Raises:
         Exit: parts of the bag were lost; what could be read was used.
     """
+    try:
+        yield
+    except (EngramError, VerbInterruptedError, typer.Exit):
+        _told(sequence, "the bag is damaged:")
+        raise
+    if _told(sequence, "the bag is damaged; what could be read was used:"):
+        raise typer.Exit(EXIT_DAMAGED)
+
+
+def _told(sequence: Drive, heading: str) -> bool:
+    """Says how a bag's images were paired, and what was lost; whether anything was."""
     from engram.sequences import BagSequence
 
     if not isinstance(sequence, BagSequence):
-        return
+        return False
     if sequence.pairing.left:
         typer.echo(sequence.pairing.text(), err=True)
     if sequence.lost:
-        typer.echo("the bag is damaged; what could be read was used:", err=True)
+        typer.echo(heading, err=True)
         for loss in sequence.lost:
             typer.echo(f"  {loss}", err=True)
-        raise typer.Exit(EXIT_DAMAGED)
+    return bool(sequence.lost)
