@@ -11,8 +11,8 @@ __all__ = ["engram"]
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--policies", "distance", "--redo", "path"), "--redo 'path': is not among the policies"),
-        (("--redo", "nonsense"), "--redo 'nonsense': is not among the policies"),
+        (("--policies", "distance", "--redo", "path"), "--redo 'path': not among the policies"),
+        (("--redo", "nonsense"), "--redo 'nonsense': not among the policies"),
         (("--redo", "path", "--report-only"), "--report-only runs nothing"),
         (("--policies", "distanec"), "no ranking policy 'distanec'"),
         (("--only-folds", "5"), "5"),
