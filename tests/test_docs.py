@@ -356,12 +356,9 @@ def sections_of_the_method() -> dict[str, str]:
 
 
 def cited_sections(text: str) -> Iterator[tuple[str, str]]:
-    """Section and item of citations such as "SPEC §3.6, §4", "SPEC §2.1–2.3", "SPEC §7 MERGE 3"."""
-    for numbers, merge in re.findall(
-        r"SPEC §(\d[\d.]*(?:(?:, §|–)\d[\d.]*)*)(?: MERGE (\d))?", text
-    ):
-        for section, item in re.findall(r"(\d+)(?:\.(\d+))?", numbers):
-            yield section, item or merge
+    """Section and item of citations such as "method §3.6, §4" and "method §2.1–2.3"."""
+    for numbers in re.findall(r"method §(\d[\d.]*(?:(?:, §|–)\d[\d.]*)*)", text):
+        yield from re.findall(r"(\d+)(?:\.(\d+))?", numbers)
 
 
 def test_every_section_that_is_cited_is_in_the_method() -> None:
@@ -376,7 +373,7 @@ def test_every_section_that_is_cited_is_in_the_method() -> None:
     ]
     assert len(cited) > 100  # the pattern still meets them
     for path, section, item in cited:
-        where = f"{path.relative_to(ROOT)}: SPEC §{section}"
+        where = f"{path.relative_to(ROOT)}: method §{section}"
         assert section in sections, where
         assert not item or re.search(rf"^{item}\. ", sections[section], re.M), f"{where}.{item}"
 

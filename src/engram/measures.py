@@ -1,4 +1,4 @@
-"""Measures of a map's quality: how often and how far a robot drives without a match (SPEC §8).
+"""Measures of a map's quality: how often and how far a robot drives without a match (method §8).
 
 All are pure functions of two arrays per session, one row per live frame: the odometry distance of
 the step that ends in the frame, and whether the frame was matched.
@@ -26,8 +26,8 @@ class Estimator(StrEnum):
 
 
 # What is shown beside every figure; g is the distance between two successive matches, d the
-# distance from the first frame without a match to the next one with. Source: SPEC §8; `reacquired`
-# is the measure of [G16] §VI-B: "after becoming lost, before reacquiring".
+# distance from the first frame without a match to the next one with. Source: method §8;
+# `reacquired` is the measure of [G16] §VI-B: "after becoming lost, before reacquiring".
 FORMULAS = {
     Estimator.ROUTE: "(1/L) Σ max(0, g − x)",
     Estimator.GAP: "#{g ≥ x} / #{g}",
@@ -95,7 +95,7 @@ class Gaps:
 
 
 def gaps(drives: Sequence[Drive]) -> Gaps:
-    """All gaps of the given sessions. Source: SPEC §8."""
+    """All gaps of the given sessions. Source: method §8."""
     lengths: list[float] = []
     failed: list[bool] = []
     lost_m: list[float] = []
@@ -166,7 +166,7 @@ def route_m(drives: Sequence[Drive]) -> float:
 
 
 def route_not_localised(drives: Sequence[Drive]) -> float:
-    """Share of the route whose steps end without an accepted match. Source: SPEC §8."""
+    """Share of the route whose steps end without an accepted match. Source: method §8."""
     length_m = route_m(drives)
     missed_m = sum(float(drive.step_m[~drive.matched].sum()) for drive in drives)
     return missed_m / length_m if length_m else 0.0

@@ -164,7 +164,7 @@ class _Drive:
         return own & (step - graph.driven_m < 30)
 
     def _places(self, step: int, world_from_live: SE3):
-        """What place recognition finds while saving (SPEC §5): large loops close by it."""
+        """What place recognition finds while saving (method §5): large loops close by it."""
         positions = self.fleet.positions[: len(self.fleet.graph)]
         offsets = np.linalg.norm(positions - world_from_live.translation, axis=1)
         return np.flatnonzero((offsets < MATCH_BASIN_M) & ~self._own_recent(step))

@@ -1,4 +1,4 @@
-"""Hour of day (SPEC §2.8)."""
+"""Hour of day (method §2.8)."""
 
 from datetime import UTC, datetime
 

@@ -1,4 +1,4 @@
-"""The neighbourhood sees every experience of a place, whatever the edges look like (SPEC §3.1)."""
+"""The neighbourhood sees every experience of a place, however the edges look (method §3.1)."""
 
 import numpy as np
 import pytest

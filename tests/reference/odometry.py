@@ -99,7 +99,7 @@ class Window:
             keyframe_from_newest and its (6, 6) float64 covariance; those of `match` if the
             landmarks do not determine the window.
 
-        Source: SPEC §2.4.
+        Source: method §2.4.
         """
         assert self._newest is not None
         assert match.reference_from_live is not None
@@ -217,7 +217,7 @@ class Odometry:
 
         Raises:
 
-        Source: SPEC §2.4; [G16] §III-A.
+        Source: method §2.4; [G16] §III-A.
         """
         if frame.status is not FrameStatus.OK:
             return OdometryStep(OdometryStatus.UNUSABLE_FRAME)

@@ -1,4 +1,4 @@
-"""How right the poses of successes are (SPEC §8)."""
+"""How right the poses of successes are (method §8)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from engram.errors import InputError
 from engram.geometry import SE3
 
-# A success with a greater error is a false one. Source: SPEC §8.
+# A success with a greater error is a false one. Source: method §8.
 FALSE_BEYOND_M = 1.0
 FALSE_BEYOND_RAD = float(np.deg2rad(5.0))
 
@@ -30,7 +30,7 @@ class PoseErrors:
 
     @property
     def false(self) -> NDArray[np.bool_]:
-        """(N,) bool: more than 1 m or 5° off. Source: SPEC §8."""
+        """(N,) bool: more than 1 m or 5° off. Source: method §8."""
         return (self.offset_m > FALSE_BEYOND_M) | (self.turn_rad > FALSE_BEYOND_RAD)
 
 

@@ -1,4 +1,4 @@
-"""Failure curves by session, and confidence intervals by bootstrap over sessions (SPEC §8).
+"""Failure curves by session, and confidence intervals by bootstrap over sessions (method §8).
 
 Frames of one session share its light, weather and driving line, so that sessions, not frames, are
 what is drawn again. Every measure here is a ratio of sums over sessions (metres without a match ÷
@@ -26,7 +26,7 @@ Statistic: TypeAlias = Callable[[Array], Array]
 LEVEL = 0.9
 
 
-# Source: SPEC §8: P_A ≤ P_B up to 20 m, and A's longest gap at most 1.5 times B's.
+# Source: method §8: P_A ≤ P_B up to 20 m, and A's longest gap at most 1.5 times B's.
 _UP_TO_M = 20.0
 _STEP_M = 0.5
 _LONGEST_GAP_RATIO = 1.5
@@ -158,7 +158,7 @@ def not_localised_sums(drives: Sequence[Drive]) -> SessionSums:
 
 
 def beats(a: Sequence[Drive], b: Sequence[Drive]) -> bool:
-    """Whether A beats B (SPEC §8); equal results beat each other.
+    """Whether A beats B (method §8); equal results beat each other.
 
     A's failure curve is nowhere above B's up to 20 m, and its longest gap is at most 1.5 times B's.
     """

@@ -1,7 +1,7 @@
 """Downloads tried out: what they promised beside what then happened on held-out drives.
 
 The mission of each trial is that of the drive itself: its date and its hour of day.
-Source: [G16] Fig. 9 (nodes, time per localisation, failure); SPEC §7 (the forecast).
+Source: [G16] Fig. 9 (nodes, time per localisation, failure); method §7 (the forecast).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-// Least uncertain chains through an experience graph (SPEC §3.1).
+// Least uncertain chains through an experience graph (method §3.1).
 //
 // The error of an edge is a small rotation of variance v (rad², any axis) about a pivot, and a small
 // translation of variance tau (m², any axis). Along a chain these add up, seen at a point p, to

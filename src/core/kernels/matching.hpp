@@ -17,7 +17,7 @@ struct Glance {
 
 ENGRAM_DECLARE_KERNELS(
     // Pairs that are each other's nearest descriptor, distinctly so, among landmarks whose patches
-    // could be of one size in the world (SPEC §2.6). With a glance, every `glance_share`-th landmark
+    // could be of one size in the world (method §2.6). With a glance, every `glance_share`-th landmark
     // of the reference is compared first; returns whether these sufficed.
     bool match_all(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
                    std::vector<RowPair> &pairs, const Glance *glance);

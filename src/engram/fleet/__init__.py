@@ -1,1 +1,1 @@
-"""The fleet: many robots, one centre (SPEC §7): merging, downloading, building."""
+"""The fleet: many robots, one centre (method §7): merging, downloading, building."""

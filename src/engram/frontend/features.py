@@ -106,7 +106,7 @@ class FeatureKind:
 
 
 def detect_corners(pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
-    """FAST corners with a disparity, the best of each cell of a grid first (SPEC §2.1–2.3)."""
+    """FAST corners with a disparity, the best of each cell of a grid first (method §2.1–2.3)."""
     return _corners(pair, config, landmarks, with_brief=False)
 
 

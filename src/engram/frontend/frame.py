@@ -38,7 +38,7 @@ class StereoPair:
 
 
 class FrameStatus(StrEnum):
-    """Whether a frame is usable (SPEC §5: unusable frames are never saved)."""
+    """Whether a frame is usable (method §5: unusable frames are never saved)."""
 
     OK = "ok"
     DARK = "dark"

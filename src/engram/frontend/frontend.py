@@ -1,4 +1,4 @@
-"""Stereo pair → `Frame` (SPEC §2.1–2.3)."""
+"""Stereo pair → `Frame` (method §2.1–2.3)."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class FrontendConfig:
             Source: scatter of disparities between successive frames of KITTI raw drive 0001. The
             matcher adds the effects of slanted surfaces and of the camera's common disparity
             offset (`MatcherConfig`).
-        min_landmarks: fewest landmarks of a usable frame; a match needs 20 inliers (SPEC §3), and
+        min_landmarks: fewest landmarks of a usable frame; a match needs 20 inliers (method §3), and
             rarely more than half of the landmarks are inliers.
         dark_mean: mean grey level below which an unusable frame counts as dark, not covered.
         thumbnails: whether frames carry a small picture for people.

@@ -41,7 +41,7 @@ class MatcherConfig:
         same_corner_px: a candidate this close to the best one is the same corner in another
             octave, not a rival.
         octave_scale: size ratio of successive octaves of the front-end.
-        patch_ratio: largest ratio of the metric sizes of two compared patches (SPEC §2.6). BRIEF
+        patch_ratio: largest ratio of the metric sizes of two compared patches (method §2.6). BRIEF
             tolerates a change of scale of about 1.5; the rest allows for slanted surfaces. Depth
             uncertainty widens it.
         pixel_sigma_px: standard deviation of a corner's pixel at full resolution, one axis, between
@@ -66,7 +66,7 @@ class MatcherConfig:
         glance_share, glance_samples, glance_consensus, glance_inliers: see their descriptions.
         confidence: stop drawing once a better pose is less likely than one minus this.
         max_view_angle_rad: largest angle between the optical axes of a valid pose: the view gate of
-            SPEC §3.1 with a margin. Beyond it images overlap only at their edges.
+            method §3.1 with a margin. Beyond it images overlap only at their edges.
         second_pass: search once more, guided by the pose found.
     """
 
@@ -181,7 +181,7 @@ def match_frames(
         IncompatibleError: the frames have different kinds of descriptors.
         InputError: a prediction without covariance, or the reverse.
 
-    Source: SPEC §2.4–2.6.
+    Source: method §2.4–2.6.
     """
     check_same_kind(reference, live)
     if (predicted is None) != (predicted_covariance is None):
@@ -208,7 +208,7 @@ def matcher_hash(config: MatcherConfig) -> str:
 
 
 def pair_seed(a: UUID, b: UUID) -> int:
-    """The seed for matching two frames, from their UUIDs (SPEC §3.2); (b, a) gives another."""
+    """The seed for matching two frames, from their UUIDs (method §3.2); (b, a) gives another."""
     digest = hashlib.blake2b(a.bytes + b.bytes, digest_size=8).digest()
     return int.from_bytes(digest, "little")
 

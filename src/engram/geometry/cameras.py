@@ -1,4 +1,4 @@
-"""Rectified stereo cameras, identified by a hash of their calibration (SPEC §2.6)."""
+"""Rectified stereo cameras, identified by a hash of their calibration (method §2.6)."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class StereoCamera:
     ) -> NDArray[np.float32]:
         """Points (N, 3) in the camera frame, m, from left pixels (N, 2) and disparities (N,), px.
 
-        Source: SPEC §2.3, ``z = fx·b/d``.
+        Source: method §2.3, ``z = fx·b/d``.
         """
         depth_m = self.focal_baseline / disparity_px.astype(np.float64)
         points = np.empty((len(pixels), 3), dtype=np.float32)

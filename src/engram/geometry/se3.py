@@ -170,7 +170,7 @@ class SE3:
     def yaw_rad(self) -> float:
         """Heading of the source's optical axis in the target's x-z plane, radians, right positive.
 
-        Camera axes are x right, y down, z forward (SPEC §1), so this is the turn about y.
+        Camera axes are x right, y down, z forward (method §1), so this is the turn about y.
         """
         return float(np.arctan2(self.rotation[0, 2], self.rotation[2, 2]))
 

@@ -1,4 +1,4 @@
-"""Remembered attempts (SPEC §3.5) as one struct of arrays."""
+"""Remembered attempts (method §3.5) as one struct of arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The match basin: how far apart two views may be and still match (SPEC §3.1)."""
+"""The match basin: how far apart two views may be and still match (method §3.1)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _COMPATIBLE_ITERATIONS = 10
 
 
 def prior_basin_m(focal_px: float) -> float:
-    """Shipped prior of the basin: 2 m for f = 256 px, 8 m for f = 707 px (SPEC §3.1), a power law.
+    """Shipped prior of the basin, a power law: 2 m for f = 256 px, 8 m for 707 px (method §3.1).
 
     Raises:
         InputError: the focal length is not finite and positive.

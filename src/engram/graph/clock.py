@@ -1,4 +1,4 @@
-"""Hour of day at a stamp (SPEC §2.8)."""
+"""Hour of day at a stamp (method §2.8)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     Mean solar time (UTC + longitude / 15) if a longitude is known, else civil time of the zone.
     None for a clock that is not UTC, and without longitude and zone.
 
-    Source: SPEC §2.8.
+    Source: method §2.8.
     """
     if source.clock is not Clock.UTC:
         return None

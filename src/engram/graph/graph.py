@@ -494,13 +494,13 @@ class ExperienceGraph:
         covariance: NDArray[np.float64],
         search: Search,
     ) -> Neighbourhood:
-        """The candidates Y near the live camera (SPEC §3.1).
+        """The candidates Y near the live camera (method §3.1).
 
         The search follows edges from the reference, least uncertain chain first, through every node
         within `margin_m` beyond the radius (or beyond the reference, if that is farther).
-        Breadth-first search, as in SPEC, takes the chain with the fewest edges; if a few uncertain
-        proximity edges compete with many certain odometry edges, its predictions are as bad as the
-        worst edge.
+        Breadth-first search ([G16] §III-A) takes the chain with the fewest edges; if a few
+        uncertain proximity edges compete with many certain odometry edges, its predictions are as
+        bad as the worst edge.
 
         Certain chains end at the reach; an uncertain one, through a gap of odometry, may wrongly
         lead back into it. For nodes reached by an uncertain chain the search looks for a better

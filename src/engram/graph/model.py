@@ -1,4 +1,4 @@
-"""The records of a map: sessions, nodes, edges, paths, attempts (SPEC §1). Immutable."""
+"""The records of a map: sessions, nodes, edges, paths, attempts (method §1). Immutable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ENGRAM_NAMESPACE = UUID("6f1d1f0e-27e5-5c0e-9d6b-3c8a5c1e7a10")
 
 
 class Clock(StrEnum):
-    """Clock of a session's stamps (SPEC §2.8)."""
+    """Clock of a session's stamps (method §2.8)."""
 
     UTC = "utc"
     RELATIVE = "relative"
@@ -126,7 +126,7 @@ class Node:
 
 
 class EdgeKind(StrEnum):
-    """Origin of an edge (SPEC §1, §3.1)."""
+    """Origin of an edge (method §1, §3.1)."""
 
     ODOMETRY = "odometry"
     MATCH = "match"
@@ -155,7 +155,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Omission:
-    """A node that a merge left out, as the map already shows its place alike (SPEC §7).
+    """A node that a merge left out, as the map already shows its place alike (method §7).
 
     Attributes:
         omitted: the node that was left out.
@@ -191,7 +191,7 @@ class PathEntry:
 
 @dataclass(frozen=True, slots=True)
 class Attempt:
-    """One remembered match attempt (SPEC §3.5).
+    """One remembered match attempt (method §3.5).
 
     Attributes:
         iteration: the localiser's iteration in this session.
@@ -238,14 +238,14 @@ class LandmarkSource(Protocol):
 
 
 def session_id(robot: str, camera: CameraId, start_ns: int, first_pair_hash: str) -> SessionId:
-    """The same drive read twice gets the same UUID (SPEC §2.7)."""
+    """The same drive read twice gets the same UUID (method §2.7)."""
     name = f"session:{robot}:{camera}:{start_ns}:{first_pair_hash}"
     return SessionId(uuid5(ENGRAM_NAMESPACE, name))
 
 
 @lru_cache(maxsize=1024)  # localisers of one drive ask for the same frame in turn
 def node_id(session: SessionId, stamp_ns: int) -> NodeId:
-    """The same frame of the same drive gets the same UUID (SPEC §2.7)."""
+    """The same frame of the same drive gets the same UUID (method §2.7)."""
     return NodeId(uuid5(session, f"node:{stamp_ns}"))
 
 

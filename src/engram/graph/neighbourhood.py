@@ -16,7 +16,7 @@ from engram.graph.model import SessionId
 
 @dataclass(frozen=True, slots=True)
 class SearchConfig:
-    """Extent of the neighbourhood search (SPEC §3.1).
+    """Extent of the neighbourhood search (method §3.1).
 
     A node predicted just outside may lie inside: the slack extends radius, gate and search.
 
@@ -74,11 +74,11 @@ DEFAULT_SEARCH = SearchConfig()
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Which nodes of an experience graph count as near (SPEC §3.1).
+    """Which nodes of an experience graph count as near (method §3.1).
 
     Attributes:
         radius_m: largest predicted distance of a node.
-        view_gate_rad: largest difference of heading (yaw alone, SPEC §2.6).
+        view_gate_rad: largest difference of heading (yaw alone, method §2.6).
         own_session: the live session; its nodes saved within the last `own_exclusion_m` before
             `own_driven_m` do not count, but chains may lead through them.
         own_driven_m: distance driven by the live session, metres.
@@ -96,7 +96,7 @@ class Search:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
-    """Candidate nodes Y of one live frame (SPEC §3.1): a struct of arrays, one row per candidate.
+    """Candidate nodes Y of one live frame (method §3.1): a struct of arrays, one row per candidate.
 
     Rows are in the order of the search: least uncertain first.
 

@@ -15,7 +15,7 @@ from engram.graph.model import PathEntry, PathEntryKind, PathId
 from engram.graph.neighbourhood import Neighbourhood
 
 ALL_KINDS = frozenset(PathEntryKind)
-# [L15 §IV]'s text records matches only (SPEC §4).
+# [L15 §IV]'s text records matches only (method §4).
 MATCHES_ONLY = frozenset({PathEntryKind.MATCHED, PathEntryKind.REPLAYED})
 
 
@@ -166,7 +166,7 @@ class PathMemory:
         Without two observed nodes only the prior counts. Results for the observed nodes are cached
         for the next call.
 
-        Source: SPEC §4, [L15 §V, eqs. (1)–(7)].
+        Source: method §4, [L15 §V, eqs. (1)–(7)].
 
         Args:
             candidates: (Y,) int32, dense node indices.

@@ -1,4 +1,4 @@
-"""Proximity edges join experiences that run side by side without matching (SPEC §3.1).
+"""Proximity edges join experiences that run side by side without matching (method §3.1).
 
 Two experiences that do not match each other may run in parallel for hundreds of metres. A robot
 localised in one of them needs the nodes of the other as candidates. So when a robot saves nodes on
@@ -65,7 +65,8 @@ class ProximityConfig:
         Meta(
             ge=0,
             description="distance along the drive from which nodes of one experience are separate "
-            "passes, each joined for itself, m; nearer own nodes are not joined. Source: SPEC §3.1",
+            "passes, each joined for itself, m; nearer own nodes are not joined. Source: "
+            "method §3.1",
         ),
     ] = 30.0
     consistent_chi2: Annotated[

@@ -18,7 +18,7 @@ def sun_height_deg(day: ArrayLike, hour: ArrayLike, latitude_deg: float) -> NDAr
 
     Args:
         day: float or array, days since 1 January 0:00 of any year.
-        hour: float or array that broadcasts with `day`, hour of day, mean solar time (SPEC §2.8).
+        hour: float or array that broadcasts with `day`, hour of day, mean solar time (method §2.8).
         latitude_deg: latitude, degrees, north positive.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Acceptance of a match: the cheap second half of an attempt (SPEC §3.2)."""
+"""Acceptance of a match: the cheap second half of an attempt (method §3.2)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Rule(StrEnum):
 class AcceptanceConfig:
     """When a match counts as a localisation.
 
-    Source of the values: SPEC §3, and trials on simulated drives (`lab/reports/constants.md`).
+    Source of the values: method §3, and trials on simulated drives (`lab/reports/constants.md`).
 
     Attributes:
         rule: `confidence` weighs all evidence (`engram.localiser.confidence`); `inliers` is the

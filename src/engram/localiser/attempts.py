@@ -47,7 +47,7 @@ class Candidate:
         index: its dense index in the experience graph.
         node: its UUID.
         prediction: where the live camera is expected; None when relocalising.
-        guided: whether matching uses the prediction (SPEC §3.2).
+        guided: whether matching uses the prediction (method §3.2).
         row: its row in the neighbourhood; None when relocalising.
         doubted: whether the prediction may be wrong: the robot is lost, and has no nodes of its
             own that confirm its position.
@@ -89,7 +89,7 @@ class Outcome:
 
 
 class Matcher(Protocol):
-    """The first half of an attempt, a pure function of two frames (SPEC §3.2)."""
+    """The first half of an attempt, a pure function of two frames (method §3.2)."""
 
     @property
     def threads(self) -> bool:
@@ -283,7 +283,7 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
 
 
 def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:
-    """The accepted outcome with the most inliers, then the best rank (SPEC §3.2)."""
+    """The accepted outcome with the most inliers, then the best rank (method §3.2)."""
     successes = [outcome for outcome in outcomes if outcome.accepted]
     return min(successes, key=lambda o: (-o.match.inliers, o.rank), default=None)
 

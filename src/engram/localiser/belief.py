@@ -10,7 +10,7 @@ Evidence is measured in standard deviations over all nodes. FAB-MAP treats neigh
 independent, so its log-likelihoods differ by hundreds between places: unscaled, the first frame
 would decide alone.
 
-Source: SPEC §6; Cummins & Newman, FAB-MAP, IJRR 27(6), 2008, §4.6 carries the belief by a motion
+Source: method §6; Cummins & Newman, FAB-MAP, IJRR 27(6), 2008, §4.6 carries the belief by a motion
 model between neighbouring places in the same way.
 """
 

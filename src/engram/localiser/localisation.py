@@ -19,7 +19,7 @@ from engram.odometry.motion import UNMOVED, Motion
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How much matching one live frame may cost (SPEC §1: Np × Nr).
+    """How much matching one live frame may cost (method §1: Np × Nr).
 
     Attributes:
         lanes: Np, attempts that run at the same time, each on its own thread.
@@ -54,7 +54,7 @@ class Budget:
 
 
 class LocalisationStatus(StrEnum):
-    """State of the robot after one frame (SPEC §3)."""
+    """State of the robot after one frame (method §3)."""
 
     LOCALISED = "localised"
     DEAD_RECKONING = "dead_reckoning"
@@ -64,7 +64,7 @@ class LocalisationStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Position:
-    """Where the live camera is, seen from a node (SPEC §1: ``(k, T_k_q)``).
+    """Where the live camera is, seen from a node (method §1: ``(k, T_k_q)``).
 
     Attributes:
         node: the reference node.

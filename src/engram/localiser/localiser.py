@@ -1,4 +1,4 @@
-"""The localiser: live frame + map + policy + budget → `Localisation` (SPEC §3, [L15] §III)."""
+"""The localiser: live frame + map + policy + budget → `Localisation` (method §3, [L15] §III)."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ class Localiser:
         return self._outcomes
 
     def attempts(self) -> list[Attempt]:
-        """The last frame's attempts that had a prediction, as a map stores them (SPEC §3.5)."""
+        """The last frame's attempts that had a prediction, as a map stores them (method §3.5)."""
         near, reference = self._near, self._reference
         if near is None or reference is None:
             return []
@@ -233,7 +233,7 @@ class Localiser:
         self.live = session.id
 
     def resume(self, driven_m: float, next_iteration: int) -> None:
-        """Continues a session at a later frame (SPEC §7 MERGE 3).
+        """Continues a session at a later frame (method §7.3).
 
         Args:
             driven_m: odometry distance from the session's start to that frame, metres.
@@ -248,7 +248,7 @@ class Localiser:
         return self._tried.iteration
 
     def settle_in(self, node: NodeId) -> None:
-        """Sets the position to `node`, as which the live frame was just saved (SPEC §4)."""
+        """Sets the position to `node`, as which the live frame was just saved (method §4)."""
         self.position = Position.at(node)
         self._prover.settled()
         self._guessed_m2 = 0.0
@@ -260,7 +260,7 @@ class Localiser:
         keeper: Keeper = KEEPS_NOTHING,
         clock: StageClock | None = None,
     ) -> Localisation:
-        """One iteration of SPEC §3: gather candidates, rank, attempt, settle.
+        """One iteration of method §3: gather candidates, rank, attempt, settle.
 
         Args:
             live: the live frame; `move` has been called with the motion that led to it.
@@ -330,7 +330,7 @@ class Localiser:
         return None
 
     def move(self, motion: Motion) -> None:
-        """Propagates the position by the motion that led to the next frame (SPEC §3).
+        """Propagates the position by the motion that led to the next frame (method §3).
 
         A frame that odometry could not use changes nothing: the next usable one carries the motion
         since the last. The robot is lost once the uncertainty of guessed motion exceeds
@@ -493,7 +493,7 @@ class Localiser:
     def _is_known_own(self, index: int, *, own: bool) -> bool:
         """Whether a node is this session's own, and recent or left to loop closure.
 
-        Recent nodes are not candidates (SPEC §3.1). While all motion is measured, the robot knows
+        Recent nodes are not candidates (method §3.1). While all motion is measured, the robot knows
         its pose relative to its own nodes up to drift: a match with one of them is a loop or a
         look-alike, and loop closure asks for a second match.
         """
@@ -531,7 +531,7 @@ class Localiser:
         return [outcome for outcome in outcomes if not outcome.damaged]
 
     def _settle(self, live: Frame, success: Outcome) -> None:
-        """Sets the position to (n, ``T_n_q``) and the open loop to 0 (SPEC §3.3)."""
+        """Sets the position to (n, ``T_n_q``) and the open loop to 0 (method §3.3)."""
         node_from_live, covariance = success.match.reference_from_live, success.match.covariance
         assert node_from_live is not None
         assert covariance is not None

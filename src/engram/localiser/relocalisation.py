@@ -1,4 +1,4 @@
-"""Finding a lost robot: which nodes of the whole map to attempt (SPEC §6)."""
+"""Finding a lost robot: which nodes of the whole map to attempt (method §6)."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Exhaustive:
 
 
 class ByAppearance:
-    """Proposes nodes that look like the live frames, by a place recogniser (SPEC §6).
+    """Proposes nodes that look like the live frames, by a place recogniser (method §6).
 
     `PlaceBelief` adds up the evidence of several frames, so that a frame that fits many places does
     not decide alone. The attempts of one frame go to different places first, and over several

@@ -45,13 +45,13 @@ class LocaliserConfig:
     """Settings of the localiser.
 
     Attributes:
-        search_radius_m: least radius of the neighbourhood. Source: SPEC §3.
+        search_radius_m: least radius of the neighbourhood. Source: method §3.
         max_search_radius_m: largest radius of the neighbourhood, unless the match basin is wider.
             Beyond it the relocaliser finds the robot.
-        view_gate_rad: largest difference of heading to a candidate. Source: SPEC §3.
+        view_gate_rad: largest difference of heading to a candidate. Source: method §3.
         own_exclusion_m: own nodes saved within this last distance are not candidates. Source:
-            SPEC §3.1.
-        lost_after_m: open-loop distance beyond which the robot is lost. Source: SPEC §3.4.
+            method §3.1.
+        lost_after_m: open-loop distance beyond which the robot is lost. Source: method §3.4.
         greatest_gap_m: largest standard deviation of motion that odometry did not measure. Beyond
             it since the last match or saved node the robot is lost; beyond it in one gap an
             experience ends.

@@ -1,4 +1,4 @@
-"""Closing large loops: each saved node is looked up once among all places (SPEC §5).
+"""Closing large loops: each saved node is looked up once among all places (method §5).
 
 Odometry drifts: after a long loop the nodes next to the robot may lie outside its search radius.
 So place recognition looks up the frame of every saved node, and the most likely places are matched
@@ -49,9 +49,9 @@ class LoopConfig:
         answer_after_frames: live frames after which a result is used. A lookup takes a few
             milliseconds, far less than this many frames.
         near_m: nodes within this distance are candidates of the localiser anyway, metres. Source:
-            the search radius, SPEC §3.
+            the search radius, method §3.
         own_exclusion_m: own nodes saved within this last distance close no loop, metres. Source:
-            SPEC §3.1.
+            method §3.1.
         confirm_after_m: least distance between two matches that confirm each other, metres; the
             depth of the first one's inliers if that is larger. The scene of one match is then out
             of sight of the other.

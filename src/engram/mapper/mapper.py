@@ -1,4 +1,4 @@
-"""The mapper: localise, else save an experience (SPEC §5, [L15] §III, [1])."""
+"""The mapper: localise, else save an experience (method §5, [L15] §III, [1])."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class MapperConfig:
 
     Attributes:
         save_every_m, save_every_rad: motion since the last saved node after which a frame that
-            did not localise is saved. Source: SPEC §5.
+            did not localise is saved. Source: method §5.
         tie_within_m: a new experience is also tied to the session's last saved node within this
-            distance, metres. Source: the search radius, SPEC §3.
+            distance, metres. Source: the search radius, method §3.
         checkpoint_every: live frames between two checkpoints of the map.
         memory_bytes: largest memory of a drive that saves no nodes, bytes; later frames are not
             remembered. About a day at 20 frames per second.
@@ -237,7 +237,7 @@ class Mapper(Memory):
             )
 
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
-        """Whether a frame is usable and far enough from the last saved one (SPEC §5).
+        """Whether a frame is usable and far enough from the last saved one (method §5).
 
         During a long gap of odometry none is: a node without an edge has no use.
         """

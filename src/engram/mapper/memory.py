@@ -1,4 +1,4 @@
-"""The memory of a drive: its path through the map, and its match attempts (SPEC §3)."""
+"""The memory of a drive: its path through the map, and its match attempts (method §3)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _Held:
 
 
 class Walk:
-    """Collects the entries of one session's path: one for each change of node (SPEC §3.3)."""
+    """Collects the entries of one session's path: one for each change of node (method §3.3)."""
 
     def __init__(self, path: PathId, first_sequence: int = 0, node: NodeId | None = None) -> None:
         self.path = path

@@ -1,4 +1,4 @@
-"""The content hash: equal for equal maps, independent of place and time (SPEC §7.5)."""
+"""The content hash: equal for equal maps, independent of place and time (method §7.5)."""
 
 from __future__ import annotations
 

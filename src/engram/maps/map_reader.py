@@ -405,7 +405,7 @@ class MapReader:
             return origin_of(connection, self._view, prefix)
 
     def content_hash(self) -> str:
-        """32 hexadecimal digits, equal for maps of equal content (SPEC §7.5)."""
+        """32 hexadecimal digits, equal for maps of equal content (method §7.5)."""
         with self._database.reading() as connection:
             return content_hash(connection, self._view.at)
 

@@ -325,7 +325,7 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_attempts(self, made: Sequence[Attempt]) -> None:
-        """Stores match attempts (SPEC §3.5) of the drive being mapped, rounded to 18 bytes each.
+        """Stores match attempts (method §3.5) of the drive being mapped, rounded to 18 bytes each.
 
         Offsets and headings keep 11 bits, standard deviations are exact to 3 %, ranks end at 255.
 

@@ -87,7 +87,7 @@ def driven_steps_m(motions: Sequence[Motion], stamps_ns: Sequence[int]) -> NDArr
     """Distance of each step of a drive, with a share for each unusable frame.
 
     The distance past unusable frames is known at the next usable one, and is shared among them by
-    time, as a robot was not localised there (SPEC §8). The distance after the last usable frame
+    time, as a robot was not localised there (method §8). The distance after the last usable frame
     is unknown and counts as 0.
 
     Args:

@@ -1,4 +1,4 @@
-"""Visual odometry: frames in temporal order → the motion between them (SPEC §2.4)."""
+"""Visual odometry: frames in temporal order → the motion between them (method §2.4)."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Odometry:
             IncompatibleError: the camera or the kind of descriptors differs from that of the
                 previous frame.
 
-        Source: SPEC §2.4; [G16] §III-A.
+        Source: method §2.4; [G16] §III-A.
         """
         if frame.status is not FrameStatus.OK:
             return OdometryStep(OdometryStatus.UNUSABLE_FRAME)

@@ -1,4 +1,4 @@
-"""Ranking policies Γ: the order in which to attempt the candidates (SPEC §4).
+"""Ranking policies Γ: the order in which to attempt the candidates (method §4).
 
 Each policy is one file and an entry of `POLICIES`. Other packages add policies by entry points of
 the group `ENTRY_POINTS`, each a callable without arguments that makes the policy.

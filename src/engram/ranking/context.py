@@ -48,7 +48,7 @@ class RankingContext:
         own_path: the live session's path, excluded from Z and N; None if it has none.
         stamp_ns: the live frame's stamp, ns.
         seed: seed for policies that draw at random.
-        foresee: makes every attempt; only for the oracle, the upper bound of all policies (SPEC
+        foresee: makes every attempt; only for the oracle, the upper bound of all policies (method
             §4). None if unavailable.
         run: this run's attempts, with their distances and success rates.
         hour: hour of day of the live frame in [0, 24); None if unknown.
@@ -87,7 +87,7 @@ class RankingContext:
         return self.graph.sessions_of(self.neighbourhood.nodes)
 
     def success_rates(self) -> NDArray[np.float64]:
-        """(Y,) float64: g(d) of each candidate, for compatible appearance (SPEC §3.1)."""
+        """(Y,) float64: g(d) of each candidate, for compatible appearance (method §3.1)."""
         near = self.neighbourhood
         return self.basin.success_rate(near.along_m, near.across_m)
 

@@ -21,7 +21,7 @@ _MEANING = {
 
 
 class PathPolicy:
-    """By p(y = i | Z, θ, π) over path memory, for all of Y (SPEC §4).
+    """By p(y = i | Z, θ, π) over path memory, for all of Y (method §4).
 
     Args:
         alpha: pseudo-count of the likelihood θ.

@@ -1,4 +1,4 @@
-"""Γ(path-near): path memory within the match basin, distance beyond it (SPEC §4)."""
+"""Γ(path-near): path memory within the match basin, distance beyond it (method §4)."""
 
 from __future__ import annotations
 

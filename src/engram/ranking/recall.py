@@ -90,11 +90,11 @@ class RecallConstants:
     ] = 8.0
     untried_rate: Annotated[
         float,
-        Meta(gt=0, description="success rate of an untried drive. Source: SPEC §4, as Γ(bandit)"),
+        Meta(gt=0, description="success rate of an untried drive. Source: method §4, as Γ(bandit)"),
     ] = 0.3
     untried_attempts: Annotated[
         float,
-        Meta(gt=0, description="weight of that rate, in attempts. Source: SPEC §4, as Γ(bandit)"),
+        Meta(gt=0, description="weight of that rate, in attempts. Source: method §4, as Γ(bandit)"),
     ] = 1.0
     likeness: Annotated[
         float,
@@ -119,7 +119,7 @@ class RecallConstants:
         Meta(
             ge=1,
             description="fewest inliers of a match; an attempt without any counts as one. "
-            "Source: SPEC §3",
+            "Source: method §3",
         ),
     ] = 20
     attempts: Annotated[

@@ -1,4 +1,4 @@
-"""The recent attempts W and their outcomes z, over the last T iterations (SPEC §3.6, §4)."""
+"""The recent attempts W and their outcomes z, over the last T iterations (method §3.6, §4)."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ class RecentConfig:
         Meta(
             description="distance makes one iteration of all frames within iteration_m of its "
             "first, so that the memory does not depend on the frame rate; frame makes one of each, "
-            "as the paper does. Source: SPEC §3.6"
+            "as the paper does. Source: method §3.6"
         ),
     ] = IterationUnit.DISTANCE
     iteration_m: Annotated[
-        float, Meta(gt=0, description="length of an iteration, m. Source: SPEC §3.6")
+        float, Meta(gt=0, description="length of an iteration, m. Source: method §3.6")
     ] = 0.5
 
     def __post_init__(self) -> None:

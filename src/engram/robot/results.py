@@ -40,7 +40,7 @@ def measure(
     options: RobotOptions,
     monitor: Monitor = QUIET,
 ) -> Drive:
-    """Localises a drive in an unchanged map; returns the input of the measures of SPEC §8."""
+    """Localises a drive in an unchanged map; returns the input of the measures of method §8."""
     return measured(localise_drive(opened, sequence, settings, options, monitor))
 
 
@@ -56,7 +56,7 @@ def measured(found: Sequence[Localisation]) -> Drive:
 
 
 def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
-    """The summary that ``localise --json`` prints; every figure is defined in SPEC §8."""
+    """The summary that ``localise --json`` prints; every figure is defined in method §8."""
     drive = measured(results)
     count = max(len(results), 1)
     statuses = [result.status for result in results]

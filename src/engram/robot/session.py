@@ -35,7 +35,7 @@ def open_drive(path: Path, **options: Any) -> Drive:
 
 
 def session_of_drive(sequence: DriveSequence) -> Session:
-    """The session of a drive: the same drive read twice is the same session (SPEC §2.7).
+    """The session of a drive: the same drive read twice is the same session (method §2.7).
 
     Raises:
         SequenceError: the drive has no usable frame.

@@ -27,7 +27,7 @@ class SequenceInfo:
         format: key in `SEQUENCES`, such as "kitti".
         clock: meaning of the stamps.
         robot: name of the robot, if the source gives one.
-        longitude_deg, zone: where the drive was, if known (SPEC §2.8).
+        longitude_deg, zone: where the drive was, if known (method §2.8).
     """
 
     name: str
@@ -95,7 +95,7 @@ class FrameSequence(Protocol):
 
 
 def first_pair_hash(pair: StereoPair) -> str:
-    """Hash of a pair's pixels, 32 hexadecimal digits; part of a session's identity (SPEC §2.7)."""
+    """Hash of a pair's pixels, 32 hexadecimal digits; part of a session's id (method §2.7)."""
     digest = hashlib.sha256(f"{pair.left.shape}{pair.right.shape}".encode())
     digest.update(np.ascontiguousarray(pair.left).data)
     digest.update(np.ascontiguousarray(pair.right).data)

@@ -35,7 +35,7 @@ DRIVE_0001 = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
 EUROC = "euroc/V1_01_easy_sparse"
 EUROC_AT_REST = "euroc/V1_01_easy_at_rest"
 
-# The product's threshold, fixed beforehand (SPEC §3).
+# The product's threshold, fixed beforehand (method §3).
 MIN_INLIERS = 20
 NEAR_M = 0.25
 # Where camera 2 of KITTI's rig stands in camera 0, from its calibration.

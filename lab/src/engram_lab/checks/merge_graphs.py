@@ -1,4 +1,4 @@
-"""Random small maps handed in to a centre: what must hold whatever they look like (SPEC §7).
+"""Random small maps handed in to a centre: what must hold whatever they look like (method §7).
 
     python -m engram_lab.checks.merge_graphs                                   # 10,000 cases
     python -m engram_lab.checks.merge_graphs --first 2000 --cases 500          # some of them

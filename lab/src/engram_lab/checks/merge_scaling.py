@@ -1,4 +1,4 @@
-"""Merging a large robot's map into a larger centre: time and memory (SPEC §7).
+"""Merging a large robot's map into a larger centre: time and memory (method §7).
 
     python -m engram_lab.checks.merge_scaling                 # 5,000 to 20,000 into 100,000
     python -m engram_lab.checks.merge_scaling --centre 2000 --robots 500,1000

@@ -11,14 +11,14 @@ from engram.ranking.context import RankingContext
 from engram.ranking.reasons import Reasons
 from engram_lab.policies.turns import IN_TURNS, round_robin
 
-# An experience looks like its nodes within so many metres do (SPEC §4).
+# An experience looks like its nodes within so many metres do (method §4).
 _HERE_M = 2.0
 
 
 class BagOfWordsPolicy:
     """By the cosine of the live frame's words and each experience's words here, round robin.
 
-    Source: SPEC §4; MacTavish, Paton, Barfoot, Visual triage: a bag-of-words experience selector
+    Source: method §4; MacTavish, Paton, Barfoot, Visual triage: a bag-of-words experience selector
     for long-term visual route following, ICRA 2017. Without a vocabulary all are alike.
     """
 

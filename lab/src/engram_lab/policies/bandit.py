@@ -11,7 +11,7 @@ from engram_lab.policies.evidence import decay, failure_weights
 
 Array = NDArray[np.float64]
 
-# Source of all four: SPEC §4.
+# Source of all four: method §4.
 _MEMORY_M = 8.0
 _REDUNDANCY = 0.8
 # Of a session that this run has not tried yet, and how many attempts that is worth.
@@ -20,7 +20,7 @@ PRIOR_ATTEMPTS = 1.0
 
 
 class BanditPolicy:
-    """p = (a + 0.3) / (a + b + 1) · g(d), picked greedily and diversely (SPEC §4).
+    """p = (a + 0.3) / (a + b + 1) · g(d), picked greedily and diversely (method §4).
 
     a and b are this run's successes and failures on the session that saved the candidate, decayed
     by exp(−Δs / 8 m), failures weighted by g of their distance. After each pick the other nodes

@@ -11,7 +11,7 @@ from engram.ranking.reasons import Reasons
 from engram_lab.policies.evidence import decay
 from engram_lab.policies.turns import IN_TURNS, round_robin
 
-# "Decayed with distance" (SPEC §4), by as much as the bandit's memory.
+# "Decayed with distance" (method §4), by as much as the bandit's memory.
 _DECAY_M = 8.0
 
 
@@ -24,7 +24,7 @@ class CollaborativePolicy:
     its own drive (path memory); and nodes here that r saved or matched. Q_live is the same for
     all, and left out.
 
-    Source: SPEC §4; MacTavish, Paton, Barfoot, Selective memory: recalling relevant experience
+    Source: method §4; MacTavish, Paton, Barfoot, Selective memory: recalling relevant experience
     for long-term visual localization, Journal of Field Robotics 2018.
     """
 

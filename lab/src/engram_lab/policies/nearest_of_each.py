@@ -11,7 +11,7 @@ from engram_lab.policies.turns import IN_TURNS, round_robin
 
 
 class NearestOfEachPolicy:
-    """Round robin over the sessions, by distance within each round. A baseline (SPEC §4)."""
+    """Round robin over the sessions, by distance within each round. A baseline (method §4)."""
 
     name = "nearest-of-each"
 

@@ -10,7 +10,7 @@ from engram.ranking.context import RankingContext, order_by
 
 
 class OraclePolicy:
-    """By whether the attempt would succeed, then inliers, then distance (SPEC §4)."""
+    """By whether the attempt would succeed, then inliers, then distance (method §4)."""
 
     name = "oracle"
     looks_ahead = True

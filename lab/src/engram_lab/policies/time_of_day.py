@@ -12,7 +12,7 @@ from engram_lab.policies.turns import IN_TURNS, round_robin
 
 
 class TimeOfDayPolicy:
-    """By difference in hour of day, then by age, experiences round robin (SPEC §4).
+    """By difference in hour of day, then by age, experiences round robin (method §4).
 
     Experiences whose hour is unknown stand behind those of any known hour; if the live frame's
     own is unknown, none has a difference and age alone decides. A frame of unknown date counts as

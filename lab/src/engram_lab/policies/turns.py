@@ -13,7 +13,7 @@ IN_TURNS = (
 
 
 def round_robin(context: RankingContext, *keys: NDArray[np.generic]) -> NDArray[np.int64]:
-    """The sessions of the candidates in turn, each with its nearest node first (SPEC §4).
+    """The sessions of the candidates in turn, each with its nearest node first (method §4).
 
     In each round sessions stand by the keys, (Y,) each and equal for all nodes of one session;
     ties by distance, then by UUID. A policy that knows which experience is best, but not which

@@ -1,4 +1,4 @@
-"""The papers' experiments: cross-validation, sweeps, figures and tables (SPEC §8)."""
+"""The papers' experiments: cross-validation, sweeps, figures and tables (method §8)."""
 
 from engram_lab.studies.configurations import DEFAULT_LANES, UNLIMITED, Configuration
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive, drives_of, open_campaign

@@ -1,4 +1,4 @@
-"""One map per fold, from its training sessions in the order of time (SPEC §8)."""
+"""One map per fold, from its training sessions in the order of time (method §8)."""
 
 from __future__ import annotations
 

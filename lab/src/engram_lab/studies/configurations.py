@@ -28,7 +28,7 @@ PATH_POLICIES = ("path-near", "path")
 class Radius(StrEnum):
     """How far candidates are searched for."""
 
-    SEARCH = "search"  # max(8 m, basin + 2σ), SPEC §3.1
+    SEARCH = "search"  # max(8 m, basin + 2σ), method §3.1
     BASIN = "basin"  # basin + 2σ: our other reading of "local metric neighbourhood"
 
 

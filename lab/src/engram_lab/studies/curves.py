@@ -37,7 +37,7 @@ def failure_line(
         drives: one per session.
         resamples: draws of sessions.
         estimator: of P.
-        scaled: times the share of the route that is not localised (SPEC §8).
+        scaled: times the share of the route that is not localised (method §8).
     """
     parts = [failure_sums(one, CURVE_AT_M, estimator) for one in drives]
     below = np.array([part[1] for part in parts])

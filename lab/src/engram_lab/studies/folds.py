@@ -1,4 +1,4 @@
-"""Cross-validation over sessions (SPEC §8)."""
+"""Cross-validation over sessions (method §8)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Fold:
 
 
 def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
-    """Every session is held out once; seeded shuffle, sizes within one. Source: SPEC §8.
+    """Every session is held out once; seeded shuffle, sizes within one. Source: method §8.
 
     Raises:
         ConfigError: fewer than two folds, or fewer sessions than folds.

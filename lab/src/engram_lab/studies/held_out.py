@@ -1,4 +1,4 @@
-"""One held-out drive in one map: where it starts, and how it is localised (SPEC §8)."""
+"""One held-out drive in one map: where it starts, and how it is localised (method §8)."""
 
 from __future__ import annotations
 

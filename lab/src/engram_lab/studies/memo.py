@@ -1,4 +1,4 @@
-"""Matches of one live session that were made once and serve every policy (SPEC §8).
+"""Matches of one live session that were made once and serve every policy (method §8).
 
 `match(live, node)` is a pure function of two frames and the matcher's configuration, so that its
 results may be kept: unguided, by (live UUID, node UUID, matcher hash). Whether a match is accepted

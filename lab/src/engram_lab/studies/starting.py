@@ -1,4 +1,4 @@
-"""Where a drive starts in a map: by truth, or found by matching (SPEC §8)."""
+"""Where a drive starts in a map: by truth, or found by matching (method §8)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from engram_lab.studies.drives import Truth
 # What an operator who sets a robot down knows of its place.
 _SIGMA_M = 0.25
 _SIGMA_RAD = float(np.deg2rad(1.0))
-_VIEW_GATE_RAD = float(np.deg2rad(60.0))  # as for candidates, SPEC §3.1
+_VIEW_GATE_RAD = float(np.deg2rad(60.0))  # as for candidates, method §3.1
 
 
 class TrueNodes:
@@ -50,7 +50,7 @@ class TrueNodes:
         return self._poses.get(node)
 
     def near(self, world_from_live: SE3, radius_m: float) -> set[NodeId]:
-        """The nodes that are truly within a radius and look the same way (SPEC §3.1)."""
+        """The nodes that are truly within a radius and look the same way (method §3.1)."""
         apart_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
         alike = self._headings @ world_from_live.rotation[:, 2] >= np.cos(_VIEW_GATE_RAD)
         return {self._ids[k] for k in np.flatnonzero((apart_m <= radius_m) & alike)}

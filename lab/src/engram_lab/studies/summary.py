@@ -83,7 +83,7 @@ class ConfigurationResult:
 
     @cached_property
     def not_localised(self) -> SessionSums:
-        """Route not localised: metres of steps without a match ÷ metres (SPEC §8)."""
+        """Route not localised: metres of steps without a match ÷ metres (method §8)."""
         return not_localised_sums(self.drives)
 
     @cached_property

@@ -43,7 +43,7 @@ def _pinhole(
     return StereoCamera(focal, focal, *middle, baseline_m, width, height)
 
 
-# SPEC's default camera (512×384, 65° across, 0.24 m), two variants of it on other robots, and
+# The town's default camera (512×384, 65° across, 0.24 m), two variants of it on other robots, and
 # KITTI's, for the calibration against its clip.
 ROBOTS: dict[str, Robot] = {
     robot.name: robot

@@ -38,7 +38,7 @@ class SimulatedSequence:
     def info(self) -> SequenceInfo:
         """What is known of the drive as a whole; campaign and seed are part of the robot's name.
 
-        They stand for the robot's identity (SPEC §2.7): wildcats of two towns are two robots.
+        They stand for the robot's identity (method §2.7): wildcats of two towns are two robots.
         """
         campaign, plan = self._drive.campaign, self._drive.plan
         return SequenceInfo(

@@ -1,4 +1,4 @@
-"""The best order of merging k groups: all k! orders over a prefix tree ([G16] §VI-E, SPEC §7).
+"""The best order of merging k groups: all k! orders over a prefix tree ([G16] §VI-E, method §7).
 
 Or only the choice of the first group, which has the largest effect (lab/reports/fleet.md).
 """

@@ -1,4 +1,4 @@
-"""Building a map in parallel: groups are mapped side by side, then merged in turn (SPEC §7)."""
+"""Building a map in parallel: groups are mapped side by side, then merged in turn (method §7)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which sessions are mapped together when a map is built by several workers (SPEC §7)."""
+"""Which sessions are mapped together when a map is built by several workers (method §7)."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def _random(drives: Sequence[Drive], seed: int) -> list[Drive]:
 
 
 def _by_condition(drives: Sequence[Drive], seed: int) -> list[Drive]:
-    """By light: distance from noon, so that morning and evening are alike (SPEC §2.8)."""
+    """By light: distance from noon, so that morning and evening are alike (method §2.8)."""
     del seed
     hours = [hour_of_day(drive.session, drive.session.start_ns) for drive in drives]
     unknown = [drive.name for drive, hour in zip(drives, hours, strict=True) if hour is None]

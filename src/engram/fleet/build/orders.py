@@ -1,6 +1,6 @@
 """Orders of merging: which are tried, how they are judged, their results and costs.
 
-Source: [G16] §VI-E, eq. (8); SPEC §7.
+Source: [G16] §VI-E, eq. (8); method §7.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ class OrderCosts:
 
 
 def order_costs(groups: int, group_s: float, merge_s: float, copy_s: float) -> OrderCosts:
-    """The cost model of trying all orders ([G16] eq. (8), SPEC §7).
+    """The cost model of trying all orders ([G16] eq. (8), method §7).
 
     Args:
         groups: k.

@@ -1,4 +1,4 @@
-"""Edges across omitted nodes, so that a download stays as connected as the fleet map (SPEC §7).
+"""Edges across omitted nodes, so that a download stays as connected as the fleet map (method §7).
 
 Every omitted node belongs to the basin of the sent node that reaches it along the chain of least
 variance. If two basins touch, the chain between their two sent nodes is a candidate. A spanning

@@ -39,7 +39,7 @@ from engram.graph.neighbourhood import Search, SearchConfig
 
 Array = NDArray[np.float64]
 
-# Places a metre apart, the spacing of saved nodes (SPEC §5).
+# Places a metre apart, the spacing of saved nodes (method §5).
 _PLACE_M = 1.0
 # Nodes farther than this many basin widths are ignored.
 _REACH = 2.0

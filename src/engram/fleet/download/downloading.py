@@ -1,4 +1,4 @@
-"""DOWNLOAD: a smaller map for one robot and one mission, complete in itself (SPEC §7, [G16] §V-B).
+"""DOWNLOAD: a small map for one robot and one mission, complete in itself (method §7, [G16] §V-B).
 
 The same revision of the same fleet map and the same options give the same bytes: the order of
 records depends only on their content, the revision carries the time of the fleet map's newest one

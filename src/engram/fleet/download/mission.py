@@ -35,7 +35,7 @@ class DownloadOptions:
             sessions matched which nodes.
         window_min: `tod`: how far a node's time of day may be from the mission's start, minutes.
             180: [G16] §VI-D.
-        epoch_min: `paths`: length Δt of an epoch, minutes. 60: SPEC §7.
+        epoch_min: `paths`: length Δt of an epoch, minutes. 60: method §7.
         best_percent: `paths`: share of the paths of each epoch that is sent. 50: [G16] §VI-D.
         buffer_min: widens the mission at both ends, minutes.
         budget_bytes: `budget`: largest size of the file.

@@ -1,4 +1,4 @@
-"""Which paths matter at which time of day ([G16] §V-B.3, Algorithms 2 and 3; SPEC §7).
+"""Which paths matter at which time of day ([G16] §V-B.3, Algorithms 2 and 3; method §7).
 
 Epochs are stretches of the day of one length, half-open: a node on a boundary belongs to the later
 one. The last epoch of the day is shorter if the length does not divide 24 hours.
@@ -61,7 +61,7 @@ def epoch_count(epoch_min: float) -> int:
 def epoch_of(hours: Array, epoch_min: float) -> NDArray[np.int64]:
     """(N,) int64, the epoch of each hour of day; -1 for NaN (unknown).
 
-    Source: [G16] (5), half-open (SPEC §9): t_k = {t | k·Δt ≤ t < (k + 1)·Δt}, k from 0.
+    Source: [G16] (5), half-open (method §9): t_k = {t | k·Δt ≤ t < (k + 1)·Δt}, k from 0.
     """
     minutes = np.where(np.isnan(hours), -1.0, hours * 60.0 + _ROUNDING_MIN)
     epochs = np.floor(minutes / epoch_min).astype(np.int64)
@@ -100,7 +100,7 @@ def mission_epochs(
     end_h: float | None,
     buffer_min: float = 0.0,
 ) -> list[int]:
-    """The epochs of a mission that have data. [G16] Algorithm 3, lines 1 to 6; SPEC §7.
+    """The epochs of a mission that have data. [G16] Algorithm 3, lines 1 to 6; method §7.
 
     A start that is missing or before the first epoch with data becomes that epoch; an end that is
     missing or after the last one becomes that one. A start later than the end runs over midnight

@@ -1,4 +1,4 @@
-"""Which nodes go along: the policies of DOWNLOAD (SPEC §7, [G16] §V-B)."""
+"""Which nodes go along: the policies of DOWNLOAD (method §7, [G16] §V-B)."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def select_copy(stock: Stock, _: DownloadOptions) -> Selection:
 def select_tod(stock: Stock, options: DownloadOptions) -> Selection:
     """Nodes whose time of day is within a window of the mission's start, across midnight if needed.
 
-    Source: [G16] (4); SPEC §7.
+    Source: [G16] (4); method §7.
     """
     return Selection(*near_start(stock, options, mission_area(stock, options)))
 
@@ -64,7 +64,7 @@ def select_paths(stock: Stock, options: DownloadOptions) -> Selection:
 
 
 def select_tod_and_paths(stock: Stock, options: DownloadOptions) -> Selection:
-    """Nodes that pass `tod` and lie on a path chosen by counts over those nodes (SPEC §7)."""
+    """Nodes that pass `tod` and lie on a path chosen by counts over those nodes (method §7)."""
     near, facts = near_start(stock, options, mission_area(stock, options))
     chosen, why = best_paths(stock, options, near)
     return Selection(near & _nodes_on(stock, chosen), {**why, **facts})

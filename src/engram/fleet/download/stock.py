@@ -83,7 +83,7 @@ class Stock:
 
     @cached_property
     def hours(self) -> Array:
-        """(N,) hour of day of each node (SPEC §2.8), NaN if unknown."""
+        """(N,) hour of day of each node (method §2.8), NaN if unknown."""
         by_id = {one.id: one for one in self.sessions}
         known = (hour_of_day(by_id[node.session], node.stamp_ns) for node in self.nodes)
         return np.array([np.nan if hour is None else hour for hour in known], np.float64)

@@ -17,10 +17,10 @@ from engram.odometry import GapFiller, OdometryStatus, OdometryStep
 from engram.robot import Robot
 from engram.sequences import LoggedFrame
 
-# Longest gap for a guess. Source: SPEC §3.4, the distance after which a robot is lost.
+# Longest gap for a guess. Source: method §3.4, the distance after which a robot is lost.
 _GUESS_WITHIN_M = 10.0
 # Longest part of a segment that is searched. Source: the distance after which own nodes are
-# neighbours again (SPEC §3.1).
+# neighbours again (method §3.1).
 _LOOK_WITHIN_M = 30.0
 # Least distance of two agreeing matches that relocate a robot (`Hypotheses`).
 _BASE_LINE_M = 4.0

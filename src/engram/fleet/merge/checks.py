@@ -57,7 +57,7 @@ def check_fits(merge: Merge) -> None:
 
 
 def _drive(session: Session) -> tuple[str, str, int]:
-    """The parts of a session's UUID; clock, longitude and zone may be set later (SPEC §2.8)."""
+    """The parts of a session's UUID; clock, longitude and zone may be set later (method §2.8)."""
     recorded = session.as_recorded
     return recorded.robot, recorded.camera, recorded.start_ns
 

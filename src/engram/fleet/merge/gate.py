@@ -18,12 +18,12 @@ from engram.robot import RobotOptions, Settings, measure, open_drive, session_of
 from engram.robot.session import DriveSequence
 from engram.sequences import FrameLog, first_pair_hash
 
-# SPEC §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
+# method §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
 _JUDGED_M = np.arange(0.0, 20.5, 0.5)
 _LONGEST_GAP_RATIO = 1.5
 # From a random point of the route: long gaps count by their length.
 ESTIMATOR = Estimator.ROUTE
-# Distances at which reports give the failure curve, metres (SPEC §8).
+# Distances at which reports give the failure curve, metres (method §8).
 _TOLD_M = (5, 10, 20)
 # Rounding of sums of the same gaps in another order.
 _ROUNDING = 1e-9
@@ -156,7 +156,7 @@ class Gate:
 
 
 def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
-    """How one map is worse than another (SPEC §8, "A beats B"); "" if it is not.
+    """How one map is worse than another (method §8, "A beats B"); "" if it is not.
 
     Args:
         after, before: the same drives in both maps.

@@ -46,7 +46,7 @@ def beyond(known: Position, edge: Edge, node: NodeId) -> Position:
 
 
 def recomposed(edge: Edge, a: Position, b: Position) -> Edge | None:
-    """An edge between two of the robot's nodes, as one between their equivalents (SPEC §7 MERGE 3).
+    """An edge between two of the robot's nodes, as one between their equivalents (method §7.3).
 
     A moved odometry edge becomes a tie, since it no longer links nodes of one experience.
 

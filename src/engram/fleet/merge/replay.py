@@ -1,4 +1,4 @@
-"""Replays a robot's segments in the fleet map as if they were live streams (SPEC §7 MERGE 3)."""
+"""Replays a robot's segments in the fleet map as if they were live streams (method §7.3)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from engram.robot.localisers import localiser_in, relocaliser_in
 from engram.sequences import LoggedFrame
 
 # A segment is seeded from a neighbour at most this far along it; beyond, by place recognition.
-# Source: the distance after which own nodes are neighbours again (SPEC §3.1).
+# Source: the distance after which own nodes are neighbours again (method §3.1).
 _SEED_WITHIN_M = 30.0
 # Kinds of edges that measure a relation, rather than dead-reckon it.
 _MEASURED = frozenset({EdgeKind.ODOMETRY, EdgeKind.MATCH, EdgeKind.TIE, EdgeKind.BRIDGE})
@@ -102,7 +102,7 @@ class Replay(Keeper):
         self._omits: bool | None = None
 
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
-        """Replays one segment: omits nodes that localise, takes the rest (SPEC §7 MERGE 3).
+        """Replays one segment: omits nodes that localise, takes the rest (method §7.3).
 
         Also takes nodes that other drives use and that match only weakly; see `MergeOptions`.
         """

@@ -1,4 +1,4 @@
-"""Divides a robot's nodes into segments, to be replayed as live streams (SPEC §7 MERGE 2)."""
+"""Divides a robot's nodes into segments, to be replayed as live streams (method §7.2)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def string_segments(nodes: Sequence[Node], edges: Iterable[Edge]) -> list[Segmen
     Returns:
         Segments by the stamp of their first node, then its UUID.
 
-    Source: SPEC §7 MERGE 2; [G16] §V-A, Algorithm 1.
+    Source: method §7.2; [G16] §V-A, Algorithm 1.
     """
     known = {node.id: node for node in nodes}
     following = _steps(known, edges)

@@ -160,7 +160,7 @@ class Merge:
     def new_entry(self, entry: PathEntry) -> PathEntry | None:
         """The robot's path entry as an entry of the fleet map's path of the same drive.
 
-        Paths are united by (path, sequence) (SPEC §7 MERGE 4). Entries of merges are compared by
+        Paths are united by (path, sequence) (method §7.4). Entries of merges are compared by
         node and stamp, and get the next free sequence number.
 
         Returns:

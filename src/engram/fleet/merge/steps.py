@@ -1,4 +1,4 @@
-"""MERGE: adds to the fleet map what it lacks of a robot's map (SPEC §7, [G16] §V-A)."""
+"""MERGE: adds to the fleet map what it lacks of a robot's map (method §7, [G16] §V-A)."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def _contributors(merge: Merge, new: Sequence[Node]) -> list[str]:
 
 
 def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
-    """The steps of SPEC §7 MERGE, in order."""
+    """The steps of method §7 in order."""
     _take_vocabulary(merge)
     segments: dict[SessionId, list[Segment]] = defaultdict(list)
     for segment in string_segments(new, merge.edges):
@@ -244,7 +244,7 @@ def _carry_omissions(merge: Merge) -> None:
 
 
 def _carry_attempts(merge: Merge, replay: Replay) -> None:
-    """Copies remembered attempts (SPEC §7 MERGE 4), and those of the replay."""
+    """Copies remembered attempts (method §7.4), and those of the replay."""
     sessions, remembered = list(merge.centre.sessions), merge.centre.attempts
     if merge.writer.shows_again:
         # A node that is shown again brings back its remembered attempts.

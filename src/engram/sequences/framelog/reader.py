@@ -139,7 +139,7 @@ class FrameLog:
 
     @property
     def first_pair_hash(self) -> str:
-        """`first_pair_hash` of the images of the first chosen frame (SPEC §2.7)."""
+        """`first_pair_hash` of the images of the first chosen frame (method §2.7)."""
         return self.pair_hash(0)
 
     def pair_hash(self, index: int) -> str:

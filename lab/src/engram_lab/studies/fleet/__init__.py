@@ -1,4 +1,4 @@
-"""[G16]'s experiments: building in parallel, sharing, downloads, orders of merging (SPEC §8)."""
+"""[G16]'s experiments: building in parallel, sharing, downloads, orders of merging (method §8)."""
 
 from engram_lab.studies.fleet.arms import ARMS, Arm
 from engram_lab.studies.fleet.experiments import fleet_tasks, run_fleet

@@ -21,7 +21,7 @@ EXPERIMENTS = (7, 8, 9, 10)
 # Raise it whenever maps are merged otherwise, or more is recorded of maps and merges: studies of
 # before are not gone on with.
 _MERGING_VERSION = 4
-# Source: SPEC §8, [G16] §VI: docking after log 7; 4 groups of 9 logs for the orders.
+# Source: method §8, [G16] §VI: docking after log 7; 4 groups of 9 logs for the orders.
 _FORAY_LOGS = 7
 _ORDER_GROUP_LOGS = 9
 ROBOTS = ("r1", "r2")

@@ -1,4 +1,4 @@
-"""Downloads for the hour of each held-out drive, tried out on it ([G16] Fig. 9, SPEC §7).
+"""Downloads for the hour of each held-out drive, tried out on it ([G16] Fig. 9, method §7).
 
 All are without thumbnails, so that equal bytes are equal: `budget` sends none unless it is told to,
 the others do, and thumbnails are a tenth of a map.
