@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ _GREATEST_SIGMA_M = 1.0
 _COMPATIBLE_ITERATIONS = 10
 
 
+@lru_cache(maxsize=64)
 def prior_basin_m(focal_px: float) -> float:
     """Shipped prior of the basin, a power law: 2 m for f = 256 px, 8 m for 707 px (method §3.1).
 
@@ -134,7 +136,8 @@ class MatchBasin:
 
         Never less than the basin or `least_m`, even if `most_m` is.
         """
-        return max(least_m, self.basin_m + min(2 * sigma_m, max(most_m - self.basin_m, 0.0)))
+        basin_m = self.basin_m
+        return max(least_m, basin_m + min(2 * sigma_m, max(most_m - basin_m, 0.0)))
 
 
 def count_attempts(

@@ -203,7 +203,8 @@ class ConfidenceModel:
 
     def alone(self, evidence: Evidence) -> float:
         """Log-odds of a match as if no fix had come before it."""
-        unproved = replace(evidence, standing=replace(evidence.standing, agreed=0))
+        standing = evidence.standing
+        unproved = replace(evidence, standing=Standing(0, standing.missed, standing.usual_inliers))
         if evidence.spread is None and math.isfinite(evidence.apart):
             return _sum(self.predicted, unproved.predicted_terms())
         return max(self.as_predicted(unproved), self.as_anywhere(evidence))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -95,7 +96,8 @@ class Tried:
             found = outcomes[at].match.reference_from_live
             assert found is not None
             ahead_m = np.array([0.0, 0.0, shifts_m[rows[at]]])
-            distance_m[at] = np.linalg.norm(found.translation - ahead_m)
+            from_node_m = found.translation - ahead_m
+            distance_m[at] = math.sqrt(from_node_m.dot(from_node_m))
         rates[known] = self._basin.success_rate(
             seen.along_m[rows[known]], seen.across_m[rows[known]]
         )

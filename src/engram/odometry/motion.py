@@ -177,7 +177,7 @@ class GapFiller:
             or covariance is None
             or doubted
             or self._too_vague(sigma_m := _sigma_m(covariance), guess)
-            or self._impossible(measured, sigma_m, seconds)
+            or self._impossible(twist := measured.log(), sigma_m, seconds)
         ):
             self._missing.append(True)
             if guess is not outside:
@@ -189,7 +189,7 @@ class GapFiller:
         self._gap_m = 0.0
         self._believed_ns = stamp_ns
         if seconds > 0:
-            self._learn(measured, covariance, sigma_m, seconds)
+            self._learn(measured.distance_m, twist / seconds, covariance, sigma_m, seconds)
         if any(self._missing):
             covariance = covariance + self._doubt(measured, seconds)
         if self._unknown_s and seconds > 0:
@@ -197,10 +197,14 @@ class GapFiller:
         return Motion(odometry, measured, covariance)
 
     def _learn(
-        self, measured: SE3, covariance: NDArray[np.float64], sigma_m: float, seconds: float
+        self,
+        step_m: float,
+        twist_per_s: NDArray[np.float64],
+        covariance: NDArray[np.float64],
+        sigma_m: float,
+        seconds: float,
     ) -> None:
         """Updates speed and turn rate for later guesses, weighted by certainty."""
-        twist_per_s, step_m = measured.log() / seconds, measured.distance_m
         sharp = sigma_m <= max(_SHARP * step_m, 0.5 * _LEAST_SIGMA_M)
         self._unlearnt = 0 if sharp else self._unlearnt + 1
         # An uncertain speed is better than none, or an old one.
@@ -249,7 +253,7 @@ class GapFiller:
     def _knows_speed(self) -> bool:
         return len(self._velocities) >= _STEPS_TO_KNOW_SPEED
 
-    def _impossible(self, measured: SE3, sigma_m: float, seconds: float) -> bool:
+    def _impossible(self, twist: NDArray[np.float64], sigma_m: float, seconds: float) -> bool:
         """Whether a step needs an impossible acceleration since the last accepted motion.
 
         The reference is the speed of the newest certain step.
@@ -259,7 +263,7 @@ class GapFiller:
         assert self._stamp_ns is not None
         assert self._believed_ns is not None
         since_s = (self._stamp_ns - self._believed_ns) / _NS_PER_S
-        changed_m = np.linalg.norm(measured.log()[:3] - self._velocities[-1] * seconds)
+        changed_m = np.linalg.norm(twist[:3] - self._velocities[-1] * seconds)
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * sigma_m)
 
