@@ -395,7 +395,7 @@ def test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper(
 def test_orders_are_judged_by_the_measure_of_their_paper():
     """Two losses, of 3 and of 12 m: of the losses half are long, of the route a twenty-fifth is."""
     published, ours = (
-        _judge("best", [Path("held-out")], read_settings(paper).build)
+        _judge("best", [Path("held-out")], read_settings(paper))
         for paper in (Path("gadd2016"), None)
     )
     matched = np.ones(50, bool)

@@ -38,7 +38,7 @@ from engram.graph.model import Clock, NodeId, Omission, SessionId
 from engram.maps import Map, RevisionWriter, check_file, copy_map
 from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings, map_drive, open_drive, session_of_drive
+from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive, session_of_drive
 
 from .robots import frame_log, merged, rewritten, robot_map
 
@@ -462,9 +462,17 @@ class TestGate:
         assert "route not localised 100.00% → 0.00%" in report.text()
 
 
-def test_a_merge_that_serves_held_out_drives_passes_the_gate(tmp_path, centre, fleet):
+def test_a_merge_that_serves_held_out_drives_passes_the_gate(tmp_path, centre, fleet, monkeypatch):
     held_out = frame_log(tmp_path / "held-out.framelog", np.arange(12, 36, 0.8), 0, day=8)
-    (report,) = merged(centre, fleet["longer"][0], require_better=[held_out])
+    asked, driven = RobotOptions(policy="distance", lanes=4), []
+
+    def spied(store, drive, settings, options, monitor):
+        driven.append(options)
+        return measure(store, drive, settings, options, monitor)
+
+    monkeypatch.setattr("engram.fleet.merge.gate.measure", spied)
+    (report,) = merged(centre, fleet["longer"][0], require_better=[held_out], localising=asked)
+    assert driven == [asked, asked]  # before and after
     assert report.revision == 2
     assert report.held_out is not None
     assert report.held_out.after.route_not_localised < report.held_out.before.route_not_localised

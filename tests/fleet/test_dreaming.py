@@ -18,7 +18,8 @@ from tests.synthetic_world import World, drive
 
 from engram.errors import ConfigError, InputError
 from engram.fleet.dream import DreamOptions, dream, hand_ins_of, keep_hand_in
-from engram.fleet.dream.dreaming import BEHAVIOURS, gain
+from engram.fleet.dream.dreaming import BEHAVIOURS
+from engram.fleet.dream.judging import gain
 from engram.graph.model import Clock
 from engram.maps import Map, check_file
 from engram.measures import Drive
@@ -247,6 +248,6 @@ def test_what_would_tell_nothing_is_refused(town, tmp_path):
 def test_the_gain_is_paired_over_drives():
     before = [Drive(np.ones(10), np.arange(10) < n) for n in (2, 5, 8)]
     after = [Drive(np.ones(10), np.arange(10) < n) for n in (4, 7, 10)]
-    estimate, low, high = gain(before, after, ASKED)
+    estimate, low, high = gain(before, after, resamples=2000, level=0.9, seed=0)
     assert estimate == pytest.approx(0.2)
     assert (low, high) == (pytest.approx(0.2), pytest.approx(0.2))

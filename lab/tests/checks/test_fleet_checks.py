@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from engram.measures import Drive
 from engram_lab.checks.both_directions import Missed, apart, by_drive, pair_of, town_of
+from engram_lab.checks.dreams import HANDED_IN, HELD_OUT, VALIDATION, made_once
+from engram_lab.checks.dreams import told as told_of_held_out
 from engram_lab.checks.lenses import told
 from engram_lab.checks.mountings import MOUNTED, MountedSequence
 from engram_lab.town.sequence import SimulatedSequence
@@ -54,3 +57,15 @@ def test_directions_are_compared_over_drives_however_many_maps_each_was_tried_in
     assert (more.low, more.high) == (pytest.approx(0.0), pytest.approx(0.2))
     assert pair_of("8,9") == [8, 9]
     assert [town_of(name).name for name in ("oxford", "401")] == ["oxford", "trial"]
+
+
+def test_what_judges_a_dream_took_no_part_in_it_and_its_maps_are_made_once(tmp_path):
+    assert len({*HANDED_IN, *VALIDATION, *HELD_OUT}) == 12
+    with pytest.raises(ZeroDivisionError):
+        made_once(tmp_path / "a.engram", lambda path: (path.write_text("half"), 1 / 0))
+    assert not list(tmp_path.glob("*.engram"))
+    before = [Drive(np.ones(10), np.arange(10) < n) for n in (5, 8)]
+    after = [Drive(np.ones(10), np.arange(10) < n) for n in (6, 9)]
+    assert told_of_held_out(before, after) == (
+        "held-out drives miss 35.00% before, 25.00% after: better by 10.00 points (10.00 … 10.00)"
+    )

@@ -70,6 +70,7 @@ def dream(
         workers=workers,
         scheduler=scheduler,
         merging=merging_of(given),
+        localising=options.driving_of(given),
         judge_at_m=given.build.max_gap_m,
         estimator=given.build.estimator,
     )

@@ -15,7 +15,7 @@ from engram.cli.history import AUTHOR
 from engram.errors import ConfigError, EngramError
 
 if TYPE_CHECKING:
-    from engram.cli.settings import AllSettings, BuildSettings
+    from engram.cli.settings import AllSettings
     from engram.fleet.build import JudgeOptions
     from engram.fleet.download import DownloadReport, UpdateReport
     from engram.fleet.merge import MergeOptions, MergeReport
@@ -94,6 +94,7 @@ def merge(
             settings=resolved.of_robot(),
             dry_run=dry_run,
             require_better=require_better or (),
+            localising=options.driving_of(resolved),
             picture=picture,
             geometry=GeometryGate(refuses=require_geometry)
             if geometry or require_geometry
@@ -343,7 +344,7 @@ def build(
         ),
         merging=merging,
         scheduler=scheduler,
-        judge=_judge(order, validate or [], resolved.build),
+        judge=_judge(order, validate or [], resolved),
     )
     report = build_map(centre, drives, resolved.of_robot(), asked, keep=keep, monitor=Bars())
     looked = None
@@ -374,7 +375,7 @@ def _grouping(text: str) -> tuple[str, int]:
     return how, int(seed)
 
 
-def _judge(order: str | None, drives: list[Path], given: BuildSettings) -> JudgeOptions | None:
+def _judge(order: str | None, drives: list[Path], given: AllSettings) -> JudgeOptions | None:
     """How orders are compared; None if the groups are merged as they come.
 
     Raises:
@@ -390,5 +391,9 @@ def _judge(order: str | None, drives: list[Path], given: BuildSettings) -> Judge
     if order not in known:
         raise ConfigError(f"--order {order!r} is unknown; known: {', '.join(known)}")
     return JudgeOptions(
-        drives, judge_at_m=given.max_gap_m, orders=known[order], estimator=given.estimator
+        drives,
+        judge_at_m=given.build.max_gap_m,
+        localising=options.driving_of(given),
+        orders=known[order],
+        estimator=given.build.estimator,
     )

@@ -41,9 +41,7 @@ def live(
     maps: Annotated[
         bool, typer.Option("--map", help="Map what the robot does not recognise.")
     ] = False,
-    ranking: options.Ranking = "recall",
-    lanes: options.Lanes = 2,
-    rounds: options.Rounds = 2,
+    effort: options.Effort,
     deadline: Annotated[
         float | None,
         typer.Option(
@@ -75,8 +73,9 @@ def live(
         raise ConfigError("give either --socket PATH, to serve a robot, or --play DRIVE")
     if rate is not None and (play is None or not rate > 0):
         raise ConfigError(f"--rate {rate}: must be > 0 Hz, and goes with --play DRIVE only")
-    asked = RobotOptions(policy=ranking, lanes=lanes, rounds=rounds, deadline_ms=deadline)
-    resolved = LiveOptions(map_path, name, maps, settings.read().of_robot(), asked)
+    given = settings.read()
+    asked = RobotOptions(**effort.over(given), deadline_ms=deadline)
+    resolved = LiveOptions(map_path, name, maps, given.of_robot(), asked)
     with ExitStack() as stack:
         viewer = stack.enter_context(viewer_for(view))
         if socket is not None:

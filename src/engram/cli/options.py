@@ -15,6 +15,7 @@ import typer
 
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
+    from engram.robot import RobotOptions
     from engram.sequences.opening import Drive as OpenDrive
     from engram.sequences.options import OpenOptions
 
@@ -56,12 +57,6 @@ Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result 
 At: TypeAlias = Annotated[
     str | None,
     typer.Option("--at", metavar="REV", help="Read this revision: 7, a tag, head~2."),
-]
-Ranking: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--ranking", metavar="NAME", help="Which nodes to try first: recall, path, distance, …"
-    ),
 ]
 Lanes: TypeAlias = Annotated[
     int, typer.Option("--lanes", metavar="N", min=1, help="Match attempts in parallel (Np).")
@@ -290,6 +285,13 @@ class Effort:
             "lanes": self.lanes or drive.lanes,
             "rounds": self.rounds or drive.rounds,
         }
+
+
+def driving_of(settings: AllSettings) -> RobotOptions:
+    """How a robot drives by the settings alone."""
+    from engram.robot import RobotOptions
+
+    return RobotOptions(**Effort().over(settings))
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,9 +46,10 @@ def view(
         if path is None:
             viewer.show(opened)
         else:
-            sequence = drive.open(path)
+            sequence, given = drive.open(path), settings.read()
+            asked = options.driving_of(given)
             with (
-                robot_on(opened, sequence, settings.read().of_robot()) as robot,
+                robot_on(opened, sequence, given.of_robot(), asked) as robot,
                 Bars().stage("view", len(sequence)) as monitor,
             ):
                 viewer.watch(robot, opened)

@@ -129,17 +129,20 @@ def try_(
         str | None, typer.Option("--arrive", metavar="H:MM", help="When the mission ends.")
     ] = None,
     window: Annotated[
-        float,
-        typer.Option("--window", metavar="MIN", help="tod: minutes before and after departure."),
-    ] = 180.0,
+        float | None,
+        typer.Option(
+            "--window",
+            metavar="MIN",
+            help="tod: minutes before and after departure [default: as in the settings].",
+        ),
+    ] = None,
     budget: Annotated[
         str | None,
         typer.Option("--budget", metavar="SIZE", help="budget: 200MB, or 25% of a full download."),
     ] = None,
-    lanes: options.Lanes = 2,
-    rounds: options.Rounds = 2,
+    effort: options.Effort,
     at: options.At = None,
-    config: options.Settings = None,
+    settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Try downloads on held-out drives.
@@ -153,7 +156,7 @@ def try_(
     """
     from engram.cli.progress import Bars
     from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
-    from engram.robot import RobotOptions, load_settings, open_drive, session_of_drive
+    from engram.robot import RobotOptions, open_drive, session_of_drive
     from engram_lab.trial import (
         LeftOut,
         TrialSummary,
@@ -163,12 +166,17 @@ def try_(
     )
 
     budget_bytes, budget_percent = budget_from_text(budget)
+    given = settings.read()
     asked = DownloadOptions(
         strict="tod" in policy or policy == "paths",  # an hour without data is a row of its own
         policy=policy,
         start_h=hour_from_text(start, "start"),
         end_h=hour_from_text(end, "end"),
-        window_min=window,
+        latitude_deg=given.download.latitude_deg,
+        window_min=given.download.window_min if window is None else window,
+        epoch_min=given.download.epoch_min,
+        best_percent=given.download.best_percent,
+        buffer_min=given.download.buffer_min,
         budget_bytes=budget_bytes,
         budget_percent=budget_percent,
     )
@@ -180,8 +188,8 @@ def try_(
         centre,
         {asked.policy: asked, "copy": DownloadOptions()},
         [partial(open_drive, drive) for drive in drives],
-        load_settings(config),
-        RobotOptions(lanes=lanes, rounds=rounds),
+        given.of_robot(),
+        RobotOptions(**effort.over(given)),
         Bars(),
         at=at,
         left_out=lambda one: left_out.append(replace(one, drive=str(named[one.drive]))),

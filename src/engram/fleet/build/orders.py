@@ -132,7 +132,7 @@ def check_countable(groups: int, orders: Orders) -> None:
     if orders is Orders.ALL and groups > _MOST_GROUPS:
         raise ConfigError(
             f"{groups} groups have {math.factorial(groups):,} orders; at most {_MOST_GROUPS} "
-            f"groups can be tried in all orders; --best-first tries {groups}"
+            f"groups can be tried in all orders; --order best-first tries {groups}"
         )
 
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from msgspec import Meta
 
 from engram.config import check_bounds, config_hash, plain, to_dict
@@ -24,6 +23,7 @@ from engram.files import draft_folder
 from engram.fleet.build.best_order import results_in
 from engram.fleet.build.orders import JudgeOptions, OrderResult, Orders
 from engram.fleet.download.updating import UpdateReport, update
+from engram.fleet.dream.judging import gain, localised_in
 from engram.fleet.dream.trying import Try, try_all
 from engram.fleet.merge.gate import check_held_out
 from engram.fleet.merge.merging import merge
@@ -32,7 +32,7 @@ from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.maps import Map, copy_map
 from engram.measures import Drive, Estimator, route_not_localised
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings, measure, open_drive
+from engram.robot import RobotOptions, Settings, open_drive
 
 # What a dream changes of the way in which robots' maps are merged.
 BEHAVIOURS: dict[str, dict[str, Any]] = {
@@ -53,7 +53,7 @@ class DreamOptions:
 
     Attributes:
         minutes, judge_at_m, resamples, level, seed: see their descriptions.
-        workers: processes that try behaviours side by side.
+        workers: processes that try behaviours, and judge the best result, side by side.
         scheduler: address of a Dask scheduler whose workers try instead.
         merging: how robots' maps are merged usually.
         localising: policy and budget of the validation.
@@ -247,36 +247,20 @@ class _Dream:
             copy_map(centre, joined)
             about = f"dream: {report.behaviour}, order {' '.join(map(str, report.order))}"
             update(dreamt, joined, monitor=monitor, message=about)
-            before, after = self._localised(centre), self._localised(joined)
+            before, after = self._judged([centre, joined], monitor)
             report.missed_before, report.missed_after = map(route_not_localised, (before, after))
-            report.better_by = gain(before, after, self.options)
+            options = self.options
+            report.better_by = gain(
+                before, after, resamples=options.resamples, level=options.level, seed=options.seed
+            )
             if report.better_by[1] > 0:
                 report.added = update(dreamt, centre, monitor=monitor, message=about)
 
     def _merging(self, behaviour: str) -> MergeOptions:
         return replace(self.options.merging, **BEHAVIOURS[behaviour])
 
-    def _localised(self, path: Path) -> list[Drive]:
-        with Map.open(path) as store:
-            return [
-                measure(store, open_drive(one), self.settings, self.options.localising)
-                for one in self.judge.drives
-            ]
-
-
-def gain(
-    before: Sequence[Drive], after: Sequence[Drive], options: DreamOptions
-) -> tuple[float, float, float]:
-    """By how much less of the route is missed, and the ends of its interval, paired over drives."""
-    missed_m = np.array(
-        [[float(one.step_m[~one.matched].sum()) for one in drives] for drives in (before, after)]
-    )
-    driven_m = np.array([float(one.step_m.sum()) for one in before])
-    spared_m = missed_m[0] - missed_m[1]
-    rng = np.random.default_rng(options.seed)
-    count = len(driven_m)
-    draws = rng.multinomial(count, np.full(count, 1 / count), options.resamples)
-    values = draws @ spared_m / (draws @ driven_m)
-    tail = 50 * (1 - options.level)
-    low, high = np.percentile(values, [tail, 100 - tail])
-    return float(spared_m.sum() / driven_m.sum()), float(low), float(high)
+    def _judged(self, maps: Sequence[Path], monitor: Monitor) -> list[list[Drive]]:
+        options = self.options
+        return localised_in(
+            maps, self.judge.drives, self.settings, options.localising, options.workers, monitor
+        )

@@ -21,7 +21,7 @@ from engram.fleet.merge.state import Merge
 from engram.fleet.merge.steps import Gates, merge_one
 from engram.maps import FORMAT_VERSION, Map, copy_map, publish_map
 from engram.monitor import QUIET, Monitor, interruptible
-from engram.robot import Settings
+from engram.robot import RobotOptions, Settings
 from engram.viewing import check_picture
 
 
@@ -34,6 +34,7 @@ def merge(
     settings: Settings | None = None,
     dry_run: bool = False,
     require_better: Sequence[Path] = (),
+    localising: RobotOptions | None = None,
     picture: Path | None = None,
     geometry: GeometryGate | None = None,
 ) -> list[MergeReport]:
@@ -51,6 +52,7 @@ def merge(
         settings: the resolved configuration, kept with the revision; None for the defaults.
         dry_run: merge into a copy of the fleet map and discard it.
         require_better: held-out drives that must not localise worse in the result.
+        localising: policy and budget of these drives; None for the defaults.
         picture: an image file for a plan view of the fleet map before and after.
         geometry: looks for wrong edges in each result; None for no look.
 
@@ -71,7 +73,7 @@ def merge(
     options, settings = options or MergeOptions(), settings or Settings()
     if picture is not None:
         check_picture(picture)
-    gate = Gate(require_better, settings) if require_better else None
+    gate = Gate(require_better, settings, localising) if require_better else None
     gates = Gates(gate, geometry)
     _check_given(centre, robots, gate)
     reports: list[MergeReport] = []

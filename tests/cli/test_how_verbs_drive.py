@@ -1,0 +1,86 @@
+"""Each verb that drives ranks and attempts as the settings say."""
+
+from __future__ import annotations
+
+import pytest
+
+from engram.errors import ConfigError
+from engram.robot import RobotOptions
+
+# Verb, what it hands its robot's options to, and where they are in what it hands over.
+VERBS = {
+    "map": ("map m.engram DRIVE", "engram.robot.map_drive", lambda given, _: given[3]),
+    "localise": (
+        "localise m.engram DRIVE", "engram.cli.localising.localise_and_print",
+        lambda given, _: given[3],
+    ),
+    "live": (
+        "live m.engram --play DRIVE", "engram.live.LiveProcess", lambda given, _: given[1].robot,
+    ),
+    "view": ("view m.engram DRIVE", "engram.robot.robot_on", lambda given, _: given[3]),
+    "merge": (
+        "merge c.engram m.engram", "engram.fleet.merge.merge",
+        lambda _, named: named["localising"],
+    ),
+    "build": (
+        "build c.engram DRIVE --order best --validate DRIVE", "engram.fleet.build.build_map",
+        lambda given, _: given[3].judge.localising,
+    ),
+    "dream": (
+        "dream c.engram m.engram --validate DRIVE", "engram.fleet.dream.dream",
+        lambda given, _: given[4].localising,
+    ),
+    "lab try": (
+        "lab try m.engram DRIVE", "engram_lab.trial.try_downloads", lambda given, _: given[4],
+    ),
+}  # fmt: skip
+
+
+class SeenError(ConfigError):
+    """The verb came as far as driving."""
+
+
+@pytest.fixture(scope="module")
+def a_map(street, tmp_path_factory):
+    from engram.robot import Settings, map_drive, open_drive
+
+    path = tmp_path_factory.mktemp("maps") / "m.engram"
+    map_drive(path, open_drive(street), Settings(), RobotOptions())
+    return path
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_settings_rank_and_attempt_unless_options_do(
+    engram, monkeypatch, a_map, street, tmp_path, verb
+):
+    typed, called, asked_of = VERBS[verb]
+    seen = []
+
+    def spied(*given, **named):
+        seen.append(asked_of(given, named))
+        raise SeenError("far enough")
+
+    monkeypatch.setattr(called, spied)
+    monkeypatch.setattr("engram_lab.trial.check_not_sent", lambda *_: None)
+    monkeypatch.setattr("engram.viewing.viewer.Viewer", lambda _: _Nothing())
+    words = [{"m.engram": a_map, "c.engram": tmp_path / "c.engram", "DRIVE": street}.get(one, one)
+             for one in typed.split()]  # fmt: skip
+    for config in ("linegar2015", "gadd2016"):
+        ran = engram(*words, "--config", config)
+        assert "far enough" in ran.err
+        assert (seen[-1].policy, seen[-1].lanes, seen[-1].rounds) == ("path", 2, 1)
+    engram(*words)
+    assert (seen[-1].policy, seen[-1].lanes, seen[-1].rounds) == ("recall", 2, 2)
+    if verb in {"map", "localise", "live", "lab try"}:
+        engram(*words, "--config", "linegar2015", "--ranking", "distance", "--lanes", 1)
+        assert (seen[-1].policy, seen[-1].lanes, seen[-1].rounds) == ("distance", 1, 1)
+
+
+class _Nothing:
+    """In place of a viewer."""
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
