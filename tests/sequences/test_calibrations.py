@@ -19,6 +19,8 @@ from engram.frontend import Frontend, StereoPair
 from engram.geometry import SE3
 from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
 from engram.sequences import BagSequence, open_sequence
+from engram.sequences.bags.inspecting import describe_bag
+from engram.sequences.options import OpenOptions
 from engram_lab.bench.data import synthetic_drive
 
 from .bag_maker import LEFT, RIGHT, StereoBag, bag, rectified_infos
@@ -324,6 +326,29 @@ class TestBags:
         found = open_sequence(tmp_path / "b").camera.cam_from_rig
         assert found is not None
         np.testing.assert_allclose(found.matrix(), base_from_left.inverse().matrix(), atol=1e-9)
+
+    def test_a_calibration_without_mounting_takes_that_of_the_bag(self, tmp_path) -> None:
+        base_from_left = SE3.exp(np.array([0.3, 0.1, 0.5, 1.2, -1.2, 1.2]))
+        with bag(tmp_path / "b", "mcap") as maker:
+            maker.transform(stamp_ns(0), "base_link", "left", base_from_left)
+            for side, topic in enumerate((LEFT, RIGHT)):
+                maker.image(topic, *self.PAIR[0][:2])
+                name = topic.replace("image_raw", "camera_info")
+                maker.info(name, stamp_ns(0), ros_infos()[side], "left")
+        (tmp_path / "chain.yaml").write_text(camchain())
+        found = open_sequence(tmp_path / "b", calibration=tmp_path / "chain.yaml")
+        assert isinstance(found, BagSequence)
+        alone = open_sequence(tmp_path / "b")
+        assert isinstance(alone, BagSequence)
+        assert found.camera.cam_from_rig is not None
+        assert alone.camera.cam_from_rig is not None
+        np.testing.assert_allclose(
+            found.camera.cam_from_rig.matrix(), alone.camera.cam_from_rig.matrix(), atol=1e-4
+        )
+        assert found.cameras.raw is not None
+        assert found.cameras.raw.left_from_rig is not None
+        facts = describe_bag(tmp_path / "b", OpenOptions(calibration=tmp_path / "chain.yaml"))
+        assert facts.mounting == "base_link"
 
     def test_two_cameras_calibrated_alone_are_joined_by_static_transforms(self, tmp_path) -> None:
         infos = [{**info, "r": np.eye(3)} for info in ros_infos()]

@@ -165,14 +165,15 @@ def _toml(cameras: Cameras) -> str:
 def _bag_text(facts: BagFacts) -> str:
     width = max(len(topic.name) for topic in facts.topics)
     lines = [
-        f"{facts.path}: {facts.size_bytes / 1e6:.1f} MB in {facts.files} "
+        f"{facts.path}: {_size(facts.size_bytes)} in {facts.files} "
         f"{'file' if facts.files == 1 else 'files'}, {facts.duration_s:.1f} s"
     ]
     for topic in facts.topics:
         gaps = f"{topic.gaps} gaps, longest {topic.longest_gap_s:.2f} s" if topic.gaps else ""
+        rate = f"{topic.rate_hz:7.1f} Hz" if topic.rate_hz else " " * 10
         lines.append(
             f"  {topic.name:{width}}  {topic.messages:>7} × {topic.type:32} "
-            f"{topic.rate_hz:7.1f} Hz {topic.size_bytes / 1e6:9.1f} MB  {gaps}".rstrip()
+            f"{rate} {_size(topic.size_bytes):>12}  {gaps}".rstrip()
         )
     if facts.left is not None:
         lines.append(f"stereo: {facts.left}, {facts.right}")
@@ -186,6 +187,10 @@ def _bag_text(facts: BagFacts) -> str:
     if facts.command:
         lines.append(f"next: {facts.command}")
     return "\n".join(lines)
+
+
+def _size(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 1e5 else f"{size_bytes / 1e3:.1f} kB"
 
 
 def _drive_facts(path: Path, opening: options.Drive) -> dict[str, object]:

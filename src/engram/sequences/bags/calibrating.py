@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import islice
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from engram.calibration import Cameras
 from engram.calibration.camera_info import CameraInfo, cameras_of_infos
+from engram.calibration.cameras import rectified_cameras
 from engram.calibration.entries import coefficients, distortion_model
 from engram.errors import CalibrationError, InputError
 from engram.geometry import SE3
@@ -109,6 +111,25 @@ def read_infos(
     return left, right
 
 
+def mounting(transforms: Transforms, frame: str) -> SE3 | None:
+    """The robot's frame in a camera's, camera_from_base; None if nothing fixed leads there."""
+    base = transforms.base_of(frame)
+    return None if base is None else transforms.between(frame, base)
+
+
+def mounted(cameras: Cameras, camera_from_base: SE3 | None) -> Cameras:
+    """With this mounting of the left camera, if they have none of their own."""
+    camera, raw = cameras.camera, cameras.raw
+    if camera.cam_from_rig is not None or camera_from_base is None:
+        return cameras
+    if raw is not None:
+        raw = replace(raw, left_from_rig=camera_from_base)
+        return rectified_cameras(raw, cameras.field_of_view_deg, cameras.topics)
+    if cameras.rectification is not None:
+        camera_from_base = cameras.rectification.rectified_from_raw @ camera_from_base
+    return replace(cameras, camera=replace(camera, cam_from_rig=camera_from_base))
+
+
 def read_cameras(
     bag: Bag,
     decoder: Decoder,
@@ -145,14 +166,13 @@ def read_cameras(
             "these images with --calibration FILE"
         )
     transforms = read_transforms(bag, decoder)
-    base = transforms.base_of(left.frame)
     try:
         return cameras_of_infos(
             left,
             right,
             rectified=stereo.are_rectified,
             right_from_left=transforms.between(right.frame, left.frame),
-            left_from_rig=None if base is None else transforms.between(left.frame, base),
+            left_from_rig=mounting(transforms, left.frame),
             field_of_view_deg=field_of_view_deg,
         )
     except InputError as error:

@@ -12,7 +12,7 @@ import numpy as np
 
 from engram.errors import InputError
 from engram.sequences.bags.bag import Bag, files_of
-from engram.sequences.bags.calibrating import read_transforms
+from engram.sequences.bags.calibrating import Transforms, read_transforms
 from engram.sequences.bags.messages import Decoder
 from engram.sequences.bags.motion import IMU, ODOMETRY, TWIST
 from engram.sequences.bags.sequence import BagSequence
@@ -59,7 +59,8 @@ class BagFacts:
         left, right: image topics of the stereo pair; None if they are not found.
         question: why the pair or its calibration is not found; "" if it is.
         calibration: what was found of the pair's calibration, in a line.
-        mounting: frame of the robot that the camera's mounting refers to; None if unknown.
+        mounting: frame of the robot that the camera's mounting refers to, or "calibration" if
+            the given one states it; None if unknown.
         command: the command that maps the bag.
         lost: what could not be read.
     """
@@ -97,7 +98,6 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
     transforms = read_transforms(bag, Decoder(bag.is_ros1))
     drive, question = _opened(path, options)
     left = None if drive is None else drive.topics.left
-    frame = None if drive is None else drive.frame
     return BagFacts(
         str(path),
         len(files_of(path)),
@@ -110,7 +110,7 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
         None if drive is None else drive.topics.right,
         question,
         "" if drive is None else _calibration(drive),
-        None if frame is None else transforms.base_of(frame),
+        _mounting(drive, transforms),
         _command(path, options, topics, drive, question),
         bag.lost,
     )
@@ -159,6 +159,12 @@ def _calibration(drive: BagSequence) -> str:
         f"{camera.width}×{camera.height} px, fx {camera.fx:.1f} px, baseline "
         f"{camera.baseline_m:.4f} m; {images}"
     )
+
+
+def _mounting(drive: BagSequence | None, transforms: Transforms) -> str | None:
+    if drive is None or drive.camera.cam_from_rig is None:
+        return None
+    return transforms.base_of(drive.frame) or "calibration"
 
 
 def _command(

@@ -18,7 +18,13 @@ from engram.geometry import StereoCamera
 from engram.graph.model import Clock
 from engram.odometry import MotionSource
 from engram.sequences.bags.bag import Bag
-from engram.sequences.bags.calibrating import read_cameras, read_transforms
+from engram.sequences.bags.calibrating import (
+    mounted,
+    mounting,
+    read_cameras,
+    read_infos,
+    read_transforms,
+)
 from engram.sequences.bags.fixes import Fix, fix_topics, fixes_of
 from engram.sequences.bags.messages import Decoder, stamp_of
 from engram.sequences.bags.motion import BagMotion
@@ -72,7 +78,8 @@ class BagSequence:
             given = self._given(options, rectified=True)
         tolerance_ns, self._first_ns = self._learn()
         self.pairing = Pairing(tolerance_ns)
-        self.cameras = given or self._calibrated(options)
+        transforms = read_transforms(self._bag, self._decoder)
+        self.cameras = mounted(given or self._calibrated(options), mounting(transforms, self.frame))
         self.camera: StereoCamera = self.cameras.camera
         check_no_view(options, self.cameras)
         self._mask = None if options.mask is None else read_mask(options.mask, self.cameras)
@@ -84,7 +91,7 @@ class BagSequence:
             self._bag,
             self._decoder,
             options.motion,
-            read_transforms(self._bag, self._decoder),
+            transforms,
             self.camera.cam_from_rig,
         )
         self._reasons: list[str] = []
@@ -103,9 +110,16 @@ class BagSequence:
 
     @property
     def frame(self) -> str:
-        """Name of the left camera's frame, of its first image; "" if it has none."""
+        """Name of the left camera's frame, of its first image or `CameraInfo`; "" without one."""
         first = next(self._shots(self.topics.left), None)
-        return "" if first is None or isinstance(first.content, str) else _frame(first.content)
+        named = "" if first is None or isinstance(first.content, str) else _frame(first.content)
+        if named:
+            return named
+        try:
+            infos = read_infos(self._bag, self._decoder, self.topics)
+        except CalibrationError:  # of a bag whose calibration is given
+            return ""
+        return "" if infos is None else infos[0].frame.lstrip("/")
 
     @property
     def frames(self) -> str:
