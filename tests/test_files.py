@@ -98,7 +98,7 @@ def test_what_is_no_draft_s_folder_stays(tmp_path: Path) -> None:
 
 def test_a_mistyped_folder_is_not_made(tmp_path: Path) -> None:
     with (
-        pytest.raises(InputError, match="is no folder"),
+        pytest.raises(InputError, match="is not a folder"),
         draft_folder(tmp_path / "twon" / "map.engram"),
     ):
         pass

@@ -91,7 +91,7 @@ class WriterLock:
 
     def _take(self, path: Path) -> None:
         if not stat.S_ISREG(os.fstat(self._file).st_mode):
-            raise MapError(f"{self._path} is no regular file; remove it to write to {path}")
+            raise MapError(f"{self._path} is not a regular file; remove it to write to {path}")
         try:
             fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, _whole_file(fcntl.F_WRLCK))
         except OSError as error:
@@ -156,7 +156,7 @@ def check_parent(path: Path) -> None:
         InputError: the folder of the file is not there.
     """
     if not path.parent.is_dir():
-        raise InputError(f"{path.parent} is no folder; make it first")
+        raise InputError(f"{path.parent} is not a folder; make it first")
 
 
 @contextmanager

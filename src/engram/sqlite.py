@@ -137,7 +137,7 @@ class SqliteFile:
         if version > kind.format_version:
             raise FormatVersionError(
                 f"{self.path} is a {kind.noun} of format {version}, this Engram ({__version__}) "
-                f"reads up to {kind.format_version}: upgrade it"
+                f"reads up to {kind.format_version}: upgrade Engram"
             )
         if version < 1:
             raise MapCorruptError(f"{self.path}: format {version} does not exist; {kind.cure}")
@@ -179,7 +179,7 @@ class SqliteFile:
         if here != wanted:
             raise MapCorruptError(
                 f"{self.path}: not the tables of its format: missing {sorted(wanted - here)}, "
-                f"strange {sorted(here - wanted)}"
+                f"unexpected {sorted(here - wanted)}"
             )
         for table in self.kind.metadata.sorted_tables:
             rows = execute(f"PRAGMA table_xinfo({table.name})").fetchall()

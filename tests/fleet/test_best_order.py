@@ -214,7 +214,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
         building.merge(centre, [maps[1]], OPTIONS)
         return found
 
-    with pytest.raises(MapError, match="written to while the orders were tried"):
+    with pytest.raises(MapError, match="changed while orders of merging were tried"):
         search(
             tmp_path / "orders", [maps[0]], judge(logs["held-out"], localise=meanwhile), root=centre
         )

@@ -454,7 +454,7 @@ class TestMistakes:
 
     def test_places_that_cannot_be_read_or_written(self, centre, tmp_path):
         (tmp_path / "there.engram").touch()
-        for out, says in (("there.engram", "exists already"), ("no/out.engram", "is no folder")):
+        for out, says in (("there.engram", "exists already"), ("no/out.engram", "is not a folder")):
             with pytest.raises(InputError, match=says):
                 sent(centre, tmp_path / out, "copy")
         with pytest.raises(NotAMapError):

@@ -239,7 +239,7 @@ def test_hand_ins_are_kept_once_in_the_order_in_which_they_came(town, tmp_path):
 
 def test_what_would_tell_nothing_is_refused(town, tmp_path):
     centre, robots, drives = copy_of(town[0], tmp_path), town[1], town[2]
-    with pytest.raises(ConfigError, match="tell nothing about chance"):
+    with pytest.raises(ConfigError, match="too few to rule out chance"):
         dream(centre, robots, drives[:2], options=ASKED)
     with pytest.raises(InputError, match="nothing was handed in"):
         dream(centre, [], drives, options=ASKED)

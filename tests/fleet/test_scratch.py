@@ -179,7 +179,7 @@ def test_a_folder_without_a_plan_is_not_taken_for_a_build(tmp_path):
 def test_a_folder_that_is_not_there_is_not_made(tmp_path, logs):
     (tmp_path / "afile").touch()
     for folder in ("nowhere", "afile"):
-        with pytest.raises(InputError, match=rf"{folder} is no folder; make it first"):
+        with pytest.raises(InputError, match=rf"{folder} is not a folder; make it first"):
             build(tmp_path / folder / "centre.engram", logs, "a", groups=1)
     assert [one.name for one in tmp_path.iterdir()] == ["afile"]
 

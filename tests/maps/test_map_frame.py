@@ -142,7 +142,7 @@ def test_a_bag_of_two_receivers_asks_which(copy, tmp_path):
         anchor_map(copy, source, author="tests")
     with pytest.raises(InputError, match="holds no fix"):
         anchor_map(copy, source, topic="/gps/fix", author="tests")
-    with pytest.raises(InputError, match="no anchor is of one of its nodes"):
+    with pytest.raises(InputError, match="none of the anchors belongs to one of its nodes"):
         anchor_map(copy, source, topic="/rtk/fix", author="tests")
 
 

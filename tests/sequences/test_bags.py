@@ -318,7 +318,7 @@ class TestPairs:
 
     def test_images_of_two_instants_are_no_pair(self, tmp_path) -> None:
         late = StereoBag(PICTURES, rectified_infos(camera()), offset_ns=30_000_000)
-        with pytest.raises(SequenceError, match=r"not of one instant: typically 30\.0 ms apart"):
+        with pytest.raises(SequenceError, match=r"not synchronised: typically 30\.0 ms apart"):
             open_sequence(late.write(tmp_path / "b", "mcap"))
 
     def test_a_lost_image_loses_its_pair_only(self, tmp_path, kind) -> None:

@@ -108,7 +108,7 @@ class TestFiles:
             ("stamp_ns,speed\n1,2\n", "first line must name the columns"),
             ("stamp_ns,forward_m_s\n", "holds no motion"),
             ("stamp_ns,forward_m_s\n5,nan\n", "line 2"),
-            ("stamp_ns,forward_m_s\n5,1\n4,1\n", "stamps do not rise"),
+            ("stamp_ns,forward_m_s\n5,1\n4,1\n", "stamps do not increase"),
         ],
     )
     def test_what_cannot_be_used_is_said_at_once(self, tmp_path, text, fact) -> None:

@@ -80,7 +80,7 @@ class Troubles:
         if not said:
             left, right = self._images
             said.append(
-                f"{left} left and {right} right images, and none of one instant: see "
+                f"{left} left and {right} right images, and none of them synchronised: see "
                 "pair_tolerance_ms"
             )
         return said

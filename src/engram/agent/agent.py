@@ -99,7 +99,8 @@ class Agent:
     ) -> None:
         if not (folder / "agent.sqlite").exists():
             raise InputError(
-                f"{folder} has no agent; enrol it: engram agent enrol {folder} URL CODE"
+                f"{folder} is not the folder of an enrolled robot; enrol it: engram agent enrol "
+                f"{folder} URL CODE --name NAME"
             )
         self.folder = folder
         self.settings = settings or AgentSettings()
@@ -230,7 +231,10 @@ class Agent:
             update(download, staged)
             problems = check_file(staged).problems
             if problems:
-                raise MapError(f"the updated map has {len(problems)} faults: {problems[0]}")
+                raise MapError(
+                    f"the updated map has {len(problems)} faults ({problems[0]}); the live map "
+                    "is unchanged"
+                )
         else:
             download.replace(staged)
         self.state.remember(staged=version, staged_on=on)

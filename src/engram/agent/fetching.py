@@ -93,7 +93,9 @@ class Fetch:
         problems = check_file(path).problems
         if problems:
             path.unlink()
-            raise MapCorruptError(f"the download has {len(problems)} faults: {problems[0]}")
+            raise MapCorruptError(
+                f"the download has {len(problems)} faults ({problems[0]}); it is fetched again"
+            )
 
     def _part(self, own: Split | None, part: PartHash) -> bytes | None:
         body = self._state.arrived(part)

@@ -115,7 +115,7 @@ class Link:
                     yield from opened.feed(piece)
                     self._pace(len(piece))
         except httpx.HTTPError as error:
-            raise Unreachable(f"the link broke: {error!r}") from error
+            raise Unreachable(f"the connection broke: {error!r}") from error
 
     def _ask(self, method: str, path: str, options: Callable[[], dict[str, Any]]) -> Any:
         answer = self._request(method, path, options())
@@ -170,7 +170,7 @@ class Link:
     @staticmethod
     def _refuse(answer: httpx.Response) -> None:
         if answer.status_code in {502, 503, 504}:
-            raise Unreachable(f"the centre is not there now ({answer.status_code})")
+            raise Unreachable(f"the centre is unavailable now (status {answer.status_code})")
         if answer.status_code >= 400:
             try:
                 detail = str(answer.json().get("detail", ""))

@@ -51,8 +51,8 @@ class Outbox:
         size = sum(map(len, parts.values()))
         if kept + size > self._limit_bytes:
             raise StorageFullError(
-                f"the outbox would take {kept + size} bytes of {self._limit_bytes}: it waits for "
-                "the link, or for a larger outbox_bytes"
+                f"the outbox would hold {kept + size} bytes, more than {self._limit_bytes}: hand "
+                "in after the next sync, or raise outbox_bytes"
             )
         self._state.queue(key, encode_manifest(taken.manifest), parts)
         self._state.remember(last_queued=key)

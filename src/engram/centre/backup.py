@@ -26,7 +26,10 @@ def back_up(centre: Centre, target: Path) -> dict[str, int]:
         ConfigError: the tables are not in the folder.
     """
     if any(centre.addresses):
-        raise ConfigError("this backs up a centre in a folder; use the database's own backups")
+        raise ConfigError(
+            "only a centre that is kept in a folder is copied; back up PostgreSQL and the "
+            "bucket with their own tools"
+        )
     if target.exists():
         raise InputError(f"{target} exists already; choose another name")
     (target / "maps").mkdir(parents=True)

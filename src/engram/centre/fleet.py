@@ -50,7 +50,7 @@ class Fleet:
             query = select(robots).where(robots.c.map == name, robots.c.robot == robot)
             row = first_row(connection, query)
         if row is None:
-            raise UnknownError("you are no robot of this map; enrol first")
+            raise UnknownError("you are not a robot of this map; enrol first")
         revision = Refs(self._centre).revision(name, row["follows"])
         return {
             "follows": row["follows"],
@@ -69,7 +69,7 @@ class Fleet:
                 .values(report=json.dumps(told), reported_ns=now)
             )
         if not changed.rowcount:
-            raise UnknownError("you are no robot of this map; enrol first")
+            raise UnknownError("you are not a robot of this map; enrol first")
         return self.wanted(name, robot)
 
     def follow(self, name: str, robot: str, ref: str, by: str) -> None:

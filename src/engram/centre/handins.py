@@ -128,7 +128,7 @@ class HandIns:
             QuotaError: more than the robot may hand in.
         """
         if row["state"] != HandInState.OPEN:
-            raise ConflictError(f"hand-in {row['id']} is {row['state']}, and takes no parts")
+            raise ConflictError(f"hand-in {row['id']} is {row['state']} and takes no more parts")
         size, now = sum(map(len, some)), self._centre.now_ns()
         with self._centre.database.reading() as connection:
             used = _used(connection, row["robot"], now)
@@ -140,7 +140,7 @@ class HandIns:
             )
         if whole is not None and whole["bytes"] + size > limits.handin_bytes:
             raise QuotaError(
-                f"a hand-in of more than {limits.handin_bytes} bytes; hand in more often"
+                f"the hand-in is larger than {limits.handin_bytes} bytes; hand in more often"
             )
         new = self._centre.packs(row["map"]).add(some, now, row["robot"])
         with self._centre.database.writing() as connection:
@@ -210,7 +210,7 @@ class HandIns:
         missing = self.wanted(row)
         if missing:
             raise ConflictError(
-                f"{len(missing)} parts are missing; ask what is wanted, and send it"
+                f"{len(missing)} parts are missing; ask which are wanted and send them"
             )
         now = self._centre.now_ns()
         with self._centre.database.writing() as connection:
@@ -376,7 +376,7 @@ class HandIns:
         if base is not None and base not in needed_manifests(
             connection, name, kept_since_ns(self._centre)
         ):
-            raise MalformedError(f"manifest {base:.40} is kept no more; send the whole")
+            raise MalformedError(f"manifest {base:.40} is no longer kept; send a whole manifest")
 
     def _check_open(self, connection: Connection, name: str, robot: str) -> None:
         query = select(func.count()).where(

@@ -85,7 +85,10 @@ class Refs:
             InputError: the name cannot be one, or there is no such revision.
         """
         if ref == HEAD or not _NAME.fullmatch(ref):
-            raise InputError(f"{ref!r:.60} cannot be moved: a letter, then letters, digits, . _ -")
+            raise InputError(
+                f"{ref!r:.60} is not the name of a movable version: use a letter, then letters, "
+                "digits, . _ -"
+            )
         with self._centre.reading(name) as store:
             if not 1 <= revision <= store.revision:
                 raise InputError(f"{name} has revisions 1 to {store.revision}, not {revision}")
@@ -95,7 +98,7 @@ class Refs:
             row = first_row(connection, query)
             version = 0 if row is None else row["version"]
             if expected is not None and expected != version:
-                raise ChangedError(f"{ref} is at version {version}, not {expected}: look again")
+                raise ChangedError(f"{ref} is at version {version}, not {expected}: read it again")
             if row is not None and row["revision"] == revision:
                 return version
             moved = {

@@ -102,7 +102,8 @@ class Centre:
         """
         if not _NAME.fullmatch(name):
             raise InputError(
-                f"{name!r:.60} cannot name a map: a letter, then letters, digits and -, 40 at most"
+                f"{name!r:.60} cannot name a map: use a letter, then letters, digits and -, at "
+                "most 40 characters"
             )
         path = self.folder / "maps" / f"{name}.engram"
         if not path.exists():

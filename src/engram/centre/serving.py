@@ -40,7 +40,8 @@ class Listening:
             raise ConfigError("--tls-certificate and --tls-key go together")
         if self.certificate is None and not self.insecure and not _is_here(self.host):
             raise ConfigError(
-                f"--host {self.host} is reached from elsewhere, and tokens would go unencrypted: "
+                f"--host {self.host} can be reached from other machines, and tokens would be "
+                "sent unencrypted: "
                 "give --tls-certificate and --tls-key, or --insecure behind a proxy that does TLS"
             )
 

@@ -85,7 +85,7 @@ def _run() -> None:
             raise
         _complain(
             EngramError(
-                f"the compiled core is older than the program: it has no {error.name}. Build it "
+                f"the compiled core is older than the program: it has no {error.name}; build it "
                 "again with make setup or pip install ."
             )
         )

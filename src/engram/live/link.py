@@ -258,5 +258,7 @@ def _slot_bytes(width: int, height: int) -> int:
 def _checked(shape: tuple[int, ...], path: str) -> tuple[int, int, int]:
     slots, width, height = (int(one) for one in shape)
     if not (2 <= slots <= _MOST_SLOTS and 1 <= width <= _LARGEST_SIDE >= height >= 1):
-        raise LinkError(f"{path}: {slots} slots of {width} × {height} px cannot be")
+        raise LinkError(
+            f"{path}: {slots} slots of {width} × {height} px are not the size of a ring"
+        )
     return slots, width, height

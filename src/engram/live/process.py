@@ -224,7 +224,10 @@ def _fix(given: Message) -> Fix:
     sigma_m = None if given.get("sigma_m") is None else float(given["sigma_m"])
     known = sigma_m is None or 0 < sigma_m < math.inf
     if not (abs(at[0]) <= 90 and abs(at[1]) <= 180 and known):
-        raise InputError(f"a fix at {at} degrees with a deviation of {sigma_m} m cannot be")
+        raise InputError(
+            f"not a valid satellite fix: latitude and longitude {at} degrees, deviation "
+            f"{sigma_m} m, must be > 0"
+        )
     return Fix(int(given["stamp_ns"]), *at, None, sigma_m)
 
 

@@ -60,7 +60,7 @@ def reading_rows(name: str) -> Iterator[None]:
             raise
         except _STUMBLES as error:
             raise MapCorruptError(
-                f"a record holds what no map holds ({type(error).__name__}: {error!s:.200}); run "
+                f"a record is malformed ({type(error).__name__}: {error!s:.200}); run "
                 "engram check, and restore a copy"
             ) from error
 

@@ -560,7 +560,8 @@ class Map(MapReader):
         if present not in {None, descriptor}:
             raise IncompatibleError(
                 f"{self._database.name} holds {present} descriptors, this session {descriptor}; "
-                "the two cannot be matched: extract the session again, or make another map"
+                "the two cannot be matched: record the drive again with the same --features, or "
+                "make another map"
             )
 
     def _interrupted_rows(self, session: SessionId) -> tuple[Row, Row]:

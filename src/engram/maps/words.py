@@ -30,7 +30,7 @@ def encode_words(found: NDArray[Any]) -> bytes:
     """
     wide = np.asarray(found, np.int64)
     if len(wide) and (wide[0] < 0 or wide[-1] > np.iinfo(_DTYPE).max or (np.diff(wide) <= 0).any()):
-        raise InputError("the words of a node must rise, from 0 to 65535 at most")
+        raise InputError("the words of a node must increase, within 0 to 65535")
     return wide.astype(_DTYPE).tobytes()
 
 
@@ -44,7 +44,7 @@ def decode_words(body: bytes) -> NDArray[np.int32]:
         raise MapCorruptError(f"{len(body)} bytes are not words of two bytes each")
     found = np.frombuffer(body, _DTYPE).astype(np.int32)
     if (np.diff(found) <= 0).any():
-        raise MapCorruptError("the words of a node do not rise")
+        raise MapCorruptError("the words of a node do not increase")
     return found
 
 

@@ -199,8 +199,8 @@ class RevisionWriter:
         if self._descriptor not in {None, descriptor}:
             raise IncompatibleError(
                 f"{self._database.name} holds {self._descriptor} descriptors, session "
-                f"{session.id} {descriptor}; the two cannot be matched: extract the session again, "
-                "or make another map"
+                f"{session.id} {descriptor}; the two cannot be matched: record the drive again "
+                "with the same --features, or make another map"
             )
         self._descriptor = descriptor
         camera_key = self._known.camera(camera)

@@ -138,7 +138,7 @@ def _given(
             raise InputError(f"{source}: a bag holds latitudes and longitudes; leave out --grid")
         return anchors_of_fixes(read_fixes(source, topic), _utc_stamps(store)[0]), True
     if topic is not None:
-        raise InputError(f"--topic names fixes of a bag; {source} is none")
+        raise InputError(f"--topic names fixes of a bag; {source} is not a bag")
     given, geographic = read_anchors(source)
     return (given, geographic) if grid is None else (on_grid(given, grid), False)
 
@@ -157,8 +157,8 @@ def _nodes_of(store: Map, given: list[GivenAnchor]) -> tuple[list[Node], list[Gi
                 found.setdefault(store.graph.node(int(order[at])), one)
     if not found:
         raise InputError(
-            f"{store.location}: no anchor is of one of its nodes; times are UTC, and count for "
-            "drives whose clock is UTC (see engram amend --recorded-at)"
+            f"{store.location}: none of the anchors belongs to one of its nodes; times are UTC, "
+            "and match only drives whose clock is UTC (see engram amend --recorded-at)"
         )
     return list(found), list(found.values())
 
@@ -184,7 +184,7 @@ def _check_spread(positions: NDArray[np.float64], source: Path) -> None:
     if not far_m >= _LEAST_APART_M:
         raise InputError(
             f"{source}: its anchors lie within {far_m:.1f} m; at least two must be "
-            f"{_LEAST_APART_M:.0f} m apart to tell a direction"
+            f"{_LEAST_APART_M:.0f} m apart to determine a direction"
         )
 
 

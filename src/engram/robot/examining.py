@@ -178,5 +178,5 @@ def refuse_unfit(diagnosis: Diagnosis, name: str, options: RobotOptions) -> None
     if diagnosis.fatal and not options.force:
         findings = "\n".join(one.text() for one in diagnosis.fatal)
         raise UnfitDriveError(
-            f"{name}: not mapped, nothing was written; --force maps it all the same\n{findings}"
+            f"{name}: not mapped, nothing was written; --force maps it anyway\n{findings}"
         )

@@ -92,7 +92,8 @@ def _geojson(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
     """Points: the nodes, then the goals."""
     if frame.origin is None:
         raise InputError(
-            f"{store.location} has no place on Earth: anchor it with latitudes and longitudes "
+            f"{store.location} has no known position on Earth: anchor it with latitudes and "
+            "longitudes "
             "(engram anchor), or export CSV, which has metres"
         )
     features = []

@@ -199,7 +199,7 @@ class IntoMap:
         if opened.session_state(session.id) is not SessionState.ABSENT:
             raise MapError(
                 f"{opened.location} already holds session {session.id}; give its recording to "
-                "engram map, which continues an interrupted session"
+                "engram map, which resumes an interrupted session"
             )
         about = {
             "author": session.robot,

@@ -180,7 +180,7 @@ def read_samples(path: Path) -> list[Sample]:
     if not samples:
         raise SequenceError(f"{path}: holds no motion")
     if any(one.stamp_ns >= then.stamp_ns for one, then in pairwise(samples)):
-        raise SequenceError(f"{path}: its stamps do not rise")
+        raise SequenceError(f"{path}: its stamps do not increase")
     return samples
 
 

@@ -44,7 +44,7 @@ class Trajectory:
                 f"{self.stamps_ns.shape}"
             )
         if (np.diff(self.stamps_ns) <= 0).any():
-            raise InputError("a trajectory's stamps must rise")
+            raise InputError("a trajectory's stamps must increase")
 
     def __len__(self) -> int:
         return len(self.world_from_cam)

@@ -63,5 +63,5 @@ def _unpacked(sent: bytes, size: int) -> bytes:
 
 def _checked(named: bytes, body: bytes) -> bytes:
     if part_hash(body) != named:
-        raise InputError(f"a part is not what its hash {named.hex()[:16]}… says; send it again")
+        raise InputError(f"a part does not match its hash {named.hex()[:16]}…; send it again")
     return body

@@ -86,11 +86,11 @@ class WireManifest:
             InputError: it is of another format, names another base, or is malformed.
         """
         if self.format != FORMAT:
-            raise InputError(f"a manifest of format {self.format!r:.40}, this reads {FORMAT}")
+            raise InputError(f"the manifest is of format {self.format!r:.40}, this reads {FORMAT}")
         if (None if base is None else base.id) != self.base:
             raise InputError("the manifest continues one that is not known here; send it whole")
         if unknown := self.tables.keys() - TABLES.keys():
-            raise InputError(f"a map has no tables {sorted(unknown)!r:.80}")
+            raise InputError(f"a map does not have the tables {sorted(unknown)!r:.80}")
         pages = {name: self._pages(name, base) for name in TABLES if name in self.tables}
         return Manifest(self.content_hash, self.revision, pages)
 

@@ -156,8 +156,8 @@ def _rerun() -> Any:
         import rerun
     except ImportError as error:
         raise MissingExtraError(
-            "the viewer needs Rerun: pip install 'engram-localisation[view]'. Without it, plot and "
-            "localise --pictures draw"
+            "the viewer needs Rerun: pip install 'engram-localisation[view]'; without it, use "
+            "engram plot and engram localise --pictures"
         ) from error
     return rerun
 

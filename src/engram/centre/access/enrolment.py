@@ -181,7 +181,7 @@ def _issue(centre: Centre, subject: str, expires_ns: int | None) -> str:
 def _subject(connection: Connection, found: str) -> Subject:
     row = first_row(connection, select(subjects).where(subjects.c.id == found))
     if row is None or row["disabled"]:
-        raise NotKnownError("whose token this was is not known any more")
+        raise NotKnownError("the owner of this token is no longer known; ask for a new one")
     held = rows_of(connection, select(grants).where(grants.c.subject == found))
     return Subject(found, row["name"], {one["map"]: Role(one["role"]) for one in held})
 

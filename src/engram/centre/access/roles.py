@@ -56,6 +56,8 @@ class Subject:
         """
         role = self.role_on(name)
         if role is None:
-            raise UnknownError(f"there is no map {name!r:.60} for you")
+            raise UnknownError(f"you have no access to a map {name!r:.60}")
         if not any(role in _INCLUDES[one] for one in roles):
-            raise NotAllowedError(f"{role} may not do this; it takes {' or '.join(roles)}")
+            raise NotAllowedError(
+                f"a role of {role} may not do this; it needs {' or '.join(roles)}"
+            )

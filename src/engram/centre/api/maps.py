@@ -127,10 +127,10 @@ def revert(
     """
     expected, path = _version(if_match), centre.map_path(name)
     if not body.dry_run and expected is None:
-        raise ChangedError("say which head this is for: If-Match with the ETag of the ref head")
+        raise ChangedError("If-Match is missing: send the ETag of the ref head")
     with Map.open(path) as store, store.writing():
         if expected is not None and store.revision != expected:
-            raise ChangedError(f"head is revision {store.revision}, not {expected}: look again")
+            raise ChangedError(f"head is revision {store.revision}, not {expected}: read it again")
         done = store.revert(
             body.revision, author=who.name, message=body.message, dry_run=body.dry_run
         )

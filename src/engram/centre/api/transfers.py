@@ -78,9 +78,9 @@ async def put_part(
     async for piece in request.stream():
         body += piece
         if len(body) > MAX_PART_BYTES:
-            raise QuotaError(f"a part of more than {MAX_PART_BYTES} bytes")
+            raise QuotaError(f"the part is larger than {MAX_PART_BYTES} bytes")
     if part_hash(bytes(body)).hex() != part:
-        raise InputError("the body is not what its hash says; send it again")
+        raise InputError("the body does not match its hash; send it again")
     await run_in_threadpool(HandIns(centre).put_parts, row, [bytes(body)])
 
 

@@ -99,8 +99,8 @@ class ServiceDatabase:
         version = connection.execute(select(centre.c.version)).scalar_one()
         if version > VERSION:
             raise FormatVersionError(
-                f"the centre's tables are of version {version}, this Engram reads up to {VERSION}: "
-                "upgrade it"
+                f"the centre's tables are of version {version}, this Engram reads up to "
+                f"{VERSION}: upgrade Engram"
             )
         for step in range(version, VERSION):
             for statement in MIGRATIONS[step]:
@@ -126,7 +126,7 @@ def _engine(url: str) -> Engine:
     try:
         engine = create_engine(url, pool_size=8, max_overflow=-1)
     except ArgumentError as error:
-        raise InputError(f"the address of the database is not one: {error}") from error
+        raise InputError(f"not a valid database address: {error}") from error
     except ImportError as error:
         raise MissingExtraError(
             "a centre on PostgreSQL needs its driver: pip install 'engram-localisation[server]'"

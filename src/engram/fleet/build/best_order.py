@@ -174,8 +174,8 @@ class _Search:
         with Map.open(self._root) as store:
             if store.content_hash() != self._root_hash:
                 raise MapError(
-                    f"{self._root} was written to while the orders were tried; the judgements do "
-                    "not apply to it; run the same command again"
+                    f"{self._root} changed while orders of merging were tried, so the results no "
+                    "longer apply; run the same command again"
                 )
 
     def _step(self, order: tuple[int, ...], place: Path, prefix: Path | None) -> _Step:

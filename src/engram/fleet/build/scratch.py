@@ -88,8 +88,8 @@ def keeping(folder: Path) -> Iterator[None]:
         if full := storage_full(error, where):
             raise full from error
         raise MapError(
-            f"{where}: {error.strerror or error}; a build keeps its maps in {folder}: it must be a "
-            "folder that can be written to, or one that can be made there"
+            f"{where}: {error.strerror or error}; a build keeps its maps in {folder}: it must be "
+            "a writable folder, or one that can be made"
         ) from error
 
 

@@ -190,7 +190,7 @@ def _check(centre: Path, handed: Sequence[Path], drives: Sequence[Path]) -> None
         raise InputError(f"{centre}: nothing was handed in; merge with --keep, or name maps")
     if len(drives) < _FEWEST_DRIVES:
         raise ConfigError(
-            f"{len(drives)} validation drives tell nothing about chance: give at least "
+            f"{len(drives)} validation drives are too few to rule out chance: give at least "
             f"{_FEWEST_DRIVES} with --validate"
         )
     with Map.open(centre) as store:

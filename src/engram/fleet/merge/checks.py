@@ -31,7 +31,7 @@ def check_fits(merge: Merge) -> None:
     if None not in {kind, theirs} and kind is not theirs:
         raise IncompatibleError(
             f"{robot.location} holds {theirs} descriptors, the fleet map {kind}; the two cannot "
-            "be matched: extract and map the drives again"
+            "be matched: record and map the drives again with the same --features"
         )
     for session in merge.sessions:
         ours = known.get(session.id)

@@ -56,7 +56,7 @@ def check_held_out(
         held = held_as(sequence, sessions)
         if held is not None:
             raise ConfigError(
-                f"{name} is not held out: {where} holds this very drive (session {held.id} of "
+                f"{name} is not held out: {where} contains this drive (session {held.id} of "
                 f"{held.robot}); give {option} drives that are in none of the maps"
             )
 
@@ -143,7 +143,7 @@ class Gate:
         if worse:
             raise RefusedError(
                 f"{robot} is refused: {', '.join(names)} localise worse in the result: {worse}; "
-                "the fleet map is unchanged by it"
+                "the fleet map is unchanged"
             )
         self._before = after
         return HeldOutReport(names, _figures(before), _figures(after))

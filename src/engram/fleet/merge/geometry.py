@@ -42,8 +42,8 @@ class GeometryGate:
         new = [one for one in wrong if _key(one) not in self._known]
         if self._refuses and new:
             raise RefusedError(
-                f"{source} would bring {len(new)} wrong edges, the surest of them: "
-                f"{new[0].text()}; mend it with engram check {source} --geometry --repair"
+                f"{source} would add {len(new)} wrong edges, the most certain of them: "
+                f"{new[0].text()}; repair it with engram check {source} --geometry --repair"
             )
         self._known = {_key(one) for one in wrong}
         return [one.to_dict() for one in wrong]

@@ -309,7 +309,7 @@ class MergeReport:
 
     def _outcome(self) -> str:
         if self.interrupted:
-            return "interrupted: the fleet map is unchanged by it; run the same command again"
+            return "interrupted: the fleet map is unchanged; run the same command again"
         if not self.changed:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"

@@ -98,8 +98,8 @@ def unpack_file(path: Path, folder: TemporaryDirectory[str]) -> Path:
                 while block := content.read(_BLOCK):
                     if file.tell() + len(block) > most:
                         raise SequenceError(
-                            f"{path}: unpacks to more than {_MOST_RATIO} times its size: it is no "
-                            "recording"
+                            f"{path}: unpacks to more than {_MOST_RATIO} times its size: it is "
+                            "not a recording"
                         )
                     file.write(block)
         except (zstd.ZstdError, EOFError) as error:

@@ -91,7 +91,7 @@ def learnt_tolerance(left_ns: Sequence[int], right_ns: Sequence[int], most_ns: i
     near = offsets[offsets <= most_ns]
     if not len(near):
         raise SequenceError(
-            f"left and right images are not of one instant: typically "
+            f"left and right images are not synchronised: typically "
             f"{np.median(offsets) / 1e6:.1f} ms apart, at most {most_ns / 1e6:.1f} ms is a pair; "
             "are these the topics of one stereo camera, triggered together?"
         )

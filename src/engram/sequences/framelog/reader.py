@@ -304,6 +304,6 @@ def _read_stamps(connection: Connection) -> tuple[NDArray[np.int64], NDArray[np.
     if (table[:, 0] != np.arange(len(table))).any():
         raise MapCorruptError("frames are missing in the frame log: their numbers have gaps")
     if (np.diff(table[:, 1]) <= 0).any():
-        raise MapCorruptError("the frame log's stamps do not rise")
+        raise MapCorruptError("the frame log's stamps do not increase")
     usable = [row.odometry_status != OdometryStatus.UNUSABLE_FRAME.value for row in rows]
     return table[:, 1].copy(), np.array(usable)
