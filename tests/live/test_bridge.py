@@ -77,26 +77,39 @@ def test_it_runs_on_python_3_8() -> None:
 def test_grey_and_coloured_images(pad: int) -> None:
     colours = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
     wanted = cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY)
-    assert np.abs(images.grey(image("rgb8", colours, pad)).astype(int) - wanted).max() <= 1
+    assert (
+        np.abs(images.grey(image("rgb8", colours, pad), images.Depth()).astype(int) - wanted).max()
+        <= 1
+    )
     assert (
         np.abs(
-            images.grey(image("bgr8", colours[..., ::-1].copy(), pad)).astype(int) - wanted
+            images.grey(image("bgr8", colours[..., ::-1].copy(), pad), images.Depth()).astype(int)
+            - wanted
         ).max()
         <= 1
     )
-    np.testing.assert_array_equal(images.grey(image("mono8", wanted, pad)), wanted)
+    np.testing.assert_array_equal(images.grey(image("mono8", wanted, pad), images.Depth()), wanted)
     ten_bits = wanted.astype(np.uint16) << 2 | 3
     ten_bits[0, 0] = 1023
-    np.testing.assert_array_equal(images.grey(image("mono16", ten_bits, 2 * pad))[1:], wanted[1:])
+    found = images.grey(image("mono16", ten_bits, 2 * pad), images.Depth())
+    np.testing.assert_array_equal(found[1:], wanted[1:])
+
+
+def test_the_brightness_of_16_bit_images_does_not_flicker() -> None:
+    depth = images.Depth()
+    bright = np.full((5, 7), 4000, np.uint16)
+    dim = np.full((5, 7), 500, np.uint16)
+    assert images.grey(image("mono16", bright), depth).max() == 4000 >> 4
+    assert images.grey(image("mono16", dim), depth).max() == 500 >> 4
 
 
 def test_images_that_cannot_be_used_say_why() -> None:
     with pytest.raises(images.ImageError, match="'32FC1' of a 7 × 5"):
-        images.grey(image("32FC1", np.zeros((5, 7, 4), np.uint8)))
+        images.grey(image("32FC1", np.zeros((5, 7, 4), np.uint8)), images.Depth())
     short = image("mono8", np.zeros((5, 7), np.uint8))
     short.data = short.data[:-1]
     with pytest.raises(images.ImageError, match="34 bytes"):
-        images.grey(short)
+        images.grey(short, images.Depth())
     with pytest.raises(images.ImageError, match="cannot be decoded"):
         images.uncompressed(SimpleNamespace(format="png", data=b"none"))
 

@@ -177,6 +177,14 @@ class TestEncodings:
         path = self.write(tmp_path, MONO16, "mono16", big_endian=True)
         np.testing.assert_array_equal(next(iter(opened(path))).left, GREY)
 
+    @pytest.mark.parametrize("bits", [10, 12])
+    def test_cameras_that_use_fewer_than_16_bits_are_not_dark(self, tmp_path, bits) -> None:
+        white = (1 << bits) - 1
+        grey = (GREY.astype(np.uint32) * white // 255).astype(np.uint16)
+        grey[0, 0] = white
+        found = next(iter(opened(self.write(tmp_path, grey, "16UC1")))).left
+        np.testing.assert_allclose(found[1:].astype(int), GREY[1:], atol=1)
+
     @pytest.mark.parametrize(("format_", "suffix"), [("jpeg", ".jpg"), ("mono8; png", ".png")])
     def test_compressed_images(self, tmp_path, format_, suffix) -> None:
         smooth = cv2.GaussianBlur(GREY, (0, 0), 4)

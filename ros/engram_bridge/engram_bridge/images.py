@@ -15,6 +15,8 @@ _COLOURS = {
 }
 
 
+# Bits that cameras store in 16.
+_DEPTHS = (8, 10, 12, 14, 16)
 # Bayer patterns: OpenCV names them by the second row's second and third pixel.
 _BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 # YUV 4:2:2: which byte of a pixel is its brightness.
@@ -25,8 +27,25 @@ class ImageError(ValueError):
     """An image message that cannot be used: says what was found, and what is understood."""
 
 
-def grey(message):
+class Depth:
+    """Bits that cameras use of 16: as many as the brightest pixel so far, of both sides, needs."""
+
+    def __init__(self) -> None:
+        self._bits = _DEPTHS[0]
+
+    def eight_bit(self, wide):
+        """(h, w) uint16 as uint8."""
+        brightest = int(wide.max(initial=0))
+        self._bits = max(self._bits, next(bits for bits in _DEPTHS if brightest < 1 << bits))
+        return (wide >> (self._bits - 8)).astype(np.uint8)
+
+
+def grey(message, depth):
     """The (height, width) uint8 image of a sensor_msgs/Image.
+
+    Args:
+        message: the image.
+        depth: of the cameras, `Depth`, which learns from it.
 
     Raises:
         ImageError: its encoding is not understood, or it has too few bytes.
@@ -38,9 +57,7 @@ def grey(message):
     if encoding in ("mono16", "16UC1"):
         order = ">u2" if message.is_bigendian else "<u2"
         wide = np.ascontiguousarray(_rows(message, data, width, 2)).view(order)[:, :, 0]
-        # Cameras store 10 or 12 bits in 16: the brightest pixel tells how many.
-        shift = max(int(wide.max(initial=0)).bit_length() - 8, 0)
-        return (wide >> shift).astype(np.uint8)
+        return depth.eight_bit(wide)
     if encoding in _COLOURS:
         red, green, blue, channels = _COLOURS[encoding]
         pixels = _rows(message, data, width, channels).astype(np.uint32)

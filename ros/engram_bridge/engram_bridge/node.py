@@ -135,9 +135,10 @@ class Bridge(Base):
 
     def _subscribe(self) -> None:
         given = self._given
+        grey = functools.partial(images.grey, depth=images.Depth())
         for side, name in enumerate(("left", "right")):
             topic, compressed = image_topic(given, name)
-            decode = images.uncompressed if compressed else images.grey
+            decode = images.uncompressed if compressed else grey
             kind = CompressedImage if compressed else Image
             self._listen(kind, topic, functools.partial(self._image, side, decode))
             self._listen(CameraInfo, given[name + "_info"], functools.partial(self._info, side))

@@ -29,9 +29,9 @@ def losses_told(sequence: Drive) -> Iterator[None]:
     try:
         yield
     except (EngramError, VerbInterruptedError, typer.Exit):
-        _told(sequence, "the bag is damaged:")
+        _told(sequence, "parts of the bag could not be read:")
         raise
-    if _told(sequence, "the bag is damaged; what could be read was used:"):
+    if _told(sequence, "parts of the bag could not be read; the rest was used:"):
         raise typer.Exit(EXIT_DAMAGED)
 
 

@@ -31,7 +31,7 @@ from engram_lab.checks.euroc_bag import Pictures, write_bag
 
 _MOST_S, _MOST_BYTES = 10.0, 1 << 30
 # A process that waits for ever.
-_PATIENCE_S = 120.0
+_PATIENCE_S = 600.0
 _LEFT, _RIGHT = "/cam0/image_raw", "/cam1/image_raw"
 _INFO = """image_width: 320
 image_height: 240

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -59,8 +59,16 @@ _ENCODINGS: Mapping[str, tuple[str, int, Callable[[Pixels], Pixels]]] = MappingP
 )
 
 
+# Bits that cameras store in 16.
+_DEPTHS = (8, 10, 12, 14, 16)
+
+
 def grey_of(
-    message: Any, where: str, size: tuple[int, int] | None = None, channel: Channel = Channel.GREY
+    message: Any,
+    where: str,
+    size: tuple[int, int] | None = None,
+    channel: Channel = Channel.GREY,
+    bits: int = 16,
 ) -> NDArray[np.uint8]:
     """The (h, w) uint8 grey image of a message.
 
@@ -69,24 +77,35 @@ def grey_of(
         where: topic and place, for messages.
         size: required width and height, px; None for any.
         channel: of colour images.
+        bits: that are used of 16-bit images; brighter pixels are white.
 
     Raises:
         SequenceError: its encoding is unknown, or its bytes do not fit.
         ConfigError: one colour channel is asked for and the image is grey.
     """
-    if hasattr(message, "format"):
-        image = decoded(where, bytes(message.data), size)
-        encoding = str(message.format).split(";")[0].strip().lower()
-        if encoding.startswith("bayer_") and encoding in _ENCODINGS and image.ndim == 2:
-            image = _ENCODINGS[encoding][2](image)
-        return grey(where, image, channel)
-    encoding = str(message.encoding).strip().lower()
-    if encoding not in _ENCODINGS:
-        known = ", ".join(_ENCODINGS)
-        raise SequenceError(f"{where}: encoding is {encoding[:40]!r}; known are {known}")
-    kind, values, to_bgr = _ENCODINGS[encoding]
-    image = _array(message, where, np.dtype(kind), values, size)
-    return grey(where, np.ascontiguousarray(to_bgr(image)), channel)
+    image = _pixels(message, where, size)
+    if bits < 16 and image.dtype == np.uint16:
+        image = np.minimum(image, (1 << bits) - 1) << (16 - bits)
+    return grey(where, image, channel)
+
+
+def depth_of(messages: Iterable[Any], where: str) -> int:
+    """Bits that the brightest pixel of 16-bit images needs, as cameras store them; else 16.
+
+    Images of which the first has 8 bits, or that cannot be decoded, are not looked at.
+    """
+    brightest = 0
+    for message in messages:
+        try:
+            image = _pixels(message, where, None)
+        except SequenceError:
+            continue
+        if image.dtype != np.uint16:
+            break
+        brightest = max(brightest, int(image.max(initial=0)))
+    if not brightest:
+        return _DEPTHS[-1]
+    return next(depth for depth in _DEPTHS if brightest < 1 << depth)
 
 
 def size_of(message: Any, where: str) -> tuple[int, int]:
@@ -99,6 +118,23 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
         height, width = decoded(where, bytes(message.data)).shape[:2]
         return width, height
     return int(message.width), int(message.height)
+
+
+def _pixels(message: Any, where: str, size: tuple[int, int] | None) -> Pixels:
+    """The grey, BGR or BGRA image of a message, of 8 or 16 bits."""
+    if hasattr(message, "format"):
+        image: Pixels = decoded(where, bytes(message.data), size)
+        encoding = str(message.format).split(";")[0].strip().lower()
+        if encoding.startswith("bayer_") and encoding in _ENCODINGS and image.ndim == 2:
+            image = _ENCODINGS[encoding][2](image)
+        return image
+    encoding = str(message.encoding).strip().lower()
+    if encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
+        raise SequenceError(f"{where}: encoding is {encoding[:40]!r}; known are {known}")
+    kind, values, to_bgr = _ENCODINGS[encoding]
+    image = to_bgr(_array(message, where, np.dtype(kind), values, size))
+    return np.ascontiguousarray(image)
 
 
 def _array(

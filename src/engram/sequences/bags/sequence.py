@@ -29,7 +29,7 @@ from engram.sequences.bags.fixes import Fix, fix_topics, fixes_of
 from engram.sequences.bags.messages import Decoder, stamp_of
 from engram.sequences.bags.motion import BagMotion
 from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
-from engram.sequences.bags.pictures import grey_of, size_of
+from engram.sequences.bags.pictures import depth_of, grey_of, size_of
 from engram.sequences.bags.records import DamageError
 from engram.sequences.bags.topics import StereoTopics, stereo_topics
 from engram.sequences.calibrating import check_no_view, read_mask
@@ -40,6 +40,8 @@ from engram.sequences.sequence import SequenceInfo
 
 # Images from which the tolerance of pairs is learnt.
 _LEARNT_FROM = 100
+# Images of either side that tell how many of 16 bits the cameras use.
+_BITS_FROM = 10
 _MOST_REASONS = 20
 
 
@@ -95,6 +97,7 @@ class BagSequence:
             self.camera.cam_from_rig,
         )
         self._reasons: list[str] = []
+        self._bits = self._depth()
 
     def motion(self) -> MotionSource | None:
         """A new pass through the motion by wheels or gyroscope; None without one."""
@@ -198,7 +201,7 @@ class BagSequence:
         if isinstance(shot.content, str):
             raise SequenceError(f"{where} {shot.content}")
         size = (self.camera.width, self.camera.height)
-        image = grey_of(shot.content, where, size, self._options.channel)
+        image = grey_of(shot.content, where, size, self._options.channel, self._bits)
         return image if table is None else rectified(image, table)
 
     def _shots(self, topic: str) -> Iterator[Shot[Any]]:
@@ -233,6 +236,20 @@ class BagSequence:
         except SequenceError as error:
             raise SequenceError(f"{self._bag.path}: {self.topics}: {error}") from error
         return tolerance_ns, min(stamps[0])
+
+    def _depth(self) -> int:
+        """Bits that the cameras use of 16-bit images, by the first ones of both."""
+        return max(
+            depth_of(
+                (
+                    shot.content
+                    for shot in islice(self._shots(topic), _BITS_FROM)
+                    if not isinstance(shot.content, str)
+                ),
+                topic,
+            )
+            for topic in (self.topics.left, self.topics.right)
+        )
 
     def _stereo_topics(self, given: Cameras | None) -> StereoTopics:
         left, right = self._options.left, self._options.right
