@@ -28,7 +28,7 @@ def test_a_healthy_drive_passes(engram, street: Path) -> None:
     ran = engram("doctor", street)
     assert ran.status == 0
     assert "12 frames examined: nothing wrong" in ran.out
-    assert "cannot be told: scale_off" in ran.out
+    assert "not checked: scale_off" in ran.out
 
 
 def test_pairs_are_drawn(engram, street: Path, tmp_path: Path) -> None:

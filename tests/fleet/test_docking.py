@@ -283,7 +283,7 @@ class TestReported:
     def test_a_map_of_another_town_becomes_a_part_of_its_own(self, centre, fleet):
         (report,) = merged(centre, fleet["other"][0])
         assert report.omitted == 0
-        assert any("no node of it matched" in note for note in report.notes)
+        assert any("none of its nodes matched" in note for note in report.notes)
 
     def test_another_town_is_told_even_where_its_drives_found_each_other(
         self, tmp_path, centre, fleet
@@ -295,7 +295,7 @@ class TestReported:
         (report,) = merged(centre, town)
         assert report.omitted
         assert report.taken
-        assert any("no node of it matched" in note for note in report.notes)
+        assert any("none of its nodes matched" in note for note in report.notes)
 
     def test_a_drive_of_which_a_part_was_not_found(self, tmp_path, centre, fleet):
         mixed = tmp_path / "mixed.engram"
@@ -426,7 +426,7 @@ class TestGate:
             merged(centre, fleet["longer"][0], robot, require_better=[drive])
         assert centre.read_bytes() == before
         merged(centre, robot)
-        with pytest.raises(ConfigError, match=r"not held out: .*centre\.engram holds"):
+        with pytest.raises(ConfigError, match=r"not held out: .*centre\.engram contains"):
             merged(centre, fleet["longer"][0], require_better=[drive])
 
     def test_the_name_of_the_robot_does_not_make_a_drive_held_out(self, tmp_path, centre, fleet):
@@ -447,7 +447,7 @@ class TestGate:
         sessions = [session_of_drive(theirs)]
         assert session_of_drive(ours).start_ns == sessions[0].start_ns
         check_held_out([("ours", ours)], sessions, "a map", "--check")
-        with pytest.raises(ConfigError, match="theirs is not held out: a map holds"):
+        with pytest.raises(ConfigError, match="theirs is not held out: a map contains"):
             check_held_out([("theirs", theirs)], sessions, "a map", "--check")
 
     def test_the_report_says_what_the_gate_saw(self, tmp_path, centre, fleet, judged):

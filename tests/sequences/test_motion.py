@@ -155,7 +155,7 @@ class TestTopics:
         np.testing.assert_allclose(found.rates_rad_s, [0, -TURN_RAD_S - 0.01, 0], atol=1e-9)
 
     def test_a_wrong_name_lists_the_right_ones(self, path) -> None:
-        with pytest.raises(SequenceError, match=r"/wheels: is no topic.*/imu/data"):
+        with pytest.raises(SequenceError, match=r"/wheels: is neither a topic.*/imu/data"):
             open_sequence(path, motion=["/wheels"])
         with pytest.raises(SequenceError, match="holds sensor_msgs/msg/Image"):
             open_sequence(path, motion=[LEFT])

@@ -87,7 +87,7 @@ class Outbox:
             before = answer["wanted"]
             answer = link.send(f"/v1/handins/{key}/parts", partial(self._parts, row, wanted))
             if answer["wanted"] and set(answer["wanted"]) == set(before):
-                error = f"{len(wanted)} parts are not on this robot any more"
+                error = f"{len(wanted)} parts are no longer on this robot"
                 self._state.set_outbox(row["id"], FAILED, None, error)
                 return False
         link.ask("POST", f"/v1/handins/{key}/complete")

@@ -79,19 +79,19 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "not_synchronised", _FATAL, sides.forward_m, "forward_m", "m",
-        "left and right are of different instants: the robot moved on between them",
+        "left and right are not synchronised: the robot moved between them",
         "trigger both cameras at once, or pair by the time of exposure; check for a dropped frame",
         explains=_CONSEQUENCES,
     ),
     Check(
         "not_synchronised", _FATAL, sides.row_jump_px, "row_jump_px", "px",
-        "left and right are of different instants: their rows jump from pair to pair",
+        "left and right are not synchronised: their rows jump from pair to pair",
         "trigger both cameras at once, or pair by the time of exposure; check for a dropped frame",
         explains=_CONSEQUENCES,
     ),
     Check(
         "rows_misaligned", _FATAL, sides.row_offset_px, "row_offset_px", "px",
-        "rows of left and right do not lie in line",
+        "rows of left and right are not aligned",
         "calibrate again; raw images need a [raw] calibration, so that they are rectified",
         explains=("no_odometry", "rows_slightly_off"),
     ),
@@ -104,29 +104,30 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "no_odometry", _FATAL, motion.without_odometry, "no_odometry", "of the frames",
         "most frames have no odometry",
-        "look at the images: dark, covered or without texture? is the baseline in metres, and the "
-        "calibration that of these images?",
+        "are the images dark, covered or without texture? is the baseline in metres, and is "
+        "the calibration that of these images?",
     ),
     Check(
         "rows_slightly_off", _WARNING, sides.row_offset_px, "slight_row_offset_px", "px",
-        "rows of left and right lie slightly out of line: half of the landmarks are lost",
+        "rows of left and right are slightly misaligned: half of the landmarks are lost",
         "calibrate again when you can",
     ),
     Check(
         "upside_down", _WARNING, sides.upside_down, "upright", "",
         "the camera hangs upside down: near things are above far ones",
-        "that works, if all drives of the map are like this; else turn the images",
+        "this works if all drives of the map are like this; otherwise turn the images",
         below=True,
     ),
     Check(
         "scale_off", _WARNING, motion.scale_off, "scale", "of the way",
-        "focal length or baseline is wrong: odometry's way differs from the one measured outside",
+        "focal length or baseline is wrong: the distance by odometry differs from the one "
+        "measured outside",
         "calibrate again; check the baseline with a ruler",
         needs="motion from outside: --motion TOPIC or FILE",
     ),
     Check(
         "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",
-        "frames bear the stamp of the frame before",
+        "frames repeat the stamp of the frame before",
         "the driver sends frames twice, or the clock is too coarse; they are left out",
     ),
     Check(
@@ -147,7 +148,7 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "repeated_images", _WARNING, motion.frozen_frames, 0, "images in a row",
-        "an image is that of the frame before",
+        "an image repeats the frame before",
         "the frame counts as unusable; look at the camera's driver",
     ),
     Check(

@@ -78,7 +78,7 @@ def _spread(descriptors: NDArray[np.uint8]) -> Check:
 def _motion(kind: FeatureKind, reference: Frame, live: Frame) -> Check:
     config = fitted_matcher(MatcherConfig(), BRIEF, kind.name)
     match = match_frames(reference, live, config, seed=1)
-    demand = f"{_FEWEST_INLIERS} landmarks agree on a motion, right to {1000 * _WITHIN_M:.0f} mm"
+    demand = f"{_FEWEST_INLIERS} landmarks agree on a motion, accurate to {1000 * _WITHIN_M:.0f} mm"
     if match.reference_from_live is None:
         return Check(demand, False, "no motion")
     off = match.reference_from_live.translation - np.array([_STEP_M, 0, 0])

@@ -200,13 +200,13 @@ class Driving:
         self._belief = None
         if self._robot is not None:
             self._robot.lose()
-        return "the robot looks for its place in the whole map"
+        return "the robot searches the whole map for its place"
 
     def place(self, position: Position) -> str:
         """Takes a position as a hint, such as the last one before a restart: it only proposes."""
         self._belief = position
         self._use_belief()
-        return "the hint is taken"
+        return "the hint is accepted"
 
     def here(self, x_m: float, y_m: float, yaw_rad: float) -> str:
         """Takes the camera's place in the map frame as a hint, from a person who looks at the map.
@@ -223,7 +223,7 @@ class Driving:
     def fixed(self, fix: Fix) -> str:
         """Takes a satellite fix: near it a lost robot looks, in a map anchored to the earth."""
         self._fix.tell(fix)
-        return "the fix is taken"
+        return "the fix is accepted"
 
     def pause(self) -> str:
         """Closes robot and map, and so commits what was mapped; the next frame opens them again.

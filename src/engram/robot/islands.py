@@ -82,9 +82,9 @@ class IslandReport:
         if not self.compared:
             return ""
         if self.revision is None:
-            return f"parts that nothing ties: {self.compared} pairs of nodes compared, none joins"
+            return f"unconnected parts: {self.compared} pairs of nodes compared, none matched"
         return (
-            f"{len(self.joined)} matches of {self.compared} join parts that nothing tied: revision "
+            f"{len(self.joined)} matches of {self.compared} join unconnected parts: revision "
             f"{self.revision}; to undo: engram revert MAP {self.revision}"
         )
 

@@ -84,8 +84,9 @@ class Saving:
                 return f"saving failed: {self.reason}"
             case SavingState.SEALED:
                 return (
-                    f"not committed, for the drive is unfit: {self.reason}; engram check --seal "
-                    "commits what was mapped all the same"
+                    f"not committed, because the drive is unfit: {self.reason}; engram check "
+                    "--seal "
+                    "commits what was mapped anyway"
                 )
         return f"saving is {self.state}"
 

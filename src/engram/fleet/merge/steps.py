@@ -294,7 +294,8 @@ def _say_what_hangs_together(merge: Merge, before: int) -> None:
     apart = ~np.isin(labels[before:], labels[:before])
     if apart.all() and not report.known:
         report.notes.append(
-            "no node of it matched the fleet map: another area, or another appearance of this one"
+            "none of its nodes matched the fleet map: it shows another area, or this one in "
+            "other conditions"
         )
     elif apart.any():
         report.notes.append(

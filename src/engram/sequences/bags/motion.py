@@ -74,7 +74,11 @@ class BagMotion:
         known = [
             one.name for one in self._bag.topics.values() if one.type in {ODOMETRY, TWIST, IMU}
         ]
-        what = f"holds {topic.type}" if topic is not None else "is no topic of the bag, and no file"
+        what = (
+            f"holds {topic.type}"
+            if topic is not None
+            else "is neither a topic of the bag nor a file"
+        )
         raise SequenceError(
             f"{self._bag.path}: --motion {name}: {what}; topics with motion: "
             f"{', '.join(known) or 'none'}"

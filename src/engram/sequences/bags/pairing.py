@@ -63,7 +63,7 @@ class Pairing:
             f"{self.tolerance_ns / 1e6:.3f} ms)"
         ]
         if self.backwards:
-            facts.append(f"{self.backwards} images left out whose stamp does not rise")
+            facts.append(f"{self.backwards} images left out whose stamp does not increase")
         if self.unusable:
             facts.append(f"{self.unusable} images could not be used")
         return "; ".join(facts)
