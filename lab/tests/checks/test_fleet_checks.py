@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from engram.measures import Drive
-from engram_lab.checks.both_directions import Missed, apart, by_drive, pair_of, town_of
+from engram_lab.checks.both_directions import Missed, apart, by_drive, of_length, pair_of, town_of
 from engram_lab.checks.dreams import HANDED_IN, HELD_OUT, VALIDATION, made_once
 from engram_lab.checks.dreams import told as told_of_held_out
 from engram_lab.checks.lenses import told
 from engram_lab.checks.mountings import MOUNTED, MountedSequence
 from engram_lab.town.sequence import SimulatedSequence
+from engram_lab.town.simulating import campaign_folder
 from engram_lab.trial_towns import longer_trial_town, trial_town
 
 
@@ -57,6 +60,10 @@ def test_directions_are_compared_over_drives_however_many_maps_each_was_tried_in
     assert (more.low, more.high) == (pytest.approx(0.0), pytest.approx(0.2))
     assert pair_of("8,9") == [8, 9]
     assert [town_of(name).name for name in ("oxford", "401")] == ["oxford", "trial"]
+    shorter = of_length(town_of("oxford"), 600.0)
+    assert campaign_folder(Path(), shorter) != campaign_folder(Path(), town_of("oxford"))
+    assert len(SimulatedSequence(shorter, 1)) == pytest.approx(600 / 0.7, rel=0.1)
+    assert of_length(shorter, None) is shorter
 
 
 def test_what_judges_a_dream_took_no_part_in_it_and_its_maps_are_made_once(tmp_path):

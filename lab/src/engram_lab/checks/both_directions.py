@@ -5,7 +5,8 @@
 
 Of each pair of drives, one each way, a map is made, and all other drives are localised there, with
 `--one-way` also in a map of the pair's first drive alone. Without `--mapped` the pair is the town's
-first drive and its first against it. Drives that are not there yet are rendered.
+first drive and its first against it. `--length` drives a loop of so many metres in place of the
+campaign's. Drives that are not there yet are rendered.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
@@ -93,6 +94,14 @@ def town_of(name: str) -> Campaign:
     return longer_trial_town(int(name)) if name.isdecimal() else campaign_named(name)
 
 
+def of_length(town: Campaign, length_m: float | None) -> Campaign:
+    """The campaign on a loop of another length: a town of its own, with the same drives."""
+    if length_m is None:
+        return town
+    name = f"{town.name}-{length_m:.0f}m"
+    return replace(town, name=name, home=name, length_m=length_m)
+
+
 def pair_of(text: str) -> list[int]:
     """Two sessions, as in 0,1."""
     first, second = map(int, text.split(","))
@@ -106,8 +115,9 @@ def main() -> None:
     parser.add_argument("sessions", type=int, nargs="+")
     parser.add_argument("--mapped", metavar="A,B", nargs="+", type=pair_of)
     parser.add_argument("--one-way", action="store_true")
+    parser.add_argument("--length", metavar="M", type=float)
     asked = parser.parse_args()
-    town: Campaign = asked.town
+    town: Campaign = of_length(asked.town, asked.length)
     first_against = next(one.number for one in town.sessions if one.reverse)
     pairs: list[list[int]] = asked.mapped or [[0, first_against]]
     wanted = sorted({*chain(*pairs), *asked.sessions})

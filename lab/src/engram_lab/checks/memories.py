@@ -5,8 +5,9 @@
 Three drives of the town are mapped: by day, by night, and in rain at night. Four more robots each
 take a copy of that map, localise in it, and hand in what they remember. The named drives are then
 localised in the fleet map with and without these memories: by `path` as published, with one attempt
-a frame and with two as in [L15], so also with the paper's settings, and by `path-near` and `recall`
-with two. Beside it stands how far ahead or behind the nodes lie that each attempts first.
+a frame and with two as in [L15], each also with the paper's settings, by `path-near` with two, and
+by `recall`, our default, with one and two. Beside it stands how far ahead or behind the nodes lie
+that each attempts first.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ MAPPED = (0, 3, 5)
 REMEMBERED = (1, 2, 4, 6)
 # Policy, lanes, and whether the settings are the paper's.
 TRIED = (
-    ("path", 1, False), ("path", 2, False), ("path", 2, True), ("path-near", 2, False),
-    ("recall", 2, False),
+    ("path", 1, False), ("path", 1, True), ("path", 2, False), ("path", 2, True),
+    ("path-near", 2, False), ("recall", 1, False), ("recall", 2, False),
 )  # fmt: skip
 
 
