@@ -30,7 +30,8 @@ def test_it_writes_a_map_and_says_what_it_promises(engram, centre: Path, tmp_pat
     assert told["nodes"] == told["of_nodes"] > 0
     assert engram("info", out, "--json").json["content_hash"] == told["content_hash"]
     text = engram("download", centre, tmp_path / "r2.engram", "--select", "copy").out
-    assert "expected share of the route without a match" in text
+    assert "route without a match in 80% of such missions: dry" in text
+    assert "nodes left out" not in text  # and no level, which past drives of one map cannot tell
 
 
 def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: Path) -> None:
@@ -39,6 +40,9 @@ def test_a_budget_may_be_a_share_of_everything(engram, centre: Path, tmp_path: P
     assert 0 < told["nodes"] < told["of_nodes"]
     assert (tmp_path / "r1.engram").stat().st_size == told["size_bytes"]
     assert told["size_bytes"] <= 0.8 * told["why"]["everything_bytes"]
+    text = engram("download", centre, tmp_path / "r2.engram", *asked[:-1]).out
+    lost = told["expected_missed"] - told["copy_missed"]
+    assert f"left out, for comparing downloads: {lost:.1%} of the route" in text
 
 
 def test_a_robot_keeps_its_map_and_takes_the_download_into_it(
@@ -63,6 +67,12 @@ def test_an_hour_without_data_is_widened_and_says_so(engram, centre: Path, tmp_p
     assert "nothing was saved within 180 minutes of 21:00: widened to 720 minutes" in text
     told = engram("download", centre, tmp_path / "r2.engram", *asked, "--json").json
     assert told["nodes"] == told["of_nodes"]
+    updated = engram("download", centre, tmp_path / "r2.engram", *asked, "--update").out
+    assert "nothing changed" in updated
+    assert "widened to 720 minutes" in updated
+    paths = ("--select", "paths", "--depart", "4:00", "--arrive", "5:00")
+    text = engram("download", centre, tmp_path / "r3.engram", *paths).out
+    assert "nothing was saved at 4:00 to 5:00: widened to " in text
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ class TrialSummary:
         """One line for people."""
         return (
             f"{self.name:16s} {self.nodes:7.0f} nodes {self.size_bytes / 1e6:7.1f} MB  "
-            f"missed {self.missed:6.1%} (promised {self.expected_missed:6.1%})  "
+            f"missed {self.missed:6.1%} (estimated {self.expected_missed:6.1%})  "
             f"P(> 10 m) {self.p_no_match_10m:6.2%}  longest {self.longest_gap_m:5.1f} m  "
             f"{self.ms_per_frame:6.2f} ms a frame"
         )

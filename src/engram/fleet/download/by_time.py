@@ -99,10 +99,9 @@ def _windows(asked_min: float, options: DownloadOptions) -> Iterator[float]:
 def _widened(options: DownloadOptions, asked_min: float, found_min: float) -> dict[str, Any]:
     if found_min == asked_min:
         return {}
-    return {
-        "widened": f"nothing was saved within {asked_min:.0f} minutes of "
-        f"{_mission(options)}: widened to {found_min:.0f} minutes"
-    }
+    mission = _mission(options)
+    near = f"within {asked_min:.0f} minutes of {mission}" if asked_min else f"at {mission}"
+    return {"widened": f"nothing was saved {near}: widened to {found_min:.0f} minutes around it"}
 
 
 def _everything(options: DownloadOptions) -> dict[str, Any]:

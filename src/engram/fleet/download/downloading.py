@@ -24,7 +24,13 @@ from engram.fleet.download.forecast import Forecast, Light
 from engram.fleet.download.marks import write_marks
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Part
-from engram.fleet.download.selections import SELECTIONS, Selection, check_options, coverage_for
+from engram.fleet.download.selections import (
+    SELECTIONS,
+    Selection,
+    check_options,
+    coverage_for,
+    facts_told,
+)
 from engram.fleet.download.stock import Stock
 from engram.maps import Map, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
@@ -87,31 +93,27 @@ class DownloadReport:
     def text(self) -> str:
         """The report as text."""
         share = self.nodes / self.of_nodes if self.of_nodes else 1.0
-        lost = self.expected_missed - self.copy_missed
+        parts = "1 component" if self.components == 1 else f"{self.components} components"
         lines = [
             f"{self.policy}: {self.nodes} of {self.of_nodes} nodes ({share:.1%}), "
             f"{self.size_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB, "
             f"of revision {self.revision}",
             f"{self.sessions} sessions, {self.edges} edges ({self.bridges} bridges), "
-            f"{self.components} components, {self.partial_paths} partial paths",
+            f"{parts}, {self.partial_paths} partial paths",
             self.forecast.text(),
-            f"expected share of the route without a match: {self.expected_missed:.1%} "
-            f"({self.copy_missed:.1%} with all nodes: {lost:+.1%} from nodes left out)",
         ]
-        if self.why.get("widened"):
-            lines.append(self.why["widened"])
-        if self.why.get("epochs"):
+        if self.nodes < self.of_nodes:
+            lost = self.expected_missed - self.copy_missed
             lines.append(
-                f"epochs {self.why['epochs'][0]} to {self.why['epochs'][-1]}, "
-                f"{len(self.why['paths'])} paths chosen"
+                f"estimated cost of the nodes left out, for comparing downloads: {lost:.1%} of the "
+                "route"
             )
+        lines += facts_told(self.why)
         if everything_bytes := self.why.get("everything_bytes"):
             lines.append(
                 f"{self.size_bytes / everything_bytes:.1%} of a full download in the same form "
                 f"({everything_bytes / 1e6:.1f} MB)"
             )
-        if self.why.get("nodes_without_hour"):
-            lines.append(f"{self.why['nodes_without_hour']} nodes left out: hour of day unknown")
         return "\n".join(lines)
 
 

@@ -117,7 +117,7 @@ class Forecast:
     def text(self) -> str:
         """The forecast as one line of text."""
         told = ", ".join(
-            f"{weather}: " + ("not known" if one is None else f"{one[0]:.1%} to {one[1]:.1%}")
+            f"{weather} " + ("not known" if one is None else f"{one[0]:.1%} to {one[1]:.1%}")
             for weather, one in self.missed.items()
         )
-        return f"share of the route without a match, {LEVEL:.0%} of such missions, {told}"
+        return f"route without a match in {LEVEL:.0%} of such missions: {told}"

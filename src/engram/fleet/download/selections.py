@@ -205,6 +205,18 @@ def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
     return within(stock, np.unique(seeds), radius_m)
 
 
+def facts_told(why: Mapping[str, Any]) -> list[str]:
+    """Lines for people on the facts of a selection: what it widened, chose and left out."""
+    lines = []
+    if widened := why.get("widened"):
+        lines.append(widened)
+    if epochs := why.get("epochs"):
+        lines.append(f"epochs {epochs[0]} to {epochs[-1]}; paths chosen: {len(why['paths'])}")
+    if unknown := why.get("nodes_without_hour"):
+        lines.append(f"{unknown} nodes left out: hour of day unknown")
+    return lines
+
+
 def _nodes_on(stock: Stock, paths: list[PathId]) -> Mask:
     sent = np.zeros(len(stock), np.bool_)
     for path in paths:

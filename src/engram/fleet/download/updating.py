@@ -23,7 +23,7 @@ from engram.fleet.download.downloading import choose_part, revision_of
 from engram.fleet.download.marks import lacking_marks
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Part
-from engram.fleet.download.selections import SELECTIONS, check_options
+from engram.fleet.download.selections import SELECTIONS, check_options, facts_told
 from engram.fleet.download.stock import Mask, Stock
 from engram.fleet.merge.positions import position_of, uncertainty_m2
 from engram.fleet.merge.state import FIRST_REPLAYED
@@ -74,13 +74,15 @@ class UpdateReport:
         """The report as text."""
         head = f"{self.policy} of revision {self.source_revision}: {self.of_nodes} nodes"
         if self.revision is None:
-            return f"{head}; {self.out.name} has them all: nothing changed"
-        return (
-            f"{head}, {self.nodes} of them new in {self.out.name} (revision {self.revision}), "
-            f"which keeps {self.own_nodes} nodes of its own\n"
-            f"copied {self.sessions} sessions, {self.edges} edges, {self.path_entries} path "
-            f"entries, {self.attempts} attempts; tied {self.ties} own nodes to equivalents"
-        )
+            lines = [f"{head}; {self.out.name} has them all: nothing changed"]
+        else:
+            lines = [
+                f"{head}, {self.nodes} of them new in {self.out.name} (revision {self.revision}), "
+                f"which keeps {self.own_nodes} nodes of its own",
+                f"copied {self.sessions} sessions, {self.edges} edges, {self.path_entries} path "
+                f"entries, {self.attempts} attempts; tied {self.ties} own nodes to equivalents",
+            ]
+        return "\n".join(lines + facts_told(self.why))
 
 
 def update(
