@@ -84,3 +84,42 @@ class _Nothing:
 
     def __exit__(self, *_):
         pass
+
+
+def test_a_copy_of_the_papers_settings_serves_every_verb_as_its_name_does(
+    engram, monkeypatch, tmp_path
+):
+    copy = tmp_path / "mine.toml"
+    copy.write_text(engram("settings", "show", "--config", "gadd2016", "--toml").out)
+    seen = []
+
+    def spied(*_, settings, **__):
+        seen.append(settings)
+        raise SeenError("far enough")
+
+    monkeypatch.setattr("engram_lab.town.simulating.simulate", spied)
+    for config in ("gadd2016", copy):
+        assert "far enough" in engram("lab", "simulate", "hamlet", "--config", config).err
+    assert seen[0] == seen[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("linegar2016", "linegar2016: no such settings file; linegar2015 and gadd2016 ship"),
+        ("", "cannot be read as settings: Is a directory"),
+        ("bytes", "cannot be read as settings: not UTF-8 text"),
+        ("half", "not valid TOML"),
+    ],
+)
+def test_a_settings_file_that_cannot_be_read_is_told_once_and_plainly(
+    engram, monkeypatch, tmp_path, name, says
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe")
+    (tmp_path / "half").write_text("[merge")
+    for verb in (("settings", "show"), ("lab", "simulate", "hamlet")):
+        ran = engram(*verb, "--config", name or tmp_path)
+        assert ran.status == 2
+        assert says in ran.err
+        assert "Errno" not in ran.err

@@ -163,8 +163,9 @@ def read_settings(path: Path | None, changes: Sequence[str] = ()) -> AllSettings
 
 
 def _toml(path: Path) -> dict[str, Any]:
+    text = settings_text(path)
     try:
-        return tomllib.loads(settings_text(path))
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
 

@@ -125,5 +125,12 @@ def settings_text(path: Path) -> str:
         return (files("engram.robot") / "papers" / f"{path}.toml").read_text(encoding="utf-8")
     try:
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as settings: {error}") from error
+    except FileNotFoundError as error:
+        known = " and ".join(PAPERS)
+        raise ConfigError(
+            f"{path}: no such settings file; {known} ship with Engram, by these names"
+        ) from error
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read as settings: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: cannot be read as settings: not UTF-8 text") from error

@@ -42,8 +42,8 @@ def relocalise(
       engram lab relocalise town.engram drives/tuesday --frames 0:1000:10 --json
     """
     from engram.cli.progress import Bars
+    from engram.cli.settings import read_settings
     from engram.localiser import Budget
-    from engram.robot import load_settings
     from engram.robot.results import damage_warning
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
@@ -51,7 +51,7 @@ def relocalise(
     starts = relocalise_drive(
         map_path,
         sequence,
-        load_settings(config),
+        read_settings(config).of_robot(),
         relocaliser=relocaliser,
         budget=Budget(lanes, lost_rounds=rounds),
         at=at,

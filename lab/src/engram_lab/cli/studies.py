@@ -201,7 +201,7 @@ def ranking(
       engram lab evaluate ranking monday.framelog tuesday.framelog … --out results/mine
     """
     from engram.cli.progress import Bars
-    from engram.robot import load_settings
+    from engram.cli.settings import read_settings
     from engram_lab.policies import STUDIED
     from engram_lab.studies import (
         DEFAULT_LANES,
@@ -225,7 +225,7 @@ def ranking(
         only_folds=study.chosen_folds,
     )
     again = _redone(redo, asked.policies, report_only=study.report_only)
-    started, settings = time.perf_counter(), load_settings(study.config)
+    started, settings = time.perf_counter(), read_settings(study.config).of_robot()
     plans = [make_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)]
     for plan in [] if study.report_only else plans:
         forget(plan, again)
@@ -288,7 +288,7 @@ def fleet(
       engram lab evaluate fleet begbroke24h --report-only
     """
     from engram.cli.progress import Bars
-    from engram.robot import load_settings
+    from engram.cli.settings import read_settings
     from engram_lab.studies.fleet import (
         FleetOptions,
         make_fleet_plan,
@@ -308,7 +308,7 @@ def fleet(
         relocaliser=None if relocaliser == "none" else relocaliser,
         only_folds=study.chosen_folds,
     )
-    started, settings = time.perf_counter(), load_settings(study.config)
+    started, settings = time.perf_counter(), read_settings(study.config).of_robot()
     plans = [
         make_fleet_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)
     ]

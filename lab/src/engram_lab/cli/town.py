@@ -120,7 +120,7 @@ def simulate(
       engram lab simulate village --images --sessions 0,3 --out campaigns
     """
     from engram.cli.progress import Bars
-    from engram.robot import load_settings
+    from engram.cli.settings import read_settings
     from engram_lab.cli.lists import numbers
     from engram_lab.town import Size, campaign_named
     from engram_lab.town.simulating import campaigns_folder
@@ -134,7 +134,7 @@ def simulate(
         images=images,
         sessions=wanted,
         workers=workers,
-        settings=load_settings(config),
+        settings=read_settings(config).of_robot(),
         monitor=Bars(),
     )
     typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
