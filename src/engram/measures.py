@@ -132,7 +132,8 @@ def failure(
         estimator: what a failure is counted over.
 
     Returns:
-        float64 of the shape of `at_m`; 0 where nothing was driven or never failed.
+        (N,) float64, or () for one distance, probabilities; 0 where nothing was driven or
+        never failed.
     """
     at = np.asarray(at_m, np.float64)
     above, below = np.zeros(at.size), 0.0

@@ -120,7 +120,7 @@ def transform(entries: dict[str, Any], name: str) -> SE3:
 
 
 def rigid(matrix: NDArray[np.float64], name: str) -> SE3:
-    """A rigid transform from a (3 or 4, 4) matrix.
+    """A rigid transform from a (3, 4) or (4, 4) matrix, its translation in m.
 
     Raises:
         CalibrationError: it is not rigid.

@@ -108,13 +108,13 @@ class Evidence:
 
     @property
     def intervals_s(self) -> Array:
-        """Between successive frames of a stretch."""
+        """(n,) float64, s: between successive frames of a stretch."""
         stamps, first = np.array(self.stamps_ns, np.int64), np.array(self.first, np.bool_)
         return (np.diff(stamps) / 1e9)[~first[1:]] if len(stamps) else np.zeros(0)
 
     @property
     def moved_m(self) -> Array:
-        """Distance of each step; nan where it was not measured."""
+        """(n,) float64, m: distance of each step; nan where it was not measured."""
         return np.array([np.nan if one is None else one.distance_m for one in self.moved])
 
 

@@ -44,6 +44,8 @@ _ARRAYS = (
 def weights() -> Mapping[str, NDArray[Any]]:
     """The arrays of `engram._core.PatchNetwork`, by the names of its arguments.
 
+    Four (out, side, side, in) int8 layers of weights; the rest int32, (n,) factors and limits.
+
     Raises:
         IncompatibleError: the installed file is not the model that this version names.
     """

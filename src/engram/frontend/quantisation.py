@@ -117,7 +117,8 @@ def quantised_landmarks(
     """N landmarks as they will be stored: `quantise`, then `landmarks_from_codes`, in one call.
 
     Args:
-        pixels, disparity_px, disparity_sigma_px: as for `quantise`, of any detector.
+        pixels: (N, 2) float32, px (x, y) in the left image, from any detector.
+        disparity_px, disparity_sigma_px: (N,) float32, px.
         descriptors: (N, B) uint8.
         octaves: (N,) uint8.
         camera: the camera that saw them.

@@ -29,7 +29,7 @@ class SE3:
     """A rigid transform ``target_from_source``.
 
     Attributes:
-        rotation: (3, 3) float64, orthonormal with determinant 1.
+        rotation: (3, 3) float64, a rotation: orthonormal with determinant 1.
         translation: (3,) float64, metres; the source's origin in the target frame.
     """
 
@@ -135,14 +135,14 @@ class SE3:
         return SE3(1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation, self.translation)
 
     def matrix(self) -> Array:
-        """The (4, 4) matrix."""
+        """The (4, 4) float64 matrix, homogeneous; translation in m."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = self.translation
         return matrix
 
     def adjoint(self) -> Array:
-        """The (6, 6) matrix that carries tangent vectors from the source to the target frame."""
+        """(6, 6) float64: carries tangent vectors (m, rad) from the source to the target frame."""
         adjoint = np.zeros((6, 6))
         adjoint[:3, :3] = self.rotation
         adjoint[:3, 3:] = skew(self.translation) @ self.rotation
@@ -182,7 +182,7 @@ def _length(vector: Array) -> float:
 
 
 def skew(vector: Array) -> Array:
-    """The (3, 3) matrix with ``skew(a) @ b == cross(a, b)``."""
+    """The (3, 3) matrix, in the unit of its (3,) vector, with ``skew(a) @ b == cross(a, b)``."""
     x, y, z = vector.tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

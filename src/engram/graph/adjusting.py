@@ -90,7 +90,7 @@ class Poses:
     """N poses ``map_from_node``, a struct of arrays.
 
     Attributes:
-        rotations: (N, 3, 3) float64.
+        rotations: (N, 3, 3) float64, rotations.
         translations: (N, 3) float64, metres.
     """
 
@@ -115,15 +115,15 @@ class Poses:
         return Poses(self.rotations.copy(), self.translations.copy())
 
     def some(self, rows: NDArray[np.integer]) -> Poses:
-        """Copies of some of them."""
+        """Copies of the chosen rows, (n,) indices."""
         return Poses(self.rotations[rows], self.translations[rows])
 
     def put(self, rows: NDArray[np.integer], poses: Poses) -> None:
-        """Sets some of them."""
+        """Sets the chosen rows, (n,) indices."""
         self.rotations[rows], self.translations[rows] = poses.rotations, poses.translations
 
     def moved(self, step: Array) -> Poses:
-        """Each pose times the exponential of its row of an (N, 6) step, in its own frame."""
+        """Each pose times the exponential of its row of (N, 6) steps (m, rad), in its own frame."""
         turned = self.rotations @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
         shifted = np.einsum("nij,nj->ni", self.rotations, step[:, :3])
         return Poses(turned, self.translations + shifted)
@@ -135,11 +135,11 @@ class Measured:
 
     Attributes:
         a, b: (E,) int64, indices of poses.
-        rotations: (E, 3, 3) float64.
+        rotations: (E, 3, 3) float64, rotations.
         translations: (E, 3) float64, metres.
         whitening: (E, 6, 6) float64: a residual times this has unit covariance.
-        trust: (E,) float64: how much wider than others its kernel is. Where a cycle does not
-            close, what is trusted less gives way.
+        trust: (E,) float64, a ratio: how much wider than others its kernel is. Where a cycle does
+            not close, what is trusted less gives way.
     """
 
     a: NDArray[np.int64]
@@ -176,7 +176,7 @@ class Measured:
         )  # fmt: skip
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.integer]) -> Measured:
-        """Some of them."""
+        """The chosen rows: (n,) indices, or (E,) bool."""
         return Measured(
             self.a[rows], self.b[rows], self.rotations[rows],
             self.translations[rows], self.whitening[rows], self.trust[rows],
@@ -187,7 +187,7 @@ class Measured:
         return self._errors(poses)[0]
 
     def chi2(self, poses: Poses) -> Array:
-        """(E,) float64: squared residuals, normalised."""
+        """(E,) float64: squared residuals in σ²."""
         whitened = np.einsum("nij,nj->ni", self.whitening, self.residuals(poses))
         return np.asarray(np.einsum("ni,ni->n", whitened, whitened))
 
@@ -204,7 +204,7 @@ class Measured:
         return np.concatenate([shift, turn], axis=1), between, error
 
     def linearised(self, poses: Poses) -> tuple[Array, Array, Array]:
-        """Whitened residuals (E, 6), and Jacobians (E, 6, 6) by the steps of a and of b."""
+        """Whitened residuals (E, 6) in σ, and Jacobians (E, 6, 6) by the steps of a and of b."""
         residual, between, error = self._errors(poses)
         by_a, by_b = np.zeros((2, len(residual), 6, 6))
         by_a[:, :3, :3] = by_a[:, 3:, 3:] = -np.eye(3)
@@ -222,7 +222,8 @@ class Priors:
 
     Attributes:
         at: (P,) int64, poses whose position is known.
-        positions: (P, 3) float64, metres; NaN for an unknown coordinate.
+        positions: (P, 3) float64, metres in the map frame; NaN for an unknown
+            coordinate.
         sigmas_m: (P,) float64, their standard deviations.
         ups: (N, 3) float64, the direction in each node's camera that is up on a level road.
         level_rad: standard deviation of the tilt of a camera; 0 to ignore it.
@@ -248,7 +249,7 @@ class Adjusted:
 
     Attributes:
         poses: the adjusted poses.
-        chi2: (E,) float64, squared, normalised residuals.
+        chi2: (E,) float64, squared residuals in σ².
         weights: (E,) float64, 0…1: the influence that each measurement kept.
     """
 
@@ -383,7 +384,7 @@ def _sparse(
 
 
 def skews(vectors: Array) -> Array:
-    """(N, 3, 3): the cross product with each row of an (N, 3) array."""
+    """(N, 3, 3): the cross product with each row of an (N, 3) array, in its unit."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -106,10 +106,10 @@ class MatchBasin:
         The two directions count as independent: ``g_along · g_across / g(0)``.
 
         Args:
-            along_m, across_m: float64 of one shape, metres in the node's frame.
+            along_m, across_m: (N,) float64, metres in the node's frame; other shapes, too.
 
         Returns:
-            float64 of that shape, 0…1.
+            (N,) float64, or of that shape: success rate, 0…1.
         """
         along = np.ascontiguousarray(along_m, dtype=np.float64)
         across = np.ascontiguousarray(across_m, dtype=np.float64)

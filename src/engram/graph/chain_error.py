@@ -107,7 +107,7 @@ def error_rows_of(poses: Array, covariances: Array) -> Array:
 
     Args:
         poses: (E, 12) float64, ``a_from_b``: rotation in row-major order, then translation.
-        covariances: (E, 6, 6) float64 of these.
+        covariances: (E, 6, 6) float64 of these, m and rad.
 
     Raises:
         InputError: a covariance is not finite or not positive semi-definite.

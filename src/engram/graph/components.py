@@ -21,7 +21,7 @@ def labels_of(ends: Indices, count: int) -> Indices:
 
 
 def grouped(labels: NDArray[np.integer]) -> list[Indices]:
-    """The indices of each label, rising, labels in the order of their first index: one pass."""
+    """The indices of each of (N,) labels, increasing; labels in the order of their first index."""
     if not len(labels):
         return []
     order = np.argsort(labels, kind="stable")

@@ -23,8 +23,8 @@ class EdgeTable(Sequence[Edge]):
         nodes: the nodes.
         ends: (E, 2) int32, places of a and b in `nodes`.
         kinds: (E,) uint8, index into `EDGE_KINDS`.
-        poses: (E, 12) float64, ``a_from_b``: rotation in row-major order, then translation.
-        covariances: (E, 6, 6) float64 of ``a_from_b``.
+        poses: (E, 12) float64, ``a_from_b``: rotation in row-major order, then translation in m.
+        covariances: (E, 6, 6) float64 of ``a_from_b``, left perturbation, m and rad.
     """
 
     nodes: Sequence[Node]

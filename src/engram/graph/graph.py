@@ -439,7 +439,7 @@ class ExperienceGraph:
 
     @property
     def edge_errors(self) -> NDArray[np.float64]:
-        """(E, 8) float64: errors of the edges in `edges`, as of `edge_error_rows`. A view."""
+        """(E, 8) float64: errors of `edges`, m and rad as of `edge_error_rows`. A view."""
         return self._errors.rows
 
     def lightest(self, weight: Callable[[Edge], float]) -> Links:

@@ -102,7 +102,8 @@ class Neighbourhood:
 
     Attributes:
         nodes: (Y,) int32, dense indices into the `ExperienceGraph`.
-        node_from_live: (Y, 4, 4) float64, predicted pose of the live camera in each node.
+        node_from_live: (Y, 4, 4) float64, homogeneous, m: predicted pose of the live camera in
+            each node.
         distance_m: (Y,) float64, norm of the predicted translation.
         along_m, across_m: (Y,) float64, offset of the live camera from the node along and across
             the node's viewing direction.

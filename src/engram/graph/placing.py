@@ -401,7 +401,16 @@ def follow_chains(
 
 
 def chain_poses(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[Poses, Indices]:
-    """Poses of all nodes along the surest chains, and the first node of each component."""
+    """Poses of all nodes along the surest chains, and the first node of each component.
+
+    Args:
+        edges: E edges.
+        ends: (E, 2) indices of their nodes.
+        count: number of nodes.
+
+    Returns:
+        The poses, each in the frame of its component's first node; (C,) indices of those nodes.
+    """
     labels = labels_of(ends, count)
     roots = np.unique(labels, return_index=True)[1]
     fixed = np.zeros(count, np.bool_)

@@ -17,12 +17,12 @@ def sun_height_deg(day: ArrayLike, hour: ArrayLike, latitude_deg: float) -> NDAr
     Accurate to 2°, as mean solar time leaves out the equation of time.
 
     Args:
-        day: float or array, days since 1 January 0:00 of any year.
-        hour: float or array that broadcasts with `day`, hour of day, mean solar time (method §2.8).
+        day: float or (N,) float64, days since 1 January 0:00 of any year.
+        hour: float or (N,) float64, hour of day, mean solar time (method §2.8).
         latitude_deg: latitude, degrees, north positive.
 
     Returns:
-        float64 of the broadcast shape.
+        (N,) float64, or one if both are; degrees.
 
     Source: Cooper, "The absorption of radiation in solar stills", 1969 (declination).
     """

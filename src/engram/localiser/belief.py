@@ -85,7 +85,7 @@ class PlaceBelief:
         """Adds the evidence of one frame.
 
         Args:
-            evidence: (N,) float64, how well the frame fits each node, on any linear scale.
+            evidence: (N,) float64, score of the frame at each node, on any linear scale.
 
         Returns:
             (N,) float64, the likelihood of each node: log-probabilities up to scale and constant.

@@ -69,7 +69,13 @@ class FixChain:
             self.settle()
 
     def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:
-        """Carries the trial on by the robot's motion."""
+        """Carries the trial on by the robot's motion.
+
+        Args:
+            prev_from_curr: pose of this frame in the one before.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation in m,
+                rotation in rad].
+        """
         if self.position is None:
             return
         self.position = self.position.carried_on(prev_from_curr, covariance)

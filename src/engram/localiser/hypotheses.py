@@ -63,7 +63,13 @@ class Hypotheses:
         self._waiting.clear()
 
     def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:
-        """Carries all positions on by the robot's motion; drops those that became too vague."""
+        """Carries all positions on by the robot's motion; drops those that became too vague.
+
+        Args:
+            prev_from_curr: pose of this frame in the one before.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation in m,
+                rotation in rad].
+        """
         for one in self._waiting:
             one.position = one.position.carried_on(prev_from_curr, covariance)
             one.driven_m += prev_from_curr.distance_m

@@ -209,7 +209,14 @@ class Localiser:
         self._guessed_m2 = guessed_m**2
 
     def standing_at(self, node: NodeId, live: Frame, covariance: NDArray[np.float64]) -> Position:
-        """Where a robot is that stands where the robot of a node stood; see `Position.mounted`."""
+        """Where a robot is that stands where the robot of a node stood; see `Position.mounted`.
+
+        Args:
+            node: the reference node.
+            live: the live frame.
+            covariance: (6, 6) float64 of the pose, left perturbation, [translation in m, rotation
+                in rad].
+        """
         known = self._graph.node(self._graph.index(node)).camera
         camera = self._background.cameras.get(known, live.camera)
         return Position.mounted(node, camera, live.camera, covariance)

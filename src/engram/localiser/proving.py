@@ -54,7 +54,13 @@ class Prover:
         self.standing, self.withdraws = self._record.standing, ()
 
     def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:
-        """Carries the fixes on trial on by the robot's motion."""
+        """Carries the fixes on trial on by the robot's motion.
+
+        Args:
+            prev_from_curr: pose of this frame in the one before.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation in m,
+                rotation in rad].
+        """
         self._chain.carry_on(prev_from_curr, covariance)
 
     def forget(self, agreed: int = 0) -> None:

@@ -227,7 +227,7 @@ def best_places(book: PlaceBook, likely: NDArray[np.float64], most: int) -> list
 
     Args:
         book: the words of the nodes.
-        likely: (N,) float64, likelihood of each node on any scale.
+        likely: (N,) float64, score of each node on any scale.
         most: how many to consider.
 
     Returns:

@@ -62,7 +62,7 @@ class AttemptTable:
     """Attempts of one session as a struct of arrays, with the keys of nodes (see `Attempt`).
 
     Attributes:
-        columns: (A,) arrays with the names and types of `COLUMNS`.
+        columns: (A,) rows with the names, types and units (in the names) of `COLUMNS`.
         policy: (A,) int32, index into `policies`.
         policies: names of the policies.
     """

@@ -24,7 +24,7 @@ class Columns:
     """The visible rows of a table without empty values, in the order of `View.select`.
 
     Attributes:
-        values: (N,) int64 or float64, or (N, size) uint8, by column.
+        values: (N,) int64 or float64 in the unit of the column, or (N, size) uint8; by column.
         texts: (N,) int32 codes and the texts that they stand for, by column.
     """
 
@@ -35,7 +35,7 @@ class Columns:
         return self.values[name]
 
     def rows(self, chosen: NDArray[np.intp]) -> Columns:
-        """The chosen rows, by place, in that order."""
+        """The chosen rows, (n,) intp by place, in that order."""
         return Columns(
             {name: values[chosen] for name, values in self.values.items()},
             {name: (codes[chosen], texts) for name, (codes, texts) in self.texts.items()},

@@ -176,7 +176,7 @@ def transforms_from_bytes(parts: Sequence[bytes], named: Callable[[int], str]) -
 
 
 def covariance_bytes(covariance: NDArray[np.float64]) -> bytes:
-    """168 bytes: the upper triangle of a (6, 6) matrix row by row, little-endian float64."""
+    """168 bytes: upper triangle of a (6, 6) covariance (m, rad), row by row, little-endian."""
     return _floats(covariance[_UPPER])
 
 

@@ -23,7 +23,7 @@ _DTYPE = np.dtype("<u2")
 
 
 def encode_words(found: NDArray[Any]) -> bytes:
-    """Encodes words (n,), rising, in two bytes each.
+    """Encodes words, (n,) increasing numbers without unit, in two bytes each.
 
     Raises:
         InputError: they do not rise, or are out of range.
@@ -49,7 +49,7 @@ def decode_words(body: bytes) -> NDArray[np.int32]:
 
 
 def words_row(node_key: int, vocabulary: bytes, found: NDArray[Any]) -> Row:
-    """The row of one node's words (n,) by the vocabulary of this hash (16 bytes)."""
+    """The row of one node's words, (n,) numbers, by the vocabulary of this hash (16 bytes)."""
     row = {"node": node_key, "vocabulary": vocabulary, "body": encode_words(found)}
     return sealed(words, row)
 

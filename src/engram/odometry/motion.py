@@ -56,11 +56,12 @@ class Motion:
         odometry: what odometry measured.
         prev_from_curr: pose of this frame in the previous usable one; None at the first frame of a
             drive and at an unusable one.
-        covariance: (6, 6) float64 of `prev_from_curr`, left perturbation, [translation,
-            rotation]; None if that is.
+        covariance: (6, 6) float64 of `prev_from_curr`, left perturbation, [translation in
+            m, rotation in rad]; None if that is.
         guessed_m: standard deviation of a guess, metres; 0 if odometry measured the motion.
         ahead: at an unusable frame, the guess of the motion since the last usable one, with its
-            covariance; it is not part of the motion that the next usable frame brings.
+            (6, 6) float64 covariance; it is not part of the motion that the next usable frame
+            brings.
     """
 
     odometry: OdometryStep

@@ -103,7 +103,14 @@ class Guess:
     has_way: bool = True
 
     def contradicts(self, measured: SE3, covariance: NDArray[np.float64], gate: float) -> bool:
-        """Whether a measured motion is too far from it, in standard deviations of both."""
+        """Whether a measured motion is too far from it, in standard deviations of both.
+
+        Args:
+            measured: pose of this frame in the one before.
+            covariance: (6, 6) float64 of that pose, left perturbation, [translation in m, rotation
+                in rad].
+            gate: most standard deviations along each axis.
+        """
         if not self.has_way:
             return False
         off = (self.prev_from_curr.inverse() @ measured).log()

@@ -64,5 +64,5 @@ class BagOfWords:
 
 
 def inverse_frequencies(statistics: WordStatistics) -> NDArray[np.float64]:
-    """(W,) float64: inverse document frequency of each word."""
+    """(W,) float64: log inverse document frequency of each word, a weight."""
     return np.asarray(np.log((statistics.images + 1) / (statistics.seen + 0.5)))

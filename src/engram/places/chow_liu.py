@@ -78,12 +78,12 @@ def mutual_information(
     """Mutual information of pairs of binary variables, from counts that broadcast.
 
     Args:
-        both: float64, images that show both words.
-        a, b: int32, images that show each of the two words.
+        both: (W, V) float64, counts of images that show both words.
+        a, b: (W, 1) and (V,) int32, counts of images that show each of the two words.
         images: number of images.
 
     Returns:
-        float64, nats.
+        (W, V) float64, nats.
     """
     p_a, p_b = a / images, b / images
     p_both = both / images

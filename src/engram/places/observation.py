@@ -44,7 +44,8 @@ class ObservationModel:
 
     Attributes:
         parents: (W,) int32, -1 for a root, which has equal columns for both values of z_parent.
-        log_p: (2, 4, W) float64: [whether the place shows the word][2 z + z_parent].
+        log_p: (2, 4, W) float64, log-probabilities: [whether the place shows the word][2 z +
+            z_parent].
     """
 
     parents: NDArray[np.int32]
@@ -91,7 +92,7 @@ def place_beliefs(p_seen: NDArray[np.float64], detector: DetectorModel) -> NDArr
     explains how often it is seen.
 
     Args:
-        p_seen: (W,) float64, p(z_q = 1).
+        p_seen: (W,) float64, probability p(z_q = 1).
         detector: detection rates of the front-end.
 
     Source: [C08] §4.4.
@@ -136,7 +137,7 @@ def _given_existence(
     """(W,) float64: p(z_q | e_q, z_parent) = (1 + α/β)⁻¹.
 
     Args:
-        p_seen: (W,) float64, p(z_q = 1).
+        p_seen: (W,) float64, probability p(z_q = 1).
         p_given_parent: (W,) float64, p(z_q = 1 | z_parent).
         sight: (2,) float64, p(z = 0 | e) and p(z = 1 | e) for the given existence e.
         z: whether the word is seen.

@@ -88,7 +88,7 @@ class ReadsFrames(Protocol):
     """A `PlaceRecogniser` that compares something else of images than their words."""
 
     def signature(self, frame: Frame) -> NDArray[np.int32]:
-        """What `add`, `compare` and `recognise` take for this image instead of its words.
+        """(n,) int32: what `add`, `compare` and `recognise` take for this image instead of words.
 
         Raises:
             IncompatibleError: its landmarks are of another kind.

@@ -128,7 +128,7 @@ class Signatures:
 
 
 def members_of(parts: NDArray[Any], count: int) -> NDArray[np.int64]:
-    """(count, N): 1 where a row belongs to a part."""
+    """(count, N) int64: 1 where a row belongs to a part."""
     members: NDArray[np.int64] = (np.arange(count)[:, None] == parts[None]).astype(np.int64)
     return members
 

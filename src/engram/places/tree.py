@@ -23,7 +23,7 @@ class TreeArrays:
 
     Attributes:
         centres: (M, B) uint8, one per node in breadth-first order; the root's is unused.
-        bounds: (M + 1,) int32, the children of node n are the nodes bounds[n] to bounds[n + 1] - 1;
+        bounds: (M+1,) int32, the children of node n are the nodes bounds[n] to bounds[n + 1] - 1;
             a node without children is a leaf, and leaves are the words, in this order.
     """
 

@@ -91,7 +91,7 @@ class NodeWords:
 
     @cached_property
     def idf(self) -> NDArray[np.float64]:
-        """(W,) float64: inverse document frequency of each word of the vocabulary."""
+        """(W,) float64: log inverse document frequency of each word, a weight."""
         return inverse_frequencies(self.vocabulary.statistics)
 
     def prepare(self) -> None:

@@ -87,7 +87,7 @@ class RankingContext:
         return self.graph.sessions_of(self.neighbourhood.nodes)
 
     def success_rates(self) -> NDArray[np.float64]:
-        """(Y,) float64: g(d) of each candidate, for compatible appearance (method §3.1)."""
+        """(Y,) float64: success rate g(d) of each candidate if it looks alike (method §3.1)."""
         near = self.neighbourhood
         return self.basin.success_rate(near.along_m, near.across_m)
 

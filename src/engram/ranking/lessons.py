@@ -30,7 +30,8 @@ class Lessons:
     """Probability that each node matches if its offset does not prevent it.
 
     Attributes:
-        base: (N,) float64, by all past drives; without nodes saved since the map was opened.
+        base: (N,) float64, that probability by all past drives; without nodes saved since the
+            map was opened.
     """
 
     base: NDArray[np.float64]
@@ -45,7 +46,7 @@ class Lessons:
         return Lessons(np.zeros(0))
 
     def of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(Y,) float64: the base of nodes, (Y,) dense indices; 0.4 if missing."""
+        """(Y,) float64: the probabilities of nodes, (Y,) dense indices; 0.4 if missing."""
         return self._and_unknown[np.minimum(nodes, len(self.base))]
 
     @staticmethod
@@ -67,7 +68,7 @@ class Lessons:
             path_memory: the paths.
             viewers: V drives, by their paths.
             attempts: their attempts; `session` indexes `viewers`.
-            rates: (A,) float64, g at the predicted offset of each attempt.
+            rates: (A,) float64, success rate g at the predicted offset of each attempt.
         """
         sharing = _sharing(graph)
         good, bad = (

@@ -16,7 +16,7 @@ class Reasons:
     """The parts of a policy's order.
 
     Attributes:
-        terms: name → (Y,) float64, by row of the neighbourhood.
+        terms: name → (Y,) float64, scores by row of the neighbourhood.
         meaning: name → description of the term.
         chances: (Y,) float64, probability of success; None if the policy estimates none.
         by_turn: (Y,) bool, whether a candidate's place is by rotation, not by its score; None if

@@ -157,7 +157,7 @@ class RecallJudgement:
     Attributes:
         order: (Y,) int64, rows best first.
         chances: (Y,) float64, probability of success when picked, if all earlier picks failed.
-        terms: name → (Y,) float64, the parts of the initial margin; they add up.
+        terms: name → (Y,) float64, the parts of the initial margin, log ratios; they add up.
         by_turn: (Y,) bool by row, whether its place is by rotation.
     """
 

@@ -106,7 +106,8 @@ class RunLog:
     ) -> None:
         """Adds the R attempts of one frame.
 
-        See `RunAttempts` for the arguments; `expected` holds `distance_m` and `rates`.
+        See `RunAttempts` for the arguments; `expected` holds `distance_m` and `rates`, (R,) float64
+        each.
         """
         distance_m, rates = expected
         self._frames += len(nodes) > 0

@@ -24,7 +24,7 @@ class Suspicion:
 
     Attributes:
         off_m, off_rad: (E,) float64, disagreement with the adjusted map.
-        chi2: (E,) float64, the same, squared and normalised.
+        chi2: (E,) float64, the same squared, in units of its variance.
         measured: (E,) bool, edges that are measurements.
         contradicted: (E,) bool, measurements that the rest of the map contradicts.
         confirmed: (E,) bool, measurements that a short other way between their ends confirms.

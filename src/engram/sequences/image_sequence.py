@@ -35,7 +35,7 @@ class ImageDrive:
         info: facts from its files.
         cameras: the stereo pair.
         places: all its pairs and faults, in the order of time.
-        read: decodes one image: path, width, height, channel.
+        read: decodes one image: path, width, height, channel → (height, width) uint8 grey.
     """
 
     path: Path

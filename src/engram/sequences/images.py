@@ -52,7 +52,7 @@ def read_image(
 def decoded(
     where: object, content: bytes, size: tuple[int, int] | None = None
 ) -> NDArray[np.generic]:
-    """The pixels of an encoded image, as they are stored: grey, BGR or BGRA, 8 or 16 bit.
+    """(h, w) or (h, w, 3 or 4) pixels of an encoded image: grey, BGR or BGRA; uint8 or uint16.
 
     Args:
         where: file or message, for messages.

@@ -212,7 +212,7 @@ def greedy_order(
 
     Args:
         coverage: of the mission; its subset is replaced.
-        size_bytes: (N,) float64, size of each node.
+        size_bytes: (N,) float64, bytes of each node.
         spare: (N,) int64, all nodes in the order in which they fill the rest.
     """
     coverage.clear()

@@ -210,7 +210,7 @@ def most_that_fit(
 
     Args:
         measure: writes the file of the first n nodes and returns its size, bytes.
-        expected_bytes: (N,) expected size of the first 1, 2, … N nodes; rising.
+        expected_bytes: (N,) float64, expected bytes of the first 1, 2, … N nodes; increasing.
         budget_bytes: largest size of the file.
 
     Raises:

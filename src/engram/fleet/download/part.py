@@ -101,7 +101,7 @@ class Part:
         return left | set(self.stock.store.partial_paths)
 
     def attempt_rows(self) -> NDArray[np.intp]:
-        """Rows of the stock's attempts of which both nodes are sent."""
+        """(A,) intp: rows of the stock's attempts whose two nodes are sent."""
         made = self.stock.attempts
         return np.flatnonzero(self.sent[made.reference] & self.sent[made.node])
 
@@ -143,7 +143,7 @@ class Part:
             writer.put_vocabulary(self.stock.store.vocabulary)
 
     def write_attempts(self, writer: RevisionWriter, rows: NDArray[np.intp]) -> None:
-        """Writes rows of the stock's attempts, session by session."""
+        """Writes rows, (A,) intp, of the stock's attempts, session by session."""
         kept = self.stock.attempts.rows(rows)
         for at, session in enumerate(self.stock.sessions):
             own = np.flatnonzero(kept.session == at)
