@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from engram.centre.access.enrolment import disable, new_code
 from engram.centre.access.roles import Role
+from engram.centre.dreams import Dreams
 from engram.centre.serving import Listening
 from engram.centre.store.audit import first_broken
 from engram.centre.store.schema import audit
@@ -53,6 +56,9 @@ ROUTES = {
     "post /v1/handins/{handin}/cancel": OPERATORS | {"own"},
     "post /v1/handins/{handin}/merge": OPERATORS,
     "get /v1/jobs/{job}": PEOPLE | {"own"},
+    "post /v1/maps/{name}/dreams": OPERATORS,
+    "get /v1/maps/{name}/dreams": PEOPLE,
+    "post /v1/dreams/{dream}/cancel": OPERATORS,
     "post /v1/maps/{name}/downloads": KNOWN,
     "get /v1/artifacts/{artifact}": frozenset({"own"}),
     "get /v1/artifacts/{artifact}/manifest": frozenset({"own"}),
@@ -118,8 +124,10 @@ def used(tmp_path_factory):
         headers=tokens["own"],
     ).json()["id"]
     site.work()
+    site.centre.set_policy(NAME, replace(POLICY, gate=("a", "b", "c")), "tests")
     places = {
         "name": NAME,
+        "dream": Dreams(site.centre).ask(NAME, "tests")["id"],
         "handin": next(iter(handin.values())),
         "job": next(iter(handin.values())),
         "artifact": artifact,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Any
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, Select, func, select
 
 from engram.centre.store.schema import artifacts, handins
 
@@ -23,8 +24,9 @@ class HandInState(StrEnum):
 ENDED = frozenset(
     {HandInState.MERGED, HandInState.REFUSED, HandInState.FAILED, HandInState.CANCELLED}
 )
-# Of downloads.
+# Of downloads, and of dreams.
 READY, ASKED, FAILED = "ready", "asked", "failed"
+DONE, CANCELLED = "done", "cancelled"
 _UNDER_WAY = (HandInState.OPEN, HandInState.COMPLETE, HandInState.REFUSED)
 
 
@@ -35,8 +37,7 @@ def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[s
     continue; of each robot's newest merged one, which its next one continues; and of downloads.
     """
     of_map = handins.c.map == name
-    merged = of_map & (handins.c.state == str(HandInState.MERGED))
-    newest = select(func.max(handins.c.place)).where(merged).group_by(handins.c.robot)
+    newest = newest_merged(name)
     late = handins.c.state.in_(map(str, _UNDER_WAY)) | (handins.c.ended_ns >= limit_ns)
     found: list[str] = []
     for query in (
@@ -47,3 +48,9 @@ def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[s
     ):
         found += connection.execute(query).scalars()
     return list(dict.fromkeys(found))
+
+
+def newest_merged(name: str) -> Select[Any]:
+    """Places of each robot's newest merged hand-in to a map."""
+    merged = (handins.c.map == name) & (handins.c.state == str(HandInState.MERGED))
+    return select(func.max(handins.c.place)).where(merged).group_by(handins.c.robot)

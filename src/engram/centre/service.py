@@ -27,6 +27,7 @@ from engram.files import WriterLock
 from engram.fleet.merge import MergeOptions
 from engram.maps import Map
 
+_HOUR_NS = DAY_NS // 24
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,39}")
 
 
@@ -38,11 +39,21 @@ class MapPolicy:
         merge: policy and budget of merging.
         gate: held-out drives that must not localise worse after a merge; paths of the centre.
         moves: ref that follows every merge that passed the gate; None for none.
+        quiet: hours of the day in which it dreams by itself, from and to, UTC; None for never.
     """
 
     merge: MergeOptions = field(default_factory=MergeOptions)
     gate: tuple[str, ...] = ()
     moves: str | None = None
+    quiet: tuple[float, float] | None = None
+
+    def is_quiet(self, now_ns: int) -> bool:
+        """Whether a time is within its quiet hours; equal ends are the whole day."""
+        if self.quiet is None:
+            return False
+        begin_h, end_h = self.quiet
+        length_h = (end_h - begin_h) % 24.0 or 24.0
+        return (now_ns / _HOUR_NS - begin_h) % 24.0 < length_h
 
 
 class Centre:

@@ -92,12 +92,14 @@ def _telling(kind: type[Any]) -> type[Any]:
     return Telling
 
 
-def run_worker(folder: Path, database: str | None, objects: str | None) -> None:
-    """Works until SIGTERM or Ctrl-C."""
+def run_worker(
+    folder: Path, database: str | None, objects: str | None, scheduler: str | None = None
+) -> None:
+    """Works until SIGTERM or Ctrl-C; Dask's workers dream where a scheduler is given."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     with Centre(folder, database, objects) as centre, Waker(database, stop.wait) as waker:
-        work(centre, waker.wait, stop.is_set)
+        work(centre, waker.wait, stop.is_set, scheduler)
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
@@ -89,8 +89,17 @@ def serve(
 
 
 @centre_group.command()
-def worker(folder: Folder, *, database: Database = None, objects: Objects = None) -> None:
-    """Merge hand-ins and make downloads until stopped.
+def worker(
+    folder: Folder,
+    *,
+    database: Database = None,
+    objects: Objects = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Dream on a Dask cluster."),
+    ] = None,
+) -> None:
+    """Merge hand-ins, make downloads and dream until stopped.
 
     Any number of workers may run. Each takes a map that has work and no other worker.
 
@@ -100,7 +109,7 @@ def worker(folder: Folder, *, database: Database = None, objects: Objects = None
     """
     from engram.centre.serving import run_worker
 
-    run_worker(folder, database, objects)
+    run_worker(folder, database, objects, scheduler)
 
 
 @centre_group.command()
@@ -182,6 +191,10 @@ def map_(
             help="Version that is moved to each merge that passed the gate.",
         ),
     ] = None,
+    quiet: Annotated[
+        str | None,
+        typer.Option("--quiet", metavar="FROM-TO", help="Hours in which the centre dreams, UTC, as in 22-5."),
+    ] = None,
     settings: options.SettingsGiven,
     database: Database = None,
 ) -> None:
@@ -196,11 +209,61 @@ def map_(
     from engram.cli.fleet import merging_of
 
     policy = MapPolicy(
-        merging_of(settings.read()), tuple(str(one.absolute()) for one in gate or ()), moves
+        merging_of(settings.read()),
+        tuple(str(one.absolute()) for one in gate or ()),
+        moves,
+        _hours(quiet),
     )
     with _open(folder, database) as centre:
         centre.add_map(name, _BY)
         centre.set_policy(name, policy, _BY)
+
+
+def _hours(text: str | None) -> tuple[float, float] | None:
+    """The quiet hours, as FROM-TO."""
+    from engram.errors import ConfigError
+
+    if text is None:
+        return None
+    begin, _, end = text.partition("-")
+    try:
+        found = float(begin), float(end)
+    except ValueError:
+        found = (-1.0, -1.0)
+    if not all(0.0 <= one <= 24.0 for one in found):
+        raise ConfigError(f"--quiet {text!r:.40} is not FROM-TO in hours of the day, such as 22-5")
+    return found
+
+
+@centre_group.command()
+def dream(
+    folder: Folder,
+    *,
+    map_name: MapName = "fleet",
+    cancel: Annotated[
+        str | None, typer.Option("--cancel", metavar="DREAM", help="End this one.")
+    ] = None,
+    as_json: options.Json = False,
+    database: Database = None,
+) -> None:
+    """Ask for a dream: a worker runs it whenever no robot waits.
+
+    It looks for a better map in what robots handed in, judged by the map's held-out drives. The
+    same command prints the outcome.
+
+    \b
+    Examples:
+      engram centre dream town
+    """
+    from engram.centre.dreams import Dreams
+
+    with _open(folder, database) as centre:
+        dreams = Dreams(centre)
+        if cancel is None:
+            row = dreams.ask(map_name, _BY)
+        else:
+            row = dreams.cancel(dreams.get(cancel), _BY)
+    typer.echo(json.dumps(row) if as_json else _told(row))
 
 
 @centre_group.command()
@@ -215,13 +278,14 @@ def jobs(
     as_json: options.Json = False,
     database: Database = None,
 ) -> None:
-    """List hand-ins and their state, newest last.
+    """List hand-ins and dreams and their state, newest last.
 
     \b
     Examples:
       engram centre jobs town
       engram centre jobs town --map campus --json
     """
+    from engram.centre.dreams import Dreams
     from engram.centre.handins import HandIns
 
     with _open(folder, database) as centre:
@@ -229,13 +293,21 @@ def jobs(
         if cancel is not None:
             handins.cancel(handins.get(cancel), _BY)
         rows = handins.listed(map_name, None, None, 2**62, 1000)
+        dreamt = Dreams(centre).listed(map_name)
     if as_json:
-        print(json.dumps({"jobs": rows}))
+        print(json.dumps({"jobs": rows, "dreams": dreamt}))
         return
     for row in reversed(rows):
-        fact = row["error"] or row["progress"] or ""
-        revision = "" if row["revision"] is None else f" revision {row['revision']}"
-        typer.echo(f"{row['id']} {row['state']}{revision} {fact}".rstrip())
+        typer.echo(_told(row))
+    for row in reversed(dreamt):
+        typer.echo(f"dream {_told(row)}")
+
+
+def _told(row: dict[str, Any]) -> str:
+    """A job on one line."""
+    fact = row["error"] or row["progress"] or ""
+    revision = "" if row["revision"] is None else f" revision {row['revision']}"
+    return f"{row['id']} {row['state']}{revision} {fact}".rstrip()
 
 
 @centre_group.command()

@@ -11,6 +11,7 @@ same command goes on where it stopped.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import random
@@ -72,6 +73,8 @@ class Harness:
         }
 
         self._warm_up()
+        gc.collect()
+        gc.freeze()  # children neither walk nor copy what the parent made
 
     def trial(self, number: int, seed: int) -> tuple[str, Trial]:
         """One case: the kind of the change, and what became of it."""

@@ -19,6 +19,7 @@ _EXPRESSIONS = (
     "((SELECT count(*) FROM sqlite_schema a, sqlite_schema b, sqlite_schema c))",
     "(printf('%.*c', 1000000000, 'x'))",
 )
+_STAND_IN = "(1)"
 _OBJECTS = (
     "CREATE VIEW seen AS SELECT {e}",
     "CREATE TRIGGER seen BEFORE INSERT ON tags BEGIN SELECT {e}; END",
@@ -57,8 +58,11 @@ def of_a_file(samples: Samples, folder: Path, chance: random.Random) -> Case:
 
 def _changed(connection: sqlite3.Connection, chance: random.Random, expression: str) -> str:
     if chance.random() < 0.4:
-        statement = chance.choice(_OBJECTS).format(e=expression)
-        connection.execute(statement)
+        made = chance.choice(_OBJECTS)
+        connection.execute(made.format(e=_STAND_IN))  # the harness evaluates nothing itself
+        connection.execute("PRAGMA writable_schema = ON")
+        statement = made.format(e=expression)
+        connection.execute("UPDATE sqlite_schema SET sql = ? WHERE name = 'seen'", [statement])
         return statement
     kept = connection.execute(
         "SELECT rowid, sql FROM sqlite_schema WHERE sql IS NOT NULL ORDER BY 1"

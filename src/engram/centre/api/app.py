@@ -18,7 +18,7 @@ from engram.centre.api.context import CentreHere
 from engram.centre.api.problems import add_problems
 from engram.centre.pages import routes as pages
 from engram.centre.service import Centre
-from engram.centre.store.schema import artifacts, handins
+from engram.centre.store.schema import artifacts, dreams, handins
 
 _ABOUT = """The fleet's shared map as a service: robots hand in what they saw, and download what the
 next mission needs. Errors are problem details (RFC 9457). Whatever is sent twice is done once."""
@@ -101,7 +101,7 @@ def _metrics(request: Request, centre: CentreHere) -> str:
     lines += [f"engram_answer_seconds_sum {state.seconds:.6f}"]
     lines += [f"engram_answer_seconds_count {count}"]
     with centre.database.reading() as connection:
-        for table in (handins, artifacts):
+        for table in (handins, artifacts, dreams):
             query = select(table.c.state, func.count()).group_by(table.c.state)
             lines += [f"# TYPE engram_{table.name} gauge"]
             lines += [

@@ -157,6 +157,21 @@ class HandIn(BaseModel):
     ] = []
 
 
+class Dream(BaseModel):
+    """A job that looks for a better map in what was handed in; `report` once it is done."""
+
+    id: Annotated[str, Field(examples=[_ID])]
+    map: Annotated[str, Field(examples=["fleet"])]
+    state: Annotated[str, Field(examples=["done"])]
+    asked_by: str
+    asked_ns: int
+    ended_ns: int | None
+    revision: Annotated[int | None, Field(description="that it made, if it found better")]
+    progress: str
+    report: dict[str, Any] | None
+    error: str | None
+
+
 class RobotReport(Body):
     """What a robot runs, and what that came to."""
 

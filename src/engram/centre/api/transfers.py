@@ -16,8 +16,10 @@ from engram.centre.api import models
 from engram.centre.api.context import Asking, CentreHere, page_of, takes
 from engram.centre.api.maps import Cursor, Limit
 from engram.centre.downloads import Downloads, options_of
+from engram.centre.dreams import Dreams
 from engram.centre.errors import NotAllowedError, QuotaError, UnknownError
 from engram.centre.handins import HandIns
+from engram.centre.keeping import ASKED
 from engram.centre.service import Centre
 from engram.centre.store.packs import PACK_BYTES
 from engram.errors import InputError
@@ -127,10 +129,11 @@ def cancel(handin: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
 
 @router.get("/maps/{name}/jobs", dependencies=[takes(Role.VIEWER)])
 def jobs(name: str, centre: CentreHere) -> list[dict[str, Any]]:
-    """What waits or runs, in its order: hand-ins, then downloads."""
+    """What waits or runs, in its order: hand-ins, then downloads, then dreams."""
     merges = [{"kind": "merge", **_plain(row)} for row in HandIns(centre).waiting(name)]
     asked = [row for row in Downloads(centre).asked() if row["map"] == name]
-    return [*merges, *({"kind": "download", **_artifact(row)} for row in asked)]
+    dreams = [{"kind": "dream", **_plain(row)} for row in Dreams(centre).listed(name, ASKED)]
+    return [*merges, *({"kind": "download", **_artifact(row)} for row in asked), *dreams]
 
 
 @router.get("/jobs/{job}")
@@ -140,6 +143,32 @@ def one_job(job: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
         return {"kind": "merge", **_plain(_handin(centre, who, job, Role.VIEWER))}
     except UnknownError:
         return {"kind": "download", **_artifact(_granted(centre, who, job))}
+
+
+@router.post(
+    "/maps/{name}/dreams", response_model=models.Dream, dependencies=[takes(Role.OPERATOR)]
+)
+def ask_dream(name: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
+    """Asks for a dream of what is handed in now. Asked again, it is the same dream."""
+    return _plain(Dreams(centre).ask(name, who.id))
+
+
+@router.get(
+    "/maps/{name}/dreams", response_model=list[models.Dream], dependencies=[takes(Role.VIEWER)]
+)
+def dreams(name: str, centre: CentreHere) -> list[dict[str, Any]]:
+    """The last dreams, newest first."""
+    return [_plain(row) for row in Dreams(centre).listed(name)]
+
+
+@router.post("/dreams/{dream}/cancel", response_model=models.Dream)
+def cancel_dream(dream: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
+    """Ends a dream; asked for again, it goes on where it was."""
+    row = Dreams(centre).get(dream)
+    if who.role_on(row["map"]) is None:
+        raise UnknownError(f"there is no dream {dream!r:.40}")
+    who.check(row["map"], Role.OPERATOR)
+    return _plain(Dreams(centre).cancel(row, who.id))
 
 
 @router.post(

@@ -16,6 +16,7 @@ from engram.centre.access.enrolment import subject_of
 from engram.centre.access.roles import Role, Subject
 from engram.centre.api.context import COOKIE, Asking, CentreHere, takes, who_asks
 from engram.centre.downloads import Downloads
+from engram.centre.dreams import Dreams
 from engram.centre.errors import CentreError, UnknownError
 from engram.centre.fleet import Fleet
 from engram.centre.handins import HandIns
@@ -180,6 +181,7 @@ def queue(name: str, centre: CentreHere, who: Asking) -> Response:
         maps=_maps(centre, who),
         jobs=jobs,
         downloads=asked,
+        dreams=[{**row, "report": _report(row)} for row in Dreams(centre).listed(name)],
         robots={row["robot"]: row["name"] for row in Fleet(centre).all(name)},
         may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
     )

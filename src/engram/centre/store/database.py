@@ -109,7 +109,13 @@ class ServiceDatabase:
 
 
 # Statements that bring the tables from this version to the next.
-MIGRATIONS: dict[int, tuple[str, ...]] = {}
+MIGRATIONS: dict[int, tuple[str, ...]] = {
+    1: (
+        "CREATE TABLE dreams (id TEXT NOT NULL PRIMARY KEY, map TEXT NOT NULL, state TEXT NOT NULL,"
+        " asked_by TEXT NOT NULL, asked_ns BIGINT NOT NULL, ended_ns BIGINT, since BIGINT NOT NULL,"
+        " revision BIGINT, progress TEXT NOT NULL, report TEXT, error TEXT)",
+    ),
+}
 
 
 def rows_of(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ from sqlalchemy import (
     Text,
 )
 
-VERSION = 1
+VERSION = 2
 
 metadata = MetaData()
 _INT = BigInteger().with_variant(Integer(), "sqlite")
@@ -182,6 +182,22 @@ artifact_grants = Table(
     metadata,
     _text("artifact", primary_key=True),
     _text("subject", primary_key=True),
+)
+
+dreams = Table(  # looks for a better map in what was handed in
+    "dreams",
+    metadata,
+    _text("id", primary_key=True),
+    _text("map"),
+    _text("state"),
+    _text("asked_by"),
+    _int("asked_ns"),
+    _int("ended_ns", nullable=True),
+    _int("since"),  # revision of the fleet map when it was asked for
+    _int("revision", nullable=True),  # that it made
+    _text("progress"),
+    _text("report", nullable=True),
+    _text("error", nullable=True),
 )
 
 usage = Table(

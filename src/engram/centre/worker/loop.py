@@ -7,6 +7,7 @@ from collections.abc import Callable
 from engram.centre.downloads import Downloads
 from engram.centre.handins import HandIns
 from engram.centre.service import Centre
+from engram.centre.worker.dreaming import dream_a_while
 from engram.centre.worker.merging import merge_hand_in
 from engram.centre.worker.sweeping import sweep_all
 
@@ -31,13 +32,19 @@ def work_off(centre: Centre) -> int:
     return settled + _make_downloads(downloads)
 
 
-def work(centre: Centre, wait: Callable[[float], object], stopped: Callable[[], bool]) -> None:
+def work(
+    centre: Centre,
+    wait: Callable[[float], object],
+    stopped: Callable[[], bool],
+    scheduler: str | None = None,
+) -> None:
     """Works until it is stopped.
 
     Args:
         centre: the centre.
         wait: returns after some seconds, or sooner when there may be work.
         stopped: whether to end.
+        scheduler: address of a Dask scheduler whose workers dream; None to dream here.
     """
     swept_ns = 0
     while not stopped():
@@ -46,6 +53,8 @@ def work(centre: Centre, wait: Callable[[float], object], stopped: Callable[[], 
         if centre.now_ns() - swept_ns >= centre.settings.sweep_h * _HOUR_NS:
             swept_ns = centre.now_ns()
             sweep_all(centre)
+        if dream_a_while(centre, wait, stopped, scheduler):
+            continue
         wait(centre.settings.poll_s)
 
 

@@ -6,9 +6,9 @@ one merges again: what was committed is found by the content hash that its revis
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,11 @@ from engram.centre.keeping import HandInState
 from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
 from engram.centre.worker.admission import admit
+from engram.centre.worker.watching import Watching
 from engram.errors import EngramError, MapLockedError, RefusedError, StorageFullError
 from engram.fleet.merge import MergeReport, merge
 from engram.maps import Map
-from engram.monitor import Monitor
 from engram.robot import Settings
-
-_TELL_S = 1.0
 
 
 def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
@@ -79,7 +77,7 @@ def _merged(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -
         centre.map_path(row["map"]),
         [thin],
         policy.merge,
-        _Watching(handins, row["id"]),
+        Watching(partial(handins.heartbeat, row["id"])),
         settings=Settings(),
         require_better=[] if row["ungated"] else [Path(one) for one in policy.gate],
     )
@@ -124,30 +122,3 @@ def _scratch(path: Path) -> Iterator[None]:
         yield
     finally:
         clear()
-
-
-class _Watching(Monitor):
-    """Tells how far the merge is, and stops it if it is cancelled."""
-
-    def __init__(self, handins: HandIns, key: str) -> None:
-        self._handins = handins
-        self._key = key
-        self._told_s = 0.0
-        self._what, self._total, self._done = "", 0, 0
-
-    @contextmanager
-    def stage(self, what: str, total: int) -> Iterator[Monitor]:
-        self._what, self._total, self._done = what.split(" /", 1)[0], total, 0
-        yield self
-
-    def advance(self, word: str = "") -> None:
-        del word
-        self._done += 1
-
-    def check(self) -> None:
-        now = time.monotonic()
-        if now - self._told_s < _TELL_S:
-            return
-        self._told_s = now
-        if self._handins.heartbeat(self._key, f"{self._what}: {self._done} of {self._total}"):
-            raise KeyboardInterrupt

@@ -44,7 +44,7 @@ BEHAVIOURS: dict[str, dict[str, Any]] = {
 }
 # More hand-ins are tried with each of them first only.
 _ALL_ORDERS = 4
-_FEWEST_DRIVES = 3
+FEWEST_DRIVES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,10 +188,10 @@ def dream(
 def _check(centre: Path, handed: Sequence[Path], drives: Sequence[Path]) -> None:
     if not handed:
         raise InputError(f"{centre}: nothing was handed in; merge with --keep, or name maps")
-    if len(drives) < _FEWEST_DRIVES:
+    if len(drives) < FEWEST_DRIVES:
         raise ConfigError(
             f"{len(drives)} validation drives are too few to rule out chance: give at least "
-            f"{_FEWEST_DRIVES} with --validate"
+            f"{FEWEST_DRIVES} with --validate"
         )
     with Map.open(centre) as store:
         named = [(path, open_drive(path)) for path in drives]

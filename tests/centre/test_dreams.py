@@ -1,0 +1,325 @@
+"""Dreams are dreamt when nobody waits, once, and given up for whatever comes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from sqlalchemy import inspect, text
+from tests.fleet.test_dreaming import ASKED as USUAL
+from tests.fleet.test_dreaming import nodes_of, town
+
+from engram.centre.dreams import Dreams
+from engram.centre.errors import ConflictError
+from engram.centre.handins import HandIns
+from engram.centre.service import Centre, MapPolicy
+from engram.centre.store.schema import dreams
+from engram.centre.worker import dreaming, merging
+from engram.centre.worker.dreaming import dream_a_while
+from engram.errors import WorkerError
+from engram.fleet.dream import DreamReport
+from engram.maps import Map, check_file, copy_map
+
+from .conftest import NAME, POLICY, Site, admit_here, drive
+from .faults import dying
+
+__all__ = ["town"]
+GATE = ("v1", "v2", "v3")
+HOUR_NS = 3_600_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("quiet", "hour", "expected"),
+    [
+        ((22.0, 5.0), 23.5, True),
+        ((22.0, 5.0), 4.9, True),
+        ((22.0, 5.0), 5.0, False),
+        ((9.0, 17.0), 8.0, False),
+        ((9.0, 17.0), 9.0, True),
+        ((0.0, 24.0), 13.0, True),
+        (None, 13.0, False),
+    ],
+)
+def test_quiet_hours_may_go_past_midnight(quiet, hour, expected):
+    assert MapPolicy(quiet=quiet).is_quiet(round(hour * HOUR_NS) + 24 * HOUR_NS) is expected
+
+
+def test_a_centre_of_the_version_before_gets_the_table(tmp_path):
+    with Centre(tmp_path) as centre, centre.database.writing() as connection:
+        connection.execute(text("DROP TABLE dreams"))
+        connection.execute(text("UPDATE centre SET version = 1"))
+    with Centre(tmp_path) as centre:
+        centre.add_map(NAME, "tests")
+        assert Dreams(centre).listed(NAME) == []
+        with centre.database.reading() as connection:
+            columns = {one["name"] for one in inspect(connection).get_columns("dreams")}
+    assert columns == {column.name for column in dreams.columns}
+
+
+def test_there_must_be_something_to_dream_of_and_to_judge_it_by(site, in_process):
+    jobs = Dreams(site.centre)
+    with pytest.raises(ConflictError, match="0 held-out drives"):
+        jobs.ask(NAME, "tests")
+    judged(site)
+    with pytest.raises(ConflictError, match="nothing is merged"):
+        jobs.ask(NAME, "tests")
+
+
+def test_the_worker_asks_in_quiet_hours_and_a_person_at_any_time(site, in_process):
+    handed_in(site, "r1", 1_000)
+    judged(site)
+    jobs = Dreams(site.centre)
+    jobs.ask_quietly()
+    assert jobs.listed(NAME) == []
+    judged(site, quiet=hours_from(site, 0.0))
+    jobs.ask_quietly()
+    (row,) = jobs.due()
+    judged(site, quiet=hours_from(site, 3.0))
+    assert jobs.due() == []
+    answer = site.http.post(f"/v1/maps/{NAME}/dreams", headers=site.token("operator"))
+    assert answer.json()["id"] == row["id"]
+    assert [one["id"] for one in jobs.due()] == [row["id"]]
+    told = site.http.get(f"/v1/maps/{NAME}/jobs", headers=site.token("viewer")).json()
+    assert [(one["kind"], one["id"]) for one in told] == [("dream", row["id"])]
+
+
+def test_a_dream_that_a_hand_in_has_overtaken_is_asked_for_anew(site, in_process):
+    handed_in(site, "r1", 1_000)
+    judged(site)
+    jobs = Dreams(site.centre)
+    before = jobs.ask(NAME, "tests")
+    judged(site, gate=())
+    handed_in(site, "r2", 5_000)
+    judged(site)
+    (row,) = jobs.due()
+    assert row["id"] != before["id"]
+    assert row["asked_by"] == "tests"
+    assert jobs.get(before["id"])["state"] == "cancelled"
+
+
+def test_what_a_person_hid_is_not_dreamt_of_until_it_is_handed_in_again(site, in_process):
+    handed_in(site, "r1", 1_000)
+    handed_in(site, "r2", 5_000)
+    jobs = Dreams(site.centre)
+    assert len(jobs.handed(NAME)) == 2
+    with Map.open(site.centre.map_path(NAME)) as store:
+        store.revert(1, author="tests")
+    (row,) = jobs.handed(NAME)
+    assert row["robot"] == site.robot("r2").state.fact("robot")
+    handed_in(site, "r1", 9_000)
+    assert len(jobs.handed(NAME)) == 2
+
+
+def test_a_robots_map_is_put_together_with_what_it_got_from_the_fleet(site, in_process, tmp_path):
+    handed_in(site, "r1", 1_000)
+    second = site.robot("r2")
+    second.step()
+    site.settle()
+    assert second.switch()
+    handed_in(site, "r2", 5_000)
+    jobs = Dreams(site.centre)
+    (row,) = [one for one in jobs.handed(NAME) if one["robot"] == second.state.fact("robot")]
+    manifest = jobs.manifest(row)
+    path = tmp_path / "r2.engram"
+    admit_here(manifest, jobs.parts(row, manifest), path)
+    with Map.open(path) as store, Map.open(second.live) as live:
+        assert store.content_hash() == live.content_hash()
+        assert len(list(store.frames.stored(store.load().nodes))) == len(live.load().nodes)
+
+
+class DreamMachine(RuleBasedStateMachine):
+    """The model: what was dreamt of. The dreams themselves are of a moment."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.folder = Path(tempfile.mkdtemp())
+        self.patch = pytest.MonkeyPatch()
+        self.patch.setattr(merging, "admit", admit_here)
+        self.patch.setattr(dreaming, "admit", admit_here)
+        self.patch.setattr(dreaming, "dream", self.dreamt)
+        self.patch.setattr(dreaming, "_dream_beside", self.beside)
+        self.site = Site(self.folder)
+        self.whole: list[tuple[str, ...]] = []
+        self.ended: set[str] = set()
+        self.drives = 0
+        for name in ("r1", "r2"):
+            self.site.robot(name)
+        self.policy(quiet=False)
+
+    def beside(self, centre, row, wait, stopped, scheduler) -> None:
+        assert not any(map(HandIns(centre).waiting, centre.map_names()))
+        dreaming.dream_of(centre, row)
+
+    def dreamt(self, path, handed, *_) -> DreamReport:
+        """As the fleet's dream: it reads what was handed in."""
+        contents = []
+        for one in handed:
+            with Map.open(one) as store:
+                contents.append(store.content_hash())
+        self.whole.append(tuple(contents))
+        return DreamReport(str(path), complete=True)
+
+    @rule(quiet=st.booleans())
+    def policy(self, quiet: bool) -> None:
+        judged(self.site, quiet=hours_from(self.site, 0.0 if quiet else 3.0))
+
+    @rule(name=st.sampled_from(["r1", "r2"]))
+    def hand_in(self, name: str) -> None:
+        self.drives += 1
+        agent = self.site.robot(name)
+        drive(agent.live, name, 1_000 * self.drives, 1)
+        agent.hand_in()
+        while agent.step(fetch=False) == 0:
+            pass
+
+    @rule()
+    def ask(self) -> None:
+        if Dreams(self.site.centre).handed(NAME):
+            Dreams(self.site.centre).ask(NAME, "tests")
+
+    @rule()
+    def cancel(self) -> None:
+        for row in Dreams(self.site.centre).listed(NAME, "asked"):
+            Dreams(self.site.centre).cancel(row, "tests")
+
+    @rule(at=st.integers(1, 60))
+    def work(self, at: int) -> None:
+        with dying(at) as death:
+            try:
+                judged(self.site, gate=())  # the drives of the gate are names only
+                self.site.work()
+                judged(self.site)
+                dream_a_while(self.site.centre, lambda _: None, lambda: False)
+            except BaseException:
+                if not death.came:
+                    raise
+        if death.came:
+            self.site.restart()
+        judged(self.site)
+
+    @invariant()
+    def what_is_done_stays_done_and_nothing_is_left(self) -> None:
+        rows = Dreams(self.site.centre).listed(NAME)
+        done = {row["id"] for row in rows if row["state"] == "done"}
+        assert self.ended <= done
+        self.ended = done
+        assert not any(row["state"] == "failed" for row in rows), rows
+
+    def teardown(self) -> None:
+        try:
+            self.policy(quiet=True)
+            judged(self.site, gate=())
+            while self.site.work():
+                pass
+            self.policy(quiet=True)
+            merged = Dreams(self.site.centre).handed(NAME)
+            while dream_a_while(self.site.centre, lambda _: None, lambda: False):
+                pass
+            jobs = Dreams(self.site.centre)
+            state = jobs.get(jobs.key(NAME))["state"] if merged else "done"
+            assert state in {"done", "cancelled"}
+            if state == "done" and merged:
+                assert tuple(row["content_hash"] for row in merged) in self.whole
+            assert not list((self.site.centre.folder / "work").glob("[!.]*"))
+        finally:
+            self.site.close()
+            self.patch.undo()
+            shutil.rmtree(self.folder)
+
+
+TestDreams = DreamMachine.TestCase
+TestDreams.settings = settings(
+    max_examples=2, stateful_step_count=8, suppress_health_check=list(HealthCheck)
+)
+
+
+class LongDreamMachine(DreamMachine):
+    """The same, many times."""
+
+
+TestManyDreams = pytest.mark.long(LongDreamMachine.TestCase)
+TestManyDreams.settings = settings(
+    max_examples=200, stateful_step_count=30, suppress_health_check=list(HealthCheck)
+)
+
+
+@pytest.mark.long
+def test_a_better_order_becomes_a_revision_and_a_hand_in_interrupts(tmp_path, town, monkeypatch):
+    """The whole way, in real processes."""
+    _, robots, drives = town
+    site = Site(tmp_path)
+    policy = MapPolicy(USUAL.merging, tuple(map(str, drives)), "stable")
+    site.centre.set_policy(NAME, replace(policy, gate=()), "tests")
+    for path in robots:
+        agent = site.robot(path.stem)
+        agent.live.parent.mkdir(exist_ok=True)
+        copy_map(path, agent.live)
+        agent.hand_in()
+        site.settle()
+    before = nodes_of(site.centre.map_path(NAME))
+    site.centre.set_policy(NAME, policy, "tests")
+    jobs = Dreams(site.centre)
+    row = jobs.ask(NAME, "tests")
+    asked = iter([False, True])
+    with monkeypatch.context() as patch:
+        patch.setattr(dreaming, "_is_asked_for", lambda _: next(asked))
+        assert dream_a_while(site.centre, time.sleep, lambda: False)
+    assert jobs.get(row["id"])["state"] == "asked"
+    assert nodes_of(site.centre.map_path(NAME)) == before
+    assert dream_a_while(site.centre, time.sleep, lambda: False)
+    row = jobs.get(row["id"])
+    assert (row["state"], row["error"]) == ("done", None)
+    report = json.loads(row["report"])
+    assert report["better_by"][1] > 0
+    assert before < nodes_of(site.centre.map_path(NAME))
+    assert check_file(site.centre.map_path(NAME)).problems == ()
+    with Map.open(site.centre.map_path(NAME)) as store:
+        assert row["revision"] == store.revision
+    answer = site.http.get(f"/v1/maps/{NAME}/refs/stable", headers=site.token("viewer"))
+    assert answer.json()["revision"] == row["revision"]
+    assert not dream_a_while(site.centre, time.sleep, lambda: False)
+    site.close()
+
+
+@pytest.mark.long
+def test_a_dream_whose_process_dies_is_told_to_have_failed(site, in_process, monkeypatch):
+    handed_in(site, "r1", 1_000)
+    judged(site)
+    row = Dreams(site.centre).ask(NAME, "tests")
+    monkeypatch.setattr(dreaming, "_dream_here", dies)
+    assert dream_a_while(site.centre, time.sleep, lambda: False)
+    assert "exit code 1" in Dreams(site.centre).get(row["id"])["error"]
+
+
+def dies(*_: object) -> None:
+    raise WorkerError("here")
+
+
+def judged(site, **change) -> None:
+    """Three held-out drives, which nobody reads where the merge has no gate."""
+    kept = site.centre.policy(NAME)
+    policy = replace(POLICY, **{"quiet": kept.quiet, "gate": GATE, **change})
+    site.centre.set_policy(NAME, policy, "tests")
+
+
+def hours_from(site, later_h: float) -> tuple[float, float]:
+    """Two quiet hours that begin so much later than the hour of now."""
+    now_h = site.clock.now_ns / HOUR_NS % 24
+    return (now_h - 0.5 + later_h) % 24, (now_h + 1.5 + later_h) % 24
+
+
+def handed_in(site, name: str, start_ns: int) -> None:
+    agent = site.robot(name)
+    drive(agent.live, name, start_ns)
+    agent.hand_in()
+    while agent.step(fetch=False) == 0:
+        pass
+    site.work()
