@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
@@ -17,7 +17,8 @@ from sqlalchemy import Connection, insert
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.files import Holder
 from engram.frontend import DescriptorKind
-from engram.geometry import StereoCamera
+from engram.geometry import SE3, StereoCamera
+from engram.graph.marks import Placement
 from engram.graph.model import Amendable, NodeId, Session, SessionId
 from engram.maps import reading
 from engram.maps.amending import checked_amendments
@@ -92,6 +93,7 @@ class Map(MapReader):
             self._release()
             raise
         self._writing: RevisionWriter | None = None
+        self._laid_out: dict[NodeId, SE3] | None = None  # once the open revision is committed
 
     @staticmethod
     def create(location: Path | str | Place) -> Map:
@@ -513,10 +515,13 @@ class Map(MapReader):
         self, own: View, drive: Resumable | None, committed_ns: int | None = None
     ) -> RevisionWriter:
         """The writer of a revision; until it ends, this map includes its rows."""
+        placed = None
         if drive is not None:
             self.forget()  # later reads include the session
             self._keys.forget_nodes()  # so do later searches for its nodes
-        self._see(own)
+        else:
+            placed = self.__dict__.get("placements")  # the revision is still empty
+        self._see(own, placed)
         self._writing = RevisionWriter(
             self._database,
             self._keys,
@@ -525,18 +530,28 @@ class Map(MapReader):
             self._writing_ended,
             drive=drive,
             committed_ns=committed_ns,
-            places=partial(new_places, self),
+            places=self._new_places,
         )
         return self._writing
 
+    def _new_places(self, contents: Mapping[str, float]) -> list[Placement]:
+        """What the open revision has to write of the layout, which is known then."""
+        found = new_places(self, contents)
+        if contents["placements"] or contents["hidden"]:
+            self._laid_out = None
+        else:
+            self._laid_out = self.placements | {one.node: one.map_from_node for one in found}
+        return found
+
     def _writing_ended(self) -> None:
-        self._writing = None
+        self._writing, laid_out, self._laid_out = None, self._laid_out, None
         with self._database.reading() as connection:
             newest = head(connection)
-        self._see(View(newest))
+        committed = newest > self._view.at
+        self._see(View(newest), laid_out if committed else None)
 
-    def _see(self, view: View) -> None:
-        self._look_from(view)
+    def _see(self, view: View, placements: dict[NodeId, SE3] | None = None) -> None:
+        self._look_from(view, placements)
         self._keys.set_view(view)
 
     def _check_none_open(self) -> None:

@@ -228,7 +228,8 @@ def moves(
         goals: goals known before.
     """
     both = [node for node in before if node in after]
-    apart_m = np.array([_apart_m(before[node], after[node]) for node in both])
+    others = [node for node in both if before[node] is not after[node]]
+    apart_m = np.array([_apart_m(before[node], after[node]) for node in others])
     moved = apart_m[apart_m >= _WORTH_M]
     far_m, lost = {}, []
     for goal in goals:

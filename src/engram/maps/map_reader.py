@@ -448,11 +448,18 @@ class MapReader:
             for name in (*_SMALL, "sessions"):
                 self.__dict__.pop(name, None)
 
-    def _look_from(self, view: View) -> None:
-        """Changes the visible revision; the graph and the paths stay as they are."""
+    def _look_from(self, view: View, placements: dict[NodeId, SE3] | None = None) -> None:
+        """Changes the visible revision; the graph and the paths stay as they are.
+
+        Args:
+            view: what is visible now.
+            placements: those of this revision where they are known already.
+        """
         self._view = view
         for name in _SMALL if self._contents else (*_SMALL, "sessions"):
             self.__dict__.pop(name, None)
+        if placements is not None:
+            self.__dict__["placements"] = placements
         self.frames.set_view(view)
 
     def _read(self, load: Callable[[Connection, View], _T]) -> _T:
