@@ -193,7 +193,9 @@ def map_(
     ] = None,
     quiet: Annotated[
         str | None,
-        typer.Option("--quiet", metavar="FROM-TO", help="Hours in which the centre dreams, UTC, as in 22-5."),
+        typer.Option(
+            "--quiet", metavar="FROM-TO", help="Hours in which the centre dreams, UTC, as in 22-5."
+        ),
     ] = None,
     settings: options.SettingsGiven,
     database: Database = None,
@@ -246,7 +248,7 @@ def dream(
     as_json: options.Json = False,
     database: Database = None,
 ) -> None:
-    """Ask for a dream: a worker runs it whenever no robot waits.
+    """Ask for a dream, for whenever no robot waits.
 
     It looks for a better map in what robots handed in, judged by the map's held-out drives. The
     same command prints the outcome.

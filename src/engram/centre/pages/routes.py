@@ -11,6 +11,7 @@ from urllib.parse import parse_qs
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader
+from markupsafe import Markup
 
 from engram.centre.access.enrolment import subject_of
 from engram.centre.access.roles import Role, Subject
@@ -48,7 +49,8 @@ _templates = Environment(
 def _when(stamp_ns: int | None) -> str:
     if stamp_ns is None:
         return "never"
-    return datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    text = datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return Markup(f"<time>{text}</time>")  # digits and our own words
 
 
 _templates.filters["when"] = _when
@@ -193,7 +195,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
     with centre.database.reading() as connection:
         broken = first_broken(connection)
         events = events_after(connection, 0, name, 10**6)[-_SHOWN:]
-    waiting = HandIns(centre).waiting(name)
+    waiting, fleet = HandIns(centre).waiting(name), Fleet(centre).all(name)
     path = centre.map_path(name)
     return _page(
         "health",
@@ -205,7 +207,8 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         waiting=waiting,
         size_bytes=path.stat().st_size,
         row=centre.map_row(name),
-        silent=[one for one in Fleet(centre).all(name) if one["reported_ns"] is None],
+        silent=[one for one in fleet if one["reported_ns"] is None],
+        names={one["robot"]: one["name"] for one in fleet},
     )
 
 

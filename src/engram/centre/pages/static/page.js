@@ -134,7 +134,7 @@ if (canvas) {
     const node = shown.nodes[i], card = document.getElementById("card");
     const found = await (await fetch(`/v1/maps/${map}/blame/${node[0]}`)).json();
     const list = document.createElement("dl");
-    const facts = { node: found.node, robot: found.robot, when: found.when, "driven": `${Number(found.driven_m).toFixed(1)} m`,
+    const facts = { node: found.node, robot: found.robot, when: `${found.when.slice(0, 19).replace("T", " ")} UTC`, "driven": `${Number(found.driven_m).toFixed(1)} m`,
       "added by": `revision ${found.revision}`, matched: `${found.matches} of ${found.attempts}`, paths: found.paths };
     for (const [name, value] of Object.entries(facts)) {
       const term = document.createElement("dt"), fact = document.createElement("dd");
