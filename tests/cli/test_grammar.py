@@ -200,11 +200,26 @@ def test_info_lists_sessions_and_nodes_by_ids_that_other_verbs_take(
 def test_plot_draws_a_map(engram, street: Path, tmp_path: Path, by: str) -> None:
     town, picture = tmp_path / "town.engram", tmp_path / "town.svg"
     engram("map", town, street, "--robot", "r1", "--recorded-at", "2026-03-01T09:30:00Z")
+    engram("goal", "add", town, "dock 5$", "--x", 1, "--y", 1)
     ran = engram("plot", town, picture, "--by", by)
     assert ran.status == 0
+    assert "<!-- dock 5" in picture.read_text()
     nodes = engram("info", town, "--json").json["nodes"]
     assert f"{nodes} nodes by {by}" in ran.out
     assert picture.stat().st_size > 5000
+
+
+def test_goals_far_from_the_map_are_warned_of_and_exported(engram, street, tmp_path) -> None:
+    town, table = tmp_path / "town.engram", tmp_path / "town.csv"
+    engram("map", town, street)
+    assert not engram("goal", "add", town, "dock", "--x", 2, "--y", 1).err
+    assert "from the nearest node" in engram("goal", "add", town, "far", "--x", 400, "--y", 1).err
+    nodes = engram("info", town, "--json").json["nodes"]
+    assert f"{nodes} nodes, 2 goals" in engram("export", town, table).out
+    assert engram("export", town, tmp_path / "town.tum").out.strip().endswith(f"{nodes} nodes")
+    wrong = tmp_path / "wrong.csv"
+    wrong.write_text("node,x,y\nffffffff,1,2\n")
+    assert "wrong.csv: none of" in engram("anchor", town, wrong).err
 
 
 def test_plot_refuses_what_it_cannot_write(engram, street: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from engram.graph.model import Clock
 from engram.maps import Map, check_file
 from engram.robot.anchoring import anchor_map
 from engram.robot.anchors import read_anchors
-from engram.robot.exporting import export_map
+from engram.robot.exporting import Exported, export_map
 from engram.robot.goals import add_goal, list_goals
 from engram.sequences.trajectories import read_tum
 
@@ -103,7 +103,7 @@ def test_gps_gives_a_place_on_earth(copy, tmp_path):
     )
     anchor_map(copy, given, author="tests")
     out = tmp_path / "road.geojson"
-    assert export_map(copy, out) == count_of(copy)
+    assert export_map(copy, out) == Exported(count_of(copy), 0)
     points = [one["geometry"]["coordinates"] for one in json.loads(out.read_text())["features"]]
     assert max(point[1] for point in points) == pytest.approx(50 + 19 / 111_320, abs=1e-5)
     assert max(abs(point[0] - 14) for point in points) < 1e-5
@@ -142,19 +142,19 @@ def test_a_bag_of_two_receivers_asks_which(copy, tmp_path):
         anchor_map(copy, source, author="tests")
     with pytest.raises(InputError, match="holds no fix"):
         anchor_map(copy, source, topic="/gps/fix", author="tests")
-    with pytest.raises(InputError, match="none of the anchors belongs to one of its nodes"):
+    with pytest.raises(InputError, match="none of the anchors belongs to one of the nodes of"):
         anchor_map(copy, source, topic="/rtk/fix", author="tests")
 
 
 def test_exports_hold_every_node(copy, tmp_path):
     add_goal(copy, "dock", 5.0, 1.0, 0.0, author="tests")
     count = count_of(copy)
-    assert export_map(copy, tmp_path / "road.tum") == count
+    assert export_map(copy, tmp_path / "road.tum") == Exported(count, 0)
     with Map.open(copy) as store:
         poses = read_tum(tmp_path / "road.tum").world_from_cam
         first = store.frame.pose(store.graph.nodes[0].id)
     assert (first.inverse() @ poses[0]).distance_m < 1e-6
-    export_map(copy, tmp_path / "road.csv")
+    assert export_map(copy, tmp_path / "road.csv") == Exported(count, 1)
     rows = list(csv.DictReader((tmp_path / "road.csv").open()))
     assert [row["what"] for row in rows].count("node") == count
     assert rows[-1]["name"] == "dock"

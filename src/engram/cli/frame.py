@@ -12,6 +12,9 @@ import typer
 from engram.cli import options
 from engram.cli.progress import Bars
 
+# Further from the nodes, a goal hangs on the direction of one node.
+_FAR_M = 30.0
+
 
 class GoalAction(StrEnum):
     """What to do with goals."""
@@ -127,6 +130,13 @@ def goal(
     if name is None or x_m is None or y_m is None:
         raise InputError("add needs a name and a position: engram goal add MAP NAME --x X --y Y")
     added = add_goal(map_path, name, x_m, y_m, math.radians(yaw_deg), author=user())
+    if (far_m := added["from_node_m"]) > _FAR_M:
+        typer.echo(
+            f"warning: {name} is {far_m:.0f} m from the nearest node: if that turns by 1°, it "
+            f"moves by {far_m * math.radians(1):.1f} m. Did you mean the map frame that engram "
+            "plot shows?",
+            err=True,
+        )
     typer.echo(json.dumps(added) if as_json else
                f"{_goal_text(added)}; revision {added['revision']}")  # fmt: skip
 
@@ -166,6 +176,9 @@ def export(
     """
     from engram.robot.exporting import export_map
 
-    count = export_map(map_path, out, None if form is None else form.value, at)
-    typer.echo(json.dumps({"nodes": count, "file": str(out)}) if as_json else
-               f"{out}: {count} nodes")  # fmt: skip
+    wrote = export_map(map_path, out, None if form is None else form.value, at)
+    if as_json:
+        typer.echo(json.dumps({"nodes": wrote.nodes, "goals": wrote.goals, "file": str(out)}))
+        return
+    goals = f", {wrote.goals} {'goal' if wrote.goals == 1 else 'goals'}" if wrote.goals else ""
+    typer.echo(f"{out}: {wrote.nodes} nodes{goals}")

@@ -119,7 +119,7 @@ def diff(
 
     found = diff_revisions(map_path, before, after, stretch_m=stretch)
     if picture is not None:
-        draw_difference(found, picture)
+        draw_difference(map_path, found, picture)
     typer.echo(json.dumps(found.to_dict()) if as_json else found.text())
 
 

@@ -85,8 +85,8 @@ def plot(
 ) -> None:
     """Draw a map from above.
 
-    Distances are true nearby. Over long distances the layout drifts, because a map has no global
-    frame.
+    Shows the map frame, in which goals are stored, and the goals. Distances are true nearby; over
+    long distances they drift unless anchors hold them.
 
     \b
     Examples:

@@ -49,10 +49,11 @@ class FramePose:
     def to_dict(self) -> dict[str, float]:
         """Plain values; the direction in degrees."""
         return {
-            "x_m": round(self.x_m, 4),
-            "y_m": round(self.y_m, 4),
-            "z_m": round(self.z_m, 4),
-            "yaw_deg": round(float(np.rad2deg(self.yaw_rad)), 3),
+            # Adding 0.0 makes -0.0 positive.
+            "x_m": round(self.x_m, 4) + 0.0,
+            "y_m": round(self.y_m, 4) + 0.0,
+            "z_m": round(self.z_m, 4) + 0.0,
+            "yaw_deg": round(float(np.rad2deg(self.yaw_rad)), 3) + 0.0,
         }
 
 

@@ -104,7 +104,7 @@ def anchor_map(
     """
     with Map.open(path, writes=not dry_run) as store:
         given, geographic = _given(store, source, grid, topic)
-        nodes, known = _nodes_of(store, given)
+        nodes, known = _nodes_of(store, given, source)
         origin = _origin(store, known) if geographic else None
         positions = np.array([one.position for one in known]).reshape(-1, 2)
         if origin is not None:
@@ -143,13 +143,18 @@ def _given(
     return (given, geographic) if grid is None else (on_grid(given, grid), False)
 
 
-def _nodes_of(store: Map, given: list[GivenAnchor]) -> tuple[list[Node], list[GivenAnchor]]:
+def _nodes_of(
+    store: Map, given: list[GivenAnchor], source: Path
+) -> tuple[list[Node], list[GivenAnchor]]:
     """The node of each anchor, and the anchors that have one; of one node the first counts."""
     stamps, order = _utc_stamps(store)
     found: dict[Node, GivenAnchor] = {}
     for one in given:
         if one.node is not None:
-            origin = store.origin(one.node)
+            try:
+                origin = store.origin(one.node)
+            except InputError as error:
+                raise InputError(f"{source}: {error}") from error
             found.setdefault(store.graph.node(store.graph.index(origin.node)), one)
         elif one.time_ns is not None and len(stamps):
             at = int(np.argmin(np.abs(stamps - one.time_ns)))
@@ -157,8 +162,8 @@ def _nodes_of(store: Map, given: list[GivenAnchor]) -> tuple[list[Node], list[Gi
                 found.setdefault(store.graph.node(int(order[at])), one)
     if not found:
         raise InputError(
-            f"{store.location}: none of the anchors belongs to one of its nodes; times are UTC, "
-            "and match only drives whose clock is UTC (see engram amend --recorded-at)"
+            f"{source}: none of the anchors belongs to one of the nodes of {store.location}; times "
+            "are UTC, and match only drives whose clock is UTC (see engram amend --recorded-at)"
         )
     return list(found), list(found.values())
 

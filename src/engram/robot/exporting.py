@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from engram.errors import InputError
@@ -14,17 +15,28 @@ from engram.maps import FramePose, Map, MapFrame
 from engram.monitor import write_whole
 
 
-def export_map(path: Path, out: Path, form: str | None = None, at: int | str | None = None) -> int:
-    """Writes where the nodes of a map lie, session by session.
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What an export wrote.
+
+    Attributes:
+        nodes, goals: how many of each.
+    """
+
+    nodes: int
+    goals: int
+
+
+def export_map(
+    path: Path, out: Path, form: str | None = None, at: int | str | None = None
+) -> Exported:
+    """Writes where the nodes and goals of a map lie; the nodes session by session.
 
     Args:
         path: the map.
         out: the file; its suffix tells the format unless `form` does.
         form: key of `FORMS`.
         at: revision; None for the newest.
-
-    Returns:
-        The number of nodes.
 
     Raises:
         InputError: the format is not known, the map has no place on Earth for GeoJSON, or the file
@@ -41,12 +53,13 @@ def export_map(path: Path, out: Path, form: str | None = None, at: int | str | N
         place = {one: number for number, one in enumerate(store.sessions)}
         nodes = sorted(store.graph.nodes, key=lambda one: (place[one.session], one.stamp_ns))
         text = FORMS[named](store, store.frame, nodes)
+        goals = len(store.goals) if named in _WITH_GOALS else 0
     try:
         with write_whole(out) as draft:
             draft.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror}") from error
-    return len(nodes)
+    return Exported(len(nodes), goals)
 
 
 def _tum(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
@@ -93,8 +106,7 @@ def _geojson(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
     if frame.origin is None:
         raise InputError(
             f"{store.location} has no known position on Earth: anchor it with latitudes and "
-            "longitudes "
-            "(engram anchor), or export CSV, which has metres"
+            "longitudes (engram anchor), or export CSV, which has metres"
         )
     features = []
     for node in nodes:
@@ -128,5 +140,6 @@ FORMS: Mapping[str, Callable[[Map, MapFrame, list[Node]], str]] = {
     "csv": _csv,
     "geojson": _geojson,
 }
+_WITH_GOALS = {"csv", "geojson"}
 _SUFFIXES = {".tum": "tum", ".kitti": "kitti", ".csv": "csv", ".geojson": "geojson",
              ".json": "geojson"}  # fmt: skip

@@ -6,13 +6,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, MissingExtraError
+from engram.untrusted import printable
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +26,7 @@ class Track:
 
     Attributes:
         label: label in the legend.
-        points_m: (N, 2) float64, x right and z forward in the picture's frame, metres.
+        points_m: (N, 2) float64, x and y in the map frame, metres.
         colour: Matplotlib colour; None for the next of a series.
     """
 
@@ -34,22 +35,38 @@ class Track:
     colour: str | None = None
 
 
-def draw_from_above(tracks: Sequence[Track], path: Path, title: str) -> None:
+def draw_from_above(
+    tracks: Sequence[Track],
+    path: Path,
+    title: str,
+    marks: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> None:
     """Draws tracks from above into an image file.
+
+    Args:
+        tracks: the lines.
+        path: image file.
+        title: title of the picture.
+        marks: places with their names, x and y, metres.
 
     Raises:
         InputError: the file cannot be written.
         MissingExtraError: Matplotlib is not installed.
     """
-    draw_panels([(title, tracks)], path)
+    draw_panels([(title, tracks)], path, marks)
 
 
-def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> None:
+def draw_panels(
+    panels: Sequence[tuple[str, Sequence[Track]]],
+    path: Path,
+    marks: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> None:
     """Draws tracks from above, side by side.
 
     Args:
         panels: title and tracks of each; a label has the same colour in all of them.
         path: image file.
+        marks: places with their names in every panel, x and y, metres.
 
     Raises:
         InputError: the file cannot be written.
@@ -60,16 +77,26 @@ def draw_panels(panels: Sequence[tuple[str, Sequence[Track]]], path: Path) -> No
     figure, all_axes = _axes(columns=len(panels))
     for axes, (title, tracks) in zip(all_axes, panels, strict=True):
         for track in tracks:
-            x, z = track.points_m[:, 0], track.points_m[:, 1]
+            x, y = track.points_m[:, 0], track.points_m[:, 1]
             colour = track.colour or colours[_name(track)]
-            axes.plot(x, z, ".", color=colour, markersize=5, label=track.label)
+            axes.plot(x, y, ".", color=colour, markersize=5, label=_shown(track.label))
+        for name, place in marks.items():
+            axes.plot(*place, "*", color="black", markersize=9)
+            axes.annotate(
+                _shown(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8
+            )
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x, m")
-        axes.set_ylabel("z, m")
-        axes.set_title(title)
+        axes.set_ylabel("y, m")
+        axes.set_title(_shown(title))
         if tracks:
             axes.legend(fontsize=8, loc="best")
     _save(figure, path)
+
+
+def _shown(text: str) -> str:
+    """A text of a stranger's map: without control characters and Matplotlib's formulas."""
+    return printable(text).replace("$", r"\$")
 
 
 def _name(track: Track) -> str:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from engram.graph.clock import hour_of_day
-from engram.graph.layout import lay_out
 from engram.graph.model import Clock, Node, Session
 from engram.maps import Map
 from engram.viewing.from_above import Track, check_picture, draw_from_above
@@ -51,10 +50,10 @@ COLOURS: Mapping[str, Callable[[Map, Node], str]] = {
 
 
 def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None = None) -> int:
-    """Draws a map from above.
+    """Draws a map and its goals from above, in the map frame.
 
-    Relative positions are accurate locally; over long distances they drift with odometry.
-    Unconnected components stand side by side.
+    Relative positions are accurate locally; over long distances they drift with odometry, where no
+    anchors hold them. Unconnected components stand side by side.
 
     Args:
         path: NAME.engram.
@@ -72,7 +71,7 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
     """
     check_picture(out)
     with Map.open(path, at=at) as opened:
-        points = lay_out(opened.graph)
+        points = opened.frame.positions[:, :2]
         labels = np.array([COLOURS[by](opened, node) for node in opened.graph.nodes], dtype=str)
         counts = Counter(labels.tolist())
         largest = {label for label, _ in counts.most_common(_NAMED)}
@@ -86,6 +85,8 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
             tracks.append(
                 Track(f"{len(rest)} more ({len(points_of_rest)} nodes)", points_of_rest, _FEW)
             )
+        places = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
+        marks = {name: (place.x_m, place.y_m) for name, place in sorted(places.items())}
         title = f"{path.name}, revision {opened.revision}, by {by}"
-        draw_from_above(tracks, out, title)
+        draw_from_above(tracks, out, title, marks)
         return len(labels)

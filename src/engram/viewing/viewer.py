@@ -18,6 +18,7 @@ from engram.localiser.attempts import best_success
 from engram.maps import Map
 from engram.robot.robot import Robot, Seen
 from engram.robot.whereabouts import Whereabouts
+from engram.untrusted import printable
 
 _STATUS_COLOURS = {
     LocalisationStatus.LOCALISED: (60, 180, 75),
@@ -87,6 +88,13 @@ class Viewer:
         colours = [_hue(numbers[node.session]) for node in opened.graph.nodes]
         points = self._rr.Points3D(opened.frame.positions, colors=colours, radii=0.3)
         self._stream.log("map/nodes", points, static=True)
+        goals = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
+        stars = self._rr.Points3D(
+            np.array([(one.x_m, one.y_m, one.z_m) for one in goals.values()]).reshape(-1, 3),
+            labels=[printable(name) for name in goals],
+            radii=0.5,
+        )
+        self._stream.log("map/goals", stars, static=True)
 
     def see(self, seen: Seen, found: Localisation) -> None:
         """Shows a frame, its inliers, the candidates, and how sure the robot is.

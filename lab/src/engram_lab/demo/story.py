@@ -150,25 +150,24 @@ def _draw(
 def _experience_tracks(
     map_path: Path, drives: list[SimulatedDrive], conditions: list[str]
 ) -> list[Track]:
-    """Nodes of each session, placed along the least uncertain chains from the first node."""
+    """Nodes of each session that are connected to the first node, in the map frame."""
     with Map.open(map_path) as opened:
         graph = opened.graph
-        tree = graph.chains_from(0)
+        tree, places_m = graph.chains_from(0), opened.frame.positions[:, :2]
         tracks = []
         for session in opened.sessions.values():
             number = graph.session_number(session.id)
             if number is None:  # it localised everywhere, and saved nothing
                 continue
             nodes = [i for i in np.flatnonzero(graph.sessions == number) if int(i) in tree.row_of]
-            points = [tree.pose(int(i)).translation[[0, 2]] for i in nodes]
             label = next(
                 text
                 for drive, text in zip(drives, conditions, strict=True)
                 if drive.stamp_ns(0) == session.start_ns
             )
-            apart = int((graph.sessions == number).sum()) - len(points)
-            label += f": {len(points)} nodes" + (f", {apart} more unconnected" if apart else "")
-            tracks.append(Track(label, np.array(points).reshape(-1, 2)))
+            apart = int((graph.sessions == number).sum()) - len(nodes)
+            label += f": {len(nodes)} nodes" + (f", {apart} more unconnected" if apart else "")
+            tracks.append(Track(label, places_m[np.array(nodes, int)]))
     return tracks
 
 

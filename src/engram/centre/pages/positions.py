@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from engram.graph.clock import hour_of_day
-from engram.graph.layout import lay_out
 from engram.maps import Map
 from engram.maps.exchange import MapRows
 from engram.maps.schema import nodes, revisions
@@ -19,10 +18,10 @@ _KEPT = 8
 
 @lru_cache(maxsize=_KEPT)
 def drawn(path: Path, version: str, revision: int) -> bytes:
-    """The nodes of a revision as JSON, laid out as ``engram plot`` does; kept by version."""
+    """The nodes of a revision as JSON, in the map frame; kept by version."""
     del version  # names the revision for good; the number alone does not after a restore
     with Map.open(path, at=revision) as store:
-        points = lay_out(store.graph)
+        points = store.frame.positions
         sessions = list(store.sessions.values())
         place = {session.id: at for at, session in enumerate(sessions)}
         brought = _brought(path, revision)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.graph.layout import lay_out
 from engram.maps import Map, open_map
 from engram.viewing import Track, draw_panels
 
@@ -32,7 +31,7 @@ def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
 
 def _tracks(opened: Map) -> list[Track]:
     """One per robot."""
-    places_m = lay_out(opened.graph)
+    places_m = opened.frame.positions[:, :2]
     robots = np.array([opened.sessions[node.session].robot for node in opened.graph.nodes], object)
     return [
         Track(f"{robot} ({int((robots == robot).sum())})", places_m[robots == robot])

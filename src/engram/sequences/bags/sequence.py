@@ -229,7 +229,8 @@ class BagSequence:
             if not found:
                 first = next(self._shots(topic), None)
                 why = "no image can be read" if first is None else f"image 0 {first.content}"
-                raise SequenceError(f"{self._bag.path}: {topic}: {why}")
+                lost = "".join(f"; {one}" for one in self._bag.lost[:1])
+                raise SequenceError(f"{self._bag.path}: {topic}: {why}{lost}")
         try:
             most_ns = self._options.pair_tolerance_ns
             tolerance_ns = learnt_tolerance(stamps[0], stamps[1], most_ns)
