@@ -12,18 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import splu
-from scipy.spatial.transform import Rotation
 
 from engram.config import check_bounds
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
 
 Array = NDArray[np.float64]
 
@@ -124,6 +124,8 @@ class Poses:
 
     def moved(self, step: Array) -> Poses:
         """Each pose times the exponential of its row of (N, 6) steps (m, rad), in its own frame."""
+        from scipy.spatial.transform import Rotation
+
         turned = self.rotations @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
         shifted = np.einsum("nij,nj->ni", self.rotations, step[:, :3])
         return Poses(turned, self.translations + shifted)
@@ -193,6 +195,8 @@ class Measured:
 
     def _errors(self, poses: Poses) -> tuple[Array, Array, Array]:
         """Residuals, ``a_from_b`` of the poses, and the rotation error."""
+        from scipy.spatial.transform import Rotation
+
         to_a = poses.rotations[self.a].transpose(0, 2, 1)
         between = to_a @ poses.rotations[self.b]
         offset = np.einsum(
@@ -301,6 +305,8 @@ def _step(
     poses: Poses, used: Measured, weights: Array, column: NDArray[np.int64], priors: Priors
 ) -> Array:
     """(N, 6): the Gauss–Newton step of all poses; 0 of fixed ones."""
+    from scipy.sparse.linalg import splu
+
     residual, by_a, by_b = used.linearised(poses)
     count = int(column.max()) + 1
     gradient = np.zeros((count, 6))
@@ -372,6 +378,8 @@ def _sparse(
     blocks: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]], count: int
 ) -> csc_matrix[np.float64]:
     """The (6N, 6N) matrix of 6×6 blocks; those of one place add up."""
+    from scipy.sparse import coo_matrix
+
     rows = np.concatenate([row for row, _, _ in blocks])
     columns = np.concatenate([column for _, column, _ in blocks])
     values = np.concatenate([value for _, _, value in blocks])

@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 
 from engram import _core
 from engram.errors import InputError
@@ -88,6 +87,8 @@ class MatchBasin:
         Raises:
             InputError: the focal length is not finite and positive.
         """
+        from scipy.optimize import isotonic_regression
+
         counts = BasinCounts.empty() if counts is None else counts
         prior = _prior_rates(prior_basin_m(focal_px))
         attempts = counts.attempts + _PRIOR_ATTEMPTS

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
 
 Indices = NDArray[np.int64]
 
 
 def labels_of(ends: Indices, count: int) -> Indices:
     """(N,) int64: the component of each node by (E, 2) ends, numbered by first node."""
+    from scipy.cluster.hierarchy import DisjointSet
+
     parts = DisjointSet(range(count))
     for a, b in ends.tolist():
         parts.merge(a, b)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from engram import _core
 from engram.errors import InputError
@@ -19,6 +19,9 @@ from engram.graph.edge_table import EDGE_KINDS, EdgeRecords, EdgeTable
 from engram.graph.growing import Column
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.graph.neighbourhood import Neighbourhood, Search
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 # From so many edges on they are linked by arrays; a mapper adds a few at a time.
 _BULK = 16
@@ -128,6 +131,8 @@ class Links:
 
     def matrix(self, count: int, rows: NDArray[np.bool_] | slice = slice(None)) -> csr_matrix:
         """(count, count) sparse weights, each link once; only of `rows`, an (L,) bool mask."""
+        from scipy.sparse import csr_matrix
+
         ends = (self.low[rows], self.high[rows])
         return csr_matrix((self.weight[rows], ends), shape=(count, count))
 
@@ -427,6 +432,9 @@ class ExperienceGraph:
 
     def components(self) -> NDArray[np.int32]:
         """(N,) int32: the connected component of each node, numbered from 0 by first node."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import connected_components
+
         ends = self.edge_ends
         links = coo_matrix((np.ones(len(ends)), (ends[:, 1], ends[:, 0])), shape=(len(self),) * 2)
         labels = connected_components(links, directed=False)[1]
@@ -453,11 +461,11 @@ class ExperienceGraph:
 
     def numbered_edges_of(self, node: int) -> list[tuple[Edge, int]]:
         """The edges at a node, newest key first, each with its index in `edges`."""
-        edges = []
+        edges, following = [], self._next_half.rows
         half = int(self._first_half.rows[node])
         while half != -1:
             edges.append((self._edges[half // 2], half // 2))
-            half = int(self._next_half.rows[half])
+            half = int(following[half])
         return edges
 
     # -- searching
@@ -480,11 +488,13 @@ class ExperienceGraph:
     def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
         """(K,) int32: nodes joined to a node by an edge of at most `reach_m`."""
         found: set[int] = set()
+        poses, targets, following = self._a_from_b.rows, self._target.rows, self._next_half.rows
         half = int(self._first_half.rows[node])
         while half >= 0:
-            if np.linalg.norm(self._a_from_b.rows[half // 2, 9:]) <= reach_m:
-                found.add(int(self._target.rows[half]))
-            half = int(self._next_half.rows[half])
+            b_in_a = poses[half // 2, 9:]
+            if math.sqrt(b_in_a @ b_in_a) <= reach_m:
+                found.add(int(targets[half]))
+            half = int(following[half])
         return np.array(sorted(found), np.int32)
 
     def neighbourhood(

@@ -9,14 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import DisjointSet
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from engram.config import check_bounds
 from engram.geometry import SE3
@@ -24,6 +21,9 @@ from engram.graph.adjusting import AdjustConfig, Measured, Poses, Priors, adjust
 from engram.graph.components import grouped, labels_of
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, NodeId
+
+if TYPE_CHECKING:
+    from scipy.cluster.hierarchy import DisjointSet
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -297,6 +297,8 @@ class _Placing:
 
     def _keep_largest_part(self, poses: Poses, fixed: NDArray[np.bool_]) -> None:
         """Of placed parts that no fitting edge holds together only the largest stays."""
+        from scipy.cluster.hierarchy import DisjointSet
+
         inside = fixed.copy()
         both = inside[self.ends].all(axis=1)
         off_m = np.linalg.norm(self.measured.residuals(poses)[:, :3], axis=1)
@@ -373,6 +375,9 @@ def follow_chains(
     Returns:
         (N,) int64: the fixed node from which each one was reached; itself if none.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import dijkstra
+
     wanted, fixed = wanted_and_fixed
     reached, roots = np.arange(len(fixed)), np.flatnonzero(fixed)
     if not len(roots) or not len(edges):
@@ -449,6 +454,8 @@ def fit_level(old: Array, new: Array) -> SE3:
 
 def _used(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[list[Edge], Indices]:
     """The measured edges, and those predicted ones without which parts would be apart."""
+    from scipy.cluster.hierarchy import DisjointSet
+
     derived = np.array([edge.kind is EdgeKind.PROXIMITY for edge in edges], np.bool_)
     parts = DisjointSet(range(count))
     for a, b in ends[~derived].tolist():

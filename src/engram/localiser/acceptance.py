@@ -142,7 +142,7 @@ def agrees(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig
 def apart(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig) -> float:
     """Distance of a pose from its prediction over the standard deviation and a share of slack."""
     apart_m = node_from_live.translation - prediction.node_from_live.translation
-    return math.sqrt(apart_m.dot(apart_m)) / math.hypot(prediction.sigma_m, config.slack_m / 3)
+    return math.sqrt(apart_m @ apart_m) / math.hypot(prediction.sigma_m, config.slack_m / 3)
 
 
 def accept_lost(match: Match, spread: Callable[[], Spread], config: AcceptanceConfig) -> bool:

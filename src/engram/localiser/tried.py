@@ -97,7 +97,7 @@ class Tried:
             assert found is not None
             ahead_m = np.array([0.0, 0.0, shifts_m[rows[at]]])
             from_node_m = found.translation - ahead_m
-            distance_m[at] = math.sqrt(from_node_m.dot(from_node_m))
+            distance_m[at] = math.sqrt(from_node_m @ from_node_m)
         rates[known] = self._basin.success_rate(
             seen.along_m[rows[known]], seen.across_m[rows[known]]
         )

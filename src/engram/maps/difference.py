@@ -8,18 +8,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from engram.errors import InputError
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, Session, SessionId
 from engram.maps.records import MapContents
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 STRETCH_M = 50.0
 # Shortest stretch, metres: shorter ones are below the spacing of nodes, and overflow int32.
@@ -65,6 +66,8 @@ def regions_of(
     Raises:
         InputError: the length is below 1 m, or not finite.
     """
+    from scipy.sparse.csgraph import dijkstra
+
     if not (np.isfinite(stretch_m) and stretch_m >= _LEAST_STRETCH_M):
         raise InputError(
             f"a stretch is {stretch_m} m long, must be finite and >= {_LEAST_STRETCH_M:g} m"

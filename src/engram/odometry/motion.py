@@ -264,7 +264,7 @@ class GapFiller:
         assert self._stamp_ns is not None
         assert self._believed_ns is not None
         since_s = (self._stamp_ns - self._believed_ns) / _NS_PER_S
-        changed_m = np.linalg.norm(twist[:3] - self._velocities[-1] * seconds)
+        changed_m = SE3(np.eye(3), twist[:3] - self._velocities[-1] * seconds).distance_m
         possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * sigma_m)
 

@@ -8,13 +8,15 @@ IJRR 27(6), 2008, §4.3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
 from engram.monitor import QUIET, Monitor
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 # Rows of the mutual information held at a time: 40 MB at 10,000 words.
 _BLOCK = 512
@@ -55,6 +57,8 @@ def learn_statistics(
         words: size of the vocabulary, W.
         monitor: receives the stage `relate`, one item per block of rows.
     """
+    from scipy.sparse import csr_array
+
     shown = _occurrences(images, words)
     seen = np.asarray(shown.sum(axis=0), dtype=np.int32)
     by_word = shown.T.tocsr()
@@ -99,6 +103,8 @@ def mutual_information(
 
 def _occurrences(images: list[NDArray[np.int32]], words: int) -> csr_array:
     """(images, W) float64, 1 where an image shows a word."""
+    from scipy.sparse import csr_array
+
     lengths = [len(image) for image in images]
     columns = np.concatenate([*images, np.zeros(0, np.int32)])
     starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -107,6 +113,9 @@ def _occurrences(images: list[NDArray[np.int32]], words: int) -> csr_array:
 
 def _strongest(forest: csr_array, information: NDArray[np.float64], first: int) -> csr_array:
     """The maximum spanning forest of a forest and a block of rows from `first` on."""
+    from scipy.sparse import coo_array, csr_array
+    from scipy.sparse.csgraph import minimum_spanning_tree
+
     rows, columns = np.nonzero(information)
     old = forest.tocoo()
     words = forest.shape[0]
@@ -117,6 +126,8 @@ def _strongest(forest: csr_array, information: NDArray[np.float64], first: int) 
 
 def _rooted(forest: csr_array, seen: NDArray[np.int32]) -> NDArray[np.int32]:
     """(W,) int32: parent of each word, if each tree's root is its most frequent word."""
+    from scipy.sparse.csgraph import breadth_first_order, connected_components
+
     words = len(seen)
     parents = np.full(words, -1, np.int32)
     _, tree_of = connected_components(forest, directed=False)

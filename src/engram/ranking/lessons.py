@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
 
 from engram.graph.attempts import Attempts
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import PathId, path_id
 from engram.graph.paths import PathMemory
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 # Evidence of another node of the experience decays e-fold per 3 m along the drive and ends at 4 m:
 # nodes are a metre apart, and a drive attempts only some of them.
@@ -101,6 +104,8 @@ def _counts(
 
 def _sharing(graph: ExperienceGraph) -> csr_matrix:
     """(N, N) weight of each node's evidence at the other nodes of its experience."""
+    from scipy.sparse import coo_matrix
+
     count = len(graph)
     driven_m, experiences = graph.driven_m, graph.experiences
     in_line = np.lexsort((np.arange(count), driven_m, experiences))

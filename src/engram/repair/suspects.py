@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from engram.graph.adjusting import Adjusted, Measured, Poses, adjust
 from engram.graph.graph import ExperienceGraph
@@ -85,6 +83,9 @@ def _adjusted(
 
 def part_labels(ends: NDArray[np.integer], count: int) -> NDArray[np.int32]:
     """(N,) int32: the component of each node, joined by edges with these ends (E, 2)."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
     a, b = ends.T
     links = coo_matrix((np.ones(len(ends)), (a, b)), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], np.int32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import cv2
@@ -92,16 +92,20 @@ def synthetic_drive(frames: int = 24, step_m: float = 0.8, seed: int = 0) -> tup
     Every plane is warped into each image by its exact homography, so geometry and motion are
     known; the camera moves `step_m` forward between frames. KITTI's focal length and size.
     """
+    return tuple(_pair_of_street(index, step_m, seed) for index in range(frames))
+
+
+@lru_cache(maxsize=64)
+def _pair_of_street(index: int, step_m: float, seed: int) -> StereoPair:
+    """One pair; read-only, as the newest are kept."""
     camera = StereoCamera(707.0, 707.0, 601.9, 183.1, 0.537, 1226, 370)
-    planes = _street(np.random.default_rng(seed))
-    pairs = []
-    for index in range(frames):
-        views = [
-            _render(planes, camera, np.array([offset, 0.0, index * step_m]))
-            for offset in (0.0, camera.baseline_m)
-        ]
-        pairs.append(StereoPair(index * 100_000_000, views[0], views[1], camera))
-    return tuple(pairs)
+    views = [
+        _render(_street(seed), camera, np.array([offset, 0.0, index * step_m]))
+        for offset in (0.0, camera.baseline_m)
+    ]
+    for view in views:
+        view.setflags(write=False)
+    return StereoPair(index * 100_000_000, views[0], views[1], camera)
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,9 @@ class _Plane:
     metres_per_pixel: float
 
 
-def _street(rng: np.random.Generator) -> list[_Plane]:
+@lru_cache(maxsize=1)
+def _street(seed: int) -> list[_Plane]:
+    rng = np.random.default_rng(seed)
     forward, right, down = np.eye(3)[[2, 0, 1]]
 
     def plane(

@@ -14,8 +14,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.graph import Links
@@ -63,6 +61,9 @@ def close_gaps(
 
 def components(count: int, ends: NDArray[np.int64]) -> NDArray[np.int64]:
     """(N,) label of each node's component."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
     links = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
@@ -99,6 +100,8 @@ class _Search:
 
     def _reach(self) -> None:
         """The chain of least variance from any sent node to each omitted node."""
+        from scipy.sparse.csgraph import dijkstra
+
         steps, through = self._steps, self._through
         links = steps.matrix(len(self._nodes), through)
         self._cost, self._before, self._source = dijkstra(

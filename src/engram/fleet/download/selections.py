@@ -8,7 +8,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import dijkstra
 
 from engram.errors import ConfigError, InputError
 from engram.fleet.download.by_time import best_paths, near_start
@@ -186,6 +185,8 @@ def mission_area(stock: Stock, options: DownloadOptions) -> Mask:
 
 def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
     """(N,) bool, the nodes within a distance of any seed, along the edges."""
+    from scipy.sparse.csgraph import dijkstra
+
     distance_m = dijkstra(
         edge_lengths(stock.graph), directed=False, indices=seeds, min_only=True, limit=radius_m
     )

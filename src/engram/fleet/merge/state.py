@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from scipy.cluster.hierarchy import DisjointSet
 
 from engram.fleet.merge.positions import position_of, uncertainty_m2
 from engram.fleet.merge.report import MergeReport
@@ -28,6 +27,9 @@ from engram.graph.model import (
 )
 from engram.localiser import Position
 from engram.maps import Map, RevisionWriter, StoredNode
+
+if TYPE_CHECKING:
+    from scipy.cluster.hierarchy import DisjointSet
 
 # Sequence numbers of entries that merges add follow all those that robots wrote (docs/format.md).
 FIRST_REPLAYED = 2**32
@@ -53,6 +55,8 @@ class Merge:
     writer: RevisionWriter
 
     def __init__(self, centre: Map, robot: Map) -> None:
+        from scipy.cluster.hierarchy import DisjointSet
+
         self.centre = centre
         self.graph = centre.graph
         self.robot = robot

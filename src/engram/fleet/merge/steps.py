@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.cluster.hierarchy import DisjointSet
 
 from engram import __version__
 from engram.config import to_dict
@@ -220,6 +219,8 @@ def _see_edges_again(merge: Merge) -> None:
 
 def _join_components(merge: Merge) -> None:
     """Joins components of the fleet map that only omitted nodes connect."""
+    from scipy.cluster.hierarchy import DisjointSet
+
     labels, index = merge.graph.components(), merge.graph.index
     edges = []
     for edge in merge.edges:
