@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from engram.fleet.download.forecast import BINS, INTERVALS, Weather
-from engram_lab.fits.forecasts import class_of, classes, interval, judge, narrowest, read, sun_deg
+from engram_lab.fits.forecasts import (
+    class_of,
+    classes,
+    interval,
+    judge,
+    judge_shipped,
+    narrowest,
+    read,
+    sun_deg,
+)
 
 REPORTS = Path(__file__).parents[2] / "reports"
 
@@ -29,6 +38,17 @@ def test_a_town_is_judged_by_what_the_others_missed(capsys):
     missed = {"a": (0.1, 0.1, 0.1), "b": (0.1, 0.1, 0.1), "c": (0.1, 0.3, 0.3)}
     judge([row | {"town": town, "missed": str(one)} for town in missed for one in missed[town]])
     assert "9 missions, 9 with a promise: 7 of 9 within (77.8%" in capsys.readouterr().out
+
+
+def test_a_new_town_is_held_against_the_table_that_ships(capsys):
+    low, high = INTERVALS[(Weather.DRY, True, True)][1]
+    row = {"weather": "fair", "apart_deg": "1.0", "drives": "3", "lost": "0.05", "town": "new"}
+    missed = (low, high, high + 0.01, high - 0.01)
+    unknown = [row | {"weather": "rain", "missed": "0.5"}]
+    judge_shipped([row | {"missed": f"{one}"} for one in missed] + unknown)
+    assert "5 missions, 4 with a promise: 3 of 4 within (75.0%" in capsys.readouterr().out
+    judge_shipped(unknown)
+    assert "1 missions, 0 with a promise: none" in capsys.readouterr().out
 
 
 def test_towns_that_differ_widen_the_interval_and_one_town_stands_for_itself():

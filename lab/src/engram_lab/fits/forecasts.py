@@ -3,6 +3,7 @@
     python -m engram_lab.fits.forecasts collect TOWN... --out rows.csv    # resumable
     python -m engram_lab.fits.forecasts fit rows.csv…                     # the table that ships
     python -m engram_lab.fits.forecasts judge rows.csv…                   # each town by the others
+    python -m engram_lab.fits.forecasts shipped rows.csv…                 # new towns, by that table
 
 A town is a folder of frame logs. Its drives are mapped one after another; after each, the next five
 are missions: a download for date and hour is made, and the drive is localised there. The fit also
@@ -28,8 +29,10 @@ from engram.fleet.download.daylight import DUSK_DEG, LOW_DEG
 from engram.fleet.download.forecast import (
     ALIKE_DEG,
     BINS,
+    INTERVALS,
     LEVEL,
     MOST_DRIVES,
+    Interval,
     Weather,
 )
 from engram.graph.sun import sun_height_deg
@@ -227,18 +230,37 @@ def fit(rows: Sequence[Row]) -> None:
 
 def judge(rows: Sequence[Row]) -> None:
     """Prints how many missions lie within intervals that were fitted on the other towns."""
-    found: dict[Class, list[tuple[bool, float]]] = {}
+    promises = []
     for town in sorted({row["town"] for row in rows}):
         others = classes([row for row in rows if row["town"] != town])
         for row in (row for row in rows if row["town"] == town):
-            key, missed = class_of(row), float(row["missed"])
-            ends = interval(others.get(key, {}), few=key[2])
-            if ends is not None:
-                found.setdefault(key, []).append((ends[0] <= missed <= ends[1], np.ptp(ends)))
-    for key, told in sorted(found.items()):
-        print(f"{_named(key)}: {_summary(told)}")
-    every = [one for told in found.values() for one in told]
-    print(f"{len(rows)} missions, {len(every)} with a promise: {_summary(every)}")
+            key = class_of(row)
+            promises.append((row, interval(others.get(key, {}), few=key[2])))
+    _print_kept(promises)
+
+
+def judge_shipped(rows: Sequence[Row]) -> None:
+    """Prints how many missions of towns that the fit never met the table that ships holds."""
+    promises = []
+    for row in rows:
+        weather, alike, few, place = class_of(row)
+        table = INTERVALS.get((weather, alike, few))
+        promises.append((row, None if table is None else table[place]))
+    _print_kept(promises)
+
+
+def _print_kept(promises: Sequence[tuple[Row, Interval | None]]) -> None:
+    found: dict[Class, list[tuple[bool, float]]] = {}
+    for row, ends in promises:
+        if ends is not None:
+            missed = float(row["missed"])
+            told = (ends[0] <= missed <= ends[1], float(np.ptp(ends)))
+            found.setdefault(class_of(row), []).append(told)
+    for key, some in sorted(found.items()):
+        print(f"{_named(key)}: {_summary(some)}")
+    every = [one for some in found.values() for one in some]
+    kept = _summary(every) if every else "none"
+    print(f"{len(promises)} missions, {len(every)} with a promise: {kept}")
 
 
 def _named(key: Class) -> str:
@@ -260,8 +282,9 @@ def _summary(told: Sequence[tuple[bool, float]]) -> str:
 
 def main() -> None:
     """Collects, fits or judges."""
+    verbs = {"fit": fit, "judge": judge, "shipped": judge_shipped}
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("verb", choices=("collect", "fit", "judge"))
+    parser.add_argument("verb", choices=("collect", *verbs))
     parser.add_argument("paths", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=Path("forecasts.csv"))
     asked = parser.parse_args()
@@ -269,7 +292,7 @@ def main() -> None:
         for town in asked.paths:
             collect(town, asked.out)
     else:
-        {"fit": fit, "judge": judge}[asked.verb](read(asked.paths))
+        verbs[asked.verb](read(asked.paths))
 
 
 if __name__ == "__main__":
