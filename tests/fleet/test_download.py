@@ -413,7 +413,7 @@ class TestMistakes:
             ({"policy": "copy", "route": "zzzz"}, "copy does not use --route"),
             ({"policy": "copy", "near": ("ffff",)}, "does not use --near"),
             ({"policy": "tod", "start_h": 9.0, "budget_bytes": 10_000}, "choose --select budget"),
-            ({"policy": "copy", "route": "0"}, "choose --select tod or paths"),
+            ({"policy": "copy", "route": "0"}, "choose --select tod, paths"),
             ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "use --budget"),
             ({"policy": "region", "near": ("0",), "budget_percent": 50.0}, "use --budget"),
             ({"policy": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "only one of"),

@@ -123,7 +123,7 @@ UNDERSTOOD: dict[str, frozenset[str]] = {
 _FLAGS = {
     "budget_bytes": "--budget",
     "budget_percent": "--budget",
-    "near": "--near",
+    "near": "--near (--region)",
     "route": "--route",
     "strict": "--strict",
 }
@@ -144,10 +144,10 @@ def check_options(options: DownloadOptions) -> None:
     for name, flag in _FLAGS.items():
         if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[policy]:
             continue
-        takers = [one for one, understood in UNDERSTOOD.items() if name in understood]
+        *others, last = [one for one, understood in UNDERSTOOD.items() if name in understood]
+        takers = f"{', '.join(others)} or {last}" if others else last
         raise ConfigError(
-            f"selection {policy} does not use {flag}; leave it out, or choose --select "
-            f"{' or '.join(takers)}"
+            f"selection {policy} does not use {flag}; leave it out, or choose --select {takers}"
         )
     _check_where(options)
     if options.start_h is None:
