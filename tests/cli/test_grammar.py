@@ -247,3 +247,13 @@ def test_map_says_what_became_of_every_frame_and_what_to_try_next(
     found = engram("localise", town, street)
     assert "12 frames: 12 localised, 0 dead reckoning, 0 lost, 0 no odometry" in found.out
     assert "ms per frame" in found.out
+
+
+def test_the_limits_of_a_repair_are_settings(engram, street: Path, tmp_path: Path) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street)
+    found = engram("check", town, "--geometry", "--set", "repair.gross_m=3", "--json")
+    assert found.status == 0
+    refused = engram("check", town, "--geometry", "--set", "repair.gross_m=-1")
+    assert refused.status == 2
+    assert "gross_m" in refused.err

@@ -96,7 +96,7 @@ def merge(
             require_better=require_better or (),
             localising=options.driving_of(resolved),
             picture=picture,
-            geometry=GeometryGate(refuses=require_geometry)
+            geometry=GeometryGate(refuses=require_geometry, config=resolved.repair)
             if geometry or require_geometry
             else None,
         )
@@ -351,7 +351,7 @@ def build(
     if geometry and not report.interrupted:
         from engram.repair import check_geometry
 
-        looked = check_geometry(centre, monitor=Bars())
+        looked = check_geometry(centre, resolved.repair, monitor=Bars())
     if as_json:
         told = report.to_dict()
         print(json.dumps(told if looked is None else {**told, "geometry": looked.to_dict()}))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from engram.cli import options
+
+if TYPE_CHECKING:
+    from engram.repair.repairing import GeometryReport
 
 
 class VocabularyAction(StrEnum):
@@ -120,6 +123,7 @@ def check(
         Path | None,
         typer.Option("--pictures", metavar="DIR", help="Draw both sides of those edges."),
     ] = None,
+    settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Verify a map.
@@ -139,7 +143,10 @@ def check(
     from engram.robot import check_map, seal_map
 
     if geometry or repair:
-        _check_geometry(map_path, pictures, as_json=as_json, commits=repair and yes)
+        looked = _check_geometry(map_path, pictures, settings, commits=repair and yes)
+        typer.echo(json.dumps(looked.to_dict()) if as_json else looked.text())
+        if looked.findings.wrong and looked.revision is None:
+            raise typer.Exit(1)
         return
     sealed = seal_map(map_path) if seal else []
     report = check_map(map_path, clean=clean)
@@ -156,16 +163,16 @@ def check(
         raise typer.Exit(1)
 
 
-def _check_geometry(map_path: Path, pictures: Path | None, *, as_json: bool, commits: bool) -> None:
+def _check_geometry(
+    map_path: Path, pictures: Path | None, settings: options.SettingsGiven, *, commits: bool
+) -> GeometryReport:
     from engram.cli.history import user
     from engram.cli.progress import Bars
     from engram.repair import check_geometry
 
     author = user() if commits else None
-    report = check_geometry(map_path, author=author, pictures=pictures, monitor=Bars())
-    typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
-    if report.findings.wrong and report.revision is None:
-        raise typer.Exit(1)
+    config = settings.read().repair
+    return check_geometry(map_path, config, author=author, pictures=pictures, monitor=Bars())
 
 
 def _print_check(report: dict[str, Any]) -> None:

@@ -20,6 +20,7 @@ from engram.errors import ConfigError
 from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.frontend import DescriptorKind
 from engram.measures import Estimator
+from engram.repair.config import RepairConfig
 from engram.robot.settings import Settings, settings_text
 
 
@@ -129,6 +130,7 @@ class AllSettings(Settings):
     merge: MergeSettings = field(default_factory=MergeSettings)
     build: BuildSettings = field(default_factory=BuildSettings)
     download: DownloadSettings = field(default_factory=DownloadSettings)
+    repair: RepairConfig = field(default_factory=RepairConfig)
 
     def of_robot(self, descriptor: str | None = None) -> Settings:
         """The part that maps and results keep.

@@ -33,7 +33,6 @@ class ChainTree:
     """Least uncertain chains from one root to all connected nodes, a struct of arrays.
 
     Attributes:
-        root: the root's dense index.
         row_of: dense index of a node → its row.
         nodes: (N,) int32, dense indices, least uncertain first; the root is row 0.
         parents: (N,) int32, row of the previous node; -1 for the root.
@@ -42,7 +41,6 @@ class ChainTree:
         moments: (N, 6) float64, `ChainError.moments` in the root's frame.
     """
 
-    root: int
     row_of: dict[int, int]
     nodes: NDArray[np.int32]
     parents: NDArray[np.int32]
@@ -556,7 +554,7 @@ class ExperienceGraph:
         lists = () if passage is None else (passage.edges, passage.closed)
         columns = _core.graph_chains(self._arrays(), root, np.array(goals, np.int32), *lists)
         row_of = {int(node): row for row, node in enumerate(columns[0])}
-        return ChainTree(root, row_of, *columns)
+        return ChainTree(row_of, *columns)
 
     def predict(self, reference: int, node: int) -> tuple[SE3, NDArray[np.float64]] | None:
         """``reference_from_node`` and its (6, 6) covariance along the least uncertain chain.

@@ -207,14 +207,14 @@ def revert_revision(
     return RevertReport(done, difference(head, done.before, after, done.after))
 
 
-def blame_node(path: Path, prefix: str, at: int | str | None = None) -> dict[str, Any]:
+def blame_node(path: Path, prefix: str) -> dict[str, Any]:
     """The origin and history of a node.
 
     Raises:
         InputError: no node or several match.
-        MapError: the map cannot be read, or has no such revision.
+        MapError: the map cannot be read.
     """
-    with open_map(path, at=at) as store:
+    with open_map(path) as store:
         origin = store.origin(prefix)
         log = {one.number: one for one in store.log()}
         contents = store.load()

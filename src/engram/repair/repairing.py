@@ -82,7 +82,6 @@ def check_geometry(
     *,
     author: str | None = None,
     pictures: Path | None = None,
-    at: int | str | None = None,
     monitor: Monitor = QUIET,
 ) -> GeometryReport:
     """Looks for wrong edges, and removes them if asked.
@@ -93,7 +92,6 @@ def check_geometry(
         author: commits a revision of this author in which the wrong edges no longer count; None
             changes nothing.
         pictures: folder for a picture of both sides of each edge; None for none.
-        at: revision to look at; None for the newest.
         monitor: receives progress, and may stop the search.
 
     Raises:
@@ -101,7 +99,7 @@ def check_geometry(
         InputError: the pictures cannot be written.
     """
     config = config or RepairConfig()
-    with Map.open(path, at=at) as store:
+    with Map.open(path) as store:
         found = find_wrong_edges(
             store.graph, store.path_memory, store.frames, config, monitor=monitor
         )

@@ -107,7 +107,6 @@ def amend_session(
     changes: Mapping[Amendable, str],
     *,
     author: str,
-    message: str = "",
 ) -> dict[str, Any]:
     """Corrects the robot, zone or start of a session, for ``engram amend``; see `Map.amend`.
 
@@ -116,7 +115,6 @@ def amend_session(
         session: its UUID, or an unambiguous prefix.
         changes: field → its correct value.
         author: author of the revision.
-        message: reason, shown by ``engram log``.
 
     Raises:
         InputError: the prefix matches no session or several, or nothing would change.
@@ -125,7 +123,7 @@ def amend_session(
     """
     with Map.open(path) as store:
         found = store.named_session(session).id
-        revision = store.amend(found, changes, author=author, message=message)
+        revision = store.amend(found, changes, author=author)
         shown = store.sessions[found]
     return {
         "session": str(found),

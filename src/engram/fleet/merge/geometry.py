@@ -10,7 +10,7 @@ from engram.errors import RefusedError
 from engram.graph.model import EdgeKind, NodeId
 from engram.maps import Map
 from engram.monitor import Monitor
-from engram.repair import Finding, find_wrong_edges
+from engram.repair import Finding, RepairConfig, find_wrong_edges
 
 _Key: TypeAlias = tuple[NodeId, NodeId, EdgeKind]
 
@@ -20,10 +20,12 @@ class GeometryGate:
 
     Args:
         refuses: whether a merge that brings new ones is refused.
+        config: what counts as wrong.
     """
 
-    def __init__(self, *, refuses: bool) -> None:
+    def __init__(self, *, refuses: bool, config: RepairConfig | None = None) -> None:
         self._refuses = refuses
+        self._config = config
         self._known: AbstractSet[_Key] = frozenset()
 
     def look_at(self, place: Path, monitor: Monitor) -> None:
@@ -48,11 +50,12 @@ class GeometryGate:
         self._known = {_key(one) for one in wrong}
         return [one.to_dict() for one in wrong]
 
-    @staticmethod
-    def _wrong(store: Map, monitor: Monitor) -> tuple[Finding, ...]:
+    def _wrong(self, store: Map, monitor: Monitor) -> tuple[Finding, ...]:
         if not len(store.graph):
             return ()
-        return find_wrong_edges(store.graph, store.path_memory, store.frames, monitor=monitor).wrong
+        return find_wrong_edges(
+            store.graph, store.path_memory, store.frames, self._config, monitor=monitor
+        ).wrong
 
 
 def _key(one: Finding) -> _Key:
