@@ -134,7 +134,7 @@ class Dreams:
 
     def heartbeat(self, key: str, progress: str) -> bool:
         """Notes how far a dream is; whether it has been ended meanwhile."""
-        with self._centre.database.writing() as connection:
+        with self._centre.database.writing(durable=False) as connection:
             connection.execute(update(dreams).where(dreams.c.id == key).values(progress=progress))
             state = connection.execute(select(dreams.c.state).where(dreams.c.id == key)).scalar()
         return state != ASKED

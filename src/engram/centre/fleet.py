@@ -62,7 +62,7 @@ class Fleet:
     def report(self, name: str, robot: str, told: dict[str, Any]) -> dict[str, Any]:
         """Keeps what a robot runs and has localised with; returns what it is to run."""
         now = self._centre.now_ns()
-        with self._centre.database.writing() as connection:
+        with self._centre.database.writing(durable=False) as connection:
             changed = connection.execute(
                 update(robots)
                 .where(robots.c.map == name, robots.c.robot == robot)

@@ -191,8 +191,9 @@ class HandIns:
                 except MapCorruptError as error:
                     raise MalformedError(str(error)) from error
 
-        known = self._known_nodes(row["map"])
-        held = {one[0] for one in rows("nodes", None) if one[1] in known}
+        own = {one[1]: one[0] for one in rows("nodes", None)}
+        with self._centre.reading(row["map"]) as store:
+            held = {own[uuid] for uuid in store.known_among(list(own))}
         found = []
         for one in rows("frames", pages):
             if one[0] not in held:
@@ -296,7 +297,7 @@ class HandIns:
 
     def heartbeat(self, key: str, progress: str) -> bool:
         """Notes how far a job is; whether it is to be cancelled."""
-        with self._centre.database.writing() as connection:
+        with self._centre.database.writing(durable=False) as connection:
             connection.execute(update(handins).where(handins.c.id == key).values(progress=progress))
             asked = connection.execute(select(handins.c.cancelled).where(handins.c.id == key))
             return bool(asked.scalar())
@@ -342,10 +343,6 @@ class HandIns:
         with self._centre.database.reading() as connection:
             had = given_by(connection, row["map"], row["robot"], some)
         return [one for one in some if one not in had]
-
-    def _known_nodes(self, name: str) -> frozenset[bytes]:
-        with self._centre.reading(name) as store:
-            return store.known_uuids
 
     def _base(self, name: str, robot: str, manifest: str) -> Manifest | None:
         """A manifest that the robot handed in to this map, or got from it; else None."""

@@ -8,12 +8,12 @@ from typing import Any
 from sqlalchemy import delete, select
 
 from engram.centre.errors import ChangedError, UnknownError
-from engram.centre.resident import log_of
 from engram.centre.service import Centre
 from engram.centre.store.audit import note
 from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.schema import refs
 from engram.errors import InputError, RevisionError
+from engram.maps import Map
 
 HEAD = "head"
 _NAME = re.compile(r"[a-z][a-z0-9._-]{0,39}")
@@ -64,8 +64,8 @@ class Refs:
     def version(self, name: str, revision: int) -> str:
         """A name of a revision that no other one ever has, even after a backup was restored."""
         with self._centre.reading(name) as store:
-            log = log_of(store)[: store.resolve(revision)]
-        return f"{revision}-{log[-1].committed_ns:x}" if log else "0"
+            found = store.newest_revision(store.resolve(revision))
+        return f"{revision}-{found.committed_ns:x}" if found is not None else "0"
 
     def move(self, name: str, ref: str, revision: int, by: str, expected: int | None) -> int:
         """Moves a ref, or makes it.
@@ -122,8 +122,7 @@ class Refs:
 
     def _head(self, name: str) -> dict[str, Any]:
         with self._centre.reading(name) as store:
-            log = log_of(store)
-        newest = log[-1] if log else None
+            newest = store.derived(Map.newest_revision)
         return {
             "map": name,
             "name": HEAD,

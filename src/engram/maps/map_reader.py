@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
@@ -292,10 +292,10 @@ class MapReader:
         """
         return self._read(reading.landmark_hashes)
 
-    @cached_property
-    def known_uuids(self) -> frozenset[bytes]:
-        """UUIDs of nodes that are held or were omitted: what a hand-in need not bring."""
-        return self._read(reading.known_uuids)
+    def known_among(self, some: Sequence[bytes]) -> frozenset[bytes]:
+        """Those of the UUIDs whose nodes are held or were omitted, and need not be handed in."""
+        with self._database.reading() as connection:
+            return reading.known_among(connection, self._view, some)
 
     @cached_property
     def blob_sizes(self) -> dict[NodeId, tuple[int, int]]:
@@ -359,6 +359,12 @@ class MapReader:
     def log(self) -> list[Revision]:
         """The visible committed revisions, oldest first."""
         return self._read(reading.log)
+
+    def newest_revision(self, number: int | None = None) -> Revision | None:
+        """The newest visible revision, up to a number; None if there is none."""
+        with self._database.reading() as connection:
+            up_to = self._view.at if number is None else number
+            return reading.newest_revision(connection, self._view, up_to)
 
     def tags(self) -> dict[str, Tag]:
         """The tags of all revisions, including later ones than this view."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,8 @@ from engram.maps.schema import (
 )
 from engram.maps.view import View
 
+# As many UUIDs as one statement takes.
+_FEW = 500
 # Most numbers per key that a table of all of them may span.
 _DENSE = 16
 
@@ -158,6 +160,19 @@ def log(connection: Connection, view: View) -> list[Revision]:
         .order_by(revisions.c.number)
     )
     return [revision_from_row(row) for row in verified(revisions, connection.execute(query))]
+
+
+def newest_revision(connection: Connection, view: View, number: int) -> Revision | None:
+    """The newest visible committed revision up to a number; None if there is none."""
+    query = (
+        select(revisions)
+        .where(revisions.c.status == "committed", revisions.c.number <= min(view.at, number))
+        .order_by(revisions.c.number.desc())
+        .limit(1)
+    )
+    for row in verified(revisions, connection.execute(query)):
+        return revision_from_row(row)
+    return None
 
 
 def revision_from_row(row: Row) -> Revision:
@@ -278,6 +293,17 @@ def known_uuids(connection: Connection, view: View) -> frozenset[bytes]:
         for table in (nodes, omissions, omitted_landmarks)
     )
     return frozenset(row[0] for query in queries for row in connection.execute(query))
+
+
+def known_among(connection: Connection, view: View, some: Sequence[bytes]) -> frozenset[bytes]:
+    """Those of some UUIDs that are in `known_uuids`; a few are found without reading all."""
+    if len(some) > _FEW:
+        return known_uuids(connection, view) & frozenset(some)
+    found = set[bytes]()
+    for table in (nodes, omissions, omitted_landmarks):
+        query = view.select(table).with_only_columns(table.c.uuid).where(table.c.uuid.in_(some))
+        found.update(row[0] for row in connection.execute(query))
+    return frozenset(found)
 
 
 def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:

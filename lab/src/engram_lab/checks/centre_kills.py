@@ -45,7 +45,7 @@ from engram_lab.programs import Figure, command_line, report
 _MAP, _ROBOTS = "fleet", ("r1", "r2")
 _NODES = 4
 _LOOK_S = 0.05
-_LONGEST_S = 600.0
+_LONGEST_S = 1800.0
 _HASTY = AgentSettings(first_retry_s=0.05, longest_retry_s=0.2, idle_s=0.1)
 
 

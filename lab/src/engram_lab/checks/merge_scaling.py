@@ -45,7 +45,12 @@ GIB = 2**30
 
 
 def write_session(
-    writer: RevisionWriter, robot: str, number: int, places: range, rng: np.random.Generator | None
+    writer: RevisionWriter,
+    robot: str,
+    number: int,
+    places: range,
+    rng: np.random.Generator | None,
+    landmarks: int = LANDMARKS,
 ) -> None:
     """One drive past some places, saved whole."""
     start_ns = 1_000_000_000_000 * (number + 1)
@@ -55,7 +60,7 @@ def write_session(
     for at, place in enumerate(places):
         stamp_ns = start_ns + at * 100_000_000
         node = node_of(drive, stamp_ns, float(at))
-        blob = landmark_bytes(np.random.default_rng(place), rng, LANDMARKS)
+        blob = landmark_bytes(np.random.default_rng(place), rng, landmarks)
         writer.copy_node(stored(node, blob))
         if before is not None:
             writer.add_edge(Edge(before.id, node.id, EdgeKind.ODOMETRY, STEP, SIGMA))

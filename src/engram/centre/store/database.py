@@ -59,13 +59,22 @@ class ServiceDatabase:
             yield connection
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
-        """One durable transaction, alone; rolled back if the block raises."""
+    def writing(self, *, durable: bool = True) -> Iterator[Connection]:
+        """One transaction, alone; rolled back if the block raises.
+
+        Args:
+            durable: whether it must outlast a power cut. What is said again by itself, such as
+                reports and tokens, need not wait for the disk; a kill loses nothing either way.
+        """
         with self._turn, _errors(), self._engine.connect() as connection:
             if self._sqlite:
+                level = "FULL" if durable else "NORMAL"
+                connection.exec_driver_sql(f"PRAGMA synchronous={level}")
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_WRITERS})"))
+                if not durable:
+                    connection.execute(text("SET LOCAL synchronous_commit TO OFF"))
             yield connection
             connection.commit()
 
@@ -144,7 +153,6 @@ def _engine(url: str) -> Engine:
             connection.isolation_level = None  # transactions begin explicitly
             connection.execute(f"PRAGMA busy_timeout={round(_BUSY_S * 1000)}")
             connection.execute("PRAGMA journal_mode=WAL")
-            connection.execute("PRAGMA synchronous=FULL")
 
     return engine
 
