@@ -153,8 +153,10 @@ class Centre:
         Raises:
             UnknownError: there is none.
         """
-        with self.database.reading() as connection:
-            row = first_row(connection, select(maps).where(maps.c.name == name))
+        row = None
+        if _NAME.fullmatch(name):
+            with self.database.reading() as connection:
+                row = first_row(connection, select(maps).where(maps.c.name == name))
         if row is None:
             raise UnknownError(f"there is no map {name!r:.60}")
         return row

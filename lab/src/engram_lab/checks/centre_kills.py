@@ -44,6 +44,13 @@ from engram_lab.programs import Figure, command_line, report
 
 _MAP, _ROBOTS = "fleet", ("r1", "r2")
 _NODES = 4
+# So that a process that starts again is soon at work.
+_LOADED = [
+    __name__,
+    "uvicorn.protocols.http.auto",
+    "engram.centre.api.app",
+    "engram.fleet.download",
+]
 _LOOK_S = 0.05
 _LONGEST_S = 1800.0
 _HASTY = AgentSettings(first_retry_s=0.05, longest_retry_s=0.2, idle_s=0.1)
@@ -131,7 +138,7 @@ class Fleet:
         self._day = day
         self._folder = folder
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload([__name__])
+        self._context.set_forkserver_preload(_LOADED)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port: int = free.getsockname()[1]

@@ -22,7 +22,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.dialects.postgresql import insert as insert_postgresql
 from sqlalchemy.dialects.sqlite import insert as insert_sqlite
-from sqlalchemy.exc import ArgumentError, DBAPIError
+from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
 from engram.centre.store.schema import VERSION, centre, metadata
 from engram.errors import FormatVersionError, InputError, MapError, MissingExtraError
@@ -161,5 +161,7 @@ def _engine(url: str) -> Engine:
 def _errors() -> Iterator[None]:
     try:
         yield
+    except DataError as error:  # a NUL, or a number beyond 64 bits, which no column takes
+        raise InputError(f"a value that no table takes: {error.orig}") from error
     except DBAPIError as error:
         raise MapError(f"the centre's database: {error.orig}") from error
