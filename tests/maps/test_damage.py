@@ -179,7 +179,7 @@ def test_creating_never_replaces_anything(tmp_path, broken):
     with pytest.raises(InputError, match="exists already"):
         Map.create(broken)
     assert broken.read_bytes() == before
-    with pytest.raises(InputError, match="no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         Map.create(tmp_path / "nowhere" / "town.engram")
 
 

@@ -2,11 +2,13 @@
 
     python -m engram_lab.checks.merge_scaling                 # 5,000 to 20,000 into 100,000
     python -m engram_lab.checks.merge_scaling --centre 2000 --robots 500,1000
+    python -m engram_lab.checks.merge_scaling --centre 20000 --robots 50 --without-words
 
 The maps are made of synthetic places, one metre from the next, each with landmarks of its own. Half
 of a robot's drives go past places of the centre, in other pixels and bits, and are omitted; half go
 where nobody was, and are taken. Every merge runs in a process of its own on a fresh copy of the
-centre; its time by the clock and on the cores and its greatest resident set are printed.
+centre; its time by the clock and on the cores and its greatest resident set are printed. The first
+merge into a map also makes the words of its nodes: ``--without-words`` recognises no places.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.fleet.merge import merge
+from engram.fleet.merge import MergeOptions, merge
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
 from engram.maps import Map, RevisionWriter, copy_map
@@ -92,10 +94,11 @@ def robot_places(nodes: int, centre: int) -> list[range]:
     return places
 
 
-def merge_once(centre: str, robot: str) -> None:
+def merge_once(centre: str, robot: str, words: str) -> None:
     """In a process of its own: the merge, then its figures as JSON."""
+    options = MergeOptions() if words == "words" else MergeOptions(relocaliser=None)
     started = time.perf_counter()
-    (report,) = merge(Path(centre), [Path(robot)])
+    (report,) = merge(Path(centre), [Path(robot)], options)
     seconds = time.perf_counter() - started
     used = resource.getrusage(resource.RUSAGE_SELF)
     peak = used.ru_maxrss * 1024
@@ -118,7 +121,8 @@ def main() -> None:
     parser.add_argument("--centre", type=int, default=100_000)
     parser.add_argument("--robots", default="0,5000,10000,20000", help="nodes of each robot's map")
     parser.add_argument("--folder", type=Path, help="keep the maps here")
-    parser.add_argument("--merge", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--without-words", action="store_true", help="recognise no places")
+    parser.add_argument("--merge", nargs=3, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.merge:
         merge_once(*asked.merge)
@@ -132,17 +136,18 @@ def main() -> None:
             drives = [range(at, min(at + SESSION_NODES, asked.centre)) for at in starts]
             write_map(centre, "centre", drives, None)
         for nodes in map(int, asked.robots.split(",")):
-            measure(folder, centre, nodes, asked.centre)
+            words = "none" if asked.without_words else "words"
+            measure(folder, centre, nodes, asked.centre, words)
 
 
-def measure(folder: Path, centre: Path, nodes: int, size: int) -> None:
+def measure(folder: Path, centre: Path, nodes: int, size: int, words: str) -> None:
     """One line: a map of so many nodes merged into a copy of the centre."""
     robot, copy = folder / f"robot-{nodes}.engram", folder / "copy.engram"
     if not robot.exists():
         write_map(robot, f"robot-{nodes}", robot_places(nodes, size) if nodes else [], seed=nodes)
     copy.unlink(missing_ok=True)
     copy_map(centre, copy)
-    command = [sys.executable, "-m", __spec__.name, "--merge", str(copy), str(robot)]
+    command = [sys.executable, "-m", __spec__.name, "--merge", str(copy), str(robot), words]
     found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
     copy.unlink()
     print(
