@@ -24,3 +24,10 @@ def test_other_faults_of_ours_are_not_hidden(engram, monkeypatch) -> None:
     monkeypatch.setattr(app, "app", faulty)
     with pytest.raises(AttributeError):
         engram("info", "map.engram")
+
+
+def test_a_mistyped_folder_does_not_become_a_centre(engram, tmp_path) -> None:
+    ran = engram("centre", "jobs", tmp_path / "twon")
+    assert ran.status == 2
+    assert "there is no centre" in ran.err
+    assert not (tmp_path / "twon").exists()

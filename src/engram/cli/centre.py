@@ -38,8 +38,16 @@ _BY = "shell"
 
 
 def _open(folder: Path, database: str | None = None, objects: str | None = None) -> Centre:
-    from engram.centre.service import Centre
+    """A centre that is there.
 
+    Raises:
+        InputError: there is no such folder; `serve` makes one, so that a mistyped name does not.
+    """
+    from engram.centre.service import Centre
+    from engram.errors import InputError
+
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
     return Centre(folder, database, objects)
 
 
@@ -79,11 +87,12 @@ def serve(
       engram centre serve town
       engram centre serve town --host 0.0.0.0 --tls-certificate town.pem --tls-key town.key
     """
+    from engram.centre.service import Centre
     from engram.centre.serving import Listening
     from engram.centre.serving import serve as run
 
     listening = Listening(host, port, certificate, key, insecure=insecure)
-    with _open(folder, database, objects) as centre:
+    with Centre(folder, database, objects) as centre:
         centre.add_map(map_name, _BY)
         run(centre, listening, worker=worker)
 

@@ -74,7 +74,7 @@ class Diagnosis:
     def text(self) -> str:
         """For people."""
         lines = [one.text() for one in self.findings]
-        lines += [f"not checked: {code}: {needs}" for code, needs in self.untold.items()]
+        lines += [f"not checked: {code} needs {needs}" for code, needs in self.untold.items()]
         alarms = sum(one.severity is not Severity.NOTE for one in self.findings)
         found = "nothing wrong" if not alarms else f"{len(self.fatal)} of {alarms} findings fatal"
         return "\n".join([f"{self.frames} frames examined: {found}", *lines])

@@ -14,6 +14,7 @@ import yaml
 
 from engram.errors import ConfigError, InputError
 from engram.sequences.options import parse_start
+from engram.untrusted import read_text
 
 # Farthest in time from a node that a line with a time may be.
 NEAR_NS = 500_000_000
@@ -46,10 +47,7 @@ def read_anchors(source: Path) -> tuple[list[GivenAnchor], bool]:
     Raises:
         InputError: it cannot be read, or a line cannot be used; names file and line.
     """
-    try:
-        text = source.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{source}: cannot be read: {error}") from error
+    text = read_text(source, InputError)
     is_json = source.suffix.lower() in {".geojson", ".json"}
     rows = _json_rows(text, source) if is_json else _csv_rows(text, source)
     found = [(line, row) for line, row in rows]
