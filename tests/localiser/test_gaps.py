@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from engram.errors import ConfigError
 from engram.geometry import SE3
 from engram.odometry import OdometryStatus, OdometryStep
-from engram.odometry.motion import GapFiller, Motion, driven_steps_m
+from engram.odometry.motion import GapConfig, GapFiller, Motion, driven_steps_m
 
 FIRST = OdometryStep(OdometryStatus.FIRST)
 BLIND = OdometryStep(OdometryStatus.NO_CONSENSUS)
@@ -310,3 +311,15 @@ def test_a_robot_at_rest_may_have_driven_off_while_nothing_was_seen() -> None:
     assert motion.ahead is not None
     # 0.5 m/s² for 4 s.
     assert np.sqrt(motion.ahead[1][2, 2]) == pytest.approx(4.0, rel=0.01)
+
+
+def test_how_far_a_guess_is_trusted_is_a_setting() -> None:
+    def guessed_m(config: GapConfig) -> float:
+        gaps = GapFiller(config)
+        gaps.motion(FIRST, 0)
+        gaps.motion(ahead(0.5), 100 * MS)
+        return gaps.motion(BLIND, 300 * MS).guessed_m
+
+    assert guessed_m(GapConfig(sigma_per_m=1.0)) == pytest.approx(2 * guessed_m(GapConfig()), 0.02)
+    with pytest.raises(ConfigError, match="sigma_per_m"):
+        GapConfig(sigma_per_m=0.0)

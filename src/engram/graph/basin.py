@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
+from engram.config import check_bounds
 from engram.errors import InputError
 
 Array = NDArray[np.float64]
@@ -19,18 +22,36 @@ BIN_COUNT = 48  # up to 24 m
 BASIN_LEVEL = 0.6
 DEFAULT_RADIUS_M = 8.0
 
-# Weight of the prior, in attempts per bin: a few dozen real attempts outweigh it.
-_PRIOR_ATTEMPTS = 10.0
-# Success rate at zero offset, compatible appearance (`lab/reports/constants.md`).
-_SUCCESS_AT_ZERO = 0.97
-# Steepness of the prior, as a share of the basin (`lab/reports/constants.md`).
-_SOFTNESS = 0.28
 # Attempts count for one direction if their offset in the other, and the uncertainty of their
 # prediction, are below this: half a metre aside costs nothing.
 _ASIDE_M = 1.0
 _GREATEST_SIGMA_M = 1.0
 # An experience is compatible if it was matched within the last 5 m: ten iterations of 0.5 m each.
 _COMPATIBLE_ITERATIONS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class BasinConfig:
+    """The prior of the match basin. Source: `lab/reports/constants.md`."""
+
+    prior_attempts: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="weight of the prior in attempts per bin: a few dozen real attempts "
+            "outweigh it",
+        ),
+    ] = 10.0
+    success_at_zero: Annotated[
+        float,
+        Meta(gt=BASIN_LEVEL, lt=1, description="success rate at zero offset, alike in appearance"),
+    ] = 0.97
+    softness: Annotated[
+        float, Meta(gt=0, description="steepness of the prior, as a share of the basin")
+    ] = 0.28
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 @lru_cache(maxsize=64)
@@ -81,8 +102,12 @@ class MatchBasin:
     rates: Array
 
     @staticmethod
-    def of(focal_px: float, counts: BasinCounts | None = None) -> MatchBasin:
-        """The basin from the shipped prior and the attempts so far.
+    def of(
+        focal_px: float,
+        counts: BasinCounts | None = None,
+        config: BasinConfig = BasinConfig(),
+    ) -> MatchBasin:
+        """The basin from the prior and the attempts so far.
 
         Raises:
             InputError: the focal length is not finite and positive.
@@ -90,9 +115,9 @@ class MatchBasin:
         from scipy.optimize import isotonic_regression
 
         counts = BasinCounts.empty() if counts is None else counts
-        prior = _prior_rates(prior_basin_m(focal_px))
-        attempts = counts.attempts + _PRIOR_ATTEMPTS
-        raw = (counts.successes + _PRIOR_ATTEMPTS * prior) / attempts
+        prior = _prior_rates(prior_basin_m(focal_px), config)
+        attempts = counts.attempts + config.prior_attempts
+        raw = (counts.successes + config.prior_attempts * prior) / attempts
         rates = np.stack(
             [
                 isotonic_regression(raw[row], weights=attempts[row], increasing=False).x
@@ -185,11 +210,11 @@ def count_attempts(
     return BasinCounts(counts[0], counts[1])
 
 
-def _prior_rates(basin_m: float) -> Array:
+def _prior_rates(basin_m: float, config: BasinConfig) -> Array:
     """(BIN_COUNT,) a logistic curve through `BASIN_LEVEL` at the basin."""
-    softness = _SOFTNESS * basin_m
-    centre = basin_m - softness * np.log(_SUCCESS_AT_ZERO / BASIN_LEVEL - 1)
-    return np.asarray(_SUCCESS_AT_ZERO / (1 + np.exp((_BIN_CENTRES_M - centre) / softness)))
+    softness, at_zero = config.softness * basin_m, config.success_at_zero
+    centre = basin_m - softness * np.log(at_zero / BASIN_LEVEL - 1)
+    return np.asarray(at_zero / (1 + np.exp((_BIN_CENTRES_M - centre) / softness)))
 
 
 _BIN_CENTRES_M = (np.arange(BIN_COUNT) + 0.5) * BIN_M

@@ -20,13 +20,7 @@ from engram.graph.neighbourhood import Neighbourhood
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import Position
-
-# Distance between two matches from which one false cause no longer explains both.
-_BASE_LINE_M = 4.0
-# Beyond this distance the scene of a weak match is out of sight, and odometry has drifted.
-_FORGOTTEN_AFTER_M = 15.0
-# Most hypotheses kept; the oldest is dropped.
-_MOST = 8
+from engram.localiser.settings import HypothesesConfig
 
 
 @dataclass(slots=True)
@@ -43,6 +37,7 @@ class Hypotheses:
         search: finds the nodes near a position.
         acceptance: thresholds by which two positions agree.
         vague_m: standard deviation of a position beyond which agreement with it says nothing.
+        config: how long they wait.
     """
 
     def __init__(
@@ -51,11 +46,13 @@ class Hypotheses:
         search: Callable[[Position], Neighbourhood],
         acceptance: AcceptanceConfig,
         vague_m: float = 1.0,
+        config: HypothesesConfig | None = None,
     ) -> None:
         self._graph = graph
         self._search = search
         self._acceptance = acceptance
         self._vague_m = vague_m
+        self._config = config or HypothesesConfig()
         self._waiting: list[_Hypothesis] = []
 
     def forget(self) -> None:
@@ -76,7 +73,8 @@ class Hypotheses:
         self._waiting = [
             one
             for one in self._waiting
-            if one.driven_m <= _FORGOTTEN_AFTER_M and one.position.sigma_m <= self._vague_m
+            if one.driven_m <= self._config.forgotten_after_m
+            and one.position.sigma_m <= self._vague_m
         ]
 
     def nodes_near(self, count: int) -> list[int]:
@@ -105,12 +103,12 @@ class Hypotheses:
         confirmed = []
         for outcome in found:
             agreeing = [one for one, near in expected if self._agree(outcome, near)]
-            if any(one.driven_m >= _BASE_LINE_M for one in agreeing):
+            if any(one.driven_m >= self._config.base_line_m for one in agreeing):
                 confirmed.append(outcome)
             elif not agreeing:
                 new = _Hypothesis(_position_of(outcome))
                 expected.append((new, self._predictions(new.position)))
-                self._waiting = [*self._waiting, new][-_MOST:]
+                self._waiting = [*self._waiting, new][-self._config.most :]
         return [
             replace(outcome, accepted=True, confidence=outcome.confidence + witness)
             if outcome in confirmed

@@ -113,7 +113,11 @@ class Localiser:
         )
         self._prover = Prover(known.graph, self.config.acceptance)
         self._hypotheses = Hypotheses(
-            known.graph, self._nodes_near, self.config.acceptance, self.config.followed_gap_m
+            known.graph,
+            self._nodes_near,
+            self.config.acceptance,
+            self.config.followed_gap_m,
+            self.config.hypotheses,
         )
         self._lenses = self._lenses_of_map()
         self._tried = Tried(self.config.recent, drive.basin, self._lenses)

@@ -9,10 +9,13 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
+from engram.config import check_bounds
 from engram.errors import ConfigError
 from engram.frontend.matching import MatcherConfig
+from engram.graph.basin import BasinConfig
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.ranking import RecentConfig
+from engram.ranking.lessons import LessonsConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
@@ -41,6 +44,34 @@ class Success(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class HypothesesConfig:
+    """How long weak matches of a lost robot wait for a second one."""
+
+    base_line_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="distance between two matches, m, from which one false cause no longer "
+            "explains both",
+        ),
+    ] = 4.0
+    forgotten_after_m: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="m driven after which a weak match is dropped: its scene is out of sight, "
+            "and odometry has drifted",
+        ),
+    ] = 15.0
+    most: Annotated[
+        int, Meta(ge=1, description="most weak matches kept; the oldest is dropped")
+    ] = 8
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+@dataclass(frozen=True, slots=True)
 class LocaliserConfig:
     """Settings of the localiser.
 
@@ -63,6 +94,8 @@ class LocaliserConfig:
             They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
         neighbourhood, path_entries, success, lens_depth_m, fix_sigmas: see their descriptions.
         recent: how the ranking weights this session's recent attempts.
+        hypotheses: how weak matches of a lost robot are confirmed.
+        basin, lessons: what the map's attempts say of distance, and of each node.
         matcher, acceptance: settings of the two halves of an attempt.
     """
 
@@ -116,6 +149,9 @@ class LocaliserConfig:
         ),
     ] = 3.0
     recent: RecentConfig = field(default_factory=RecentConfig)
+    hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)
+    basin: BasinConfig = field(default_factory=BasinConfig)
+    lessons: LessonsConfig = field(default_factory=LessonsConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
 

@@ -1,6 +1,6 @@
 """Frame stream → motion between successive frames, with covariance."""
 
-from engram.odometry.motion import UNMOVED, GapFiller, Motion, driven_steps_m
+from engram.odometry.motion import UNMOVED, GapConfig, GapFiller, Motion, driven_steps_m
 from engram.odometry.odometry import Odometry, OdometryConfig
 from engram.odometry.outside import MotionSource, OutsideConfig, OutsideModel, OutsideMotion
 from engram.odometry.step import OdometryStatus, OdometryStep
@@ -8,6 +8,7 @@ from engram.odometry.window import WindowConfig
 
 __all__ = [
     "UNMOVED",
+    "GapConfig",
     "GapFiller",
     "Motion",
     "MotionSource",

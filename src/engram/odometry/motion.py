@@ -4,8 +4,6 @@ A drop on the lens, a flash or a bus that fills the view stops odometry for a fr
 robot hardly changes its speed in that time, and discarding its position would break up every map
 made in a shower. So its motion is extrapolated, with a covariance that allows for braking and
 turning. Over longer gaps that covariance grows until the robot counts as lost.
-
-Source of the constants: trials on simulated wet drives (`lab/reports/constants.md`).
 """
 
 from __future__ import annotations
@@ -13,39 +11,92 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from engram.config import check_bounds
 from engram.geometry import SE3
 from engram.odometry.outside import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
 
 _NS_PER_S = 1e9
-# Standard deviation of a guess per metre of the gap; covers 68 % of all but the longest gaps.
-_SIGMA_PER_M = 0.5
-_SIGMA_RAD_PER_M = float(np.deg2rad(2.5))
-# Steps in the median speed: odometry often degrades before it fails.
-_STEPS = 5
-# Largest standard deviation of a step that counts for the speed, as a share of its length: wrong
-# steps in rain and at night are mostly too short.
-_SHARP = 0.5 * _SIGMA_PER_M
 # Variance of an unknown turn rate, (rad/s)².
 _ANY_TURN = 1e4
-# A car brakes with up to 8 m/s², a drone turns back with 10.
-_GREATEST_ACCELERATION_M_S2 = 10.0
-# Measurements after which the speed counts as known.
-_STEPS_TO_KNOW_SPEED = 3
-# Window of steps: the share that is missing gives the share of measured steps assumed to be wrong
-# by their whole length.
-_NEWEST_STEPS = 10
-# Least standard deviation of a guess, also for a robot that stood still.
-_LEAST_SIGMA_M = 0.05
-_LEAST_SIGMA_RAD = float(np.deg2rad(0.5))
-# Standard deviation of the mean acceleration over a gap: a car pulls away with 1 m/s².
-_SIGMA_ACCELERATION_M_S2 = 0.5
-# Within this time no robot sets off unnoticed: the terms above allow for it.
-_STEADY_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class GapConfig:
+    """How motion is guessed where odometry fails. Source: `lab/reports/constants.md`."""
+
+    sigma_per_m: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="standard deviation of a guess per metre of the gap; 0.5 covers 68 % of "
+            "all but the longest gaps",
+        ),
+    ] = 0.5
+    sigma_rad_per_m: Annotated[
+        float, Meta(gt=0, description="standard deviation of its turn, rad per metre of the gap")
+    ] = float(np.deg2rad(2.5))
+    least_sigma_m: Annotated[
+        float, Meta(gt=0, description="least standard deviation of a guess, m, even at rest")
+    ] = 0.05
+    least_sigma_rad: Annotated[
+        float, Meta(gt=0, description="least standard deviation of its turn, rad")
+    ] = float(np.deg2rad(0.5))
+    speed_steps: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="steps in the median speed, and vague ones in a row that do not count: "
+            "odometry often degrades before it fails",
+        ),
+    ] = 5
+    steps_to_know_speed: Annotated[
+        int, Meta(ge=1, description="measured steps after which the speed counts as known")
+    ] = 3
+    sharp_share: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="largest standard deviation of a step that counts for the speed, as a "
+            "share of its length: wrong steps in rain and at night are mostly too short",
+        ),
+    ] = 0.25
+    newest_steps: Annotated[
+        int,
+        Meta(
+            ge=1,
+            description="window of steps; the share that is missing is the share of measured steps "
+            "taken to be wrong by their whole length",
+        ),
+    ] = 10
+    greatest_acceleration_m_s2: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="m/s²; a measured step beyond it counts as missing: a car brakes with up "
+            "to 8, a drone turns back with 10",
+        ),
+    ] = 10.0
+    acceleration_m_s2: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="standard deviation of the mean acceleration over a gap, m/s²: a car pulls "
+            "away with 1",
+        ),
+    ] = 0.5
+    steady_s: Annotated[
+        float, Meta(ge=0, description="s within which no robot sets off unnoticed")
+    ] = 0.5
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,11 +172,15 @@ class GapFiller:
     - The covariance of measured steps grows with the share of missing steps among the newest.
     - A robot that starts its drive moving, without a measured step, has no known speed. Its first
       measured step also accounts for the time before, at the same speed.
+
+    Args:
+        config: how far a guess is trusted.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, config: GapConfig = GapConfig()) -> None:
+        self._config = config
         # (3,) m/s each, in the camera that they begin in; the newest last.
-        self._velocities: deque[NDArray[np.float64]] = deque(maxlen=_STEPS)
+        self._velocities: deque[NDArray[np.float64]] = deque(maxlen=self._config.speed_steps)
         # Their median.
         self._velocity: NDArray[np.float64] = np.zeros(3)
         # Consecutive measurements too uncertain to determine the speed.
@@ -140,9 +195,9 @@ class GapFiller:
         # Stamp of the newest motion that was measured and accepted.
         self._believed_ns: int | None = None
         # Whether each of the newest steps was missing.
-        self._missing: deque[bool] = deque(maxlen=_NEWEST_STEPS)
+        self._missing: deque[bool] = deque(maxlen=self._config.newest_steps)
         # Speed that was expected at each of the newest steps.
-        self._guessed_m_per_s: deque[float] = deque(maxlen=_NEWEST_STEPS)
+        self._guessed_m_per_s: deque[float] = deque(maxlen=self._config.newest_steps)
         # Time for which the robot has moved at a speed not yet known.
         self._unknown_s = 0.0
 
@@ -206,15 +261,15 @@ class GapFiller:
         seconds: float,
     ) -> None:
         """Updates speed and turn rate for later guesses, weighted by certainty."""
-        sharp = sigma_m <= max(_SHARP * step_m, 0.5 * _LEAST_SIGMA_M)
+        sharp = sigma_m <= max(self._config.sharp_share * step_m, 0.5 * self._config.least_sigma_m)
         self._unlearnt = 0 if sharp else self._unlearnt + 1
         # An uncertain speed is better than none, or an old one.
-        if sharp or not self._knows_speed or self._unlearnt > _STEPS:
+        if sharp or not self._knows_speed or self._unlearnt > self._config.speed_steps:
             self._velocities.append(twist_per_s[:3])
             self._velocity = _median(self._velocities)
         # A Kalman filter; the turn rate changes per step by the error of a guess. The change does
         # not grow over a gap: the next guesses would then rest on the first uncertain step.
-        change_rad = max(_SIGMA_RAD_PER_M * step_m, _LEAST_SIGMA_RAD)
+        change_rad = max(self._config.sigma_rad_per_m * step_m, self._config.least_sigma_rad)
         expected = self._turn_variance + (change_rad / seconds) ** 2
         measured_to = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) / seconds**2
         gain = expected / (expected + measured_to)
@@ -230,7 +285,8 @@ class GapFiller:
         """
         steps, self._unknown_s = self._unknown_s / seconds, 0.0
         before = SE3(np.eye(3), measured.log()[:3] * steps)
-        wrong = np.repeat([_SIGMA_PER_M, _SIGMA_RAD_PER_M], 3) * before.distance_m
+        per_m = [self._config.sigma_per_m, self._config.sigma_rad_per_m]
+        wrong = np.repeat(per_m, 3) * before.distance_m
         adjoint = before.adjoint()
         carried = adjoint @ covariance @ adjoint.T
         return before @ measured, carried + steps**2 * covariance + np.diag(wrong**2)
@@ -241,18 +297,18 @@ class GapFiller:
         For a robot that seems to have stopped it follows from its previous speed.
         """
         step_m = max(measured.distance_m, max(self._guessed_m_per_s, default=0.0) * seconds)
-        share = sum(self._missing) / _NEWEST_STEPS
-        variances = np.repeat([step_m**2, (_SIGMA_RAD_PER_M * step_m) ** 2], 3)
+        share = sum(self._missing) / self._config.newest_steps
+        variances = np.repeat([step_m**2, (self._config.sigma_rad_per_m * step_m) ** 2], 3)
         return np.diag(share * variances)
 
     def _too_vague(self, sigma_m: float, guess: Guess) -> bool:
         vague = sigma_m > guess.sigma_m
         self._vague = self._vague + 1 if vague else 0
-        return vague and self._vague <= _STEPS
+        return vague and self._vague <= self._config.speed_steps
 
     @property
     def _knows_speed(self) -> bool:
-        return len(self._velocities) >= _STEPS_TO_KNOW_SPEED
+        return len(self._velocities) >= self._config.steps_to_know_speed
 
     def _impossible(self, twist: NDArray[np.float64], sigma_m: float, seconds: float) -> bool:
         """Whether a step needs an impossible acceleration since the last accepted motion.
@@ -265,7 +321,7 @@ class GapFiller:
         assert self._believed_ns is not None
         since_s = (self._stamp_ns - self._believed_ns) / _NS_PER_S
         changed_m = SE3(np.eye(3), twist[:3] - self._velocities[-1] * seconds).distance_m
-        possible_m = _GREATEST_ACCELERATION_M_S2 * since_s * seconds
+        possible_m = self._config.greatest_acceleration_m_s2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * sigma_m)
 
     def _ahead(
@@ -290,8 +346,10 @@ class GapFiller:
         # Errors of the steps of one gap are correlated: they add up, not their variances.
         growth_m2 = (self._gap_m + guess.distance_m) ** 2 - self._gap_m**2
         started_m = self._started_m(seconds, stamp_ns)
-        sigma_m = float(np.hypot(_SIGMA_PER_M * np.sqrt(growth_m2), max(_LEAST_SIGMA_M, started_m)))
-        sigma_rad = float(np.hypot(_SIGMA_RAD_PER_M * np.sqrt(growth_m2), _LEAST_SIGMA_RAD))
+        config, grown_m = self._config, np.sqrt(growth_m2)
+        least_m = max(config.least_sigma_m, started_m)
+        sigma_m = float(np.hypot(config.sigma_per_m * grown_m, least_m))
+        sigma_rad = float(np.hypot(config.sigma_rad_per_m * grown_m, config.least_sigma_rad))
         covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
         if outside is not None:
             guess = SE3(outside.prev_from_curr.rotation, guess.translation)
@@ -301,8 +359,9 @@ class GapFiller:
     def _started_m(self, seconds: float, stamp_ns: int) -> float:
         """How far a robot that stood, or held its speed, may have got by speeding up, metres."""
         gap_s = seconds if self._believed_ns is None else (stamp_ns - self._believed_ns) / _NS_PER_S
-        until_s, since_s = (max(one - _STEADY_S, 0.0) for one in (gap_s, gap_s - seconds))
-        return 0.5 * _SIGMA_ACCELERATION_M_S2 * float(np.sqrt(max(until_s**4 - since_s**4, 0.0)))
+        steady_s, acceleration_m_s2 = self._config.steady_s, self._config.acceleration_m_s2
+        until_s, since_s = (max(one - steady_s, 0.0) for one in (gap_s, gap_s - seconds))
+        return 0.5 * acceleration_m_s2 * float(np.sqrt(max(until_s**4 - since_s**4, 0.0)))
 
 
 def _median(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

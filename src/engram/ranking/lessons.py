@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
+from engram.config import check_bounds
 from engram.graph.attempts import Attempts
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import PathId, path_id
@@ -17,15 +19,43 @@ from engram.graph.paths import PathMemory
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
-# Evidence of another node of the experience decays e-fold per 3 m along the drive and ends at 4 m:
-# nodes are a metre apart, and a drive attempts only some of them.
-_POOL_M, _POOL_REACH_M = 3.0, 4.0
-_POOL_NODES = 8
-# Successes counted for the drive that saved a node, which would surely have matched it.
-_SAVING_COUNTS = 2.0
-# Match probability of a node without evidence, and the weight of it in attempts.
+# Match probability of a node without evidence.
 UNKNOWN_BASE = 0.4
-_BASE_ATTEMPTS = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class LessonsConfig:
+    """How past drives' attempts count for a node. Source: `lab/reports/ranking-policies.md`."""
+
+    pool_m: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="m along the drive over which evidence of another node of the experience "
+            "decays e-fold: nodes are a metre apart, and a drive attempts some of them",
+        ),
+    ] = 3.0
+    pool_reach_m: Annotated[float, Meta(ge=0, description="m at which that evidence ends")] = 4.0
+    pool_nodes: Annotated[
+        int, Meta(ge=0, description="most nodes before and after that share their evidence")
+    ] = 8
+    saving_counts: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="successes counted for the drive that saved a node, which would surely "
+            "have matched it",
+        ),
+    ] = 2.0
+    unknown_base: Annotated[
+        float, Meta(gt=0, lt=1, description="match probability of a node without evidence")
+    ] = UNKNOWN_BASE
+    base_attempts: Annotated[
+        float, Meta(gt=0, description="weight of that probability, in attempts")
+    ] = 2.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +65,15 @@ class Lessons:
     Attributes:
         base: (N,) float64, that probability by all past drives; without nodes saved since the
             map was opened.
+        unknown: that probability of a node without evidence.
     """
 
     base: NDArray[np.float64]
+    unknown: float = UNKNOWN_BASE
     _and_unknown: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_and_unknown", np.append(self.base, UNKNOWN_BASE))
+        object.__setattr__(self, "_and_unknown", np.append(self.base, self.unknown))
 
     @staticmethod
     def none() -> Lessons:
@@ -49,7 +81,7 @@ class Lessons:
         return Lessons(np.zeros(0))
 
     def of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(Y,) float64: the probabilities of nodes, (Y,) dense indices; 0.4 if missing."""
+        """(Y,) float64: the probabilities of nodes, (Y,) dense indices."""
         return self._and_unknown[np.minimum(nodes, len(self.base))]
 
     @staticmethod
@@ -59,6 +91,7 @@ class Lessons:
         viewers: Sequence[PathId],
         attempts: Attempts,
         rates: NDArray[np.float64],
+        config: LessonsConfig = LessonsConfig(),
     ) -> Lessons:
         """Learns from the drives of a map.
 
@@ -72,12 +105,16 @@ class Lessons:
             viewers: V drives, by their paths.
             attempts: their attempts; `session` indexes `viewers`.
             rates: (A,) float64, success rate g at the predicted offset of each attempt.
+            config: how they count.
         """
-        sharing = _sharing(graph)
-        good, bad = (
-            sharing @ counts for counts in _counts(graph, path_memory, viewers, attempts, rates)
-        )
-        return Lessons((good + _BASE_ATTEMPTS * UNKNOWN_BASE) / (good + bad + _BASE_ATTEMPTS))
+        sharing = _sharing(graph, config)
+        good, bad = _counts(graph, path_memory, viewers, attempts, rates)
+        known = set(viewers)
+        saved = [path_id(graph.session(number)) in known for number in range(graph.session_count)]
+        good += config.saving_counts * np.array(saved, np.bool_)[graph.sessions]
+        good, bad = sharing @ good, sharing @ bad
+        prior, unknown = config.base_attempts, config.unknown_base
+        return Lessons((good + prior * unknown) / (good + bad + prior), unknown)
 
 
 def _counts(
@@ -96,13 +133,10 @@ def _counts(
     silent = [viewer for number, viewer in enumerate(viewers) if number not in spoke]
     walked = [graph.index(one.node) for path in silent for one in path_memory.entries(path)]
     np.add.at(good, np.array(walked, np.int64), 1.0)
-    known = set(viewers)
-    saved = [path_id(graph.session(number)) in known for number in range(graph.session_count)]
-    good += _SAVING_COUNTS * np.array(saved, np.bool_)[graph.sessions]
     return good, bad
 
 
-def _sharing(graph: ExperienceGraph) -> csr_matrix:
+def _sharing(graph: ExperienceGraph, config: LessonsConfig) -> csr_matrix:
     """(N, N) weight of each node's evidence at the other nodes of its experience."""
     from scipy.sparse import coo_matrix
 
@@ -110,13 +144,13 @@ def _sharing(graph: ExperienceGraph) -> csr_matrix:
     driven_m, experiences = graph.driven_m, graph.experiences
     in_line = np.lexsort((np.arange(count), driven_m, experiences))
     rows, columns, weights = [np.arange(count)], [np.arange(count)], [np.ones(count)]
-    for step in range(1, _POOL_NODES + 1):
+    for step in range(1, config.pool_nodes + 1):
         a, b = in_line[:-step], in_line[step:]
         apart_m = driven_m[b] - driven_m[a]
-        near = (experiences[a] == experiences[b]) & (apart_m <= _POOL_REACH_M)
+        near = (experiences[a] == experiences[b]) & (apart_m <= config.pool_reach_m)
         if not near.any():
             break
-        weight = np.exp(-apart_m[near] / _POOL_M)
+        weight = np.exp(-apart_m[near] / config.pool_m)
         rows += [a[near], b[near]]
         columns += [b[near], a[near]]
         weights += [weight, weight]

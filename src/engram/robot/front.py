@@ -58,7 +58,7 @@ class Front:
     def restart(self) -> None:
         """Forgets all motion: what comes next is another drive, or another part of one."""
         self._odometry = Odometry(self._settings.odometry)
-        self._gaps = GapFiller()
+        self._gaps = GapFiller(self._settings.gaps)
         self._outside = OutsideModel(self._settings.outside)
         self._frozen = _FrozenStream()
         self.examination.begin()

@@ -25,7 +25,7 @@ from engram.localiser import (
     Matcher,
     Relocaliser,
 )
-from engram.localiser.settings import PathEntries
+from engram.localiser.settings import LocaliserConfig, PathEntries
 from engram.maps import Map
 from engram.places.words import words_of
 from engram.ranking import (
@@ -86,7 +86,7 @@ def localiser_in(
     words = opened.derived(words_of, descriptor)
     background = Background(
         opened.derived(drives_of),
-        opened.derived(lessons_of, camera.fx),
+        opened.derived(lessons_of, camera.fx, settings.localiser),
         words,
         opened.cameras,
     )
@@ -96,7 +96,7 @@ def localiser_in(
     return Localiser(
         MapParts(opened.graph, paths, opened.frames, background, parts.get("search")),
         LiveDrive(
-            MatchBasin.of(camera.fx, opened.basin_counts),
+            MatchBasin.of(camera.fx, opened.basin_counts, settings.localiser.basin),
             parts.get("live", UNNAMED_LIVE_SESSION),
             parts.get("saves", False),
             parts.get("clock"),
@@ -141,10 +141,10 @@ def drives_of(opened: Map) -> dict[SessionId, Session]:
     return dict(opened.sessions)
 
 
-def lessons_of(opened: Map, focal_px: float) -> Lessons:
+def lessons_of(opened: Map, focal_px: float, config: LocaliserConfig) -> Lessons:
     """`Lessons` of a map, for a live camera of this focal length, px; for `Map.derived`."""
-    made, basin = opened.attempts, MatchBasin.of(focal_px, opened.basin_counts)
+    made, basin = opened.attempts, MatchBasin.of(focal_px, opened.basin_counts, config.basin)
     along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
     rates = basin.success_rate(along_m, across_m)
     viewers = [path_id(session) for session in opened.sessions]
-    return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates)
+    return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates, config.lessons)

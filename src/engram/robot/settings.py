@@ -14,7 +14,7 @@ from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
 from engram.localiser import Budget, LocaliserConfig
 from engram.mapper import MapperConfig
-from engram.odometry import OdometryConfig, OutsideConfig
+from engram.odometry import GapConfig, OdometryConfig, OutsideConfig
 from engram.ranking import check_for_robot
 
 # Settings files that ship with the package: the rules of one paper each.
@@ -31,6 +31,7 @@ class Settings:
     mapper: MapperConfig = field(default_factory=MapperConfig)
     doctor: DoctorConfig = field(default_factory=DoctorConfig)
     outside: OutsideConfig = field(default_factory=OutsideConfig)
+    gaps: GapConfig = field(default_factory=GapConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
         """These settings for a map's kind of descriptor; None keeps their own.
@@ -89,18 +90,14 @@ class RobotOptions:
         return Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)
 
 
-def load_settings(path: Path | None, descriptor: str | None = None) -> Settings:
-    """Settings from a TOML file, or the defaults.
-
-    Args:
-        path: the file; None for the defaults.
-        descriptor: kind of descriptor that replaces the file's; None keeps it.
+def load_settings(path: Path | None) -> Settings:
+    """Settings from a TOML file; with None the defaults.
 
     Raises:
         ConfigError: the file cannot be read, or a setting is unknown or out of range.
     """
     settings = Settings() if path is None else _read_settings(path)
-    return settings.for_descriptor(None if descriptor is None else DescriptorKind(descriptor))
+    return settings.for_descriptor(None)
 
 
 def _read_settings(path: Path) -> Settings:

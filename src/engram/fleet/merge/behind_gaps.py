@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from engram.fleet.merge.segments import Segment
 from engram.localiser import Localisation, Position
 from engram.localiser.attempts import Outcome
-from engram.odometry import GapFiller, OdometryStatus, OdometryStep
+from engram.odometry import GapConfig, GapFiller, OdometryStatus, OdometryStep
 from engram.robot import Robot
 from engram.sequences import LoggedFrame
 
@@ -39,19 +39,22 @@ class Ahead:
     outcomes: list[Outcome]
 
 
-def position_behind_gap(end: Position, before: Segment, segment: Segment) -> Position | None:
+def position_behind_gap(
+    end: Position, before: Segment, segment: Segment, config: GapConfig
+) -> Position | None:
     """Predicts the start of a segment from the robot's speed before the gap.
 
     Args:
         end: position of the last node of the segment before.
         before: the segment before, of the same session.
         segment: the one behind the gap.
+        config: how far a guess is trusted.
 
     Returns:
         The guess with its covariance (`GapFiller`); None if the speed is unknown, or if the robot
             would have driven more than 10 m.
     """
-    gaps = GapFiller()
+    gaps = GapFiller(config)
     gaps.motion(OdometryStep(OdometryStatus.FIRST), before.nodes[0].stamp_ns)
     for node, motion in zip(before.nodes[1:], before.motions, strict=True):
         gaps.motion(OdometryStep(OdometryStatus.OK, *motion), node.stamp_ns)

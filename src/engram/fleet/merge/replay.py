@@ -242,7 +242,9 @@ class Replay(Keeper):
         if before is None or before.nodes[0].session != session.id:
             return None
         end = self._merge.equivalent(before.nodes[-1].id)
-        start = None if end is None else position_behind_gap(end, before, segment)
+        start = (
+            None if end is None else position_behind_gap(end, before, segment, self._settings.gaps)
+        )
         if start is None:
             return None
         localiser = self._localiser_of(session, segment, relocaliser=None)
