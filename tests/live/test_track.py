@@ -71,6 +71,48 @@ def test_a_short_gap_is_driven_through() -> None:
     assert robot.longest_step_m == pytest.approx(0.5)
 
 
+@pytest.mark.parametrize("dark", [2, 4, 8, 12, 20])
+@pytest.mark.parametrize("really_m_s", [0.0, 4.0, 7.0, 9.0, 12.0, 14.0, 20.0])
+def test_a_wrong_guess_is_not_corrected_by_a_jump(dark: int, really_m_s: float) -> None:
+    """Ten metres a second, and another speed while it was dark: no step back, and none of two."""
+    robot = Driven()
+    for _ in range(10):
+        robot.see(ahead(1.0))
+    for _ in range(dark):
+        robot.see(DARK)
+    way_m = 0.1 * really_m_s * (dark + 1)
+    robot.see(ahead(way_m))
+    for _ in range(5):
+        robot.see(ahead(1.0))
+    steps_m = np.diff(robot.way_m)
+    assert steps_m.min() > -0.6
+    assert steps_m.max() < 1.6
+    assert abs(robot.way_m[-1] - (10.0 + way_m + 5.0)) < 3 * robot.sigma_m
+
+
+def test_a_stop_that_was_not_seen_is_taken_at_once() -> None:
+    robot = Driven()
+    for _ in range(10):
+        robot.see(ahead(1.0))
+    for _ in range(4):
+        robot.see(FAILED)
+    robot.see(ahead(0.0))
+    assert robot.way_m[-1] == robot.way_m[-2]
+
+
+def test_a_turn_that_was_not_seen_is_not_made_up_for_at_once() -> None:
+    robot = Driven()
+    for _ in range(10):
+        robot.see(ahead(1.0))
+    for _ in range(4):
+        robot.see(DARK)
+    turned = SE3.exp(np.array([0.0, 0.0, 5.0, 0.0, 0.8, 0.0]))
+    before = robot.track.odom_from_live
+    after = robot.see(OdometryStep(OdometryStatus.OK, turned, np.eye(6) * 1e-6)).odom_from_live
+    assert (before.inverse() @ after).angle_rad < 0.1
+    assert np.sqrt(robot.track.covariance[4, 4]) > 0.3
+
+
 def test_an_unplugged_camera_is_no_reason_to_jump() -> None:
     robot = Driven()
     for _ in range(10):

@@ -12,17 +12,19 @@ from engram.live.driving import Step
 
 # A motion that was guessed for longer, or less surely, is no step: the robot may have stood.
 _LONGEST_GUESS_NS, _LARGEST_SIGMA_M = 1_000_000_000, 1.0
-# A step of one frame may be longer than the longest of the last ones by so much, m.
-_LONGER_BY, _LEAST_STEP_M = 2.0, 0.05
-_STEPS = 10
+# After a guess, a step may differ from going on as before by this share of it, and by so much;
+# a guess itself, by wheels, by more.
+_UNLIKE, _LONGER_BY, _LEAST_STEP_M, _LEAST_TURN_RAD = 0.5, 1.0, 0.05, 0.03
+_NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
     """Odometry since the start. While the camera sees nothing it goes on by the guess for a while.
 
-    Where that turns out wrong, or nothing is known any more, the track stays where it is, rather
-    than jump; its covariance keeps the error that may be in it.
+    Where that turns out wrong, the track goes on from the guess, rather than jump to what was
+    measured; where nothing is known any more it stays where it is. Its covariance keeps the error
+    that may be in it.
 
     Attributes:
         odom_from_live: pose of the camera in that of its first image.
@@ -34,7 +36,10 @@ class Track:
     # Of the newest usable frame, from which a guess goes ahead.
     _usable: tuple[SE3, NDArray[np.float64]] | None = None
     _stamp_ns: int | None = None
-    _steps_m: tuple[float, ...] = ()
+    # Of the newest step, (6,) m/s and rad/s; None before the first.
+    _twist_per_s: NDArray[np.float64] | None = None
+    # Whether the newest step was guessed, and taken.
+    _guessed: bool = False
 
     def after(self, step: Step, stamp_ns: int) -> Track:
         """The track after one more frame; it holds still where nothing is known of the motion."""
@@ -56,21 +61,37 @@ class Track:
         covariance = propagate_covariance(base, base_covariance, ahead[1])
         guessed = motion.guessed_m > 0 or motion.ahead is not None
         moved = self.odom_from_live.inverse() @ to
-        blind = self._usable is not None or guessed
+        seconds = (since_ns or 0) / _NS_PER_S
         doubtful = guessed and (
             (since_ns or 0) > _LONGEST_GUESS_NS or ahead[1][:3, :3].max() > _LARGEST_SIGMA_M**2
         )
-        if doubtful or (blind and moved.distance_m > self._longest_m):
-            to, covariance = self.odom_from_live, _held(self.odom_from_live, to, covariance)
-            steps_m = self._steps_m
-        else:
-            steps_m = (*self._steps_m, moved.distance_m)[-_STEPS:]
-        usable = (base, base_covariance) if motion.ahead is not None else None
-        return Track(to, covariance, usable, stamp_ns, steps_m)
+        taken = SE3.identity() if doubtful else self._without_jump(moved, seconds, guessed)
+        stays = to if taken is moved else self.odom_from_live @ taken
+        covariance = _held(stays, to, covariance)
+        usable = None
+        if motion.ahead is not None:
+            # From where the guess would have led here: what comes next goes on from here.
+            back = base if taken is moved or doubtful else stays @ ahead[0].inverse()
+            usable = back, _held(stays, to, base_covariance)
+        twist_per_s = taken.log() / seconds if seconds > 0 else self._twist_per_s
+        return Track(stays, covariance, usable, stamp_ns, twist_per_s, guessed and not doubtful)
 
-    @property
-    def _longest_m(self) -> float:
-        return _LONGER_BY * max(self._steps_m, default=np.inf) + _LEAST_STEP_M
+    def _without_jump(self, moved: SE3, seconds: float, guessed: bool) -> SE3:
+        """A step; going on as before, where it would make up for a wrong guess."""
+        blind = self._usable is not None or guessed or self._guessed
+        if not blind or self._twist_per_s is None:
+            return moved
+        as_before = SE3.exp(self._twist_per_s * seconds)
+        away = as_before.inverse() @ moved
+        longer_by = _LONGER_BY if guessed else _UNLIKE
+        most_m = longer_by * as_before.distance_m + _LEAST_STEP_M
+        # A gyroscope may feel a turn that the camera does not see.
+        most_rad = np.inf if guessed else _UNLIKE * as_before.angle_rad + _LEAST_TURN_RAD
+        jumps = (
+            min(moved.distance_m, away.distance_m) > most_m
+            or min(moved.angle_rad, away.angle_rad) > most_rad
+        )
+        return as_before if jumps else moved
 
     def _at(self, stamp_ns: int) -> Track:
         return replace(self, _stamp_ns=stamp_ns)
