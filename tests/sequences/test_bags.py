@@ -126,6 +126,19 @@ class TestContainers:
         assert_whole(opened(made(tmp_path / "apart", kind)))
 
 
+def test_a_bag_cut_before_the_right_images_says_so(tmp_path) -> None:
+    with bag(tmp_path / "apart", "ros1") as maker:
+        for side, topic in enumerate((LEFT, RIGHT)):
+            for stamp, *images in PICTURES:
+                maker.image(topic, stamp, images[side])
+    path = tmp_path / "apart.bag"
+    content = path.read_bytes()
+    cut = content.index(PICTURES[0][2].tobytes())
+    path.write_bytes(content[:cut])
+    with pytest.raises(SequenceError, match=r"no image can be read; .*cut short"):
+        open_sequence(path)
+
+
 def colours() -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
 
