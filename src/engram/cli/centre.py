@@ -41,7 +41,7 @@ def _open(folder: Path, database: str | None = None, objects: str | None = None)
     """A centre that is there.
 
     Raises:
-        InputError: there is no such folder; `serve` makes one, so that a mistyped name does not.
+        InputError: no such folder; `serve` and `map` make one, a mistyped name does not.
     """
     from engram.centre.service import Centre
     from engram.errors import InputError
@@ -216,7 +216,7 @@ def map_(
       engram centre map town campus --gate held-out.framelog --moves stable
       engram centre map town fleet --set merge.rounds=8
     """
-    from engram.centre.service import MapPolicy
+    from engram.centre.service import Centre, MapPolicy
     from engram.cli.fleet import merging_of
 
     policy = MapPolicy(
@@ -225,7 +225,7 @@ def map_(
         moves,
         _hours(quiet),
     )
-    with _open(folder, database) as centre:
+    with Centre(folder, database) as centre:
         centre.add_map(name, _BY)
         centre.set_policy(name, policy, _BY)
 
