@@ -74,6 +74,25 @@ def test_what_speaks_against_a_match_lowers_its_confidence(doubt: dict[str, obje
     assert MODEL.as_predicted(evidence(**doubt)) < MODEL.as_predicted(evidence())
 
 
+def test_few_inliers_count_more_where_odometry_tracks_few_too() -> None:
+    """Drops on the lens hide landmarks of both; a look-alike far off does not touch odometry."""
+    usual = Standing(agreed=5, usual_inliers=100.0)
+    rain = replace(usual, tracked=0.4)
+    for known in ({}, {"spread": WIDE}):
+        dry, wet = (evidence(25, standing=standing, **known) for standing in (usual, rain))
+        assert MODEL.as_predicted(wet) > MODEL.as_predicted(dry)
+
+
+def test_what_odometry_tracks_is_compared_with_the_frames_of_fixes() -> None:
+    record = Record()
+    for tracked in (200, 300, 400):
+        record.begin_frame(tracked)
+        record.fixed(80, agrees=True)
+    for tracked, share in ((150, 0.5), (900, 1.0), (0, 1.0)):
+        record.begin_frame(tracked)
+        assert record.standing.tracked == share
+
+
 def test_a_match_has_only_the_readings_that_fit_it() -> None:
     assert MODEL.as_predicted(evidence(apart=math.inf)) == -math.inf
     assert MODEL.as_anywhere(evidence()) == -math.inf

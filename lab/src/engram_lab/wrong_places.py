@@ -84,11 +84,22 @@ class WrongPlaces:
             off = np.concatenate([rng.normal(0.0, sigma_m, 3), rng.normal(0.0, SIGMA_RAD, 3)])
             prediction = Prediction(pose @ SE3.exp(off), sigma_m, SIGMA_RAD)
             missed = float(rng.uniform(0.0, _MOST_MISSED))
-            standing = Standing(_CONFIRMED if usual_inliers else 0, missed, usual_inliers)
+            standing = Standing(missed=missed)
+            if usual_inliers:
+                tracked = float(self._tracked[there.frame])
+                standing = Standing(_CONFIRMED, missed, usual_inliers, tracked)
             self.attempts += 1
             outcome = self._attempt(there.frame, index, prediction, standing)
             if self._is_wrong(there.frame, outcome):
                 yield WrongPlace(there.frame, outcome)
+
+    @cached_property
+    def _tracked(self) -> NDArray[np.float64]:
+        """Share of the usual landmarks that odometry tracks to each frame; see `Standing`."""
+        counts = np.array([one.odometry.inliers for one in self._street.frames], np.float64)
+        known = counts > 0
+        usual = float(np.median(counts[known])) if known.any() else 1.0
+        return np.where(known, np.minimum(counts / usual, 1.0), 1.0)
 
     def _attempt(
         self, frame: int, index: int, prediction: Prediction | None, standing: Standing

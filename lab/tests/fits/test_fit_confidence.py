@@ -59,7 +59,7 @@ def test_look_alikes_do_not_make_every_match_less_likely() -> None:
     for kind in ("predicted", "doubted", "told", "anywhere"):
         met += rows(600, kind, right=True) + rows(200, kind, right=False)
     alike = rows(2_000, "anywhere", right=False) + rows(2_000, "told", right=False)
-    plain, with_them = fitted(Rows(met, [])), fitted(Rows(met, alike))
+    plain, with_them = fitted(Rows(met, []), 35), fitted(Rows(met, alike), 35)
     found = rows(20, "anywhere", right=True) + rows(20, "told", right=True)
     for row in found:
         before = max(plain.as_anywhere(row.evidence), plain.as_predicted(row.evidence))

@@ -64,7 +64,7 @@ class AcceptanceConfig:
     """
 
     rule: Rule = Rule.CONFIDENCE
-    min_confidence: float = 3.5
+    min_confidence: float = 4.25
     min_confidence_told: float = 5.0
     min_confidence_lost: float = 5.5
     sure_confidence: float = 8.5

@@ -225,6 +225,8 @@ class Attempter:
         pose = match.reference_from_live
         in_reach = pose.distance_m <= acceptance.reach_m
         unproved = prediction is None or candidate.doubted or not candidate.standing.agreed
+        weak = match.inliers < confidence_of(live.descriptor).weak_inliers
+        spreads = (in_reach if unproved else weak) and match.inliers >= _LEAST_WEIGHED
         return Evidence(
             match.inliers,
             match.inliers / len(live.landmarks),
@@ -235,7 +237,7 @@ class Attempter:
             apart(pose, prediction, acceptance)
             if prediction is not None and agrees(pose, prediction, acceptance)
             else math.inf,
-            spread() if in_reach and unproved and match.inliers >= _LEAST_WEIGHED else None,
+            spread() if spreads else None,
         )
 
     def _weighed(

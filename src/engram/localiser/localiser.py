@@ -285,7 +285,7 @@ class Localiser:
         clock = clock or StageClock()
         self._new_damaged, self._near, self._looked_up = (), None, False
         self._tried.begin_frame(self._driven_m)
-        self._prover.begin_frame()
+        self._prover.begin_frame(self._motion.odometry.inliers)
         outcomes: list[Outcome] = []
         if live.status is FrameStatus.OK:
             self._near = self._neighbourhood()

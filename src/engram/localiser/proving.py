@@ -49,8 +49,9 @@ class Prover:
         after = self._accepted.doubt_after
         return after > 0 and (self._told or self.standing.missed >= after)
 
-    def begin_frame(self) -> None:
-        """Begins a frame: nothing is withdrawn yet."""
+    def begin_frame(self, tracked: int) -> None:
+        """Begins a frame, with the landmarks that odometry tracked; nothing is withdrawn yet."""
+        self._record.begin_frame(tracked)
         self.standing, self.withdraws = self._record.standing, ()
 
     def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:

@@ -19,13 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import Budget
+from engram.localiser import METHOD_VERSION, Budget
 from engram.monitor import QUIET
 from engram.robot import Settings
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
-from engram_lab.town.simulating import campaigns_folder
-from engram_lab.trial_towns import HELD_OUT_TOWNS, streets
+from engram_lab.trial_towns import HELD_OUT_TOWNS, streets, towns_folder
 
 KINDS = {"told": Kind.TOLD, "carried": Kind.CARRIED, "gap": Kind.GAP, "lost": Kind.LOST}
 
@@ -88,15 +87,16 @@ def main() -> None:
     parser.add_argument("--tries", type=int, default=3000)
     parser.add_argument("--kinds", default="told,carried")
     parser.add_argument("--lost-rounds", type=int, default=Budget().lost_rounds)
-    parser.add_argument("--out", type=Path, default=campaigns_folder() / "hints.jsonl")
+    parser.add_argument("--out", type=Path, help="where tries are kept")
     asked = parser.parse_args()
     settings = Settings().for_descriptor(asked.kind)
     kinds = [KINDS[name] for name in asked.kinds.split(",")]
-    known = _known(asked.out)
+    out = asked.out or towns_folder(settings) / f"hints-{METHOD_VERSION}.jsonl"
+    known = _known(out)
     places = list(streets(asked.towns, settings, asked.lost_rounds, QUIET))
     per_street = -(-asked.tries // (len(places) * len(kinds)))
     done: list[Came] = []
-    with asked.out.open("a", encoding="utf-8") as lines:
+    with out.open("a", encoding="utf-8") as lines:
         for name, street in places:
             for kind in kinds:
                 for one in street.tries(kind, per_street, seed=1):

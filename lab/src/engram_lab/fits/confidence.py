@@ -32,6 +32,7 @@ from engram.localiser.confidence import (
     ConfidenceModel,
     Evidence,
     Standing,
+    confidence_of,
 )
 from engram.monitor import Monitor, write_whole
 from engram.robot import Settings
@@ -62,7 +63,7 @@ _RIDGE = 1.0
 _BIN = 1.0
 # What each weight may be, in the order of the terms.
 _MATCH_SIGNS = (0, 1, 1, -1, -1)
-_PREDICTED_SIGNS = (*_MATCH_SIGNS, -1, -1, -1, 1, 1)
+_PREDICTED_SIGNS = (*_MATCH_SIGNS, -1, -1, -1, 1, 1, -1)
 _DOUBTED_SIGNS = (*_PREDICTED_SIGNS, 1, 1)
 _TOLD_SIGNS = (*_MATCH_SIGNS, -1, -1, -1, 1, 1)
 _ANYWHERE_SIGNS = (*_MATCH_SIGNS, 1, 1)
@@ -227,7 +228,7 @@ def log_loss(log_odds: Array, right: Array) -> float:
 # The readings of a match, by name: terms, their signs, and what one look-alike counts.
 _READINGS: dict[str, tuple[Callable[[Evidence], tuple[float, ...]], tuple[int, ...], float]] = {
     "predicted": (Evidence.predicted_terms, _PREDICTED_SIGNS, 0.1),
-    "doubted": (Evidence.doubted_terms, _DOUBTED_SIGNS, 0.0),
+    "doubted": (Evidence.doubted_terms, _DOUBTED_SIGNS, 1.0),
     "told": (Evidence.told_terms, _TOLD_SIGNS, 1.0),
     "anywhere": (Evidence.anywhere_terms, _ANYWHERE_SIGNS, 1.0),
 }
@@ -241,20 +242,24 @@ def _readings_of(row: Row) -> Iterator[str]:
     if not np.isfinite(found.apart):
         return
     if found.standing.agreed:
-        yield "predicted" if found.spread is None else "doubted"
+        # Weak ones, too: strong ones are wrong too seldom to learn from.
+        if found.spread is None or _is_sure(found):
+            yield "predicted"
+        if found.spread is not None:
+            yield "doubted"
     elif found.spread is not None:
         yield "told"
 
 
-def fitted(rows: Rows) -> ConfidenceModel:
-    """The weights that fit best."""
+def fitted(rows: Rows, weak_inliers: int) -> ConfidenceModel:
+    """The weights that fit best; `weak_inliers` those with which the rows were collected."""
     weights = {}
     for name, (terms, signs, counts) in _READINGS.items():
         met, alike = (
             [row for row in some if name in _readings_of(row)] for some in (rows.met, rows.alike)
         )
         weights[name] = _weights(terms, signs, (met, alike), counts)
-    return ConfidenceModel(**weights, witness=WITNESS)
+    return ConfidenceModel(**weights, witness=WITNESS, weak_inliers=weak_inliers)
 
 
 def _weights(
@@ -302,7 +307,14 @@ def judged(model: ConfidenceModel, rows: Sequence[Row], fit: Sequence[Row]) -> I
 
 def _is_anywhere(row: Row) -> bool:
     near = row.evidence.distance_m <= AcceptanceConfig().reach_m
-    return near and row.evidence.spread is not None
+    return near and row.evidence.spread is not None and not _is_sure(row.evidence)
+
+
+def _is_sure(found: Evidence) -> bool:
+    """Whether the match agrees with a position that fixes confirmed and none contradicts."""
+    standing = found.standing
+    confirmed = standing.agreed > 0 and standing.missed < AcceptanceConfig().doubt_after
+    return confirmed and bool(np.isfinite(found.apart))
 
 
 def _inliers(rows: Sequence[Row]) -> Array:
@@ -315,7 +327,8 @@ def text_of(model: ConfidenceModel) -> str:
     lines += [f"    # {', '.join(DOUBTED_TERMS)}", f"    doubted={model.doubted},"]
     lines += [f"    # {', '.join(TOLD_TERMS)}", f"    told={model.told},"]
     lines += [f"    # {', '.join(ANYWHERE_TERMS)}", f"    anywhere={model.anywhere},"]
-    return "\n".join(["ConfidenceModel(", *lines, f"    witness={model.witness},", ")"])
+    lines += [f"    witness={model.witness},", f"    weak_inliers={model.weak_inliers},"]
+    return "\n".join(["ConfidenceModel(", *lines, ")"])
 
 
 def main() -> None:
@@ -329,7 +342,7 @@ def main() -> None:
     folder = towns_folder(settings) / "confidence"
     folder.mkdir(parents=True, exist_ok=True)
     rows = collected(asked.towns, folder, settings, Bars())
-    model = fitted(rows)
+    model = fitted(rows, confidence_of(asked.kind).weak_inliers)
     print(text_of(model))
     held_out = collected(asked.held_out, folder, settings, Bars())
     report(judged(model, held_out.met, rows.met), asked.json, "confidence, held-out towns")
