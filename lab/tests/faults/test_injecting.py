@@ -5,16 +5,26 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import pytest
 
 from engram.frontend import StereoPair
-from engram.geometry import StereoCamera
-from engram_lab.studies.faults.clips import JUDGING, MAPPED, SETTING
+from engram.geometry import SE3, StereoCamera
+from engram.graph.model import NodeId
+from engram_lab.studies.faults.clips import JUDGING, MAPPED, SETTING, Clip
 from engram_lab.studies.faults.injected import FAULTS, Blackout, Frozen, Kidnapped, Stall
 from engram_lab.studies.faults.page import headline, matrix
-from engram_lab.studies.faults.study import KINDS, Trial, drawn, read_trials
+from engram_lab.studies.faults.study import (
+    CARRIED,
+    KINDS,
+    Place,
+    Trial,
+    drawn,
+    read_trials,
+    run_trial,
+)
 
 CAMERA = StereoCamera(60.0, 60.0, 47.5, 31.5, 0.2, 96, 64)
 
@@ -83,3 +93,14 @@ def test_results_are_read_as_far_as_they_are_whole_and_counted(tmp_path: Path) -
     rows = matrix(trials).splitlines()
     assert len(rows) == 2 + 1 + 2 + 1
     assert rows[-1].startswith("| all |  | 3 | 150 | 120 | 4 | 1 | 7.50 |")
+
+
+def test_a_map_without_a_far_place_tells_no_robot_a_wrong_one(pairs) -> None:
+    """Clips of a wide camera are short: all nodes may lie within 15 m of the robot."""
+    place = Place.__new__(Place)
+    here = SE3.identity()
+    place.world_from_node = {NodeId(UUID(int=k)): here for k in range(1, 4)}
+    clip = Clip(JUDGING[1], pairs, [here] * len(pairs))
+    assert run_trial(2, CARRIED, clip, place, np.random.default_rng(1)) is None
+    place.world_from_node[NodeId(UUID(int=9))] = SE3.exp([0, 0, 15.5, 0, 0, 0])
+    assert place.nodes_off(here) == [NodeId(UUID(int=9))]

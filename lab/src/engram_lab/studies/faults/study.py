@@ -29,6 +29,8 @@ FALSE_M = 1.0
 FALSE_RAD = float(np.deg2rad(5.0))
 # False fixes less than this apart are one event.
 _EVENT_M = 20.0
+# A place is wrong that is so far off, m.
+_OFF_M = 15.0
 # Frames before the fault: the robot has found itself.
 _BEFORE = 15
 # Frames of a drive that are shown, at most.
@@ -99,6 +101,14 @@ class Place:
         wrong = node_from_live.inverse() @ found.node_from_live
         return wrong.distance_m, wrong.angle_rad
 
+    def nodes_off(self, world_from_cam: SE3) -> list[NodeId]:
+        """Nodes so far from a camera that it would be told a wrong place by them."""
+        return [
+            node
+            for node, pose in self.world_from_node.items()
+            if (world_from_cam.inverse() @ pose).distance_m >= _OFF_M
+        ]
+
     def close(self) -> None:
         """Closes the map."""
         self.opened.close()
@@ -122,9 +132,13 @@ def drawn(number: int, plans: Sequence[ClipPlan]) -> tuple[str, ClipPlan, np.ran
     return KINDS[number % len(KINDS)], live[int(rng.integers(len(live)))], rng
 
 
-def run_trial(number: int, fault: str, clip: Clip, place: Place, rng: np.random.Generator) -> Trial:
-    """One drive with one fault."""
+def run_trial(
+    number: int, fault: str, clip: Clip, place: Place, rng: np.random.Generator
+) -> Trial | None:
+    """One drive with one fault; None if the map is too short to tell the robot a wrong place."""
     start = int(rng.integers(_BEFORE, max(_BEFORE + 1, len(clip) - 25)))
+    if fault == CARRIED and not place.nodes_off(clip.world_from_cam[start]):
+        return None
     shown, strength, hint = _shown(fault, clip, start, place, rng)
     trial = Trial(number, fault, clip.plan.name, start, strength)
     steps = zip(clip.world_from_cam, clip.world_from_cam[1:], strict=False)
@@ -155,12 +169,7 @@ def _shown(
         return plain, 0.0, None
     if fault == CARRIED:
         sigma_m = float(np.exp(rng.uniform(np.log(0.1), np.log(3.0))))
-        here = clip.world_from_cam[start]
-        far = [
-            node
-            for node, pose in place.world_from_node.items()
-            if (here.inverse() @ pose).distance_m >= 15.0
-        ]
+        far = place.nodes_off(clip.world_from_cam[start])
         covariance = np.diag([sigma_m**2] * 3 + [np.deg2rad(2.0) ** 2] * 3)
         node = far[int(rng.integers(len(far)))]
         return plain, sigma_m, Position(node, SE3.identity(), covariance)
@@ -212,6 +221,8 @@ def run(
                     if place is None:
                         continue
                     trial = run_trial(number, fault, places.clip(plan), place, rng)
+                    if trial is None:
+                        continue
                     with file.open("a", encoding="utf-8") as out:
                         out.write(json.dumps(asdict(trial)) + "\n")
                     monitor.advance(fault)
