@@ -305,6 +305,33 @@ def judged(model: ConfidenceModel, rows: Sequence[Row], fit: Sequence[Row]) -> I
         yield Figure(f"claimed {low:+.0f} to {low + _BIN:+.0f} ({count}): true log-odds", actual)
 
 
+def passing(model: ConfidenceModel, rows: Rows) -> Iterator[Figure]:
+    """Matches that robots near a confirmed or a told position would believe, of those that count.
+
+    Matches count that have the least inliers and determine the position.
+    """
+    limits = AcceptanceConfig()
+    for name, agreed, least in (
+        ("confirmed", True, limits.min_confidence),
+        ("told", False, limits.min_confidence_told),
+    ):
+        for what, some in (
+            ("right", [row for row in rows.met if row.right]),
+            ("wrong", [row for row in rows.met if not row.right]),
+            ("look-alikes", rows.alike),
+        ):
+            known = [
+                row.evidence
+                for row in some
+                if (row.evidence.standing.agreed > 0) is agreed
+                and np.isfinite(row.evidence.apart)
+                and row.evidence.inliers >= limits.min_inliers
+                and row.evidence.match_sigma_m <= limits.max_sigma_m
+            ]
+            passed = sum(model.as_predicted(one) >= least for one in known)
+            yield Figure(f"{name}: {what} that pass, of {len(known)}", passed)
+
+
 def _is_anywhere(row: Row) -> bool:
     near = row.evidence.distance_m <= AcceptanceConfig().reach_m
     return near and row.evidence.spread is not None and not _is_sure(row.evidence)
@@ -344,6 +371,7 @@ def main() -> None:
     rows = collected(asked.towns, folder, settings, Bars())
     model = fitted(rows, confidence_of(asked.kind).weak_inliers)
     print(text_of(model))
+    report(passing(model, rows), None, "confidence, fitted towns")
     held_out = collected(asked.held_out, folder, settings, Bars())
     report(judged(model, held_out.met, rows.met), asked.json, "confidence, held-out towns")
 
