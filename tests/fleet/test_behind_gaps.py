@@ -18,7 +18,7 @@ from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, SessionId, node_id
 from engram.localiser import Position
 from engram.maps import open_map
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import GapConfig, OdometryStatus, OdometryStep
 
 from .robots import DAY_NS, WORLD, merged, robot_map, truth_of
 
@@ -78,7 +78,7 @@ def behind(segments, gap_ns):
     before, node = segments
     last = before.nodes[-1]
     after = Segment((replace(node, stamp_ns=last.stamp_ns + gap_ns),), ())
-    return position_behind_gap(Position.at(last.id), before, after)
+    return position_behind_gap(Position.at(last.id), before, after, GapConfig())
 
 
 def test_the_robot_is_taken_to_drive_on_as_it_did(segments):

@@ -75,7 +75,7 @@ def test_a_folder_that_does_not_exist_is_told(tmp_path: Path) -> None:
 def test_malformed_tum_is_told_with_the_line(tmp_path: Path, text: str) -> None:
     path = tmp_path / "a.txt"
     path.write_text(text)
-    with pytest.raises(SequenceError, match=r"a\.txt.*(line 1|rise)"):
+    with pytest.raises(SequenceError, match=r"a\.txt.*(line 1|increase)"):
         read_tum(path)
 
 
@@ -99,9 +99,9 @@ def test_the_nearest_pose_within_the_tolerance_is_found() -> None:
     assert trajectory.at(0, tolerance_ns=100) is poses[0]
 
 
-def test_stamps_of_a_trajectory_must_rise_and_fit() -> None:
+def test_stamps_of_a_trajectory_must_increase_and_fit() -> None:
     poses = [SE3.identity()] * 2
-    with pytest.raises(InputError, match="rise"):
+    with pytest.raises(InputError, match="increase"):
         Trajectory(np.array([1, 1]), poses)
     with pytest.raises(InputError, match="2 poses"):
         Trajectory(np.array([1, 2, 3]), poses)

@@ -82,7 +82,7 @@ class IslandReport:
         if not self.compared:
             return ""
         if self.revision is None:
-            return f"unconnected parts: {self.compared} pairs of nodes compared, none matched"
+            return f"unconnected parts: {self.compared} pairs of nodes compared, none joins them"
         return (
             f"{len(self.joined)} matches of {self.compared} join unconnected parts: revision "
             f"{self.revision}; to undo: engram revert MAP {self.revision}"
