@@ -141,6 +141,7 @@ def test_what_a_search_of_firsts_judged_all_orders_need_not_judge_again(
     assert search(tmp_path, maps[:2], by).results == searched[1].results
 
 
+@pytest.mark.long
 def test_a_build_that_began_with_the_best_first_goes_on_as_such(tmp_path, logs, monkeypatch):
     centre, by = tmp_path / "centre.engram", judge(logs["held-out"], orders=Orders.FIRST)
     merge = building.merge
@@ -220,6 +221,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
         )
 
 
+@pytest.mark.long
 def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch):
     centre = tmp_path / "centre.engram"
     with monkeypatch.context() as patch:

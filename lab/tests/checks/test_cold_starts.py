@@ -50,6 +50,7 @@ def test_known_looks_are_found_and_unknown_ones_are_not_possible(
     assert values["sampled frames found among all nodes"] == 1
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_where_it_stopped(
     campaign: DriveSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

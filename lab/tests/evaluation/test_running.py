@@ -127,6 +127,7 @@ class _KilledError(Exception):
     pass
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("moment", ["building", "running"])
 def test_a_run_that_was_killed_goes_on_to_the_same_end(
     campaign, plan: Plan, tmp_path: Path, monkeypatch, moment: str

@@ -35,6 +35,7 @@ def test_light_costs_inliers_as_it_was_calibrated_to(seen: Appearance) -> None:
     assert means["night"] < 5
 
 
+@pytest.mark.long
 def test_a_visit_matches_itself_at_every_place() -> None:
     places = Places(1, every_m=75.0)
     frames = reference_frames(places, VISITS["morning"])

@@ -34,6 +34,7 @@ def test_the_month_has_every_weather_in_its_share(seed: int) -> None:
         assert abs(some[weather] - count * LAPS / 140) <= 1.0
 
 
+@pytest.mark.long
 def test_laps_that_look_alike_are_saved_once_and_fail_nowhere(tmp_path: Path) -> None:
     drives = write_campaign(tmp_path, looks=(0,) * 5).drives
     found = measure_laps([drive.path for drive in drives], tmp_path / "work")

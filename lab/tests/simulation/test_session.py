@@ -30,6 +30,7 @@ def test_pairs_have_the_camera_s_size_and_rising_stamps(drive: SimulatedDrive) -
         assert pair.left.std() > 10  # something is to be seen
 
 
+@pytest.mark.long
 def test_the_same_drive_twice_gives_the_same_pictures(hamlet: Campaign) -> None:
     first = [p.left for p in islice(small(SimulatedDrive(hamlet, 0)), 2)]
     second = [p.left for p in islice(small(SimulatedDrive(hamlet, 0)), 2)]
@@ -52,6 +53,7 @@ def test_threads_do_not_change_the_picture(hamlet: Campaign) -> None:
     np.testing.assert_array_equal(one.right, three.right)
 
 
+@pytest.mark.long
 def test_a_covered_lens_shows_nothing_and_what_was_seen_comes_back(hamlet: Campaign) -> None:
     drive = small(SimulatedDrive(hamlet, 0))
     covered = Lens(covered_from_m=drive.poses[3].driven_m, covered_to_m=drive.poses[5].driven_m)

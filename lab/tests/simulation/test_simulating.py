@@ -136,6 +136,7 @@ def contents(file: str) -> list[tuple[object, ...]]:
     return rows
 
 
+@pytest.mark.long
 def test_a_killed_run_is_taken_up_again(short: Campaign, tmp_path: Path) -> None:
     class Killed(BaseException):
         pass

@@ -118,6 +118,7 @@ def test_clouds_open_and_close_along_the_way() -> None:
 
 @given(seed=st.integers(0, 2**31 - 1), weather=st.sampled_from(sorted(WEATHERS)))
 @settings(max_examples=50)
+@pytest.mark.long
 def test_the_sky_does_not_jump_along_the_way(seed: int, weather: str) -> None:
     conditions = Conditions(datetime(2025, 7, 1, 12, tzinfo=UTC), weather, seed)
     sky = np.array([conditions.at(0.7 * k, 0.14 * k).sky_power for k in range(600)])
