@@ -14,7 +14,7 @@ from typing import Any
 from sqlalchemy import Connection, func, or_, select, update
 
 from engram.centre.errors import ConflictError, MalformedError, QuotaError, UnknownError
-from engram.centre.keeping import ENDED, HandInState, needed_manifests
+from engram.centre.keeping import ENDED, HandInState, manifest_key, needed_manifests
 from engram.centre.service import Centre, kept_since_ns
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
@@ -396,8 +396,3 @@ class MissingPartsError(MapError):
 def _used(connection: Connection, robot: str, now_ns: int) -> int:
     query = select(usage.c.bytes).where(usage.c.subject == robot, usage.c.day == now_ns // DAY_NS)
     return connection.execute(query).scalar() or 0
-
-
-def manifest_key(name: str, manifest: str) -> str:
-    """Where a manifest is kept."""
-    return f"manifests/{name}/{manifest}"

@@ -30,6 +30,11 @@ DONE, CANCELLED = "done", "cancelled"
 _UNDER_WAY = (HandInState.OPEN, HandInState.COMPLETE, HandInState.REFUSED)
 
 
+def manifest_key(name: str, manifest: str) -> str:
+    """Where a manifest is kept among the objects."""
+    return f"manifests/{name}/{manifest}"
+
+
 def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[str]:
     """Manifests of one map whose parts must stay.
 

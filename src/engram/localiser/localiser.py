@@ -168,27 +168,9 @@ class Localiser:
 
     def attempts(self) -> list[Attempt]:
         """The last frame's attempts that had a prediction, as a map stores them (method §3.5)."""
-        near, reference = self._near, self._reference
-        if near is None or reference is None:
+        if self._near is None or self._reference is None:
             return []
-        return [
-            Attempt(
-                iteration=self._tried.iteration,
-                reference=reference,
-                node=outcome.candidate.node,
-                along_m=float(near.along_m[row]),
-                across_m=float(near.across_m[row]),
-                yaw_rad=float(near.yaw_rad[row]),
-                sigma_m=float(near.sigma_m[row]),
-                sigma_yaw_rad=float(near.sigma_yaw_rad[row]),
-                accepted=outcome.accepted,
-                inliers=outcome.match.inliers,
-                rank=outcome.rank,
-                policy=self._policy.name,
-            )
-            for outcome in self._outcomes
-            if (row := outcome.candidate.row) is not None
-        ]
+        return self._tried.stored(self._near, self._reference, self._outcomes, self._policy.name)
 
     def place_at(
         self,

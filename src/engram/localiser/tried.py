@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from engram.frontend import Frame
 from engram.graph.basin import MatchBasin
+from engram.graph.model import Attempt, NodeId
 from engram.graph.neighbourhood import Neighbourhood
 from engram.localiser.attempts import Outcome
 from engram.localiser.lenses import Lenses
@@ -80,6 +81,40 @@ class Tried:
             [one.match.inliers for one in outcomes],
             len(live.landmarks),
         )
+
+    def stored(
+        self,
+        near: Neighbourhood,
+        reference: NodeId,
+        outcomes: Sequence[Outcome],
+        policy: str,
+    ) -> list[Attempt]:
+        """The attempts of the current iteration that had a prediction, as a map stores them.
+
+        Args:
+            near: the neighbourhood of the candidates.
+            reference: node that the position referred to.
+            outcomes: of all attempts.
+            policy: name of the policy that ordered them.
+        """
+        return [
+            Attempt(
+                iteration=self.iteration,
+                reference=reference,
+                node=outcome.candidate.node,
+                along_m=float(near.along_m[row]),
+                across_m=float(near.across_m[row]),
+                yaw_rad=float(near.yaw_rad[row]),
+                sigma_m=float(near.sigma_m[row]),
+                sigma_yaw_rad=float(near.sigma_yaw_rad[row]),
+                accepted=outcome.accepted,
+                inliers=outcome.match.inliers,
+                rank=outcome.rank,
+                policy=policy,
+            )
+            for outcome in outcomes
+            if (row := outcome.candidate.row) is not None
+        ]
 
     def _expected(
         self, near: Neighbourhood | None, outcomes: Sequence[Outcome]

@@ -13,9 +13,10 @@ from engram.maps.history import (
     show_revision,
     tag_revision,
 )
-from engram.maps.map import Map, open_map
+from engram.maps.map import Map
 from engram.maps.map_files import check_file, compact_map, copy_map, publish_map
 from engram.maps.map_frame import FramePose, MapFrame, Moves, moves
+from engram.maps.opening import open_map
 from engram.maps.provenance import Origin
 from engram.maps.records import (
     CheckReport,

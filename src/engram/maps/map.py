@@ -595,20 +595,3 @@ class Map(MapReader):
 
 class _DryRunError(Exception):
     """Ends a transaction without committing it."""
-
-
-def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
-    """Opens a map for localising, writing or reading.
-
-    Args:
-        path: NAME.engram.
-        at: number or tag of a revision, to see the map as it was then; None for the newest.
-        create: create an empty map if the file does not exist.
-
-    Raises:
-        MapError: the file is not a map, of a newer format, or damaged.
-        RevisionError: there is no such revision.
-    """
-    if create and not map_path(path).exists():
-        Map.create(path).close()
-    return Map.open(path, at=at)

@@ -14,8 +14,7 @@ from typing import TypeAlias
 
 from sqlalchemy import select
 
-from engram.centre.handins import manifest_key
-from engram.centre.keeping import ASKED, needed_manifests
+from engram.centre.keeping import ASKED, manifest_key, needed_manifests
 from engram.centre.service import Centre, kept_since_ns
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note

@@ -26,9 +26,13 @@ class _Judgement:
 
 
 def localised_in(
-    maps: Sequence[Path], drives: Sequence[Path], settings: Settings, localising: RobotOptions,
-    workers: int, monitor: Monitor,
-) -> list[list[Drive]]:  # fmt: skip
+    maps: Sequence[Path],
+    drives: Sequence[Path],
+    settings: Settings,
+    localising: RobotOptions,
+    workers: int,
+    monitor: Monitor,
+) -> list[list[Drive]]:
     """Localises each drive in each map.
 
     Args:
