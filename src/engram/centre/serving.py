@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import multiprocessing
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -19,6 +20,8 @@ from engram.errors import ConfigError, MissingExtraError
 from engram.processes import end_with_parent
 
 _RESTART_S = 1.0
+# The worker's priority below the service's: a merge that takes a core delays no answer.
+_WORKER_NICE = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +133,7 @@ def _work_beside(folder: Path, database: str | None, objects: str | None) -> Non
     """Main function of the worker beside the service."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends it
+    os.nice(_WORKER_NICE)
     run_worker(folder, database, objects)
 
 

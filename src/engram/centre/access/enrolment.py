@@ -95,7 +95,7 @@ def _add_robot(
 def new_nonce(centre: Centre, robot: str) -> str:
     """What a robot must sign to get a token; the same answer whether or not it is known."""
     nonce, now = secrets.token_hex(16), centre.now_ns()
-    with centre.database.writing() as connection:
+    with centre.database.writing(durable=False) as connection:
         connection.execute(delete(nonces).where(nonces.c.expires_ns < now))
         known = first_row(connection, select(subjects.c.id).where(subjects.c.id == robot))
         if known is not None:
@@ -113,7 +113,7 @@ def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
             signature is not its.
     """
     now = centre.now_ns()
-    with centre.database.writing() as connection:
+    with centre.database.writing(durable=False) as connection:
         query = select(nonces).where(nonces.c.nonce == nonce, nonces.c.subject == robot)
         row = first_row(connection, query)
         connection.execute(delete(nonces).where(nonces.c.nonce == nonce))
@@ -171,7 +171,7 @@ def disable(centre: Centre, robot: str, by: str) -> None:
 
 def _issue(centre: Centre, subject: str, expires_ns: int | None) -> str:
     token = secrets.token_urlsafe(32)
-    with centre.database.writing() as connection:
+    with centre.database.writing(durable=expires_ns is None) as connection:
         connection.execute(delete(tokens).where(tokens.c.expires_ns < centre.now_ns()))
         row = {"hash": _hash(token), "subject": subject, "expires_ns": expires_ns}
         centre.database.add(connection, tokens, [row])

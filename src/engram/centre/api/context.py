@@ -15,8 +15,12 @@ from engram.centre.service import Centre
 COOKIE = "engram_token"
 
 
-def centre_of(request: Request) -> Centre:
+async def centre_of(request: Request) -> Centre:
     """The centre of the application."""
+    return _centre(request)
+
+
+def _centre(request: Request) -> Centre:
     found: Centre = request.app.state.centre
     return found
 
@@ -32,7 +36,7 @@ def who_asks(request: Request) -> Subject:
         token = request.cookies.get(COOKIE, "") if _reads_only(request) else ""
     if not token:
         raise NotKnownError("send Authorization: Bearer TOKEN")
-    return subject_of(centre_of(request), token)
+    return subject_of(_centre(request), token)
 
 
 def _reads_only(request: Request) -> bool:
@@ -47,7 +51,7 @@ Asking = Annotated[Subject, Depends(who_asks)]
 def takes(*roles: Role) -> Any:
     """Refuses who has none of these roles on the map of the path."""
 
-    def check(name: str, who: Asking) -> None:
+    async def check(name: str, who: Asking) -> None:  # a thread for it would take longer
         who.check(name, *roles)
 
     check.roles = roles  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ import hashlib
 import json
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, insert, select
 
 from engram.centre.store.database import rows_of
 from engram.centre.store.schema import audit
@@ -28,8 +28,8 @@ def note(
         name: of the map; "" for none.
         **detail: plain data.
     """
-    last = connection.execute(select(func.max(audit.c.number))).scalar() or 0
-    before = connection.execute(select(audit.c.hash).where(audit.c.number == last)).scalar() or ""
+    newest = select(audit.c.number, audit.c.hash).order_by(audit.c.number.desc()).limit(1)
+    last, before = connection.execute(newest).first() or (0, "")
     row = {
         "number": last + 1,
         "at_ns": at_ns,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -49,6 +50,7 @@ class ServiceDatabase:
         self._sqlite = self._engine.dialect.name == "sqlite"
         # Threads queue here: those that SQLite turns away sleep ever longer, and starve.
         self._turn = threading.Lock()
+        self._log = _SharedSync(f"{self._engine.url.database}-wal")
         with self.writing() as connection:
             self._migrate(connection)
 
@@ -65,11 +67,13 @@ class ServiceDatabase:
         Args:
             durable: whether it must outlast a power cut. What is said again by itself, such as
                 reports and tokens, need not wait for the disk; a kill loses nothing either way.
+
+        Raises:
+            InputError: a value that no table takes.
+            MapError: the database cannot be written to.
         """
         with self._turn, _errors(), self._engine.connect() as connection:
             if self._sqlite:
-                level = "FULL" if durable else "NORMAL"
-                connection.exec_driver_sql(f"PRAGMA synchronous={level}")
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             else:
                 connection.execute(text(f"SELECT pg_advisory_xact_lock({_WRITERS})"))
@@ -77,6 +81,8 @@ class ServiceDatabase:
                     connection.execute(text("SET LOCAL synchronous_commit TO OFF"))
             yield connection
             connection.commit()
+        if durable and self._sqlite:
+            self._log.sync()
 
     def add(self, connection: Connection, table: Table, rows: list[dict[str, Any]]) -> int:
         """Adds rows whose keys are new; returns how many."""
@@ -137,6 +143,51 @@ def first_row(connection: Connection, query: Select[Any]) -> dict[str, Any] | No
     return next(iter(rows_of(connection, query.limit(1))), None)
 
 
+class _SharedSync:
+    """Makes SQLite's log durable, after the turn: one sync serves all who committed before it.
+
+    SQLite syncs the log by itself only before it moves rows from there into the database.
+
+    Args:
+        path: of the log.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._turn = threading.Lock()
+        self._count = threading.Lock()
+        self._asked = self._done = 0
+
+    def sync(self) -> None:
+        """Returns once all that was committed before the call is on the disk.
+
+        Raises:
+            MapError: the disk does not take it.
+        """
+        with self._count:
+            self._asked += 1
+            mine = self._asked
+        with self._turn:
+            if self._done >= mine:
+                return
+            served = self._asked
+            try:
+                self._sync_file()
+            except OSError as error:
+                raise MapError(f"the centre's database: {self._path}: {error.strerror}") from error
+            self._done = served
+
+    def _sync_file(self) -> None:
+        try:
+            file = os.open(self._path, os.O_RDONLY)
+        except FileNotFoundError:  # the last connection moved all of it into the database
+            return
+        try:
+            os.fsync(file)
+        finally:
+            os.close(file)
+
+
 def _engine(url: str) -> Engine:
     try:
         engine = create_engine(url, pool_size=8, max_overflow=-1)
@@ -153,6 +204,7 @@ def _engine(url: str) -> Engine:
             connection.isolation_level = None  # transactions begin explicitly
             connection.execute(f"PRAGMA busy_timeout={round(_BUSY_S * 1000)}")
             connection.execute("PRAGMA journal_mode=WAL")
+            connection.execute("PRAGMA synchronous=NORMAL")  # `writing` syncs what must be durable
 
     return engine
 
