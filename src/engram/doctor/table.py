@@ -197,13 +197,13 @@ CHECKS: tuple[Check, ...] = (
         below=True,
     ),
     Check(
-        "clock_unknown", _WARNING, stamps.hours_needed, 0.5, "",
+        "clock_unknown", _WARNING, stamps.hours_needed, 0, "of 2 unknown",
         "missions by hour need a UTC clock and a zone or longitude",
         "give --recorded-at, and --zone or --longitude",
         explains=("clock_unstated",),
     ),
     Check(
-        "clock_unstated", _NOTE, stamps.clock_unknown, 0.5, "",
+        "clock_unstated", _NOTE, stamps.hours_unknown, 0, "of 2 unknown",
         "the hour of the drive is unknown",
         "for downloads by hour give --recorded-at, and --zone or --longitude",
     ),

@@ -59,16 +59,16 @@ def rate_hz(seen: Evidence) -> float | None:
     return float(1 / max(float(np.median(intervals_s)), 1e-9))
 
 
-def clock_unknown(seen: Evidence) -> float | None:
-    """1 if nobody knows what hour the stamps mean, or where on earth that was."""
+def hours_unknown(seen: Evidence) -> float | None:
+    """How much is unknown of two: that the stamps are UTC, and where on earth that was."""
     facts = seen.facts
-    somewhere = facts.zone is None and facts.longitude_deg is None
-    return float(facts.clock is not Clock.UTC or somewhere)
+    nowhere = facts.zone is None and facts.longitude_deg is None
+    return float((facts.clock is not Clock.UTC) + nowhere)
 
 
 def hours_needed(seen: Evidence) -> float | None:
     """The same, where missions by hour need it."""
-    return clock_unknown(seen) if seen.facts.by_hour else None
+    return hours_unknown(seen) if seen.facts.by_hour else None
 
 
 def _usual(intervals_s: Array) -> Array:
