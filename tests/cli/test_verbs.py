@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from engram.localiser import Localiser
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
@@ -20,11 +21,17 @@ FRAME_KEYS = {
 STATUSES = {"localised", "dead_reckoning", "lost", "no_odometry"}
 
 
-@pytest.fixture
-def town(engram, street: Path, tmp_path: Path) -> Path:
-    path = tmp_path / "town.engram"
-    assert engram("map", path, street).status == 0
+@pytest.fixture(scope="module")
+def mapped_street(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "town.engram"
+    map_drive(path, open_drive(street), Settings(), RobotOptions())
     return path
+
+
+@pytest.fixture
+def town(mapped_street: Path, tmp_path: Path) -> Path:
+    """A map of the street of the test's own."""
+    return Path(shutil.copy(mapped_street, tmp_path / "town.engram"))
 
 
 def test_mapping_reports_what_it_saved(engram, street: Path, tmp_path: Path) -> None:
