@@ -13,6 +13,9 @@ export ENGRAM_DATA := $(abspath ../shared/data)
 endif
 endif
 
+# Tests, builds and centres start many processes: each would compile all of Engram again.
+export PYTHONDONTWRITEBYTECODE :=
+
 .PHONY: setup demo centre-demo test test-services test-long test-ros goldens check format clean
 
 setup: $(STAMP)
