@@ -482,3 +482,22 @@ def test_tags_that_are_gone_with_their_rows_are_missed(broken, gone):
         connection.execute(f"DELETE FROM tags WHERE {gone}")
     (problem,) = check_file(broken).problems
     assert "counts 2 rows of tags" in problem.fact
+
+
+def test_tables_that_a_disk_exchanged_are_found_by_the_check(sound, broken):
+    with Map.open(broken, writes=True) as store:
+        store.tag("one", 1, author="tests")
+    with contextlib.closing(sqlite3.connect(broken)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        found = connection.execute("SELECT name, rootpage FROM sqlite_schema WHERE type = 'table'")
+        roots = dict(found.fetchall())
+        (size,) = connection.execute("PRAGMA page_size").fetchone()
+    whole = broken.read_bytes()
+    for name, root in roots.items():
+        if name == "tags":
+            continue
+        body = bytearray(whole)
+        one, other = (slice((at - 1) * size, at * size) for at in (root, roots["tags"]))
+        body[one], body[other] = whole[other], whole[one]
+        broken.write_bytes(body)
+        assert not check_file(broken).sound, name

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.errors import EngramError, InputError
+from engram.errors import EngramError, InputError, MapCorruptError
 from engram.localiser import LocalisationStatus
 from engram.maps import open_map
 from engram.robot import Recorder, RecorderConfig, Settings, open_drive
@@ -102,6 +104,20 @@ def test_a_damaged_record_is_a_clear_error_or_reads_as_it_was(
     except EngramError as error:
         said = str(error)
         assert path.name in said or "frame log" in said
+
+
+@pytest.mark.parametrize("table", ["images", "decisions", "report"])
+def test_what_is_gone_from_a_record_is_missed(pairs, tmp_path: Path, table: str) -> None:
+    path = recorded(pairs, tmp_path)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(f"DELETE FROM {table} WHERE rowid IN (SELECT max(rowid) FROM {table})")
+
+    def read() -> None:
+        read_decisions(path)
+        read_images(path, 0)
+
+    with pytest.raises(MapCorruptError, match=rf"written with {len(pairs)}|lost its report"):
+        read()
 
 
 def recorded(pairs, folder: Path, *, images: bool = True, **config: float) -> Path:

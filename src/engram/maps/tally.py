@@ -41,5 +41,8 @@ def check_tally(connection: Connection) -> None:
 def _counted(connection: Connection) -> Row:
     query = select(tags.c.key, tags.c.checksum).order_by(tags.c.key)
     rows = connection.execute(query).fetchall()
-    body = b"".join(struct.pack("<qq", key, checksum) for key, checksum in rows)
+    try:
+        body = b"".join(struct.pack("<qq", key, checksum) for key, checksum in rows)
+    except struct.error as error:  # columns of a damaged file hold anything
+        raise MapCorruptError("tags have a key or checksum that is not an integer") from error
     return {"rows": len(rows), "digest": content_digest(body)}

@@ -66,6 +66,11 @@ class _Entry:
         images = 0 if self.images is None else len(self.images[0]) + len(self.images[1])
         return images + len(landmarks) * 70
 
+    def made_as(self, first: Frame) -> bool:
+        """Whether camera and front-end are those of another frame: one record holds one of each."""
+        frame = self.logged.frame
+        return (frame.camera, frame.frontend) == (first.camera, first.frontend)
+
 
 @dataclass(slots=True)
 class _Request:
@@ -223,27 +228,28 @@ class Recorder:
             self.info.longitude_deg, self.info.zone,
         )  # fmt: skip
         header = FrameLogHeader(info, first.camera, first.descriptor, first.frontend)
+        entries = [one for one in self._ring if one.made_as(first)]
         with FlightWriter(draft, header, checkpoint_every=10_000) as writer:
-            writer.add_report(
-                {
-                    "reason": request.reason,
-                    "engram": __version__,
-                    "machine": platform.machine(),
-                    "settings": to_dict(self.config),
-                    "made_by": config_hash(self.config),
-                    **request.about,
-                }
-            )
-            for entry in self._ring:
-                frame = entry.logged.frame
-                if (frame.camera, frame.frontend) != (first.camera, first.frontend):
-                    continue
+            images = sum(one.images is not None for one in entries)
+            writer.add_report(self._about(request), frames=len(entries), images=images)
+            for entry in entries:
                 writer.append(self._anonymous(entry.logged), entry.pair_hash)
                 writer.add_decision(entry.decision)
                 if entry.images is not None:
                     writer.add_images(*entry.images)
         draft.replace(request.path)
         self.written.append(request.path)
+
+    def _about(self, request: _Request) -> dict[str, Any]:
+        """Why a record is made, where and by what."""
+        return {
+            "reason": request.reason,
+            "engram": __version__,
+            "machine": platform.machine(),
+            "settings": to_dict(self.config),
+            "made_by": config_hash(self.config),
+            **request.about,
+        }
 
     def _anonymous(self, logged: LoggedFrame) -> LoggedFrame:
         """The frame, without its thumbnail if no images are kept."""

@@ -31,6 +31,8 @@ _MERGING = MergeOptions(relocaliser=None)
 _FOUND = re.compile(r"make a map of content ([0-9a-f]{32})")
 # Follow from other rows, or tell nothing of the map.
 _DERIVED = frozenset({"words"})
+# So many first and last nodes are read one by one, too, as a robot does.
+_SINGLY = 100
 
 
 def read(case: Case, folder: Path, *, merges: bool) -> bool:
@@ -112,7 +114,10 @@ def _each(readers: Iterable[Callable[[Any], object]], store: Any) -> None:
 
 
 def _frames(store: Map) -> None:
-    for node in store.load().nodes:
+    nodes = store.load().nodes
+    with suppress(EngramError):
+        list(store.frames.stored(nodes))
+    for node in [*nodes[:_SINGLY], *nodes[-_SINGLY:]]:
         with suppress(EngramError):
             store.frames.frame(node.id)
         with suppress(EngramError):

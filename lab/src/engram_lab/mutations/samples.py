@@ -76,7 +76,7 @@ def make_samples(folder: Path) -> Samples:
     with FrameLogWriter(framelog, _header()) as writer:
         _record(writer)
     with FlightWriter(flight, _header()) as record:
-        record.add_report({"reason": "lost", "robot": "r1"})
+        record.add_report({"reason": "lost", "robot": "r1"}, frames=_NODES, images=_NODES)
         _record(record)
     taken = split(town)
     names = [*taken.pages, *taken.blobs]

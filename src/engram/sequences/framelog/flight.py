@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, func, insert, select
 
 from engram.errors import MapCorruptError
 from engram.frontend.blobs import content_digest
@@ -28,13 +28,22 @@ from engram.sequences.framelog.reader import read_header
 from engram.sequences.framelog.writer import FrameLogWriter
 from engram.sequences.images import header_size
 
+# Keys of the report: how many decisions, and images, belong to it.
+_FRAMES, _IMAGES = "frames", "images"
+
 
 class FlightWriter(FrameLogWriter):
     """Writes a flight record, NAME.flight. Each frame is appended, then what belongs to it."""
 
-    def add_report(self, content: Mapping[str, Any]) -> None:
-        """Stores why and where the record was made, plain JSON data."""
-        text = json.dumps(content)
+    def add_report(self, content: Mapping[str, Any], *, frames: int, images: int) -> None:
+        """Stores why and where the record was made.
+
+        Args:
+            content: plain JSON data.
+            frames, images: how many frames, and of how many the images, will be added: so that a
+                reader finds out what is gone.
+        """
+        text = json.dumps({**content, _FRAMES: frames, _IMAGES: images})
         with self._or_abandon() as connection:
             row = {"key": 1, "content": text, "digest": content_digest(text.encode())}
             connection.execute(insert(report_table), row)
@@ -65,15 +74,16 @@ def read_report(path: Path) -> dict[str, Any]:
         MapCorruptError: it is damaged.
     """
     with _reading(path) as connection:
-        row = connection.execute(select(report_table).order_by(report_table.c.key)).first()
-        return {} if row is None else _json(path, row)
+        return _report(path, connection)
 
 
 def read_decisions(path: Path) -> dict[int, dict[str, Any]]:
     """What the robot concluded from each frame, by its number; see `read_report` for errors."""
     with _reading(path) as connection:
         rows = connection.execute(select(decisions_table).order_by(decisions_table.c.number))
-        return {row.number: _json(path, row) for row in rows}
+        found = {row.number: _json(path, row) for row in rows}
+        _check_count(path, len(found), _report(path, connection), _FRAMES)
+        return found
 
 
 def read_images(path: Path, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
@@ -87,6 +97,8 @@ def read_images(path: Path, number: int) -> tuple[NDArray[np.uint8], NDArray[np.
         columns = images_table.c
         query = select(images_table).where(columns.number == number).order_by(columns.number)
         row = connection.execute(query).first()
+        stored = connection.execute(select(func.count()).select_from(images_table)).scalar_one()
+        _check_count(path, stored, _report(path, connection), _IMAGES)
         header, _ = read_header(connection)
     if row is None:
         return None
@@ -112,6 +124,31 @@ def _reading(path: Path) -> Iterator[Connection]:
             yield connection
     finally:
         engine.dispose()
+
+
+def _report(path: Path, connection: Connection) -> dict[str, Any]:
+    """The report of a record, which has one.
+
+    Raises:
+        MapCorruptError: it has none, or it is damaged.
+    """
+    row = connection.execute(select(report_table).order_by(report_table.c.key)).first()
+    if row is None:
+        raise MapCorruptError(f"{path}: the flight record has lost its report")
+    return _json(path, row)
+
+
+def _check_count(path: Path, stored: int, report: Mapping[str, Any], name: str) -> None:
+    """Compares the rows that are stored with those that the report counts.
+
+    Raises:
+        MapCorruptError: they differ. Records of before Engram counted them are not compared.
+    """
+    counted = report.get(name, stored)
+    if stored != counted:
+        raise MapCorruptError(
+            f"{path}: the flight record has {stored} {name}, and was written with {counted}"
+        )
 
 
 def _json(path: Path, row: Any) -> dict[str, Any]:
