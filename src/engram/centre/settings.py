@@ -41,7 +41,7 @@ class CentreSettings:
         4 * _GIB
     )
     admission_s: Annotated[int, Meta(ge=1, description="processor time of admission, s")] = 600
-    poll_s: Annotated[float, Meta(gt=0, description="a worker looks for work this often, s")] = 1.0
+    poll_s: Annotated[float, Meta(gt=0, description="a worker looks for work this often, s")] = 0.25
 
     def __post_init__(self) -> None:
         check_bounds(self)

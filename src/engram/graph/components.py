@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 Indices = NDArray[np.int64]
 
 
-def labels_of(ends: Indices, count: int) -> Indices:
+def labels_of(ends: NDArray[np.integer], count: int) -> Indices:
     """(N,) int64: the component of each node by (E, 2) ends, numbered by first node."""
-    from scipy.cluster.hierarchy import DisjointSet
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
 
-    parts = DisjointSet(range(count))
-    for a, b in ends.tolist():
-        parts.merge(a, b)
-    number: dict[int, int] = {}
-    return np.array(
-        [number.setdefault(parts[node], len(number)) for node in range(count)], np.int64
-    )
+    links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    labels = connected_components(links, directed=False)[1]
+    return np.asarray(labels, dtype=np.int64)
 
 
 def grouped(labels: NDArray[np.integer]) -> list[Indices]:

@@ -15,6 +15,7 @@ from engram import _core
 from engram.errors import InputError
 from engram.geometry import SE3
 from engram.graph.chain_error import ChainError, edge_error_rows, error_rows_of
+from engram.graph.components import labels_of
 from engram.graph.edge_table import EDGE_KINDS, EdgeRecords, EdgeTable
 from engram.graph.growing import Column
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
@@ -430,13 +431,7 @@ class ExperienceGraph:
 
     def components(self) -> NDArray[np.int32]:
         """(N,) int32: the connected component of each node, numbered from 0 by first node."""
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import connected_components
-
-        ends = self.edge_ends
-        links = coo_matrix((np.ones(len(ends)), (ends[:, 1], ends[:, 0])), shape=(len(self),) * 2)
-        labels = connected_components(links, directed=False)[1]
-        return np.asarray(labels, dtype=np.int32)
+        return labels_of(self.edge_ends, len(self)).astype(np.int32)
 
     @property
     def edge_ends(self) -> NDArray[np.int32]:

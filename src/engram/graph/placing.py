@@ -302,8 +302,12 @@ class _Placing:
         inside = fixed.copy()
         both = inside[self.ends].all(axis=1)
         off_m = np.linalg.norm(self.measured.residuals(poses)[:, :3], axis=1)
+        fitting = self.ends[both & (off_m <= self.config.fits_m)]
+        labels = labels_of(fitting, len(fixed))[inside]
+        if (labels == labels[0]).all():
+            return  # as nearly always; what follows goes node by node
         parts = DisjointSet(np.flatnonzero(inside).tolist())
-        for a, b in self.ends[both & (off_m <= self.config.fits_m)].tolist():
+        for a, b in fitting.tolist():
             parts.merge(a, b)
         # Through nodes that are not placed a part may hang together, too: those between them.
         largest = max(parts.subsets(), key=lambda part: (len(part), -min(part)))
@@ -457,15 +461,15 @@ def _used(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[list[Edge],
     from scipy.cluster.hierarchy import DisjointSet
 
     derived = np.array([edge.kind is EdgeKind.PROXIMITY for edge in edges], np.bool_)
-    parts = DisjointSet(range(count))
-    for a, b in ends[~derived].tolist():
-        parts.merge(a, b)
+    measured = labels_of(ends[~derived], count)
+    parts = DisjointSet(range(int(measured.max(initial=-1)) + 1))
     kept = ~derived
     spread = [
         float(np.trace(edges[row].covariance[:3, :3])) for row in np.flatnonzero(derived).tolist()
     ]
     for row in np.flatnonzero(derived)[np.argsort(spread, kind="stable")].tolist():
-        kept[row] = parts.merge(int(ends[row, 0]), int(ends[row, 1]))
+        a, b = measured[ends[row]].tolist()
+        kept[row] = parts.merge(a, b)
     rows = np.flatnonzero(kept)
     return [edges[row] for row in rows.tolist()], ends[rows].reshape(-1, 2)
 

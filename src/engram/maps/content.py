@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Table, select
 from engram.errors import MapCorruptError
 from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, unpack
 from engram.maps.reading import load_cameras, load_frontends
-from engram.maps.rows import Row, verified
+from engram.maps.rows import Row, verified, verified_values
 from engram.maps.schema import (
     NEWER,
     VERSIONED,
@@ -145,19 +145,25 @@ def _canonical_rows(
         .where(table.c.revision.in_(view.revision_keys()))
         .order_by(*table.primary_key.columns)
     )
-    rows = verified(table, connection.execute(query))
+    found = connection.execute(query)
     if table is attempts:
-        return _canonical_attempts(list(rows), identities)
-    return {row["key"]: _canonical_row(row, identities) for row in rows}
-
-
-def _canonical_row(row: Row, identities: Identities) -> bytes:
-    values = [
-        _identity(identities, _REFERENCES[name], value) if name in _REFERENCES else value
-        for name, value in row.items()
-        if name not in _LEFT_OUT
+        return _canonical_attempts(list(verified(table, found)), identities)
+    # Tens of thousands of rows: what is the same for all of them is looked up once.
+    columns = [
+        (at, _REFERENCES.get(column.name))
+        for at, column in enumerate(table.columns)
+        if column.name not in _LEFT_OUT
     ]
-    return _encode(values)
+    key = [column.name for column in table.columns].index("key")
+    return {
+        row[key]: _encode(
+            [
+                row[at] if other is None else _identity(identities, other, row[at])
+                for at, other in columns
+            ]
+        )
+        for row in verified_values(table, found)
+    }
 
 
 def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, bytes]:

@@ -12,6 +12,7 @@ from engram.errors import InputError, MapCorruptError
 from engram.geometry import SE3
 from engram.graph.marks import Anchor, Goal, Mark, Placement, Removal, same_measurement
 from engram.graph.model import EdgeKind, NodeId
+from engram.maps.columns import read_columns
 from engram.maps.rows import (
     Row,
     checked_int,
@@ -87,12 +88,10 @@ def _removals(connection: Connection, rows: list[Row]) -> tuple[Removal, ...]:
 def load_placements(connection: Connection, view: View) -> dict[NodeId, SE3]:
     """The newest ``map_from_node`` of each placed node."""
     ids = _all_node_ids(connection, view)
-    newest = {row["node"]: row for row in view.rows(connection, placements) if row["node"] in ids}
-    rows = list(newest.values())
-    poses = transforms_from_bytes(
-        [row["map_from_node"] for row in rows], lambda at: f"placement {rows[at]['key']}"
-    )
-    return {ids[row["node"]]: pose for row, pose in zip(rows, poses, strict=True)}
+    found = read_columns(connection, view, placements, {"map_from_node": 96}).newest("node")
+    keys, placed = found["key"], found["node"].tolist()
+    poses = transforms_from_bytes(found["map_from_node"], lambda at: f"placement {keys[at]}")
+    return {ids[node]: pose for node, pose in zip(placed, poses, strict=True) if node in ids}
 
 
 def load_anchors(connection: Connection, view: View) -> tuple[Anchor, ...]:

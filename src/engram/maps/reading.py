@@ -248,13 +248,16 @@ def load_vocabulary(connection: Connection, view: View) -> bytes | None:
 
 def load_omissions(connection: Connection, view: View) -> dict[NodeId, Omission]:
     """Omitted nodes, each with its newest visible equivalent."""
+    rows = list(view.rows(connection, omissions))
+    if not rows:
+        return {}
     query = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
     node_ids = {row[0]: node_from_bytes(row[1]) for row in connection.execute(query)}
     landmarks = {
         row["uuid"]: row["landmark_hash"] for row in view.rows(connection, omitted_landmarks)
     }
     found = {}
-    for row in view.rows(connection, omissions):
+    for row in rows:
         omitted = NodeId(uuid_from_bytes(row["uuid"], f"omission {row['key']}"))
         if row["node"] in node_ids:
             transform = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")

@@ -58,7 +58,14 @@ def sealed(table: Table, values: Row) -> Row:
 
 
 def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
-    """Rows of one table as dicts, each checked against its checksum.
+    """Rows of one table as dicts, each checked against its checksum; see `verified_values`."""
+    names, _ = _shape(table)
+    for values in verified_values(table, rows):
+        yield dict(zip(names, values, strict=True))
+
+
+def verified_values(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Sequence[Any]]:
+    """Rows of one table, each checked against its checksum: the values of its columns.
 
     Args:
         table: the rows begin with all its columns, in order; further columns are dropped.
@@ -70,10 +77,10 @@ def verified(table: Table, rows: Iterable[Sequence[Any]]) -> Iterator[Row]:
     names, kinds = _shape(table)
     count = len(names)
     for row in rows:
-        values = list(row[:count])
+        values = row[:count]
         if checksum(values[:-1]) != values[-1] or tuple(map(type, values)) not in kinds:
             raise mismatch(table, values)
-        yield dict(zip(names, values, strict=True))
+        yield values
 
 
 def mismatch(table: Table, values: Sequence[Any]) -> MapCorruptError:
@@ -168,9 +175,9 @@ def transform_from_bytes(data: bytes, what: str) -> SE3:
     return SE3(values[:9].reshape(3, 3), values[9:])
 
 
-def transforms_from_bytes(parts: Sequence[bytes], named: Callable[[int], str]) -> list[SE3]:
-    """Inverse of `transform_bytes` for many; `named` gives the name of one for messages."""
-    values = _arrays(parts, 12, named)
+def transforms_from_bytes(data: NDArray[np.uint8], named: Callable[[int], str]) -> list[SE3]:
+    """Inverse of `transform_bytes` for (N, 96) of them; `named` gives a row's name for messages."""
+    values = _finite(data, named)
     rotations, translations = values[:, :9].reshape(-1, 3, 3), values[:, 9:]
     return [SE3(*both) for both in zip(rotations, translations, strict=True)]
 
