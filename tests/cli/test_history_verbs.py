@@ -85,6 +85,7 @@ def test_revert_and_its_undoing(engram, town: Path, monkeypatch: pytest.MonkeyPa
     assert done["lost_by_others"] == dry["lost_by_others"]
     text = engram("revert", town, 3).out
     assert "reverted by 4" in text
+    assert text.splitlines()[-1] == f"to undo: engram revert {town} 4"
     after = engram("info", town, "--json").json
     assert after["nodes"] == before["nodes"]
     assert after["components"] == before["components"]

@@ -56,7 +56,7 @@ def test_parts_at_one_place_are_joined_by_matches(parted: Path, shift_m: float) 
     assert parts == 1
     assert len(report.joined) > 1
     assert set(report.joined) <= edges
-    assert f"revert MAP {report.revision}" in report.text()
+    assert f"revision {report.revision}" in report.text()
 
 
 def test_without_anchors_nothing_is_compared(parted: Path) -> None:

@@ -11,6 +11,7 @@ import typer
 
 from engram.cli import options
 from engram.cli.progress import Bars
+from engram.cli.wording import undo_text
 
 # Further from the nodes, a goal hangs on the direction of one node.
 _FAR_M = 30.0
@@ -79,7 +80,8 @@ def anchor(
     if as_json:
         typer.echo(json.dumps({**report.to_dict(), "islands": islands.to_dict()}))
         return
-    typer.echo("\n".join(filter(None, (report.text(), islands.text()))))
+    undo = undo_text(map_path, *filter(None, (islands.revision, report.revision)))
+    typer.echo("\n".join(filter(None, (report.text(), islands.text(), undo))))
 
 
 def goal(

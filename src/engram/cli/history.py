@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from engram.cli import options
+from engram.cli.wording import undo_text
 from engram.errors import ConfigError
 
 Revision = Annotated[str, typer.Argument(metavar="REV", help="A revision: 7, a tag, head, head~2.")]
@@ -203,7 +204,11 @@ def revert(
     from engram.maps.history import revert_revision
 
     report = revert_revision(map_path, revision, author=user(), message=message, dry_run=dry_run)
-    typer.echo(json.dumps(report.to_dict()) if as_json else report.text())
+    if as_json:
+        typer.echo(json.dumps(report.to_dict()))
+        return
+    made = report.reverted.revision
+    typer.echo(f"{report.text()}\n{undo_text(map_path, made.number) if made else 'dry run'}")
 
 
 def user() -> str:

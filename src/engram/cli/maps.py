@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from engram.cli import options
+from engram.cli.wording import undo_text
 
 if TYPE_CHECKING:
     from engram.repair.repairing import GeometryReport
@@ -144,7 +145,11 @@ def check(
 
     if geometry or repair:
         looked = _check_geometry(map_path, pictures, settings, commits=repair and yes)
-        typer.echo(json.dumps(looked.to_dict()) if as_json else looked.text())
+        if as_json:
+            typer.echo(json.dumps(looked.to_dict()))
+        else:
+            undo = undo_text(map_path, *filter(None, [looked.revision]))
+            typer.echo("\n".join(filter(None, (looked.text(), undo))))
         if looked.findings.wrong and looked.revision is None:
             raise typer.Exit(1)
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 # A drive is known, or its area new, from these shares of localised frames on.
@@ -53,6 +54,12 @@ def localised_text(
         *_stages(summary["stages_ms"]),
     ]
     return _lines(*lines, f"next: {_after_localising(frames, map_path)}")
+
+
+def undo_text(map_path: Path | str, *revisions: int) -> str:
+    """The commands that undo revisions, in this order; "" if there are none."""
+    path = quote(str(map_path))
+    return "\n".join(f"to undo: engram revert {path} {number}" for number in revisions)
 
 
 def _lines(*lines: str) -> str:

@@ -182,7 +182,6 @@ class RevertReport:
             lines.append(f"of other revisions, {regained} are shown again")
         if told["components"]["after"] > told["components"]["before"]:
             lines.append("the map has more components: positions cannot be carried between them")
-        lines.append(f"to undo: engram revert MAP {revision.number}" if revision else "dry run")
         return "\n".join(lines)
 
 

@@ -69,8 +69,7 @@ class GeometryReport:
             lines.append(f"without the wrong ones the map has {self.components[0]} components, "
                          f"not {self.components[1]}")  # fmt: skip
         if self.revision is not None:
-            lines.append(f"removed by revision {self.revision}; to undo: engram revert MAP "
-                         f"{self.revision}")  # fmt: skip
+            lines.append(f"removed by revision {self.revision}")
         if self.moved:
             lines.append(self.moved.text())
         return "\n".join(lines)

@@ -73,8 +73,9 @@ class AnchorReport:
         lines += [f"does not fit: node {node}" for node in self.outliers]
         if self.moved:
             lines.append(self.moved.text())
-        undo = f"revision {self.revision}; to undo: engram revert MAP {self.revision}"
-        lines.append("preview: nothing was written" if self.revision is None else undo)
+        lines.append(
+            "preview: nothing was written" if self.revision is None else f"revision {self.revision}"
+        )
         return "\n".join(lines)
 
 

@@ -85,7 +85,7 @@ class IslandReport:
             return f"unconnected parts: {self.compared} pairs of nodes compared, none joins them"
         return (
             f"{len(self.joined)} matches of {self.compared} join unconnected parts: revision "
-            f"{self.revision}; to undo: engram revert MAP {self.revision}"
+            f"{self.revision}"
         )
 
 
