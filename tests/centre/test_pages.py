@@ -59,7 +59,8 @@ def test_logging_in_sets_a_cookie_that_only_the_server_reads(visited):
     assert visited.http.post("/login", data={"token": "x"}).status_code == 401
 
 
-def test_what_a_viewer_may_not_do_is_not_offered(visited):
-    url = f"/maps/{NAME}/history"
-    assert "Revert…" not in visited.http.get(url, headers=cookie(visited)).text
-    assert "Revert…" in visited.http.get(url, headers=cookie(visited, "operator")).text
+@pytest.mark.parametrize(("page", "offer"), [("history", "Revert…"), ("fleet", "data-follows")])
+def test_what_a_viewer_may_not_do_is_not_offered(visited, page, offer):
+    url = f"/maps/{NAME}/{page}"
+    assert offer not in visited.http.get(url, headers=cookie(visited)).text
+    assert offer in visited.http.get(url, headers=cookie(visited, "operator")).text

@@ -192,7 +192,7 @@ def _print(agent: Agent, *, as_json: bool) -> None:
         return
     for name, value in found.items():
         if name != "outbox":
-            typer.echo(f"{name}: {value}")
+            typer.echo(f"{name}: {'-' if value in (None, '') else value}")
     for row in found["outbox"]:
         typer.echo(
             f"outbox {row['id'][:12]} {row['state']} {row['bytes']} bytes {row['error'] or ''}"

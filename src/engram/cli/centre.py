@@ -343,10 +343,14 @@ def sweep(folder: Folder, *, database: Database = None, objects: Objects = None)
 def backup(
     folder: Folder,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="A new folder.")],
+    *,
+    database: Database = None,
+    objects: Objects = None,
 ) -> None:
     """Copy a centre while it runs.
 
-    Robots may then delete what the copy holds.
+    Robots may then delete what the copy holds. PostgreSQL and a bucket are not copied: do that with
+    their own tools first.
 
     \b
     Examples:
@@ -354,6 +358,6 @@ def backup(
     """
     from engram.centre.backup import back_up
 
-    with _open(folder) as centre:
+    with _open(folder, database, objects) as centre:
         for name, revision in back_up(centre, target).items():
             typer.echo(f"{name}: revision {revision} copied")

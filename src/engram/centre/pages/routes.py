@@ -166,8 +166,15 @@ def robots(name: str, centre: CentreHere, who: Asking) -> Response:
         except UnknownError:
             revision, wanted = None, None
         rows.append({**row, "wanted": revision, "up_to_date": row["report"].get("runs") == wanted})
-    refs = [one["name"] for one in Refs(centre).all(name)]
-    return _page("robots", who, map=name, maps=_maps(centre, who), robots=rows, refs=refs)
+    return _page(
+        "robots",
+        who,
+        map=name,
+        maps=_maps(centre, who),
+        robots=rows,
+        refs=[one["name"] for one in Refs(centre).all(name)],
+        may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
+    )
 
 
 @router.get("/maps/{name}/queue", dependencies=VIEWERS)

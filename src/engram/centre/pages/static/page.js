@@ -41,12 +41,33 @@ for (const form of document.querySelectorAll("[data-put]"))
     location.reload();
   }));
 
+for (const form of document.querySelectorAll("[data-follows]"))
+  form.addEventListener("submit", trying(async () => {
+    await send("PUT", form.dataset.follows, Object.fromEntries(new FormData(form)));
+    location.reload();
+  }));
+
+for (const details of document.querySelectorAll("[data-diff]"))
+  details.addEventListener("toggle", trying(async () => {
+    if (!details.open || details.dataset.shown) return;
+    const found = await send("GET", details.dataset.diff);
+    details.dataset.shown = "yes";
+    const sides = (one) => `${Math.round(one.before)} → ${Math.round(one.after)}`;
+    const list = document.createElement("ul");
+    const lines = [`nodes ${sides(found.nodes)}: ${found.nodes.added} added, ${found.nodes.removed} removed`,
+      `metres mapped ${sides(found.mapped_m)}`, `components ${sides(found.components)}`, `attempts remembered ${sides(found.attempts)}`,
+      ...found.regions.map((one) => `${one.added} added, ${one.removed} removed at ${one.from_m} to ${one.to_m} m of ${one.oldest_session.slice(0, 8)}`)];
+    list.append(...lines.map((line) => Object.assign(document.createElement("li"), { textContent: line })));
+    details.append(list);
+  }));
+
 for (const button of document.querySelectorAll("[data-revert]"))
   button.addEventListener("click", trying(async () => {
     const revision = Number(button.dataset.revert);
     const url = `/v1/maps/${map}/reverts`;
     const would = await send("POST", url, { revision, dry_run: true });
-    const lost = Object.entries(would.lost_by_others).map(([name, n]) => `${n} ${name}`).join(", ");
+    const lost = Object.entries(would.lost_by_others).filter(([, n]) => n > 0)
+      .map(([name, n]) => `${n} ${name.replace("_", " ")}`).join(", ");
     const question = `Hide what revision ${revision} added?` + (lost ? ` Others lose ${lost}.` : "");
     if (!confirm(question)) return;
     await send("POST", url, { revision }, { "If-Match": `"${button.dataset.head}"` });
@@ -134,7 +155,8 @@ if (canvas) {
     const node = shown.nodes[i], card = document.getElementById("card");
     const found = await (await fetch(`/v1/maps/${map}/blame/${node[0]}`)).json();
     const list = document.createElement("dl");
-    const facts = { node: found.node, robot: found.robot, when: `${found.when.slice(0, 19).replace("T", " ")} UTC`, "driven": `${Number(found.driven_m).toFixed(1)} m`,
+    const dated = /^\d{4}-/.test(found.when); // a robot without a date counts from its start
+    const facts = { node: found.node, robot: found.robot, when: dated ? `${found.when.slice(0, 19).replace("T", " ")} UTC` : found.when, "driven": `${Number(found.driven_m).toFixed(1)} m`,
       "added by": `revision ${found.revision}`, matched: `${found.matches} of ${found.attempts}`, paths: found.paths };
     for (const [name, value] of Object.entries(facts)) {
       const term = document.createElement("dt"), fact = document.createElement("dd");

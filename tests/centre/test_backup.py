@@ -1,0 +1,35 @@
+"""Backups: of what is in the folder, after which robots may forget what they handed in."""
+
+from __future__ import annotations
+
+import pytest
+
+from engram.centre.backup import back_up
+from engram.centre.service import Centre
+from engram.errors import InputError
+from engram.maps import Map
+
+from .conftest import NAME, drive
+
+
+def test_a_backup_holds_the_folder_and_robots_may_forget(site, in_process, tmp_path):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    site.settle()
+    assert back_up(site.centre, tmp_path / "backup") == {NAME: 1}
+    assert site.centre.map_row(NAME)["durable_revision"] == 1
+    with Map.open(tmp_path / "backup" / "maps" / f"{NAME}.engram") as copy:
+        assert copy.content_hash() == site.content()
+    # PostgreSQL and a bucket are copied by their own tools.
+    database, bucket = site.centre.addresses
+    assert (tmp_path / "backup" / "centre.sqlite").exists() == (database is None)
+    assert (tmp_path / "backup" / "objects").exists() == (bucket is None)
+    with pytest.raises(InputError, match="exists already"):
+        back_up(site.centre, tmp_path / "backup")
+
+
+def test_tables_that_name_no_map_are_those_of_another_centre(tmp_path):
+    with Centre(tmp_path / "centre") as centre, pytest.raises(InputError, match="give --database"):
+        back_up(centre, tmp_path / "backup")
+    assert not (tmp_path / "backup").exists()

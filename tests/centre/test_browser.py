@@ -1,0 +1,117 @@
+"""The pages in a browser, over a socket: Chromium of this machine, driven by Playwright."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+
+import pytest
+import uvicorn
+
+from engram.centre.api.app import create_app
+from engram.centre.fleet import Fleet
+from engram.centre.refs import Refs
+from engram.maps import Map
+
+from .conftest import NAME, drive
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    driver = pytest.importorskip("playwright.sync_api", reason="no Playwright: make test-services")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine")
+    with driver.sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+@pytest.fixture
+def address(site, in_process):
+    """Of a centre that two robots handed in to."""
+    for number, name in enumerate(("r1", "r2")):
+        agent = site.robot(name)
+        drive(agent.live, name, 1_000 + number)
+        agent.hand_in()
+        site.settle()
+    server = uvicorn.Server(uvicorn.Config(create_app(site.centre), port=0, log_level="warning"))
+    running = threading.Thread(target=server.run)
+    answers = threading.Event()
+    startup = server.startup
+
+    async def started(sockets=None) -> None:
+        await startup(sockets)
+        answers.set()
+
+    server.startup = started
+    running.start()
+    assert answers.wait(60)
+    port = server.servers[0].sockets[0].getsockname()[1]
+    yield f"http://127.0.0.1:{port}"
+    server.should_exit = True
+    running.join()
+
+
+@pytest.fixture
+def page(browser, site, address):
+    """An operator's, on a tablet; the browser complains of refused requests at most."""
+    context = browser.new_context(base_url=address, viewport={"width": 1024, "height": 768})
+    found, complaints = context.new_page(), []
+    found.on("pageerror", lambda error: complaints.append(str(error)))
+    found.on("console", lambda one: complaints.append(one.text))
+    found.goto("/")
+    found.fill("input[name=token]", site.token("operator")["Authorization"].split()[1])
+    found.press("input[name=token]", "Enter")
+    found.wait_for_url("**/map")
+    yield found
+    context.close()
+    assert [one for one in complaints if not one.startswith("Failed to load resource")] == []
+
+
+def test_the_map_by_keyboard_and_slider(page):
+    page.get_by_text("6 nodes", exact=True).wait_for()
+    page.focus("#canvas")
+    page.keyboard.press("n")
+    page.wait_for_selector("#card dl")
+    assert "revision 1" in page.inner_text("#card")
+    seen = page.locator("#card img")
+    assert seen.evaluate("image => image.decode().then(() => image.naturalWidth)") > 0
+    page.focus("#slider")
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("3 nodes", exact=True).wait_for()
+    page.select_option("#colour", "robot")
+    assert page.inner_text("#legend") == "r1 (3)"
+
+
+def test_a_version_for_a_robot_and_a_revert_with_its_preview(page, site):
+    page.goto(f"/maps/{NAME}/history")
+    page.get_by_text("What changed").first.click()
+    page.get_by_text("nodes 3 → 6: 3 added, 0 removed").wait_for()
+    page.fill("input[name=ref]", "canary")
+    page.fill("input[name=revision]", "1")
+    with page.expect_navigation():
+        page.get_by_role("button", name="Move").click()
+    assert Refs(site.centre).get(NAME, "canary")["revision"] == 1
+
+    page.goto(f"/maps/{NAME}/fleet")
+    field = page.get_by_label("What r2 follows")
+    field.fill("canary")
+    with page.expect_navigation():
+        field.press("Enter")
+    follows = {one["name"]: one["follows"] for one in Fleet(site.centre).all(NAME)}
+    assert follows == {"r1": "head", "r2": "canary"}
+    page.get_by_label("What r1 follows").fill("no-such-ref")
+    page.get_by_label("What r1 follows").press("Enter")
+    page.get_by_text("has no ref 'no-such-ref'").wait_for()
+
+    page.goto(f"/maps/{NAME}/history")
+    asked = []
+    page.on("dialog", lambda one: (asked.append(one.message), one.accept()))
+    with page.expect_navigation():
+        page.click("[data-revert='2']")
+    assert asked == ["Hide what revision 2 added?"]
+    with Map.open(site.centre.map_path(NAME)) as store:
+        assert (store.revision, store.node_count()) == (3, 3)
