@@ -30,7 +30,7 @@ def back_up(centre: Centre, target: Path) -> dict[str, int]:
     names, (database, bucket) = centre.map_names(), centre.addresses
     if not names:
         raise InputError(
-            f"{centre.folder} has no maps in its tables; if these are in PostgreSQL, give --database"
+            f"{centre.folder} has no maps in its tables; if PostgreSQL has them, give --database"
         )
     (target / "maps").mkdir(parents=True)
     if database is None:
