@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 import typer
+import yaml
 
 import engram
 from engram.cli.app import app, main
@@ -296,6 +297,10 @@ def shown_commands() -> Iterator[tuple[str, list[str]]]:
             for words in block.commands:
                 if words[0] == "engram" and len(words) > 1 and not words[1].startswith("-"):
                     yield page.name, words
+    services = yaml.safe_load((DOCS / "compose.yaml").read_text())["services"]
+    for service in services.values():
+        if "command" in service:
+            yield "compose.yaml", shlex.split(service["command"])
 
 
 @pytest.mark.parametrize(("page", "words"), list(shown_commands()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
@@ -10,9 +11,10 @@ from hypothesis import strategies as st
 
 from engram.centre.access.roles import Role
 from engram.centre.api.app import create_app
+from engram.centre.dreams import Dreams
 from engram.maps import Map
 
-from .conftest import NAME, Site, admit_here, drive
+from .conftest import NAME, POLICY, Site, admit_here, drive
 
 schemathesis = pytest.importorskip("schemathesis")
 pytestmark = pytest.mark.skipif(
@@ -25,7 +27,7 @@ TAKES_THE_ROBOT = "DELETE /v1/maps/{name}/robots/{robot}"  # that the others ask
 
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
-    """A centre with a robot, a hand-in and a download; what places in paths can name."""
+    """A centre with a robot, a hand-in, a download and a dream; what places in paths can name."""
     from engram.centre.worker import merging
 
     patch = pytest.MonkeyPatch()
@@ -38,6 +40,7 @@ def used(tmp_path_factory):
     tokens = {"admin": site.token(Role.ADMIN, "*"), "own": own.link._headers()}
     asked = site.http.post(f"/v1/maps/{NAME}/downloads", json={}, headers=tokens["own"]).json()
     site.work()
+    site.centre.set_policy(NAME, replace(POLICY, gate=("a", "b", "c")), "tests")
     with Map.open(own.live) as store:
         node = str(store.graph.nodes[0].id)
     handin = next(iter(own.state.fact("handin").values()))
@@ -48,6 +51,7 @@ def used(tmp_path_factory):
             "name": NAME,
             "handin": handin,
             "job": handin,
+            "dream": Dreams(site.centre).ask(NAME, "tests")["id"],
             "artifact": asked["id"],
             "ref": "head",
             "robot": own.state.fact("robot"),

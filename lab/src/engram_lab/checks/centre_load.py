@@ -6,11 +6,13 @@ An embedded centre with its worker runs as a program of its own, with a fleet ma
 places. Each agent is enrolled, and in turn drives past places of its own, hands in, and reports,
 until the time is over; all of them start at random moments. Then one hands in 50 nodes by itself,
 and a mission's download is asked for twice, by two robots. Times of answers are the service's own
-histogram; downloads are timed from asking to the first byte.
+histogram, and those that the agents saw, who share the machine with it; downloads are timed from
+asking to the first byte.
 """
 
 from __future__ import annotations
 
+import os
 import random
 import re
 import socket
@@ -19,14 +21,17 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import httpx
+import numpy as np
 
 from engram.agent import Agent, enrol
+from engram.agent.link import new_client
 from engram.centre.access.enrolment import new_code
 from engram.centre.service import Centre, MapPolicy
 from engram.fleet.merge import MergeOptions
@@ -74,6 +79,7 @@ class Day:
     Attributes:
         troubles: what went wrong for an agent, in words; a day without any has none.
         forays: how many were handed in.
+        seen_s: time of each answer as its agent saw it, from asking to the answer's head.
     """
 
     def __init__(self, folder: Path, url: str, minutes: float, forays: float) -> None:
@@ -84,24 +90,37 @@ class Day:
         self._over = threading.Event()
         self.troubles: list[str] = []
         self.forays = 0
+        self.seen_s: list[float] = []
 
     def live(self, number: int, code: str) -> None:
         """The day of one robot."""
         folder, name = self._folder / f"r{number}", f"r{number}"
-        chance = random.Random(number)
-        enrol(folder, self._url, code, name)
-        foray = 0
-        with Agent(folder) as agent:
-            while self._waited(chance.expovariate(1 / self._pause_s)):
-                at = 1_000_000 + number * 10_000 + foray * _FORAY_NODES
-                drive(agent.live, name, foray, range(at, at + _FORAY_NODES))
-                foray += 1
-                agent.hand_in()
-                while agent.step(fetch=False) == 0:
-                    pass
-                self.forays += 1
-                if agent.trouble is not None:
-                    self.troubles.append(f"{name}: {agent.trouble}")
+        with new_client(self._url, event_hooks=self._timed()) as client:
+            enrol(folder, self._url, code, name, client)
+            with Agent(folder, client=client) as agent:
+                self._drive(agent, name, number)
+
+    def _drive(self, agent: Agent, name: str, number: int) -> None:
+        """Drives and hands in at random moments."""
+        foray, chance = 0, random.Random(number)
+        while self._waited(chance.expovariate(1 / self._pause_s)):
+            at = 1_000_000 + number * 10_000 + foray * _FORAY_NODES
+            drive(agent.live, name, foray, range(at, at + _FORAY_NODES))
+            foray += 1
+            agent.hand_in()
+            while agent.step(fetch=False) == 0:
+                pass
+            self.forays += 1
+            if agent.trouble is not None:
+                self.troubles.append(f"{name}: {agent.trouble}")
+
+    def _timed(self) -> dict[str, list[Callable[[Any], None]]]:
+        """What a client calls around each of its requests, which come one after another."""
+        began: list[float] = []
+        return {
+            "request": [lambda _: began.append(time.perf_counter())],
+            "response": [lambda _: self.seen_s.append(time.perf_counter() - began.pop())],
+        }
 
     def _waited(self, seconds: float) -> bool:
         """Whether the day goes on after some seconds."""
@@ -137,6 +156,29 @@ def answers(url: str) -> list[Figure]:
             if limit != "+Inf"
         ),
     ]
+
+
+def seen(times_s: list[float]) -> list[Figure]:
+    """The share of answers that agents had within some times."""
+    whole = np.array(times_s)
+    return [
+        Figure(f"seen by agents within {limit} s", 100.0 * float(np.mean(whole <= limit)), "%")
+        for limit in (0.05, 0.2, 0.5, 1.0)
+    ]
+
+
+def used_below(pid: int) -> tuple[float, float]:
+    """What the processes that one started take: time of a core, s, and greatest memory, bytes."""
+    time_s = memory = 0.0
+    for children in Path(f"/proc/{pid}").glob("task/*/children"):
+        for child in children.read_text().split():
+            folder = Path("/proc") / child
+            fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+            peak = re.search(r"VmHWM:\s+(\d+) kB", (folder / "status").read_text())
+            below_s, below = used_below(int(child))
+            time_s += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK") + below_s
+            memory += (1024.0 * int(peak.group(1)) if peak else 0.0) + below
+    return time_s, memory
 
 
 def first_byte_s(folder: Path) -> float:
@@ -187,12 +229,17 @@ def main() -> None:
             day = Day(folder, url, asked.minutes, asked.forays)
             with ThreadPoolExecutor(asked.agents) as robots:
                 list(robots.map(day.live, range(asked.agents), codes))
-            figures = answers(url)
+            figures = [*answers(url), *seen(day.seen_s)]
             settle(url)
+            before_s, _ = used_below(os.getpid())
+            until_s = visible_s(folder / "r0", 0)
+            after_s, memory = used_below(os.getpid())
             figures += [
                 Figure("forays handed in", day.forays),
                 Figure("troubles of agents", len(day.troubles)),
-                Figure("50 nodes handed in, until visible", visible_s(folder / "r0", 0), "s"),
+                Figure("50 nodes handed in, until visible", until_s, "s"),
+                Figure("the same, of a core of the centre", after_s - before_s, "s"),
+                Figure("memory of the centre's processes", memory / 1e9, "GB"),
                 Figure("first robot's download, first byte", first_byte_s(folder / "r0"), "s"),
                 Figure("second robot's download, first byte", first_byte_s(folder / "r1"), "s"),
             ]
