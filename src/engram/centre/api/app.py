@@ -15,7 +15,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from engram import __version__
 from engram.centre.api import maps, robots, transfers
 from engram.centre.api.context import CentreHere
-from engram.centre.api.problems import add_problems
+from engram.centre.api.models import Health
+from engram.centre.api.problems import DESCRIBED, add_problems
 from engram.centre.pages import routes as pages
 from engram.centre.service import Centre
 from engram.centre.store.schema import artifacts, dreams, handins
@@ -35,6 +36,7 @@ def create_app(centre: Centre) -> FastAPI:
         description=_ABOUT,
         docs_url=None,
         redoc_url=None,
+        responses=DESCRIBED,
     )
     app.state.centre = centre
     app.state.answers = Counter[int]()
@@ -43,7 +45,7 @@ def create_app(centre: Centre) -> FastAPI:
     for part in (robots, maps, transfers):
         app.include_router(part.router, prefix="/v1")
     app.include_router(pages.router)
-    app.add_api_route("/v1/health", _health, tags=["service"])
+    app.add_api_route("/v1/health", _health, response_model=Health, tags=["service"])
     app.add_api_route("/v1/metrics", _metrics, tags=["service"], response_class=PlainTextResponse)
     app.add_middleware(_Counting)
     return app

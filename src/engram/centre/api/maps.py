@@ -31,7 +31,7 @@ Node = Annotated[str, Path(max_length=36, pattern=r"^[0-9a-fA-F-]+$")]
 _EVENTS_AT_ONCE = 100
 
 
-@router.get("/maps")
+@router.get("/maps", response_model=list[models.MapListed])
 def maps(centre: CentreHere, who: Asking) -> list[dict[str, Any]]:
     """The maps of the one who asks."""
     return [
@@ -41,7 +41,7 @@ def maps(centre: CentreHere, who: Asking) -> list[dict[str, Any]]:
     ]
 
 
-@router.get("/maps/{name}", dependencies=READERS)
+@router.get("/maps/{name}", response_model=models.MapCounts, dependencies=READERS)
 def one_map(name: str, centre: CentreHere) -> dict[str, Any]:
     """Counts and sizes of a map."""
     with centre.reading(name) as store:
@@ -57,7 +57,7 @@ def revisions(name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit
     return page_of(rest[: limit + 1], limit, lambda one: one["number"])
 
 
-@router.get("/maps/{name}/diff", dependencies=PEOPLE)
+@router.get("/maps/{name}/diff", response_model=models.Difference, dependencies=PEOPLE)
 def diff(
     name: str,
     before: Annotated[int, Query(ge=0, le=2**53)],
@@ -69,7 +69,7 @@ def diff(
         return store.diff(before, after).to_dict()
 
 
-@router.get("/maps/{name}/blame/{node}", dependencies=PEOPLE)
+@router.get("/maps/{name}/blame/{node}", response_model=models.Blame, dependencies=PEOPLE)
 def blame(name: str, node: Node, centre: CentreHere) -> dict[str, Any]:
     """Where a node comes from; its UUID, or enough of its beginning."""
     return blame_node(centre.map_path(name), node)
@@ -113,7 +113,9 @@ def remove_ref(name: str, ref: str, centre: CentreHere, who: Asking) -> None:
     Refs(centre).remove(name, ref, who.id)
 
 
-@router.post("/maps/{name}/reverts", dependencies=[takes(Role.OPERATOR)])
+@router.post(
+    "/maps/{name}/reverts", response_model=models.Reverted, dependencies=[takes(Role.OPERATOR)]
+)
 def revert(
     name: str,
     body: models.RevertRequest,

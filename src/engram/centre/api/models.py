@@ -62,7 +62,7 @@ class Token(BaseModel):
 class Page(BaseModel):
     """Some of a list; ask again with `next` as cursor until it is null."""
 
-    items: list[dict[str, Any]]
+    items: Annotated[list[dict[str, Any]], Field(examples=[[{"number": 42}]])]
     next: Annotated[str | None, Field(examples=["41"])]
 
 
@@ -210,3 +210,98 @@ class Code(BaseModel):
     """Shown once."""
 
     code: Annotated[str, Field(examples=["q8vJx2mWc1-sT0aZ"])]
+
+
+class Open(BaseModel):
+    """Has further fields, which depend on the map and the job."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Me(BaseModel):
+    """Who the token is for."""
+
+    id: Annotated[str, Field(examples=[_ID])]
+    name: Annotated[str, Field(examples=["alice"])]
+    roles: Annotated[dict[str, str], Field(examples=[{"fleet": "operator"}])]
+
+
+class MapListed(BaseModel):
+    """A map of the one who asks."""
+
+    name: Annotated[str, Field(examples=["fleet"])]
+    durable_revision: Annotated[int, Field(examples=[5])]
+
+
+class MapCounts(Open):
+    """Counts and sizes of a map, as ``engram info --json`` has them."""
+
+    name: Annotated[str, Field(examples=["fleet"])]
+    revision: Annotated[int, Field(examples=[7])]
+    nodes: Annotated[int, Field(examples=[20_000])]
+    size_bytes: Annotated[int, Field(examples=[901_120_000])]
+    content_hash: Annotated[str, Field(examples=[_ID])]
+
+
+class Difference(Open):
+    """What changed, as ``engram diff --json`` has it."""
+
+    before: Annotated[int, Field(examples=[6])]
+    after: Annotated[int, Field(examples=[7])]
+    nodes: Annotated[
+        dict[str, int],
+        Field(examples=[{"before": 19_950, "after": 20_000, "added": 50, "removed": 0}]),
+    ]
+
+
+class Blame(Open):
+    """Where a node comes from, as ``engram show NODE --json`` has it."""
+
+    node: Annotated[str, Field(examples=["4188d6f9-03d1-55ee-b0ea-31579aa2d671"])]
+    robot: Annotated[str, Field(examples=["r1"])]
+    revision: Annotated[int, Field(examples=[7])]
+
+
+class Reverted(BaseModel):
+    """A revision that hides another one; null for a dry run."""
+
+    revision: Annotated[int | None, Field(examples=[8])]
+    dry_run: bool
+    lost_by_others: Annotated[dict[str, int], Field(examples=[{"edges": 2}])]
+
+
+class RobotListed(BaseModel):
+    """A robot, what it follows, and its last report."""
+
+    robot: Annotated[str, Field(examples=[_ID])]
+    map: Annotated[str, Field(examples=["fleet"])]
+    name: Annotated[str, Field(examples=["r1"])]
+    follows: Annotated[str, Field(examples=["stable"])]
+    report: Annotated[dict[str, Any], Field(examples=[{"runs": "7-18a3f0c2", "outbox": 0}])]
+    reported_ns: Annotated[int | None, Field(examples=[1_795_589_202_183_444_985])]
+    disabled: Annotated[int, Field(examples=[0])]
+    handins: Annotated[int | None, Field(examples=[3])]
+
+
+class Job(Open):
+    """A hand-in, a download or a dream that waits or runs."""
+
+    kind: Annotated[str, Field(examples=["merge"])]
+    id: Annotated[str, Field(examples=[_ID])]
+    state: Annotated[str, Field(examples=["complete"])]
+
+
+class Health(BaseModel):
+    """The service answers and reaches its database."""
+
+    status: Annotated[str, Field(examples=["ok"])]
+    version: Annotated[str, Field(examples=["0.2.0"])]
+
+
+class Problem(Open):
+    """Problem details of RFC 9457: why a request is not served."""
+
+    type: Annotated[str, Field(examples=["about:blank"])]
+    title: Annotated[str, Field(examples=["Changed meanwhile"])]
+    status: Annotated[int, Field(examples=[412])]
+    detail: Annotated[str, Field(examples=["stable is at version 4, not 3: read it again"])]

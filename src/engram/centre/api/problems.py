@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from engram.centre.api.models import Problem
 from engram.centre.errors import CentreError
 from engram.errors import (
     EngramError,
@@ -22,6 +23,13 @@ from engram.errors import (
 )
 
 MEDIA = "application/problem+json"
+# For the description of the API: any request can fail in this way.
+DESCRIBED: dict[int | str, dict[str, Any]] = {
+    "4XX": {
+        "description": "The request is not served.",
+        "content": {MEDIA: {"schema": Problem.model_json_schema()}},
+    }
+}
 
 _STATUS: tuple[tuple[type[EngramError], int], ...] = (
     (MapLockedError, 409),

@@ -36,7 +36,7 @@ def ask_token(body: models.TokenRequest, centre: CentreHere) -> dict[str, Any]:
     return {"token": token, "expires_in_s": centre.settings.token_s}
 
 
-@router.get("/me")
+@router.get("/me", response_model=models.Me)
 def who_am_i(who: Asking) -> dict[str, Any]:
     """Who the token is for."""
     return {"id": who.id, "name": who.name, "roles": dict(who.roles)}
@@ -58,7 +58,11 @@ def wanted(name: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
     return Fleet(centre).wanted(name, who.id)
 
 
-@router.get("/maps/{name}/robots", dependencies=[takes(Role.VIEWER)])
+@router.get(
+    "/maps/{name}/robots",
+    response_model=list[models.RobotListed],
+    dependencies=[takes(Role.VIEWER)],
+)
 def robots(name: str, centre: CentreHere) -> list[dict[str, Any]]:
     """The robots of a map and their last reports."""
     return Fleet(centre).all(name)

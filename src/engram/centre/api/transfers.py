@@ -127,7 +127,7 @@ def cancel(handin: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
     return _shown(centre, HandIns(centre).cancel(row, who.id))
 
 
-@router.get("/maps/{name}/jobs", dependencies=[takes(Role.VIEWER)])
+@router.get("/maps/{name}/jobs", response_model=list[models.Job], dependencies=[takes(Role.VIEWER)])
 def jobs(name: str, centre: CentreHere) -> list[dict[str, Any]]:
     """What waits or runs, in its order: hand-ins, then downloads, then dreams."""
     merges = [{"kind": "merge", **_plain(row)} for row in HandIns(centre).waiting(name)]
@@ -136,7 +136,7 @@ def jobs(name: str, centre: CentreHere) -> list[dict[str, Any]]:
     return [*merges, *({"kind": "download", **_artifact(row)} for row in asked), *dreams]
 
 
-@router.get("/jobs/{job}")
+@router.get("/jobs/{job}", response_model=models.Job)
 def one_job(job: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
     """A job by the id of its hand-in or artifact."""
     try:
