@@ -1,7 +1,7 @@
 """The C++ core: arrays in, arrays out. Every function releases the GIL. Sorted by subject."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,14 +215,17 @@ def estimate_pose(
     settings: MatchSettings,
     seed: int,
 ) -> PoseAndInliers | None: ...
+
+class WorkThreads:
+    def __init__(self, others: int) -> None: ...
+
+AttemptArguments: TypeAlias = tuple[
+    Features, MatchSettings, int, NDArray[np.float64] | None, NDArray[np.float64] | None
+]
+
 def attempt(
-    reference: Features,
-    live: Features,
-    settings: MatchSettings,
-    seed: int,
-    predicted: NDArray[np.float64] | None = None,
-    covariance: NDArray[np.float64] | None = None,
-) -> PoseAndInliers | None: ...
+    live: Features, attempts: Sequence[AttemptArguments], threads: WorkThreads | None = None
+) -> list[PoseAndInliers | None]: ...
 
 # --- ordering
 

@@ -244,8 +244,10 @@ def test_twice_the_same_bits_match_as_once() -> None:
 
     from engram.frontend.matching import core_settings
 
-    one = _core.attempt(*(features(f, 1) for f in once), core_settings(config), 3)
-    two = _core.attempt(*(features(f, 2) for f in once), core_settings(doubled), 3)
+    one, two = (
+        _core.attempt(features(once[1], by), [(features(once[0], by), settings, 3, None, None)])[0]
+        for by, settings in ((1, core_settings(config)), (2, core_settings(doubled)))
+    )
     assert one is not None
     assert two is not None
     for a, b in zip(one, two, strict=True):

@@ -23,7 +23,6 @@ ROAD = np.arange(0.0, 25.0, 0.7)
 class _Counting(FrameMatcher):
     """Matches as a robot does, and counts."""
 
-    threads = False
     calls = 0
 
     def match(self, live, live_id, node, guide):
@@ -150,8 +149,6 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
 
 class _Damaged(FrameMatcher):
     """The landmarks of the map's first node cannot be read."""
-
-    threads = False
 
     def __init__(self, opened: Map) -> None:
         super().__init__(opened.frames, Settings().localiser.matcher)

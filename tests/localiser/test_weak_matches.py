@@ -25,8 +25,6 @@ CONFIRMED = Standing(agreed=20, usual_inliers=80.0)
 class Matches:
     """One match of so many inliers, where it was expected."""
 
-    threads = False
-
     def __init__(self, inliers: int, extent: Spread) -> None:
         self._inliers, self._extent = inliers, extent
         self.asked = 0

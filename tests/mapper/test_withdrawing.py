@@ -29,10 +29,8 @@ MIRAGE = 10
 class Mirage:
     """Matches as usual, but for some frames only a look-alike, with few inliers."""
 
-    threads = False
-
     def __init__(self, opened: Map, node: NodeId, stamps_ns: set[int]) -> None:
-        self._usual = FrameMatcher(opened.frames, Settings().localiser.matcher, threads=False)
+        self._usual = FrameMatcher(opened.frames, Settings().localiser.matcher)
         self._node, self._stamps_ns = node, stamps_ns
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:

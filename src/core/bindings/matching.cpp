@@ -2,12 +2,18 @@
 
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
+#include <exception>
 #include <optional>
+#include <tuple>
+#include <vector>
 
 #include "bindings/features.hpp"
 #include "bindings/transforms.hpp"
 #include "kernels/pose.hpp"
+#include "work_threads.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -93,19 +99,56 @@ nb::object estimate_pose(const Features &reference, const Features &live,
   return to_python(estimate);
 }
 
-nb::object attempt(const Features &reference, const Features &live, const MatchSettings &settings,
-                   uint64_t seed, std::optional<Matrix> predicted,
-                   std::optional<Matrix> covariance) {
-  check_comparable(reference, live);
-  const auto prediction = prediction_of(predicted, covariance);
-  const FrameView a = reference.view(), b = live.view();
-  PoseEstimate estimate;
+// One attempt: what it compares, and what came of it. Its arrays belong to the caller.
+struct Attempt {
+  FrameView reference;
+  MatchSettings settings;
+  uint64_t seed;
+  std::optional<Prediction> prediction;
+  PoseEstimate estimate{};
+  std::exception_ptr error{};
+
+  void make(const FrameView &live) {
+    try {
+      estimate = ENGRAM_CALL(attempt, reference, live, settings, seed,
+                             prediction ? &*prediction : nullptr);
+    } catch (...) {
+      error = std::current_exception();
+    }
+  }
+};
+
+// (reference, settings, seed, predicted, covariance); the last two may be None.
+using AttemptArguments = std::tuple<const Features *, const MatchSettings *, uint64_t,
+                                    std::optional<Matrix>, std::optional<Matrix>>;
+
+nb::list attempt(const Features &live, const std::vector<AttemptArguments> &asked,
+                 WorkThreads *threads) {
+  std::vector<Attempt> attempts;
+  for (const auto &[reference, settings, seed, predicted, covariance] : asked) {
+    check_comparable(*reference, live);
+    attempts.push_back(
+        {reference->view(), *settings, seed, prediction_of(predicted, covariance)});
+  }
+  const FrameView view = live.view();
+  std::vector<WorkThreads::Job> jobs;
+  for (Attempt &one : attempts)
+    jobs.push_back([&one, &view] { one.make(view); });
   {
     nb::gil_scoped_release unlocked;
-    estimate =
-        ENGRAM_CALL(attempt, a, b, settings, seed, prediction ? &*prediction : nullptr);
+    if (threads)
+      threads->run(jobs);
+    else
+      for (const WorkThreads::Job &job : jobs)
+        job();
   }
-  return to_python(estimate);
+  nb::list found;
+  for (const Attempt &one : attempts) {
+    if (one.error)
+      std::rethrow_exception(one.error);
+    found.append(to_python(one.estimate));
+  }
+  return found;
 }
 
 } // namespace
@@ -155,8 +198,11 @@ void bind_matching(nb::module_ &module) {
              "live_rows"_a, "settings"_a, "seed"_a,
              "(reference_from_live (4, 4), covariance (6, 6), reference rows, live rows of the "
              "inliers), or None where too few rows agree on a pose.");
-  module.def("attempt", &attempt, "reference"_a, "live"_a, "settings"_a, "seed"_a,
-             "predicted"_a = nb::none(), "covariance"_a = nb::none(),
-             "`match_rows` and `estimate_pose` in one, with a second pass guided by what the first "
-             "one found. Same result as `estimate_pose`.");
+  nb::class_<WorkThreads>(module, "WorkThreads",
+                          "Threads that make attempts beside the caller's; started when needed.")
+      .def(nb::init<int>(), "others"_a);
+  module.def("attempt", &attempt, "live"_a, "attempts"_a, "threads"_a = nb::none(),
+             "For each (reference, settings, seed, predicted, covariance) `match_rows` and "
+             "`estimate_pose` in one, with a second pass guided by what the first one found; same "
+             "result as `estimate_pose`. Side by side where threads are given.");
 }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated
@@ -157,6 +158,47 @@ class Match:
 NO_MATCH = Match(None, None, 0, np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Question:
+    """What a live frame is matched with.
+
+    Attributes:
+        reference: the reference frame; its camera may differ from the live one.
+        config: the settings.
+        seed: seed of the random draws, 0 … 2⁶⁴ − 1; see `pair_seed`.
+        predicted: predicted reference_from_live; only landmarks near their predicted pixels are
+            then compared. None to search the whole frame.
+        predicted_covariance: (6, 6) float64 of `predicted`, left perturbation, [translation,
+            rotation]; required with it.
+    """
+
+    reference: Frame
+    config: MatcherConfig
+    seed: int
+    predicted: SE3 | None = None
+    predicted_covariance: NDArray[np.float64] | None = None
+
+
+class Lanes:
+    """Matches a live frame with several others at once, on threads of the core.
+
+    Args:
+        count: of the lanes; the first is the thread of the caller.
+    """
+
+    def __init__(self, count: int = 1) -> None:
+        self._threads = _core.WorkThreads(count - 1)
+
+    def match(self, live: Frame, questions: Sequence[Question]) -> list[Match]:
+        """The match of each; see `match_frames`."""
+        asked = [_arguments(one, live) for one in questions]
+        return [_match(found) for found in _core.attempt(features(live), asked, self._threads)]
+
+    def close(self) -> None:
+        """Ends the threads; later matches are made on the caller's."""
+        self._threads = _core.WorkThreads(0)
+
+
 def match_frames(
     reference: Frame,
     live: Frame,
@@ -183,17 +225,25 @@ def match_frames(
 
     Source: method §2.4–2.6.
     """
-    check_same_kind(reference, live)
-    if (predicted is None) != (predicted_covariance is None):
+    question = Question(reference, config, seed, predicted, predicted_covariance)
+    return _match(_core.attempt(features(live), [_arguments(question, live)])[0])
+
+
+def _arguments(asked: Question, live: Frame) -> _core.AttemptArguments:
+    check_same_kind(asked.reference, live)
+    predicted, covariance = asked.predicted, asked.predicted_covariance
+    if (predicted is None) != (covariance is None):
         raise InputError("give a prediction and its covariance together or not at all")
-    found = _core.attempt(
-        features(reference),
-        features(live),
-        core_settings(config, same_camera=reference.camera == live.camera),
-        seed,
+    return (
+        features(asked.reference),
+        core_settings(asked.config, same_camera=asked.reference.camera == live.camera),
+        asked.seed,
         None if predicted is None else predicted.matrix(),
-        None if predicted_covariance is None else np.ascontiguousarray(predicted_covariance),
+        None if covariance is None else np.ascontiguousarray(covariance),
     )
+
+
+def _match(found: _core.PoseAndInliers | None) -> Match:
     if found is None:
         return NO_MATCH
     matrix, covariance, reference_rows, live_rows = found

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from engram.errors import MapCorruptError
 from engram.frontend import Frame
-from engram.frontend.matching import NO_MATCH, Match, MatcherConfig, match_frames, pair_seed
+from engram.frontend.matching import (
+    NO_MATCH,
+    Lanes,
+    Match,
+    MatcherConfig,
+    Question,
+    match_frames,
+    pair_seed,
+)
 from engram.geometry import SE3
 from engram.graph.model import LandmarkSource, NodeId
 from engram.localiser.acceptance import (
@@ -91,11 +99,6 @@ class Outcome:
 class Matcher(Protocol):
     """The first half of an attempt, a pure function of two frames (method §3.2)."""
 
-    @property
-    def threads(self) -> bool:
-        """Whether attempts run faster on separate threads."""
-        ...
-
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
         """The match of a live frame with a node; `guide` is given for a guided attempt only."""
         ...
@@ -115,21 +118,11 @@ class FrameMatcher:
     Args:
         frames: the landmarks.
         config: settings.
-        threads: see `Matcher`. False if other processes use the cores: each hand-over between
-            threads would wait for a core.
     """
 
-    def __init__(
-        self, frames: LandmarkSource, config: MatcherConfig, *, threads: bool = True
-    ) -> None:
+    def __init__(self, frames: LandmarkSource, config: MatcherConfig) -> None:
         self._frames = frames
         self._config = config
-        self._threads = threads
-
-    @property
-    def threads(self) -> bool:
-        """See `Matcher`."""
-        return self._threads
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
         """See `Matcher`; seeded by both UUIDs."""
@@ -147,31 +140,45 @@ class FrameMatcher:
 
 
 class Attempter:
-    """Makes one attempt: matches the live frame with a node, and judges the match.
-
-    Any thread may call `attempt`; the core releases the GIL, so that several run in parallel.
+    """Makes attempts: matches the live frame with nodes, and judges the matches.
 
     Args:
         frames: where the landmarks of nodes come from.
         config: settings of both halves.
         matcher: the first half, for studies that keep matches; None matches with `frames`.
+        lanes: how many matches with `frames` are made at once.
     """
 
     def __init__(
-        self, frames: LandmarkSource, config: LocaliserConfig, matcher: Matcher | None = None
+        self,
+        frames: LandmarkSource,
+        config: LocaliserConfig,
+        matcher: Matcher | None = None,
+        lanes: int = 1,
     ) -> None:
+        self._lanes = Lanes(lanes)
         self._frames = frames
         self._config = config.matcher
         self._lost_config = config.lost_matcher
         self._acceptance = config.acceptance
         self._matcher = matcher
 
+    def close(self) -> None:
+        """Ends the threads of the lanes."""
+        self._lanes.close()
+
     def prefetch(self, nodes: list[NodeId]) -> None:
         """Announces the nodes likely to be attempted next."""
         (self._frames if self._matcher is None else self._matcher).prefetch(nodes)
 
     def attempt(self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate) -> Outcome:
-        """The outcome of matching one candidate.
+        """The outcome of matching one candidate; see `attempts`."""
+        return self.attempts(live, live_id, rank, [candidate])[0]
+
+    def attempts(
+        self, live: Frame, live_id: NodeId, rank: int, candidates: Sequence[Candidate]
+    ) -> list[Outcome]:
+        """The outcomes of matching some candidates, at once as far as there are lanes.
 
         A node with damaged landmarks is reported in its outcome instead of raising: a robot can
         do without one node of its map.
@@ -179,28 +186,49 @@ class Attempter:
         Args:
             live: the live frame.
             live_id: its UUID; with the node's UUID it seeds the matcher.
-            rank: place of the candidate in the order.
-            candidate: what to attempt.
+            rank: place of the first candidate in the order.
+            candidates: what to attempt.
         """
+        matches: list[Match | None]
+        if self._matcher is None:
+            questions = [self._question(live_id, candidate) for candidate in candidates]
+            found = iter(self._lanes.match(live, [one for one in questions if one is not None]))
+            matches = [None if one is None else next(found) for one in questions]
+        else:
+            matches = [self._of_matcher(live, live_id, candidate) for candidate in candidates]
+        return [
+            self._judged(live, live_id, rank + at, candidate, match)
+            for at, (candidate, match) in enumerate(zip(candidates, matches, strict=True))
+        ]
+
+    def _question(self, live_id: NodeId, candidate: Candidate) -> Question | None:
+        """What the live frame is matched with; None if the node is damaged."""
+        config = self._lost_config if candidate.prediction is None else self._config
+        try:
+            reference = self._frames.frame(candidate.node)
+        except MapCorruptError:
+            return None
+        guide = candidate.prediction if candidate.guided else None
+        seed = pair_seed(live_id, candidate.node)
+        return Question(reference, config, seed, *_expected(guide))
+
+    def _of_matcher(self, live: Frame, live_id: NodeId, candidate: Candidate) -> Match | None:
+        """The matcher's match; None if the node is damaged."""
+        assert self._matcher is not None
         guide = candidate.prediction if candidate.guided else None
         try:
-            if self._matcher is None:
-                config = self._lost_config if candidate.prediction is None else self._config
-                seed = pair_seed(live_id, candidate.node)
-                reference = self._frames.frame(candidate.node)
-                match = match_frames(reference, live, config, seed, *_expected(guide))
-            else:
-                match = self._matcher.match(live, live_id, candidate.node, guide)
-            return self._judged(live, live_id, rank, candidate, match)
+            return self._matcher.match(live, live_id, candidate.node, guide)
         except MapCorruptError:
-            return Outcome(candidate, rank, NO_MATCH, accepted=False, damaged=True)
+            return None
 
     def _judged(
-        self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match
+        self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match | None
     ) -> Outcome:
+        if match is None:
+            return Outcome(candidate, rank, NO_MATCH, accepted=False, damaged=True)
         if match.reference_from_live is None:
             return Outcome(candidate, rank, match, accepted=False)
-        spread = cache(partial(self._spread, live, live_id, candidate.node, match))
+        spread = partial(self._spread, live, live_id, candidate.node, match)
         evidence = self._evidence(live, candidate, match, spread)
         model = confidence_of(live.descriptor)
         anywhere = candidate.prediction is None or candidate.doubted
@@ -263,6 +291,7 @@ class Attempter:
     ) -> tuple[bool, bool]:
         """The same by the published rule, in inliers."""
         acceptance, prediction = self._acceptance, candidate.prediction
+        spread = cache(spread)
         if prediction is not None and accept(match, prediction, acceptance):
             return True, False
         anywhere = prediction is None or candidate.doubted
@@ -281,7 +310,9 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
     """The pose that guides matching, and its (6, 6) covariance."""
     if guide is None:
         return None, None
-    return guide.node_from_live, np.diag([guide.sigma_m**2] * 3 + [guide.sigma_yaw_rad**2] * 3)
+    covariance = np.zeros((6, 6))
+    covariance.flat[:21:7], covariance.flat[21::7] = guide.sigma_m**2, guide.sigma_yaw_rad**2
+    return guide.node_from_live, covariance
 
 
 def best_success(outcomes: Sequence[Outcome]) -> Outcome | None:

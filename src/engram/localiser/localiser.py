@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from time import perf_counter
 from typing import Self
 
@@ -74,7 +72,7 @@ class Localiser:
             reckoning, within a growing radius.
         config: settings.
         matcher: the first half of an attempt; None matches with the landmarks of `known`.
-        threads: whether lanes run on threads; a given `matcher` decides this itself.
+        threads: whether lanes run on threads; a given `matcher` runs on the caller's.
     """
 
     def __init__(
@@ -102,15 +100,9 @@ class Localiser:
         self._budget = budget
         self._relocaliser = relocaliser
         self._search = known.search or self._own_search()
-        self._attempter = Attempter(known.frames, self.config, matcher)
-        # The first lane is the thread of the caller. On one core each hand-over would only cost.
-        self._pool = (
-            ThreadPoolExecutor(budget.lanes - 1, thread_name_prefix="engram-lane")
-            if budget.lanes > 1
-            and cores() > 1
-            and (threads if matcher is None else matcher.threads)
-            else None
-        )
+        # On one core each hand-over between threads would only cost.
+        lanes = budget.lanes if threads and cores() > 1 else 1
+        self._attempter = Attempter(known.frames, self.config, matcher, lanes)
         self._prover = Prover(known.graph, self.config.acceptance)
         self._hypotheses = Hypotheses(
             known.graph,
@@ -153,8 +145,7 @@ class Localiser:
 
     def close(self) -> None:
         """Ends the threads of the lanes."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._attempter.close()
 
     @property
     def driven_m(self) -> float:
@@ -275,14 +266,12 @@ class Localiser:
             order = self._rank(live, self._near)
             clock.lap("rank")
             candidates = self._candidates(live, self._near, order, keeper, clock)
-            attempt = partial(self._attempter.attempt, live, node_id(self.live, live.stamp_ns))
+            live_id = node_id(self.live, live.stamp_ns)
             for start in range(0, len(candidates), self._budget.lanes):
                 if deadline is not None and perf_counter() >= deadline:
                     break
                 lanes = candidates[start : start + self._budget.lanes]
-                others = self._handed_out(attempt, start + 1, lanes[1:])
-                outcomes += map(attempt, count(start), lanes[: len(lanes) - len(others)])
-                outcomes += (other.result() for other in others)
+                outcomes += self._attempter.attempts(live, live_id, start, lanes)
                 if any(outcome.accepted for outcome in outcomes):
                     break
             if self.config.success is Success.FIRST:
@@ -293,14 +282,6 @@ class Localiser:
         success = self._conclude(live, outcomes)
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
-
-    def _handed_out(
-        self, attempt: Callable[[int, Candidate], Outcome], rank: int, lanes: Sequence[Candidate]
-    ) -> list[Future[Outcome]]:
-        """Attempts on the threads of lanes, the first one ranked `rank`; none without threads."""
-        if self._pool is None:
-            return []
-        return [self._pool.submit(attempt, rank + lane, one) for lane, one in enumerate(lanes)]
 
     def _conclude(self, live: Frame, outcomes: list[Outcome]) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""

@@ -32,7 +32,7 @@ from engram.maps.rows import (
     amendment_from_row,
     camera_from_row,
     describe,
-    edge_from_row,
+    edges_from_rows,
     from_json,
     session_from_row,
     transform_from_bytes,
@@ -341,7 +341,7 @@ def _check_frame(checking: _Checking, row: Row) -> None:
 
 
 def _check_edge(_: _Checking, row: Row) -> None:
-    edge = edge_from_row(row, _NOBODY, _NOBODY)
+    (edge,) = edges_from_rows([row], [(_NOBODY, _NOBODY)])
     _check_rotation(edge.a_from_b.rotation)
 
 

@@ -295,11 +295,6 @@ def edge_row(edge: Edge, key: int, revision: int, a: int, b: int) -> Row:
     }
 
 
-def edge_from_row(row: Row, a: NodeId, b: NodeId) -> Edge:
-    """The edge."""
-    return edges_from_rows([row], [(a, b)])[0]
-
-
 def edges_from_rows(rows: Sequence[Row], ends: Sequence[tuple[NodeId, NodeId]]) -> tuple[Edge, ...]:
     """The edges, each with its ends (a, b)."""
 

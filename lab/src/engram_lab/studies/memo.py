@@ -43,8 +43,6 @@ class MatchMemo:
         matcher_hash: of the matcher's settings and version.
     """
 
-    threads = False
-
     def __init__(self, matcher: Matcher, path: Path, matcher_hash: str) -> None:
         self._matcher = matcher
         self._path = path

@@ -165,7 +165,7 @@ def _in_vain_ms(
     landmarks are in memory, as they are for those who are lost for a while.
     """
     landmarks, acceptance = opened.frames, settings.localiser.acceptance
-    matcher = FrameMatcher(landmarks, settings.localiser.lost_matcher, threads=False)
+    matcher = FrameMatcher(landmarks, settings.localiser.lost_matcher)
     session = session_of_drive(log).id
     for logged in islice(log, 0, None, max(len(log) // _LOST_PLACES, 1)):
         live = logged.frame
