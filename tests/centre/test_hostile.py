@@ -7,10 +7,11 @@ import random
 import msgspec
 import pytest
 
+from engram.centre import downloads
 from engram.centre.handins import HandIns
 from engram.centre.settings import CentreSettings
 from engram.centre.worker.admission import admit
-from engram.errors import EngramError, MapCorruptError
+from engram.errors import EngramError, MapCorruptError, MapLockedError
 from engram.maps import Map, check_file
 from engram.transfers import Manifest, bundle, part_hash, split
 
@@ -210,6 +211,27 @@ def test_what_the_gate_refuses_stays_and_a_person_may_merge_it(site, robot, monk
     assert (row["state"], row["revision"]) == ("merged", 1)
     refs = site.http.get(f"/v1/maps/{NAME}/refs", headers=operator).json()
     assert [one["name"] for one in refs] == ["head"]  # what a person forced moves no ref
+
+
+def test_an_error_names_no_place_on_the_centres_machine(site, robot, monkeypatch):
+    robot.hand_in()
+    site.settle()
+
+    def locked(*_, **__):
+        raise MapLockedError(f"{site.centre.map_path(NAME)} is locked")
+
+    monkeypatch.setattr(downloads, "download", locked)
+    asked = {"options": {"thumbnails": False}}
+    row = robot.link.ask("POST", f"/v1/maps/{NAME}/downloads", asked)
+    site.work()
+    row = robot.link.ask("GET", f"/v1/artifacts/{row['id']}")
+    assert (row["state"], row["error"]) == ("failed", f"maps/{NAME}.engram is locked")
+    monkeypatch.setattr(Map, "writing", locked)
+    answer = site.http.post(
+        f"/v1/maps/{NAME}/reverts", json={"revision": 1, "dry_run": True},
+        headers=site.token("operator"),
+    )  # fmt: skip
+    assert answer.json()["detail"] == f"maps/{NAME}.engram is locked"
 
 
 def test_what_stays_incomplete_or_unused_goes(site, robot):

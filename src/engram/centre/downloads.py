@@ -152,7 +152,7 @@ class Downloads:
         try:
             change = self._made(row)
         except EngramError as error:
-            change = {"state": FAILED, "error": str(error)}
+            change = {"state": FAILED, "error": self._centre.words_of(error)}
         with self._centre.database.writing() as connection:
             connection.execute(
                 update(artifacts).where(artifacts.c.id == row["id"]).values(**change)

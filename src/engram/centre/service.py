@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -98,6 +99,10 @@ class Centre:
         """Closes the database and the maps."""
         self._resident.close()
         self.database.close()
+
+    def words_of(self, error: Exception) -> str:
+        """What an error says, for robots and people: not where on its machine the centre lies."""
+        return str(error).replace(f"{self.folder}{os.sep}", "")
 
     def packs(self, name: str) -> Packs:
         """The parts of a map."""

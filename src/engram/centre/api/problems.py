@@ -51,11 +51,12 @@ def add_problems(app: FastAPI) -> None:
     """Lets an application answer errors with problem details."""
 
     @app.exception_handler(EngramError)
-    def foreseen(_: Request, error: EngramError) -> JSONResponse:
+    def foreseen(request: Request, error: EngramError) -> JSONResponse:
+        told = request.app.state.centre.words_of(error)
         if isinstance(error, CentreError):
-            return problem(error.status, error.title, str(error))
+            return problem(error.status, error.title, told)
         status = next((code for kind, code in _STATUS if isinstance(error, kind)), 500)
-        return problem(status, HTTPStatus(status).phrase, str(error))
+        return problem(status, HTTPStatus(status).phrase, told)
 
     @app.exception_handler(HTTPException)
     def refused(_: Request, error: HTTPException) -> JSONResponse:

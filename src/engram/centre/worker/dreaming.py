@@ -121,7 +121,7 @@ def dream_of(centre: Centre, row: dict[str, Any], scheduler: str | None = None) 
         dreams.end(row, CANCELLED, error="cancelled")
         return
     except EngramError as error:
-        dreams.end(row, FAILED, error=str(error))
+        dreams.end(row, FAILED, error=centre.words_of(error))
         return
     told = report.to_dict() | {"centre": row["map"]}
     if report.added is None:

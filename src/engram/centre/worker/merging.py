@@ -44,7 +44,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
     except MissingPartsError:  # the map changed since they were asked for, by a revert
         handins.end(row, HandInState.OPEN)
     except RefusedError as error:
-        handins.end(row, HandInState.REFUSED, error=str(error))
+        handins.end(row, HandInState.REFUSED, error=centre.words_of(error))
     except (MapLockedError, StorageFullError):
         handins.put_off(row)
         return False
@@ -53,7 +53,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
             raise
         handins.end(row, HandInState.CANCELLED, error="cancelled")
     except EngramError as error:
-        handins.end(row, HandInState.FAILED, error=str(error))
+        handins.end(row, HandInState.FAILED, error=centre.words_of(error))
     else:
         _settle(centre, handins, row, outcome)
     return True
