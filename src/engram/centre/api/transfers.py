@@ -100,10 +100,17 @@ async def put_parts(
             if sum(map(len, some)) >= PACK_BYTES:
                 whole, some = some, []
                 await run_in_threadpool(store.put_parts, row, whole)
-    finally:
+    except BaseException:
         if some:
             await run_in_threadpool(store.put_parts, row, some)
-    return await run_in_threadpool(_shown, centre, store.get(handin))
+        raise
+
+    def end() -> dict[str, Any]:
+        if some:
+            store.put_parts(row, some)
+        return _shown(centre, store.get(handin))
+
+    return await run_in_threadpool(end)
 
 
 @router.post("/handins/{handin}/complete", response_model=models.HandIn)
