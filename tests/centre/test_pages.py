@@ -64,3 +64,11 @@ def test_what_a_viewer_may_not_do_is_not_offered(visited, page, offer):
     url = f"/maps/{NAME}/{page}"
     assert offer not in visited.http.get(url, headers=cookie(visited)).text
     assert offer in visited.http.get(url, headers=cookie(visited, "operator")).text
+
+
+def test_health_shows_the_newest_change_first(visited):
+    page = visited.http.get(f"/maps/{NAME}/health", headers=cookie(visited)).text
+    numbers = [int(one) for one in re.findall(r"<tr><td>(\d+)</td>", page)]
+    assert len(numbers) > 5
+    assert numbers == sorted(numbers, reverse=True)
+    assert "changed at row" not in page

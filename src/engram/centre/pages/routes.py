@@ -24,7 +24,7 @@ from engram.centre.handins import HandIns
 from engram.centre.pages.positions import drawn, thumbnail
 from engram.centre.refs import Refs
 from engram.centre.service import Centre
-from engram.centre.store.audit import events_after, first_broken
+from engram.centre.store.audit import first_broken, newest_events
 from engram.maps import map_log
 from engram.untrusted import printable
 
@@ -201,7 +201,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
     """Whether all is well, and the last changes of state."""
     with centre.database.reading() as connection:
         broken = first_broken(connection)
-        events = events_after(connection, 0, name, 10**6)[-_SHOWN:]
+        events = newest_events(connection, name, _SHOWN)
     waiting, fleet = HandIns(centre).waiting(name), Fleet(centre).all(name)
     path = centre.map_path(name)
     return _page(
@@ -210,7 +210,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         map=name,
         maps=_maps(centre, who),
         broken=broken,
-        events=list(reversed(events)),
+        events=events,
         waiting=waiting,
         size_bytes=path.stat().st_size,
         row=centre.map_row(name),

@@ -9,7 +9,7 @@ import hashlib
 import json
 from typing import Any
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, Select, insert, select
 
 from engram.centre.store.database import rows_of
 from engram.centre.store.schema import audit
@@ -48,6 +48,16 @@ def events_after(
     query = select(audit).where(audit.c.number > number).order_by(audit.c.number).limit(limit)
     if name is not None:
         query = query.where(audit.c.map == name)
+    return _events(connection, query)
+
+
+def newest_events(connection: Connection, name: str, limit: int) -> list[dict[str, Any]]:
+    """The last rows of one map, newest first."""
+    query = select(audit).where(audit.c.map == name).order_by(audit.c.number.desc()).limit(limit)
+    return _events(connection, query)
+
+
+def _events(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:
     rows = rows_of(connection, query)
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]
 
