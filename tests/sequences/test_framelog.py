@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from engram.errors import (
     SequenceError,
     StorageFullError,
 )
+from engram.frontend.blobs import content_digest
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.model import Clock
 from engram.odometry import OdometryStatus
@@ -343,6 +345,44 @@ def test_a_made_up_file_is_refused(tmp_path: Path, hostile: str) -> None:
     database.close()
     with pytest.raises(MapCorruptError, match=r"a\.framelog"):
         list(open_sequence(path))
+
+
+@pytest.mark.parametrize("gone", [1, PAIRS - 1])
+def test_a_log_that_lost_its_last_frames_is_told(tmp_path: Path, gone: int) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    change(path, "DELETE FROM frames WHERE number >= ?", PAIRS - gone)
+    with pytest.raises(MapCorruptError, match=f"{PAIRS - gone} frames, and was recorded with"):
+        FrameLog(path)
+
+
+@pytest.mark.parametrize("complete", [0, 1, PAIRS + 1])
+def test_a_count_of_frames_that_was_changed_is_told(tmp_path: Path, complete: int) -> None:
+    path = write_log(tmp_path / "a.framelog")
+    change(path, "UPDATE log SET complete = ?", complete)
+    with pytest.raises(MapCorruptError, match="does not match its hash"):
+        FrameLog(path)
+
+
+def test_a_log_of_before_frames_were_counted_is_read_and_goes_on(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "a.framelog", [logged(at) for at in range(PAIRS - 1)])
+    digest = content_digest(log_header().to_json().encode())
+    change(path, "UPDATE log SET complete = 1, digest = ?", digest)
+    change(path, "PRAGMA user_version = 1")
+    log = FrameLog(path)
+    assert log.complete
+    assert len(log) == PAIRS - 1
+    log.close()
+    with FrameLogWriter(path, log_header()) as writer:
+        writer.append(logged(PAIRS - 1), pair_hash(PAIRS - 1))
+        writer.checkpoint()
+        assert not FrameLog(path).complete  # one that is killed now is resumed
+    assert FrameLog(path).complete
+    assert len(FrameLog(path)) == PAIRS
+
+
+def change(path: Path, statement: str, *values: object) -> None:
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(statement, values)
 
 
 @pytest.mark.parametrize("keep", [0.3, 0.6, 0.95])

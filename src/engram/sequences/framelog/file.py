@@ -9,13 +9,15 @@ from sqlalchemy import BigInteger, Column, Connection, Integer, LargeBinary, Met
 from sqlalchemy.exc import OperationalError
 
 from engram.errors import SequenceError
+from engram.frontend.blobs import content_digest
 from engram.sqlite import FileKind, SqliteFile
 
 metadata = MetaData()
 
 _INT64 = BigInteger().with_variant(Integer(), "sqlite")
 
-# One row. `digest` is that of `header`; `complete` is 1 once the whole drive is recorded.
+# One row. `complete` is the number of frames once the whole drive is recorded, and in format 1,
+# which did not count them, 1; `digest` is `log_digest`.
 log_table = Table(
     "log",
     metadata,
@@ -26,6 +28,12 @@ log_table = Table(
     Column("digest", LargeBinary(), nullable=False),
     sqlite_strict=True,
 )
+
+
+def log_digest(header: str, complete: int) -> bytes:
+    """Hash of a log's row: of the header, and of the number of frames where they are counted."""
+    return content_digest(f"{header}{complete if complete > 1 else ''}".encode())
+
 
 # One row a frame, numbered from 0 without gaps. The blobs have their own hashes; `digest` covers
 # all other columns and those hashes.
@@ -50,7 +58,7 @@ frames_table = Table(
 FRAME_LOG = FileKind(
     noun="frame log",
     application_id=0x456E464C,  # "EnFL"
-    format_version=1,
+    format_version=2,
     metadata=metadata,
     strange=SequenceError,
     cure="restore a copy or record it again",
@@ -96,7 +104,7 @@ images_table = Table(
 FLIGHT_RECORD = FileKind(
     noun="flight record",
     application_id=0x456E4652,  # "EnFR"
-    format_version=1,
+    format_version=2,
     metadata=_flight_metadata,
     strange=SequenceError,
     cure="restore a copy",

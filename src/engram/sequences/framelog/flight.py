@@ -99,8 +99,10 @@ def read_images(path: Path, number: int) -> tuple[NDArray[np.uint8], NDArray[np.
         row = connection.execute(query).first()
         stored = connection.execute(select(func.count()).select_from(images_table)).scalar_one()
         _check_count(path, stored, _report(path, connection), _IMAGES)
-        header, _ = read_header(connection)
+        header, frames = read_header(connection)
     if row is None:
+        if stored == frames:
+            raise MapCorruptError(f"{path}: the images of frame {number} are not found")
         return None
     sides = (row.left_image, row.right_image)
     if not all(isinstance(one, bytes) for one in sides) or content_digest(b"".join(sides)) != (

@@ -12,10 +12,15 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from engram.errors import ConfigError, MapCorruptError, SequenceError
-from engram.frontend.blobs import content_digest
 from engram.geometry import StereoCamera, propagate_covariance
 from engram.odometry import MotionSource, OdometryStatus, OdometryStep
-from engram.sequences.framelog.file import FLIGHT_SUFFIX, framelog_file, frames_table, log_table
+from engram.sequences.framelog.file import (
+    FLIGHT_SUFFIX,
+    framelog_file,
+    frames_table,
+    log_digest,
+    log_table,
+)
 from engram.sequences.framelog.header import FrameLogHeader
 from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
 from engram.sequences.image_sequence import with_options
@@ -80,8 +85,13 @@ class FrameLog:
             with self._file.errors(), self._engine.connect() as connection:
                 self._file.identify(connection.exec_driver_sql)
                 self._file.check_tables(connection.exec_driver_sql)
-                self._header, self._complete = read_header(connection)
+                self._header, counted = read_header(connection)
                 stamps_ns, self._usable = _read_stamps(connection)
+                if counted > 1 and counted != len(stamps_ns):
+                    raise MapCorruptError(
+                        f"the log has {len(stamps_ns)} frames, and was recorded with {counted}"
+                    )
+                self._complete = counted > 0
         except MapCorruptError as error:
             raise self._named(error) from error
         self._info = with_options(self._header.info, options)
@@ -275,8 +285,8 @@ def compose(first: OdometryStep | None, second: OdometryStep) -> OdometryStep:
     )
 
 
-def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
-    """Header and completeness of a log.
+def read_header(connection: Connection) -> tuple[FrameLogHeader, int]:
+    """Header of a log, and its number of frames: 0 before it is complete, 1 if not counted.
 
     Raises:
         MapCorruptError: it is missing or does not match its hash.
@@ -285,10 +295,11 @@ def read_header(connection: Connection) -> tuple[FrameLogHeader, bool]:
     if (
         len(rows) != 1
         or not isinstance(rows[0].header, str)
-        or content_digest(rows[0].header.encode()) != rows[0].digest
+        or not isinstance(rows[0].complete, int)
+        or log_digest(rows[0].header, rows[0].complete) != rows[0].digest
     ):
         raise MapCorruptError("the frame log's header is missing or does not match its hash")
-    return FrameLogHeader.from_json(rows[0].header), bool(rows[0].complete)
+    return FrameLogHeader.from_json(rows[0].header), rows[0].complete
 
 
 def _read_stamps(connection: Connection) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

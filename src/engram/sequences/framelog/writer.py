@@ -12,12 +12,12 @@ from sqlalchemy import Connection, func, insert, select, update
 
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapError
-from engram.frontend.blobs import content_digest
 from engram.sequences.framelog.file import (
     begin_writing,
     fold_log_in,
     framelog_file,
     frames_table,
+    log_digest,
     log_table,
     log_while_writing,
 )
@@ -150,7 +150,7 @@ class FrameLogWriter:
             return
         try:
             with self._file.errors():
-                connection.execute(update(log_table).values(complete=int(complete)))
+                self._mark(connection, self._recorded if complete else 0)
                 connection.commit()
                 fold_log_in(connection)
         finally:
@@ -179,12 +179,14 @@ class FrameLogWriter:
         if self._file.is_new(run):
             self._make(connection)
             return 0, None
-        found, _ = read_header(connection)
+        found, complete = read_header(connection)
         if found.to_json() != self._header.to_json():
             raise IncompatibleError(
                 f"{self._path}: holds the log of another drive, or one made with another camera, "
                 "front-end, odometry or choice of frames; choose another file or remove it"
             )
+        if complete:
+            self._mark(connection, 0)  # until it is closed: what is appended is not counted yet
         count, last_ns = connection.execute(
             select(func.count(), func.max(frames_table.c.stamp_ns)).select_from(frames_table)
         ).one()
@@ -201,11 +203,17 @@ class FrameLogWriter:
                 "header": header,
                 "tool_version": __version__,
                 "complete": 0,
-                "digest": content_digest(header.encode()),
+                "digest": log_digest(header, 0),
             },
         )
         connection.commit()
         begin_writing(connection)
+
+    def _mark(self, connection: Connection, complete: int) -> None:
+        """Writes how many frames a complete log has, or 0."""
+        self._file.mark(connection.exec_driver_sql)
+        digest = log_digest(self._header.to_json(), complete)
+        connection.execute(update(log_table).values(complete=complete, digest=digest))
 
     @contextmanager
     def _or_abandon(self) -> Iterator[Connection]:
