@@ -71,6 +71,7 @@ def extract(
 # --- graph search
 
 def pivoted_error(covariance: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def greatest_sigma(covariance: NDArray[np.float64]) -> float: ...
 def pivoted_errors(
     covariances: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]: ...
@@ -130,6 +131,25 @@ def graph_chains(
     NDArray[np.float64],
     NDArray[np.float64],
 ]: ...
+
+# --- transforms
+
+def chain(
+    rotation: NDArray[np.float64],
+    translation: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    next_rotation: NDArray[np.float64],
+    next_translation: NDArray[np.float64],
+    next_covariance: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
+def transform_of(
+    tangent: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]: ...
+def turn_of(rotation: NDArray[np.float64]) -> tuple[float, float]: ...
+def tangent_of(
+    rotation: NDArray[np.float64], translation: NDArray[np.float64], angle: float
+) -> NDArray[np.float64]: ...
+def orthonormalised(rotation: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
 # --- hamming
 

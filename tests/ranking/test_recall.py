@@ -183,10 +183,11 @@ class TestLearning:
 
     def test_of_nodes_saved_since_the_map_was_opened_nothing_is_known(self) -> None:
         lessons = lessons_of(flat_graph(3), [(0, 1, 0.9, False)])
-        known = lessons.of(np.array([1, 3, 0, 9], np.int32))
-        assert known[1] == known[3] == UNKNOWN_BASE
-        assert known[2] == lessons.base[0]
-        assert Lessons.none().of(np.array([4], np.int32)).tolist() == [UNKNOWN_BASE]
+        known = lessons.log_odds_of(np.array([1, 3, 0, 9], np.int32))
+        unknown = np.log(UNKNOWN_BASE / (1 - UNKNOWN_BASE))
+        assert known[1] == known[3] == unknown
+        assert known[2] == np.log(lessons.base[0] / (1 - lessons.base[0]))
+        assert Lessons.none().log_odds_of(np.array([4], np.int32)).tolist() == [unknown]
 
 
 class TestPicking:

@@ -154,6 +154,12 @@ auto pivoted_error(const Input<double, 2> &covariance) {
   return engram::to_numpy(std::move(error), {5});
 }
 
+double greatest_sigma(const Input<double, 2> &covariance) {
+  if (covariance.shape(0) != 6 || covariance.shape(1) != 6)
+    throw std::invalid_argument("greatest_sigma: expected a covariance (6, 6)");
+  return std::sqrt(ENGRAM_CALL(greatest_variance, covariance.data()));
+}
+
 auto pivoted_errors(const Input<double, 3> &covariances) {
   const size_t count = covariances.shape(0);
   if (covariances.shape(1) != 6 || covariances.shape(2) != 6)
@@ -176,6 +182,9 @@ auto pivoted_errors(const Input<double, 3> &covariances) {
 void bind_graph_search(nb::module_ &module) {
   module.def("pivoted_error", &pivoted_error, "covariance"_a,
              "The error model (5,) tau, v, pivot of a covariance (6, 6).");
+  module.def("greatest_sigma", &greatest_sigma, "covariance"_a,
+             "Standard deviation of the position along its least certain axis, by a covariance "
+             "(6, 6) [translation, rotation].");
   module.def("pivoted_errors", &pivoted_errors, "covariances"_a,
              "The error models (E, 5) of covariances (E, 6, 6), and (E,) uint8 whether each is "
              "surely positive definite.");

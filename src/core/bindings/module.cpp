@@ -17,6 +17,7 @@ void bind_path_scores(nb::module_ &module);
 void bind_places(nb::module_ &module);
 void bind_recall(nb::module_ &module);
 void bind_rows(nb::module_ &module);
+void bind_transforms(nb::module_ &module);
 void bind_window_ba(nb::module_ &module);
 
 NB_MODULE(_core, module) {
@@ -35,5 +36,6 @@ NB_MODULE(_core, module) {
   bind_places(module);
   bind_recall(module);
   bind_rows(module);
+  bind_transforms(module);
   bind_window_ba(module);
 }

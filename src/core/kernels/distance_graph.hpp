@@ -29,7 +29,7 @@ public:
                 const std::vector<RowPair> &pairs, const MatchSettings &settings)
       : count_(static_cast<int>(pairs.size())), words_((count_ + 63) / 64),
         bits_(static_cast<size_t>(count_) * words_, 0), degrees_(count_) {
-    Ends x, y;
+    Ends x(pairs.size()), y(pairs.size());
     for (const RowPair &pair : pairs) {
       x.add(reference, pair.reference, settings);
       y.add(live, pair.live, settings);
@@ -56,6 +56,7 @@ public:
   // Those with at least so many in common.
   std::vector<Edge> edges(int least) const {
     std::vector<Edge> result;
+    result.reserve(static_cast<size_t>(4 * count_));
     for (int i = 0; i < count_; ++i) {
       if (degrees_[i] <= least) // the other end is none of what they have in common
         continue;
@@ -112,6 +113,11 @@ private:
   // One side's landmarks. Depth errors move them along their rays, pixel errors across.
   struct Ends {
     std::vector<float> x, y, z, relative_variance, lateral_variance;
+
+    explicit Ends(size_t wanted) {
+      for (auto *values : {&x, &y, &z, &relative_variance, &lateral_variance})
+        values->reserve(wanted + kLanes);
+    }
 
     void add(const FrameView &frame, int32_t row, const MatchSettings &settings) {
       const float *point = frame.points_in_cam + 3 * row;

@@ -380,6 +380,10 @@ void pivoted_error(const double *covariance, double *error) {
   error[1] = std::max(largest_eigenvalue(rotation), 0.0);
 }
 
+double greatest_variance(const double *covariance) {
+  return std::max(largest_eigenvalue(block(covariance, 0, 0)), 0.0);
+}
+
 void search_chains(const GraphView &graph, int32_t root, const SearchLimits &limits,
                    std::vector<Reached> &reached) {
   std::vector<Reached> seen;

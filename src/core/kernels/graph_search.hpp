@@ -88,6 +88,9 @@ ENGRAM_DECLARE_KERNELS(
     // the pivot is where the translational error is smallest.
     void pivoted_error(const double *covariance, double *error);
 
+    // Variance of the position along its least certain axis, by the same covariance.
+    double greatest_variance(const double *covariance);
+
     // Every node within the limits, in the order in which the search settles them: least uncertain
     // first, ties by node index. Throws std::invalid_argument when the arrays are inconsistent.
     void search_chains(const GraphView &graph, int32_t root, const SearchLimits &limits,

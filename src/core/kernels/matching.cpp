@@ -494,7 +494,9 @@ public:
   WholeSearch(const FrameView &reference, const FrameView &live, const MatchSettings &settings,
               Width width)
       : reference_(reference), settings_(settings), width_(width),
-        blocks_(blocks_of(live, settings, width)), distances_(blocks_) {}
+        blocks_(blocks_of(live, settings, width)), distances_(blocks_) {
+    forward_.reserve(reference.count);
+  }
 
   // Every `step`-th landmark of the reference, from `first` on; `in_order` if none that comes
   // later in it has been compared.

@@ -464,6 +464,7 @@ private:
   // is good enough or the samples are used up.
   void search() {
     std::vector<RowPair> drawn_from;
+    drawn_from.reserve(order_.size());
     for (const int32_t i : order_)
       drawn_from.push_back(pairs_[i]);
     const DistanceGraph graph(reference_, live_, drawn_from, settings_);

@@ -15,13 +15,12 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from engram import _core
 from engram.errors import InputError
 
 Array = NDArray[np.float64]
 
-# Below this angle (rad) the closed forms lose digits to cancellation; the series up to the fourth
-# power are exact to 1e-15 there.
-_SMALL_ANGLE_RAD = 1e-2
+_ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,27 +85,11 @@ class SE3:
     @staticmethod
     def exp(tangent: ArrayLike) -> SE3:
         """The transform of a (6,) tangent vector [translation m, rotation rad]."""
-        vector = np.asarray(tangent, dtype=np.float64)
-        rotation_vector = vector[3:]
-        a, b, c = _rodrigues_coefficients(_length(rotation_vector))
-        k = skew(rotation_vector)
-        kk = k @ k
-        rotation = np.eye(3) + a * k + b * kk
-        return SE3(rotation, (np.eye(3) + b * k + c * kk) @ vector[:3])
+        return SE3(*_core.transform_of(np.ascontiguousarray(tangent, dtype=np.float64)))
 
     def log(self) -> Array:
         """The (6,) tangent vector [translation m, rotation rad]; inverse of `exp`."""
-        rotation_vector = _rotation_log(self.rotation)
-        angle = _length(rotation_vector)
-        a, b, _ = _rodrigues_coefficients(angle)
-        k = skew(rotation_vector)
-        # Inverse of the left Jacobian of SO(3).
-        if angle < _SMALL_ANGLE_RAD:
-            d = 1 / 12 + angle**2 / 720 + angle**4 / 30240
-        else:
-            d = (1 - a / (2 * b)) / angle**2
-        inverse_jacobian = np.eye(3) - 0.5 * k + d * (k @ k)
-        return np.concatenate([inverse_jacobian @ self.translation, rotation_vector])
+        return _tangent(self.rotation, self.translation)
 
     @overload
     def __matmul__(self, other: SE3) -> SE3: ...
@@ -131,8 +114,7 @@ class SE3:
 
         One Newton step towards the nearest rotation squares the error.
         """
-        rotation = self.rotation
-        return SE3(1.5 * rotation - 0.5 * rotation @ rotation.T @ rotation, self.translation)
+        return SE3(_core.orthonormalised(self.rotation), self.translation)
 
     def matrix(self) -> Array:
         """The (4, 4) float64 matrix, homogeneous; translation in m."""
@@ -140,6 +122,23 @@ class SE3:
         matrix[:3, :3] = self.rotation
         matrix[:3, 3] = self.translation
         return matrix
+
+    def chain(self, covariance: Array, other: SE3, other_covariance: Array) -> tuple[SE3, Array]:
+        """``self @ other`` with its covariance, in one call: see `propagate_covariance`.
+
+        Args:
+            covariance, other_covariance: (6, 6) float64 of the two, left perturbation,
+                [translation m, rotation rad].
+        """
+        rotation, translation, both = _core.chain(
+            self.rotation,
+            self.translation,
+            covariance,
+            other.rotation,
+            other.translation,
+            other_covariance,
+        )
+        return SE3(rotation, translation), both
 
     def adjoint(self) -> Array:
         """(6, 6) float64: carries tangent vectors (m, rad) from the source to the target frame."""
@@ -196,39 +195,11 @@ def propagate_covariance(a_from_b: SE3, covariance_ab: Array, covariance_bc: Arr
     return covariance_ab + adjoint @ covariance_bc @ adjoint.T
 
 
-def _rodrigues_coefficients(angle: float) -> tuple[float, float, float]:
-    """Coefficients of 1, k, k² in exp and in the left Jacobian."""
-    square = angle * angle
-    if angle < _SMALL_ANGLE_RAD:
-        return (
-            1 - square / 6 * (1 - square / 20),
-            0.5 - square / 24 * (1 - square / 30),
-            1 / 6 - square / 120 * (1 - square / 42),
-        )
-    sine, cosine = np.sin(angle), np.cos(angle)
-    return sine / angle, (1 - cosine) / square, (angle - sine) / (square * angle)
-
-
 def _rotation_log(rotation: Array) -> Array:
     """The rotation vector (3,) of a rotation matrix, angle in [0, π]."""
-    axis_sine = 0.5 * np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
-    sine = _length(axis_sine)
-    cosine = 0.5 * (float(np.trace(rotation)) - 1)
-    angle = float(np.arctan2(sine, cosine))
-    if sine < 1e-9 and cosine > 0:
-        return axis_sine
-    if np.pi - angle > 1e-3:
-        return axis_sine * (angle / sine)
-    # Near π the antisymmetric part vanishes: take the axis from R + Rᵀ instead.
-    symmetric = (rotation + rotation.T) / 2 - cosine * np.eye(3)
-    column = symmetric[:, int(np.argmax(np.diag(symmetric)))]
-    axis = column / np.linalg.norm(column)
-    if axis @ axis_sine < 0:
-        axis = -axis
-    return np.asarray(angle * axis)
+    return _tangent(rotation, _ORIGIN)[3:]
+
+
+def _tangent(rotation: Array, translation: Array) -> Array:
+    """The tangent vector (6,) of a transform. The angle is NumPy's: libm's differs in bits."""
+    return _core.tangent_of(rotation, translation, float(np.arctan2(*_core.turn_of(rotation))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Annotated
 
@@ -95,11 +95,16 @@ class MatchBasin:
         counts: the attempts learnt from.
         rates: (2, BIN_COUNT) float64, success rate in the middle of each bin, along and across,
             decreasing with distance (isotonic regression over counts and prior).
+        basin_m: the farthest distance along the viewing direction with g >= 0.6, metres.
     """
 
     focal_px: float
     counts: BasinCounts
     rates: Array
+    basin_m: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "basin_m", _basin_m(self.rates[0]))
 
     @staticmethod
     def of(
@@ -141,19 +146,6 @@ class MatchBasin:
         across = np.ascontiguousarray(across_m, dtype=np.float64)
         rates = _core.success_rates(self.rates, BIN_M, along.reshape(-1), across.reshape(-1))
         return rates.reshape(along.shape)
-
-    @property
-    def basin_m(self) -> float:
-        """The farthest distance along the viewing direction with g >= 0.6, metres."""
-        rates = self.rates[0]
-        below = np.flatnonzero(rates < BASIN_LEVEL)
-        if len(below) == 0:
-            return BIN_M * BIN_COUNT
-        first = int(below[0])
-        if first == 0:
-            return float(_BIN_CENTRES_M[0] * rates[0] / BASIN_LEVEL)
-        share = (rates[first - 1] - BASIN_LEVEL) / (rates[first - 1] - rates[first])
-        return float(_BIN_CENTRES_M[first - 1] + share * BIN_M)
 
     def search_radius_m(
         self, sigma_m: float, least_m: float = DEFAULT_RADIUS_M, most_m: float = math.inf
@@ -208,6 +200,18 @@ def count_attempts(
         for row, some in enumerate((here, here & accepted)):
             counts[row, direction] = np.bincount(bins[some], minlength=BIN_COUNT)
     return BasinCounts(counts[0], counts[1])
+
+
+def _basin_m(rates: Array) -> float:
+    """Where (BIN_COUNT,) rates fall below `BASIN_LEVEL`, metres."""
+    below = np.flatnonzero(rates < BASIN_LEVEL)
+    if len(below) == 0:
+        return BIN_M * BIN_COUNT
+    first = int(below[0])
+    if first == 0:
+        return float(_BIN_CENTRES_M[0] * rates[0] / BASIN_LEVEL)
+    share = (rates[first - 1] - BASIN_LEVEL) / (rates[first - 1] - rates[first])
+    return float(_BIN_CENTRES_M[first - 1] + share * BIN_M)
 
 
 def _prior_rates(basin_m: float, config: BasinConfig) -> Array:

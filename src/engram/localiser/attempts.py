@@ -251,6 +251,7 @@ class Attempter:
         assert match.covariance is not None
         prediction, acceptance = candidate.prediction, self._acceptance
         pose = match.reference_from_live
+        x_m2, y_m2, z_m2 = match.covariance.diagonal()[:3].tolist()
         in_reach = pose.distance_m <= acceptance.reach_m
         unproved = prediction is None or candidate.doubted or not candidate.standing.agreed
         weak = match.inliers < confidence_of(live.descriptor).weak_inliers
@@ -259,7 +260,7 @@ class Attempter:
             match.inliers,
             match.inliers / len(live.landmarks),
             pose.distance_m,
-            math.sqrt(float(np.trace(match.covariance[:3, :3]))),
+            math.sqrt(x_m2 + y_m2 + z_m2),
             candidate.standing,
             math.inf if prediction is None else prediction.sigma_m,
             apart(pose, prediction, acceptance)

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from statistics import median
 
 from engram.frontend import BRIEF, DescriptorKind
 from engram.frontend.features import NET
@@ -75,11 +75,11 @@ class Record:
     @property
     def standing(self) -> Standing:
         """The current one."""
-        usual = float(median(self._inliers)) if self._inliers else 0.0
+        usual = _median(self._inliers)
         return Standing(self._agreed, self._missed, usual, self._share_tracked())
 
     def _share_tracked(self) -> float:
-        usual = median(self._tracked) if self._tracked else 0.0
+        usual = _median(self._tracked)
         now = self._tracked_now
         return min(now / usual, 1.0) if now and usual else 1.0
 
@@ -108,6 +108,15 @@ class Record:
     def forget(self, agreed: int = 0) -> None:
         """The position comes from elsewhere, where so many fixes have confirmed it."""
         self._agreed, self._missed = agreed, 0.0
+
+
+def _median(numbers: Iterable[int]) -> float:
+    """The median; 0 of none. That of `statistics` takes three times as long."""
+    ordered = sorted(numbers)
+    middle = len(ordered) // 2
+    if not ordered or len(ordered) % 2:
+        return float(ordered[middle]) if ordered else 0.0
+    return (ordered[middle - 1] + ordered[middle]) / 2
 
 
 @dataclass(frozen=True, slots=True)

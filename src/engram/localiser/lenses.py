@@ -41,9 +41,14 @@ class Lenses:
         self._sessions, self._cameras = sessions, cameras
         self._focal_px, self._depth_m = focal_px, depth_m
         self._of_session = np.zeros(0)
+        self._alike = True  # whether none of them shifts
 
     def shifts_m(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
         """(Y,) metres along the viewing direction at which nodes are most alike the live view."""
+        self._look_at_sessions()
+        return self._of_session[self._graph.sessions_of(nodes)]
+
+    def _look_at_sessions(self) -> None:
         while len(self._of_session) < self._graph.session_count:
             session = self._sessions.get(self._graph.session(len(self._of_session)))
             camera = None if session is None else self._cameras.get(session.camera)
@@ -51,12 +56,12 @@ class Lenses:
             if camera is not None:
                 shift_m = self._depth_m * (1 - self._focal_px / camera.fx)
             self._of_session = np.append(self._of_session, shift_m)
-        return self._of_session[self._graph.sessions_of(nodes)]
+            self._alike = self._alike and not shift_m
 
     def as_seen(self, near: Neighbourhood) -> Neighbourhood:
         """Candidates with their offsets as by one lens; the very same if all lenses are."""
-        shifts_m = self.shifts_m(near.nodes)
-        if not shifts_m.any():
+        self._look_at_sessions()
+        if self._alike or not (shifts_m := self.shifts_m(near.nodes)).any():
             return near
         along_m = near.along_m - shifts_m
         height_m = near.node_from_live[:, 1, 3]

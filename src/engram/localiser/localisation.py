@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.errors import ConfigError
-from engram.geometry import SE3, StereoCamera, propagate_covariance
+from engram.geometry import SE3, StereoCamera
 from engram.graph.model import NodeId
 from engram.odometry.motion import UNMOVED, Motion
 
@@ -107,15 +108,13 @@ class Position:
     def carried_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> Position:
         """The position after one more step of odometry with its (6, 6) covariance."""
         return Position(
-            self.node,
-            self.node_from_live @ prev_from_curr,
-            propagate_covariance(self.node_from_live, self.covariance, covariance),
+            self.node, *self.node_from_live.chain(self.covariance, prev_from_curr, covariance)
         )
 
     @property
     def sigma_m(self) -> float:
         """Standard deviation of the position along its least certain axis, metres."""
-        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariance[:3, :3])[-1], 0.0)))
+        return _core.greatest_sigma(self.covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

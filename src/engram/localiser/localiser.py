@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import Frame, FrameStatus
+from engram.frontend.matching import NO_MATCH
 from engram.graph.breadth_first import breadth_first
 from engram.graph.clock import day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
@@ -529,9 +530,11 @@ class Localiser:
         success: Outcome | None,
         stage_ms: dict[str, float],
     ) -> Localisation:
-        unmatched = Localisation(
+        node = None if success is None else self._graph.node(success.candidate.index)
+        match = NO_MATCH if success is None else success.match
+        return Localisation(
             stamp_ns=live.stamp_ns,
-            status=self._status_without_match(),
+            status=self._status_without_match() if node is None else LocalisationStatus.LOCALISED,
             attempts=len(self._outcomes),
             proposed=sum(one.candidate.prediction is None for one in self._outcomes),
             candidates=0 if self._near is None else len(self._near),
@@ -541,21 +544,15 @@ class Localiser:
             looked_up=self._looked_up,
             damaged=self._new_damaged,
             withdraws=self._prover.withdraws,
-            confidence=max((one.confidence for one in self._outcomes), default=-math.inf),
+            node=None if node is None else node.id,
+            node_stamp_ns=None if node is None else node.stamp_ns,
+            node_from_live=match.reference_from_live,
+            covariance=match.covariance,
+            inliers=match.inliers,
+            confidence=max((one.confidence for one in self._outcomes), default=-math.inf)
+            if success is None
+            else success.confidence,
             stage_ms=stage_ms,
-        )
-        if success is None:
-            return unmatched
-        node = self._graph.node(success.candidate.index)
-        return replace(
-            unmatched,
-            status=LocalisationStatus.LOCALISED,
-            node=node.id,
-            node_stamp_ns=node.stamp_ns,
-            node_from_live=success.match.reference_from_live,
-            covariance=success.match.covariance,
-            inliers=success.match.inliers,
-            confidence=success.confidence,
         )
 
     def _position_now(self) -> Position | None:

@@ -121,19 +121,20 @@ class Tried:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(R,) distances, metres, and rates of success of attempts; NaN without a prediction."""
         distance_m, rates = np.full((2, len(outcomes)), np.nan)
-        rows = np.array([-1 if (row := one.candidate.row) is None else row for one in outcomes])
-        if near is None or not (known := rows >= 0).any():
+        predicted = [one.candidate.row for one in outcomes]
+        known = [at for at, row in enumerate(predicted) if row is not None]
+        if near is None or not known:
             return distance_m, rates
-        seen, shifts_m = self._lenses.as_seen(near), self._lenses.shifts_m(near.nodes)
-        distance_m[known] = seen.rms_distance_m[rows[known]]
-        accepted = known & np.array([one.accepted for one in outcomes])
-        for at in np.flatnonzero(accepted).tolist():
+        rows = [row for row in predicted if row is not None]
+        seen = self._lenses.as_seen(near)
+        distance_m[known] = np.hypot(seen.distance_m[rows], seen.sigma_m[rows])
+        rates[known] = self._basin.success_rate(seen.along_m[rows], seen.across_m[rows])
+        for at, row in zip(known, rows, strict=True):
             found = outcomes[at].match.reference_from_live
-            assert found is not None
-            ahead_m = np.array([0.0, 0.0, shifts_m[rows[at]]])
-            from_node_m = found.translation - ahead_m
-            distance_m[at] = math.sqrt(from_node_m @ from_node_m)
-        rates[known] = self._basin.success_rate(
-            seen.along_m[rows[known]], seen.across_m[rows[known]]
-        )
+            if outcomes[at].accepted and found is not None:
+                from_node_m = found.translation
+                if seen is not near:
+                    shift_m = self._lenses.shifts_m(near.nodes[[row]])
+                    from_node_m = from_node_m - np.array([0.0, 0.0, *shift_m])
+                distance_m[at] = math.sqrt(from_node_m @ from_node_m)
         return distance_m, rates

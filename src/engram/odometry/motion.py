@@ -8,6 +8,7 @@ turning. Over longer gaps that covariance grows until the robot counts as lost.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.config import check_bounds
 from engram.geometry import SE3
 from engram.odometry.outside import Guess
@@ -179,8 +181,8 @@ class GapFiller:
 
     def __init__(self, config: GapConfig = GapConfig()) -> None:
         self._config = config
-        # (3,) m/s each, in the camera that they begin in; the newest last.
-        self._velocities: deque[NDArray[np.float64]] = deque(maxlen=self._config.speed_steps)
+        # x, y, z in m/s each, in the camera that they begin in; the newest last.
+        self._velocities: deque[list[float]] = deque(maxlen=self._config.speed_steps)
         # Their median.
         self._velocity: NDArray[np.float64] = np.zeros(3)
         # Consecutive measurements too uncertain to determine the speed.
@@ -232,7 +234,7 @@ class GapFiller:
             measured is None
             or covariance is None
             or doubted
-            or self._too_vague(sigma_m := _sigma_m(covariance), guess)
+            or self._too_vague(sigma_m := _core.greatest_sigma(covariance), guess)
             or self._impossible(twist := measured.log(), sigma_m, seconds)
         ):
             self._missing.append(True)
@@ -265,7 +267,7 @@ class GapFiller:
         self._unlearnt = 0 if sharp else self._unlearnt + 1
         # An uncertain speed is better than none, or an old one.
         if sharp or not self._knows_speed or self._unlearnt > self._config.speed_steps:
-            self._velocities.append(twist_per_s[:3])
+            self._velocities.append(twist_per_s[:3].tolist())
             self._velocity = _median(self._velocities)
         # A Kalman filter; the turn rate changes per step by the error of a guess. The change does
         # not grow over a gap: the next guesses would then rest on the first uncertain step.
@@ -320,7 +322,8 @@ class GapFiller:
         assert self._stamp_ns is not None
         assert self._believed_ns is not None
         since_s = (self._stamp_ns - self._believed_ns) / _NS_PER_S
-        changed_m = SE3(np.eye(3), twist[:3] - self._velocities[-1] * seconds).distance_m
+        changed = twist[:3] - np.array(self._velocities[-1]) * seconds
+        changed_m = math.sqrt(changed @ changed)
         possible_m = self._config.greatest_acceleration_m_s2 * since_s * seconds
         return bool(changed_m > possible_m + 3 * sigma_m)
 
@@ -350,7 +353,9 @@ class GapFiller:
         least_m = max(config.least_sigma_m, started_m)
         sigma_m = float(np.hypot(config.sigma_per_m * grown_m, least_m))
         sigma_rad = float(np.hypot(config.sigma_rad_per_m * grown_m, config.least_sigma_rad))
-        covariance = np.diag([sigma_m**2] * 3 + [sigma_rad**2] * 3)
+        covariance = np.zeros((6, 6))
+        variances = covariance.reshape(-1)[::7]
+        variances[:3], variances[3:] = sigma_m**2, sigma_rad**2
         if outside is not None:
             guess = SE3(outside.prev_from_curr.rotation, guess.translation)
             covariance[3:, 3:] = outside.covariance[3:, 3:]
@@ -364,13 +369,8 @@ class GapFiller:
         return 0.5 * acceleration_m_s2 * float(np.sqrt(max(until_s**4 - since_s**4, 0.0)))
 
 
-def _median(rows: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The median of each column, as `np.median` has it, which takes five times as long."""
-    ordered, middle = np.sort(rows, axis=0), len(rows) // 2
-    median: NDArray[np.float64] = 0.5 * (ordered[(len(rows) - 1) // 2] + ordered[middle])
-    return median
-
-
-def _sigma_m(covariance: NDArray[np.float64]) -> float:
-    """Standard deviation along the least certain axis."""
-    return float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
+def _median(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
+    """The median of each column, as `np.median` has it."""
+    low, high = (len(rows) - 1) // 2, len(rows) // 2
+    columns = (sorted(column) for column in zip(*rows, strict=True))
+    return np.array([0.5 * (column[low] + column[high]) for column in columns])

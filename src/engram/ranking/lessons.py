@@ -70,19 +70,20 @@ class Lessons:
 
     base: NDArray[np.float64]
     unknown: float = UNKNOWN_BASE
-    _and_unknown: NDArray[np.float64] = field(init=False, repr=False)
+    _log_odds: NDArray[np.float64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_and_unknown", np.append(self.base, self.unknown))
+        base = np.append(self.base, self.unknown)
+        object.__setattr__(self, "_log_odds", np.log(base / (1 - base)))
 
     @staticmethod
     def none() -> Lessons:
         """Lessons of an empty map."""
         return Lessons(np.zeros(0))
 
-    def of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(Y,) float64: the probabilities of nodes, (Y,) dense indices."""
-        return self._and_unknown[np.minimum(nodes, len(self.base))]
+    def log_odds_of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(Y,) float64: log odds of the probabilities of nodes, (Y,) dense indices."""
+        return self._log_odds[np.minimum(nodes, len(self.base))]
 
     @staticmethod
     def learnt(

@@ -263,10 +263,10 @@ class RecallPolicy:
         The cost is the margin lost by distance less that gain.
         """
         c, near = self._constants, context.neighbourhood
-        base = context.background.lessons.of(near.nodes[canonical])
+        past = context.background.lessons.log_odds_of(near.nodes[canonical])
         likeness = self._likeness(context, canonical)
         costs = self._per_m(context) * context.as_seen.rms_distance_m[canonical] - likeness
-        return costs, c.level + c.lessons * np.log(base / (1 - base)), likeness
+        return costs, c.level + c.lessons * past, likeness
 
     def _likeness(self, context: RankingContext, canonical: NDArray[np.int64]) -> Array:
         """(Y,) float64, nearest first: margins gained by similarity to the live frame.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -109,19 +110,16 @@ class RunLog:
         See `RunAttempts` for the arguments; `expected` holds `distance_m` and `rates`, (R,) float64
         each.
         """
-        distance_m, rates = expected
         self._frames += len(nodes) > 0
-        telling = np.array(accepted, np.bool_) | ~np.isnan(distance_m)
-        count = int(telling.sum())
-        if self._end + count > len(self._columns[0]):
-            self._make_room(driven_m, count)
-        place = slice(self._end, self._end + count)
-        for column, values in zip(
-            self._columns[1:-1], (nodes, distance_m, rates, accepted, inliers), strict=True
-        ):
-            column[place] = np.asarray(values)[telling]
-        self._columns[0][place], self._columns[-1][place] = driven_m, landmarks
-        self._end += count
+        distances_m, rates = (values.tolist() for values in expected)
+        tried = zip(nodes, distances_m, rates, accepted, inliers, strict=True)
+        told = [one for one in tried if one[3] or not math.isnan(one[1])]
+        if self._end + len(told) > len(self._columns[0]):
+            self._make_room(driven_m, len(told))
+        for row in told:
+            for column, value in zip(self._columns, (driven_m, *row, landmarks), strict=True):
+                column[self._end] = value
+            self._end += 1
 
     def attempts(self, driven_m: float) -> RunAttempts:
         """The attempts remembered after `driven_m` metres of the session.
@@ -138,7 +136,8 @@ class RunLog:
 
     def _forget(self, driven_m: float) -> None:
         at_m = self._columns[0][self._start : self._end]
-        self._start += int(np.searchsorted(at_m, driven_m - _REMEMBERED_M))
+        if len(at_m) and at_m[0] < driven_m - _REMEMBERED_M:
+            self._start += int(np.searchsorted(at_m, driven_m - _REMEMBERED_M))
         self._start = max(self._start, self._end - _REMEMBERED)
 
     def _make_room(self, driven_m: float, count: int) -> None:
