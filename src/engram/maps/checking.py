@@ -432,7 +432,8 @@ def _check_words(checking: _Checking, row: Row) -> None:
 
 
 def _check_rotation(rotation: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no rotation has
+        skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not skew <= _ROTATION_TOLERANCE:
         raise MapCorruptError(f"its rotation is off by {skew:.2g}")
 
