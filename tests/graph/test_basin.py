@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import isotonic_regression
 from tests.reference import basin as reference
 from tests.worlds import make_node
 
 from engram.errors import InputError
-from engram.graph.basin import BasinCounts, MatchBasin, count_attempts, prior_basin_m
+from engram.graph.basin import BasinCounts, MatchBasin, _falling, count_attempts, prior_basin_m
 from engram.graph.model import Attempt
 
 NODE = make_node(0, 0).id
@@ -62,6 +63,15 @@ def test_learns_the_basin_of_each_direction_whatever_the_prior() -> None:
         across = np.arange(0, 10, 0.05)
         reach = across[basin.success_rate(np.zeros_like(across), across) >= 0.6].max()
         assert reach == pytest.approx(3.0, abs=0.5)
+
+
+@given(st.integers(0, 2**32), st.integers(1, 60), st.sampled_from([1, 3, 16]))
+def test_isotonic_regression_is_scipys_to_the_bit(seed: int, count: int, digits: int) -> None:
+    rng = np.random.default_rng(seed)
+    values = np.round(np.linspace(1, 0, count) + rng.normal(0, 0.2, count), digits)
+    weights = 10.0 + rng.integers(0, 40, count)
+    expected = isotonic_regression(values, weights=weights, increasing=False).x
+    assert _falling(values, weights).tobytes() == expected.tobytes()
 
 
 @given(st.integers(0, 2**32), st.floats(150, 1000))

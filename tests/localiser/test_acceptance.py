@@ -7,7 +7,7 @@ from tests.synthetic_world import World, see
 from engram.frontend.matching import Match
 from engram.geometry import SE3
 from engram.localiser import AcceptanceConfig, Prediction, Spread, accept, accept_lost, plausible
-from engram.localiser.spread import inlier_spread
+from engram.localiser.spread import _extent, _median, inlier_spread
 
 CONFIG = AcceptanceConfig()
 WIDE = Spread(0.5, 0.9, 10.0)
@@ -111,3 +111,13 @@ def test_spread_is_that_of_the_inliers_alone_in_the_poorer_image() -> None:
     assert spread(everywhere).height == pytest.approx(1.0)
     assert spread(level).height <= 0.6 / np.ptp(np.percentile(heights_m, [10, 90]))
     assert inlier_spread(match(None, 0), frame, frame) == Spread(0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 11, 12, 57, 400])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_extents_and_medians_are_numpys_to_the_bit(count: int, kind: type) -> None:
+    rng = np.random.default_rng(count)
+    for values in (rng.normal(size=count).astype(kind), rng.normal(size=(count, 2)).astype(kind)):
+        low, high = np.percentile(values, [10, 90], axis=0)
+        assert np.asarray(_extent(values)).tobytes() == np.asarray(high - low).tobytes()
+    assert _median(values[:, 0]) == float(np.median(values[:, 0]))
