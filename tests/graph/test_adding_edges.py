@@ -1,7 +1,7 @@
 """Edges added all at once, by arrays, give the same graph as edges added one by one."""
 
 from dataclasses import replace
-from uuid import UUID
+from uuid import UUID, uuid5
 
 import numpy as np
 import pytest
@@ -15,6 +15,12 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, SessionId, node_id
 
 ARRAYS = ("_first_half", "_next_half", "_target", "_a_from_b", "_errors", "_experiences")
+
+
+def test_the_uuid_of_a_node_is_by_name_in_its_session() -> None:
+    session = SessionId(UUID(int=77))
+    assert node_id(session, 123) == uuid5(session, "node:123")
+    assert node_id(session, 123).version == 5
 
 
 def nodes() -> list[Node]:
