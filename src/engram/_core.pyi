@@ -173,6 +173,12 @@ class MatchSettings:
     max_radius_px: float
     chi2: float
     independent_landmarks: float
+    few_inliers: float
+    displaced_m: float
+    offset_doubt: float
+    calibration_share: float
+    calibration_m: float
+    calibration_rad: float
     min_consensus: int
     max_samples: int
     max_hypotheses: int
@@ -312,6 +318,7 @@ class OdometrySettings:
     min_inliers: int
     unexpected_inliers: int
     plausible_inliers: int
+    few_inliers: float
     usual_share: float
     acceleration_m_s2: float
     angular_acceleration_rad_s2: float

@@ -21,8 +21,15 @@ AS_SIMULATED = OdometryConfig(
         offset_sigma_px=1e-3,
         offset_drift_px=1e-3,
         independent_landmarks=1e9,
+        few_inliers=0,
+        displaced_m=0,
+        offset_doubt=0,
+        calibration_share=0,
+        calibration_m=0,
+        calibration_rad=0,
     ),
     window=WindowConfig(offset_sigma_px=1e-3),
+    few_inliers=0,
 )
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.frontend import Frame, FrameStatus, Match, MatcherConfig, match_frames
+from engram.frontend import Frame, FrameStatus, Match, match_frames
 from engram.geometry import SE3, propagate_covariance
-from engram.odometry import OdometryConfig, OdometryStatus, OdometryStep, WindowConfig
+from engram.odometry import OdometryConfig, OdometryStatus, OdometryStep
 from engram.odometry.outside import Guess
 
 _S_PER_NS = 1e-9
@@ -49,11 +49,10 @@ class Window:
     `keep_newest` was called, so that the window spans motion, not time.
     """
 
-    def __init__(
-        self, first: Frame, config: WindowConfig, matcher: MatcherConfig, offset_px: float = 0.0
-    ) -> None:
-        self._config = config
-        self._matcher = matcher
+    def __init__(self, first: Frame, config: OdometryConfig, offset_px: float = 0.0) -> None:
+        self._config = config.window
+        self._matcher = config.matcher
+        self._few_inliers = config.few_inliers
         self._keyframes = [self._place(first, SE3.identity())]
         self._newest: _Placed | None = None
         self._next_track = 0
@@ -92,12 +91,12 @@ class Window:
         self._keyframes = [*self._keyframes, self._newest][-(self._config.frames - 1) :]
         self._newest = None
 
-    def optimise(self, match: Match) -> tuple[SE3, NDArray[np.float64]]:
+    def optimise(self, match: Match) -> tuple[SE3, NDArray[np.float64], NDArray[np.float64]]:
         """Adjust all poses but the oldest, and all landmarks.
 
         Returns:
-            keyframe_from_newest and its (6, 6) float64 covariance; those of `match` if the
-            landmarks do not determine the window.
+            keyframe_from_newest, its (6, 6) float64 covariance, and the same as wide as matching
+            searches; those of `match` if the landmarks do not determine the window.
 
         Source: method §2.4.
         """
@@ -107,21 +106,30 @@ class Window:
         placed = [*self._keyframes, self._newest]
         adjusted = self._adjust(placed) if self._config.iterations else None
         if adjusted is None:
-            return match.reference_from_live, match.covariance
+            return match.reference_from_live, match.covariance, match.covariance
         matrices, covariance, self._offset_px = adjusted
         moved = [
             replace(each, world_from_cam=SE3(matrix[:3, :3], matrix[:3, 3]))
             for each, matrix in zip(placed, matrices, strict=True)
         ]
         self._keyframes, self._newest = moved[:-1], moved[-1]
-        # As in a match: landmarks share errors, which do not average out.
-        shared = 1 + match.inliers / self._matcher.independent_landmarks
         keyframe_from_world = moved[-2].world_from_cam.inverse()
         carry = keyframe_from_world.adjoint()
-        return (
-            keyframe_from_world @ moved[-1].world_from_cam,
-            shared * carry @ _covariance_of_last_step(covariance) @ carry.T,
-        )
+        keyframe_from_newest = keyframe_from_world @ moved[-1].world_from_cam
+        by_residuals = carry @ _covariance_of_last_step(covariance) @ carry.T
+        moved_m = keyframe_from_newest.distance_m
+        wider = 1 + match.inliers / self._matcher.independent_landmarks
+        doubted = self._doubted(by_residuals, match.inliers, moved_m)
+        return keyframe_from_newest, doubted, wider * by_residuals
+
+    def _doubted(
+        self, covariance: NDArray[np.float64], inliers: int, moved_m: float
+    ) -> NDArray[np.float64]:
+        matcher = self._matcher
+        shift = (matcher.displaced_m / inliers) ** 2 + matcher.calibration_m**2
+        shift += (matcher.calibration_share * moved_m) ** 2
+        unseen = np.diag([shift] * 3 + [matcher.calibration_rad**2] * 3)
+        return (1 + (self._few_inliers / inliers) ** 2) * covariance + unseen
 
     def _place(self, frame: Frame, world_from_cam: SE3) -> _Placed:
         marks = frame.landmarks
@@ -233,8 +241,7 @@ class Odometry:
 
         self._inliers.append(match.inliers)
         self._intervals.append(interval_s)
-        keyframe_from_curr, covariance = self._track.place(frame, match)
-        return self._track.advance(frame, match, keyframe_from_curr, covariance)
+        return self._track.advance(frame, match, *self._track.place(frame, match))
 
     def _believes(self, match: Match, interval_s: float) -> bool:
         """Whether enough landmarks agree on the motion; after a gap in time more are needed."""
@@ -261,10 +268,11 @@ class _Track:
 
     def __init__(self, first: Frame, config: OdometryConfig, offset_px: float = 0.0) -> None:
         self._config = config
-        self._window = Window(first, config.window, config.matcher, offset_px)
+        self._window = Window(first, config, offset_px)
         self.stamp_ns = first.stamp_ns
         self._keyframe_from_prev = SE3.identity()
         self._covariance = np.zeros((6, 6))  # of keyframe_from_prev
+        self._searched = np.zeros((6, 6))  # the same, as wide as matching searches
         self._velocity: NDArray[np.float64] | None = None  # (6,) tangent per second
 
     @property
@@ -288,8 +296,10 @@ class _Track:
             match = self._match_to_keyframe(frame, expected)
         return match
 
-    def place(self, frame: Frame, match: Match) -> tuple[SE3, NDArray[np.float64]]:
-        """keyframe_from_curr after joint optimisation, with its (6, 6) covariance."""
+    def place(
+        self, frame: Frame, match: Match
+    ) -> tuple[SE3, NDArray[np.float64], NDArray[np.float64]]:
+        """keyframe_from_curr after joint optimisation; see `Window.optimise`."""
         self._window.add(frame, match)
         return self._window.optimise(match)
 
@@ -299,6 +309,7 @@ class _Track:
         match: Match,
         keyframe_from_curr: SE3,
         covariance: NDArray[np.float64],
+        searched: NDArray[np.float64],
     ) -> OdometryStep:
         """Make the frame the previous one; returns the motion that led to it.
 
@@ -307,6 +318,7 @@ class _Track:
             match: its match to the keyframe.
             keyframe_from_curr: its pose in the keyframe.
             covariance: (6, 6) float64 of that pose, left perturbation, [translation, rotation].
+            searched: (6, 6) float64, the same, as wide as matching searches.
         """
         prev_from_keyframe = self._keyframe_from_prev.inverse()
         prev_from_curr = prev_from_keyframe @ keyframe_from_curr
@@ -321,6 +333,7 @@ class _Track:
         self._velocity = prev_from_curr.log() / interval_s if interval_s > 0 else None
         self.stamp_ns = frame.stamp_ns
         self._keyframe_from_prev, self._covariance = keyframe_from_curr, covariance
+        self._searched = searched
         if self._has_moved_on(frame, match):
             self._keep_previous_as_keyframe()
         return step
@@ -345,9 +358,7 @@ class _Track:
                 return None
             return (
                 self._keyframe_from_prev @ expected.prev_from_curr,
-                propagate_covariance(
-                    self._keyframe_from_prev, self._covariance, expected.covariance
-                ),
+                propagate_covariance(self._keyframe_from_prev, self._searched, expected.covariance),
             )
         prev_from_curr = SE3.exp(self._velocity * interval_s)
         sigma = np.repeat(
@@ -356,13 +367,13 @@ class _Track:
         noise = np.diag((sigma * interval_s**2) ** 2)
         return (
             self._keyframe_from_prev @ prev_from_curr,
-            propagate_covariance(self._keyframe_from_prev, self._covariance, noise),
+            propagate_covariance(self._keyframe_from_prev, self._searched, noise),
         )
 
     def _keep_previous_as_keyframe(self) -> None:
         self._window.keep_newest()
         self._keyframe_from_prev = SE3.identity()
-        self._covariance = np.zeros((6, 6))
+        self._covariance, self._searched = np.zeros((6, 6)), np.zeros((6, 6))
 
     def _has_moved_on(self, frame: Frame, match: Match) -> bool:
         before = self._window.keyframe.landmarks

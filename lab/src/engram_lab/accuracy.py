@@ -14,6 +14,8 @@ from engram.geometry import SE3
 # A success with a greater error is a false one. Source: method §8.
 FALSE_BEYOND_M = 1.0
 FALSE_BEYOND_RAD = float(np.deg2rad(5.0))
+# Shares of errors that the ellipsoids of covariances should hold.
+LEVELS = (0.5, 0.9, 0.99)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,3 +50,9 @@ def pose_errors(estimated: Sequence[SE3], true: Sequence[SE3]) -> PoseErrors:
     ]
     turns = [(t.inverse() @ e).angle_rad for e, t in zip(estimated, true, strict=True)]
     return PoseErrors(np.array(offsets, np.float64), np.array(turns, np.float64))
+
+
+def squared(found: SE3, covariance: NDArray[np.float64], truth: SE3) -> float:
+    """χ² of a pose with its (6, 6) covariance, left perturbation."""
+    off = (truth @ found.inverse()).log()
+    return float(off @ np.linalg.solve(covariance + 1e-12 * np.eye(6), off))

@@ -90,7 +90,7 @@ def streets(
         which: numbers of the drives that are mapped, and of the one that is localised.
     """
     for seed in towns:
-        drives = _drives(seed, settings, monitor)
+        drives = drives_in(seed, settings, monitor)
         for mapped, live in which:
             yield _street(seed, drives, mapped, seed, drives[live], settings, lost_rounds)
 
@@ -104,7 +104,7 @@ def all_streets(
         The plan of the drive, the name of the street, the street.
     """
     for seed in towns:
-        drives, plans = _drives(seed, settings, monitor), trial_town(seed).sessions
+        drives, plans = drives_in(seed, settings, monitor), trial_town(seed).sessions
         for mapped in dict.fromkeys(mapped for mapped, _ in STREETS):
             for live in range(len(drives)):
                 if live not in mapped:
@@ -120,17 +120,17 @@ def other_towns(
     """The same with a drive of the next town in the map of each: nothing can be found there."""
     for seed, other in zip(towns, [*towns[1:], *towns[:1]], strict=True):
         if seed != other:
-            drives = _drives(seed, settings, monitor)
-            live = _drives(other, settings, monitor)[0]
+            drives = drives_in(seed, settings, monitor)
+            live = drives_in(other, settings, monitor)[0]
             yield _street(seed, drives, (2,), other, live, settings, lost_rounds)
 
 
 def town_pairs(towns: Sequence[int], settings: Settings) -> Iterator[tuple[str, Street]]:
     """Each map of each town with every drive of every town that it was not built from."""
     for seed in towns:
-        drives = _drives(seed, settings, QUIET)
+        drives = drives_in(seed, settings, QUIET)
         for other in towns:
-            shown = _drives(other, settings, QUIET)
+            shown = drives_in(other, settings, QUIET)
             for mapped in dict.fromkeys(mapped for mapped, _ in STREETS):
                 for number, live in enumerate(shown):
                     if seed != other or number not in mapped:
@@ -143,7 +143,8 @@ def towns_folder(settings: Settings) -> Path:
     return campaigns_folder() if kind == BRIEF else campaigns_folder() / kind
 
 
-def _drives(seed: int, settings: Settings, monitor: Monitor) -> Sequence[EvaluatedDrive]:
+def drives_in(seed: int, settings: Settings, monitor: Monitor = QUIET) -> Sequence[EvaluatedDrive]:
+    """The drives of a town; renders what is not there yet."""
     folder, town = towns_folder(settings), trial_town(seed)
     simulate(town, folder, settings=settings, monitor=monitor)
     return drives_of(campaign_logs(town, folder))

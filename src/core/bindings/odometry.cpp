@@ -83,6 +83,7 @@ void bind_odometry(nb::module_ &module) {
       .def_rw("min_inliers", &OdometrySettings::min_inliers)
       .def_rw("unexpected_inliers", &OdometrySettings::unexpected_inliers)
       .def_rw("plausible_inliers", &OdometrySettings::plausible_inliers)
+      .def_rw("few_inliers", &OdometrySettings::few_inliers)
       .def_rw("usual_share", &OdometrySettings::usual_share)
       .def_rw("acceleration_m_s2", &OdometrySettings::acceleration_m_s2)
       .def_rw("angular_acceleration_rad_s2", &OdometrySettings::angular_acceleration_rad_s2)

@@ -51,7 +51,7 @@ std::optional<Prediction> predict(const OdometryTrack &track, const OdometrySett
     if (expected == nullptr)
       return std::nullopt;
     return Prediction{compose(keyframe_from_prev, expected->prev_from_curr),
-                      track.covariance + carried(keyframe_from_prev, expected->covariance)};
+                      track.searched + carried(keyframe_from_prev, expected->covariance)};
   }
   Tangent moved = *track.velocity;
   for (double &entry : moved)
@@ -64,7 +64,7 @@ std::optional<Prediction> predict(const OdometryTrack &track, const OdometrySett
     noise[7 * i] = sigma * sigma;
   }
   return Prediction{compose(keyframe_from_prev, exponential(moved)),
-                    track.covariance + carried(keyframe_from_prev, noise)};
+                    track.searched + carried(keyframe_from_prev, noise)};
 }
 
 // The matcher refines in single precision: many small updates skew the rotation by 1e-6.
@@ -184,6 +184,7 @@ private:
     track_.stamp_ns = stamp_ns_;
     track_.keyframe_from_prev = keyframe_from_curr.pose;
     track_.covariance = keyframe_from_curr.covariance;
+    track_.searched = keyframe_from_curr.searched;
     if (has_moved_on(match))
       keep_previous_as_keyframe();
     return motion;
@@ -207,6 +208,7 @@ private:
     keep_newest(track_.window, settings_);
     track_.keyframe_from_prev = RigidTransform{};
     track_.covariance = {};
+    track_.searched = {};
   }
 
   OdometryState &state_;

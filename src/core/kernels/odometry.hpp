@@ -15,7 +15,7 @@ struct OdometrySettings {
   int32_t window_frames = 0, window_landmarks = 0, window_iterations = 0;
   double window_offset_sigma_px = 0;
   int32_t min_inliers = 0, unexpected_inliers = 0, plausible_inliers = 0;
-  double usual_share = 0;
+  double usual_share = 0, few_inliers = 0;
   double acceleration_m_s2 = 0, angular_acceleration_rad_s2 = 0;
   double max_prediction_s = 0;
   double keyframe_flow_px = 0, keyframe_share = 0;
@@ -55,6 +55,7 @@ struct OdometryTrack {
   int64_t stamp_ns = 0;
   RigidTransform keyframe_from_prev;
   std::array<double, 36> covariance{}; // of keyframe_from_prev
+  std::array<double, 36> searched{};   // the same, as wide as matching searches
   std::optional<std::array<double, 6>> velocity; // tangent per second
 };
 

@@ -8,6 +8,7 @@
 
 #include "kernels/correspondences.hpp"
 #include "kernels/distance_graph.hpp"
+#include "kernels/doubt.hpp"
 #include "kernels/matching.hpp"
 #include "kernels/triangles.hpp"
 #include "kernels/uncertainty.hpp"
@@ -115,6 +116,12 @@ struct Estimate {
 // one offset, but for the little that it drifts.
 struct OffsetPrior {
   double own = 0, cross = 0;
+
+  // χ² of two offsets.
+  double chi2(const Offsets &offsets) const {
+    return own * (squared(offsets.reference) + squared(offsets.live)) +
+           2 * cross * offsets.reference * offsets.live;
+  }
 
   explicit OffsetPrior(const MatchSettings &settings) {
     const double spread = 1 / (settings.offset_sigma_px * settings.offset_sigma_px);
@@ -380,9 +387,9 @@ PoseEstimate settle(const FrameView &reference, const FrameView &live,
                     Estimate estimate) {
   const Correspondences matches =
       correspondences(reference, live, pairs, settings, OffsetsAre::estimated);
-  const auto equations =
-      refine<kPoseAndOffsets>(matches, estimate, static_cast<float>(settings.chi2), kIterations,
-                              OffsetPrior(settings));
+  const OffsetPrior prior(settings);
+  const auto equations = refine<kPoseAndOffsets>(
+      matches, estimate, static_cast<float>(settings.chi2), kIterations, prior);
   const std::vector<uint8_t> agrees = inliers(matches, estimate, settings.chi2);
   PoseEstimate result;
   for (size_t i = 0; i < pairs.size(); ++i)
@@ -398,12 +405,17 @@ PoseEstimate settle(const FrameView &reference, const FrameView &live,
     return result;
   }
   invert_factorised(factor, kPoseAndOffsets, covariance);
-  // Errors that landmarks share: more of them do not average them out.
-  const double shared =
-      1 + static_cast<double>(result.inliers.size()) / settings.independent_landmarks;
+  const auto inliers_found = static_cast<double>(result.inliers.size());
+  Covariance by_residuals;
   for (int row = 0; row < 6; ++row)
     for (int column = 0; column < 6; ++column)
-      result.covariance[6 * row + column] = shared * covariance[8 * row + column];
+      by_residuals[6 * row + column] = covariance[8 * row + column];
+  result.searched = searched(by_residuals, inliers_found, settings);
+  // Among far landmarks a pose that is metres off fits as well, with offsets that no camera has.
+  const double growth = growth_of_few(settings.few_inliers, inliers_found) +
+                        squared(settings.offset_doubt * prior.chi2(estimate.offsets));
+  result.covariance = doubted(by_residuals, growth, inliers_found,
+                              estimate.pose.translation, settings);
   result.reference_from_live = estimate.pose;
   return result;
 }
@@ -623,7 +635,7 @@ namespace {
 PoseEstimate second_pass(const FrameView &reference, const FrameView &live,
                          const MatchSettings &settings, const PoseEstimate &first) {
   std::vector<RowPair> pairs;
-  const Prediction found{first.reference_from_live, first.covariance};
+  const Prediction found{first.reference_from_live, first.searched};
   match_near(reference, live, found, settings, pairs);
   return settle(reference, live, pairs, settings, {first.reference_from_live, {}});
 }

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <utility>
 
+#include "kernels/doubt.hpp"
 #include "kernels/twist.hpp"
 #include "kernels/window_ba.hpp"
 
@@ -188,7 +189,7 @@ void keep_newest(OdometryWindow &window, const OdometrySettings &settings) {
 
 PlacedPose optimise_window(OdometryWindow &window, const PoseEstimate &match,
                            const OdometrySettings &settings) {
-  const PlacedPose matched{match.reference_from_live, match.covariance};
+  const PlacedPose matched{match.reference_from_live, match.covariance, match.covariance};
   const std::vector<KeptFrame *> frames = frames_of(window);
   const std::vector<int32_t> length = living_tracks(window, frames);
   if (settings.window_iterations == 0)
@@ -210,15 +211,16 @@ PlacedPose optimise_window(OdometryWindow &window, const PoseEstimate &match,
   window.offset_px = adjusted.offset_px;
   for (size_t p = 0; p < frames.size(); ++p)
     frames[p]->world_from_cam = adjusted.world_from_cam[p];
-  // As in a match: landmarks share errors, which do not average out.
-  const double shared = 1 + static_cast<double>(match.inliers.size()) /
-                                settings.match.independent_landmarks;
   const RigidTransform keyframe_from_world = inverse(adjusted.world_from_cam[frames.size() - 2]);
   PlacedPose placed{compose(keyframe_from_world, adjusted.world_from_cam.back()),
                     carried(keyframe_from_world,
-                            covariance_of_last_step(adjusted, frames.size() - 1))};
-  for (double &entry : placed.covariance)
-    entry *= shared;
+                            covariance_of_last_step(adjusted, frames.size() - 1)),
+                    {}};
+  const auto inliers = static_cast<double>(match.inliers.size());
+  placed.searched = searched(placed.covariance, inliers, settings.match);
+  placed.covariance =
+      doubted(placed.covariance, growth_of_few(settings.few_inliers, inliers), inliers,
+              placed.pose.translation, settings.match);
   return placed;
 }
 

@@ -9,6 +9,7 @@ namespace engram::ENGRAM_ISA {
 struct PlacedPose {
   RigidTransform pose;
   std::array<double, 36> covariance;
+  std::array<double, 36> searched; // the same, as wide as matching searches
 };
 
 // A window of the first frame of a run.

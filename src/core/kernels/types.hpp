@@ -51,6 +51,10 @@ struct MatchSettings {
   double max_radius_px = 0;
   double chi2 = 0;
   double independent_landmarks = 0;
+  double few_inliers = 0;
+  double displaced_m = 0;
+  double offset_doubt = 0;
+  double calibration_share = 0, calibration_m = 0, calibration_rad = 0;
   int32_t min_consensus = 0;
   int32_t max_samples = 0;
   int32_t max_hypotheses = 0;
@@ -75,6 +79,7 @@ struct PoseEstimate {
   bool found = false;
   RigidTransform reference_from_live;
   std::array<double, 36> covariance{}; // [translation, rotation], left perturbation
+  std::array<double, 36> searched{};   // the same, as wide as a second pass searches
   std::vector<RowPair> inliers;
 };
 

@@ -58,9 +58,17 @@ class MatcherConfig:
         max_radius_px: largest radius of a search window, whatever the prediction's covariance.
         chi2: largest squared normalised reprojection error of an inlier: 99 % of χ² with the
             three degrees of freedom of left u, left v and disparity.
-        independent_landmarks: landmarks beyond this number share their errors (residual
-            distortion, rectification, scene geometry), so that they do not reduce the covariance
-            further. Source: motion capture of EuRoC.
+        independent_landmarks: a second pass searches as wide as if landmarks beyond this number
+            shared their errors. Source: motion capture of EuRoC.
+        few_inliers: variances of a pose grow by the square of this over its number of inliers: of
+            few, a large share agrees by chance. Source: `lab/reports/trust.md`, as the next two.
+        displaced_m: standard deviation of a position, each axis, times the number of inliers: edges
+            of shadows move with the sun.
+        offset_doubt: variances grow by the square of this times χ² of the offsets that fit best: a
+            wrong pose on far landmarks needs large ones.
+        calibration_share, calibration_m, calibration_rad: what calibration leaves: standard
+            deviations of a position, each axis, per metre between the cameras and at any distance,
+            and of the rotation. Source: KITTI; motion capture of EuRoC.
         min_consensus: fewest landmarks of a pose; any three agree on some pose. The localiser
             accepts a match by a higher threshold.
         max_samples, max_hypotheses, min_followers: see their descriptions.
@@ -86,6 +94,12 @@ class MatcherConfig:
     max_radius_px: Annotated[float, Meta(gt=0)] = 128.0
     chi2: Annotated[float, Meta(gt=0)] = 11.34
     independent_landmarks: Annotated[float, Meta(gt=0)] = 10.0
+    few_inliers: Annotated[float, Meta(ge=0)] = 25.0
+    displaced_m: Annotated[float, Meta(ge=0)] = 2.0
+    offset_doubt: Annotated[float, Meta(ge=0)] = 1.0
+    calibration_share: Annotated[float, Meta(ge=0)] = 0.005
+    calibration_m: Annotated[float, Meta(ge=0)] = 0.01
+    calibration_rad: Annotated[float, Meta(ge=0)] = 0.001
     min_consensus: Annotated[int, Meta(ge=4)] = 6
     max_samples: Annotated[
         int,

@@ -40,6 +40,7 @@ class OdometryConfig:
             prediction: repeating lamps, trees and kerb stones match as well as the same place.
             `usual_share` of the usual number (median of the last steps) suffices if it is less.
         usual_share: see `unexpected_inliers`.
+        few_inliers: see its description.
         plausible_inliers: sufficient inliers after a gap if the speed before it, changed by
             `acceleration_m_s2` throughout the gap, explains the motion; above every grossly wrong
             match on KITTI (`lab/reports/constants.md`).
@@ -58,6 +59,15 @@ class OdometryConfig:
     unexpected_inliers: Annotated[int, Meta(ge=6)] = 60
     usual_share: Annotated[float, Meta(ge=0, le=1)] = 0.4
     plausible_inliers: Annotated[int, Meta(ge=6)] = 35
+    few_inliers: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="variances of a step grow by the square of this number over that of its "
+            "inliers: drops on the lens and one's own headlights agree that nothing moves. "
+            "Source: `lab/reports/trust.md`",
+        ),
+    ] = 400.0
     acceleration_m_s2: float = 4.0
     angular_acceleration_rad_s2: float = 5.0
     max_prediction_s: float = 0.25

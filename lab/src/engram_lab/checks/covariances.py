@@ -25,11 +25,11 @@ from engram.localiser import Position
 from engram.monitor import QUIET
 from engram.odometry import GapFiller
 from engram.robot import Settings
+from engram_lab.accuracy import LEVELS, squared
 from engram_lab.misplaced import Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.trial_towns import HELD_OUT_TOWNS, all_streets, light_of
 
-LEVELS = (0.5, 0.9, 0.99)
 WRONG_M, SHARP_M = 0.2, 0.1
 RECKONED_M, EVERY = 20.0, 5
 
@@ -49,12 +49,6 @@ class Errors:
     ways: list[float] = field(default_factory=list)
     wrong_sharp: int = 0
     sharp: int = 0
-
-
-def squared(found: SE3, covariance: NDArray[np.float64], truth: SE3) -> float:
-    """χ² of a pose with its (6, 6) covariance, left perturbation."""
-    off = (truth @ found.inverse()).log()
-    return float(off @ np.linalg.solve(covariance + 1e-12 * np.eye(6), off))
 
 
 def add_motion(errors: Errors, street: Street) -> None:
