@@ -16,6 +16,7 @@ model between neighbouring places in the same way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -78,7 +79,7 @@ class PlaceBelief:
         elif len(self._belief):
             self._moved_m = self._moved_m + motion.translation
             self._since_m += motion.distance_m
-            if np.linalg.norm(self._moved_m) >= self.config.step_m:
+            if math.sqrt(self._moved_m @ self._moved_m) >= self.config.step_m:
                 self._carry()
 
     def observe(self, evidence: Array) -> Array:
@@ -117,7 +118,8 @@ class PlaceBelief:
     def _carry(self) -> None:
         """Moves the belief along the edges, in steps about as long as they are."""
         steps = self._edges()
-        count = max(1, round(float(np.linalg.norm(self._moved_m)) / self.config.step_m))
+        moved_m = math.sqrt(self._moved_m @ self._moved_m)
+        count = max(1, round(moved_m / self.config.step_m))
         motion = self._moved_m / count
         off = ((steps.target_in_source - motion) ** 2).sum(axis=1)
         cost = off / (2 * self.config.slack_m**2)
