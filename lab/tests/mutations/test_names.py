@@ -16,10 +16,9 @@ from tests.sequences.synthetic import camera, picture, stamp_ns
 
 from engram.cli import main
 from engram.cli.app import app
-from engram.frontend.blobs import content_digest
 from engram.maps.rows import sealed
 from engram.maps.schema import metadata
-from engram.sequences.framelog.file import log_table
+from engram.sequences.framelog.file import log_digest, log_table
 from engram_lab.mutations.samples import make_samples
 
 # A terminal's title, a cleared screen, text from right to left; markup of bars, formulas of plots.
@@ -151,14 +150,15 @@ def plant(path, *, closed: bool) -> None:
 
 def plant_in_a_drive(path) -> None:
     with closing(sqlite3.connect(path)) as connection, connection:
-        (header,) = connection.execute(f"SELECT header FROM {log_table.name}").fetchone()
+        found = connection.execute(f"SELECT header, complete FROM {log_table.name}")
+        header, complete = found.fetchone()
         values = json.loads(header)
         for name in ("name", "robot", "source_format", "frontend", "odometry"):
             values[name] += WILD
         header = json.dumps(values, sort_keys=True)
         connection.execute(
             f"UPDATE {log_table.name} SET header = ?, digest = ?",
-            [header, content_digest(header.encode())],
+            [header, log_digest(header, complete)],
         )
 
 

@@ -15,7 +15,7 @@ from sqlalchemy import Table
 from engram.frontend.blobs import content_digest
 from engram.maps.rows import sealed
 from engram.maps.schema import frames, metadata, nodes
-from engram.sequences.framelog.file import frames_table, log_table
+from engram.sequences.framelog.file import frames_table, log_digest, log_table
 from engram.sequences.framelog.rows import row_digest
 from engram_lab.mutations import values
 from engram_lab.mutations.case import Case, Subject
@@ -150,7 +150,8 @@ def _change_drive(connection: sqlite3.Connection, chance: random.Random, seal: b
         header = values.text(row["header"], chance)
         changed = {**row, "header": header}
         if seal:
-            changed["digest"] = content_digest(header.encode(errors="replace"))
+            known = header.encode(errors="replace").decode()
+            changed["digest"] = log_digest(known, row["complete"])
         _update(connection, log_table, changed)
         return f"header {header!r:.60}"
     row = _any_row(connection, frames_table, chance)
