@@ -1,4 +1,8 @@
-"""The C++ core: arrays in, arrays out. Every function releases the GIL. Sorted by subject."""
+"""The C++ core: arrays in, arrays out. Sorted by subject.
+
+Functions of many rows release the GIL, `verified_columns` excepted, which reads Python's objects.
+Those of a single transform or covariance do not: to take it back costs more than they do.
+"""
 
 from collections.abc import Sequence
 from typing import Any, TypeAlias

@@ -23,7 +23,7 @@ void bind_window_ba(nb::module_ &module);
 NB_MODULE(_core, module) {
   // An error's traceback may keep arrays alive until the interpreter is gone; that is no leak.
   nb::set_leak_warnings(false);
-  module.doc() = "The measured hot kernels of Engram. Every function but verified_columns releases the GIL.";
+  module.doc() = "The measured hot kernels of Engram. See _core.pyi for which release the GIL.";
   module.attr("isa") = engram::name_of(engram::active_isa());
   bind_extraction(module);
   bind_graph_search(module);

@@ -174,16 +174,11 @@ NO_MATCH = Match(None, None, 0, np.empty(0, dtype=np.int32), np.empty(0, dtype=n
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Question:
-    """What a live frame is matched with.
+    """What a live frame is matched with: the arguments of `match_frames`.
 
     Attributes:
-        reference: the reference frame; its camera may differ from the live one.
-        config: the settings.
-        seed: seed of the random draws, 0 … 2⁶⁴ − 1; see `pair_seed`.
-        predicted: predicted reference_from_live; only landmarks near their predicted pixels are
-            then compared. None to search the whole frame.
-        predicted_covariance: (6, 6) float64 of `predicted`, left perturbation, [translation,
-            rotation]; required with it.
+        reference, config, seed, predicted: see there.
+        predicted_covariance: (6, 6) float64 of `predicted`, see there.
     """
 
     reference: Frame
