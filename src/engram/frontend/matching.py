@@ -178,7 +178,8 @@ class Question:
 
     Attributes:
         reference, config, seed, predicted: see there.
-        predicted_covariance: (6, 6) float64 of `predicted`, see there.
+        predicted_covariance: (6, 6) float64 of `predicted`, left perturbation, [translation m,
+            rotation rad].
     """
 
     reference: Frame
