@@ -62,9 +62,10 @@ def map_simulated(
     *,
     closes_loops: bool = False,
     longitude_deg: float | None = None,
+    settings: Settings | None = None,
     **budget: int,
 ) -> Mapped:
-    first = drive[0].frame
+    first, settings = drive[0].frame, settings or Settings()
     with open_map(path, create=True) as opened, opened.writing():
         session = session_for(drive, name, longitude_deg)
         writer = opened.begin_session(
@@ -79,7 +80,7 @@ def map_simulated(
         localiser = localiser_in(
             opened,
             first.camera,
-            Settings(),
+            settings,
             policy=policy,
             budget=Budget(**budget),
             live=session.id,
@@ -87,14 +88,14 @@ def map_simulated(
         )
         searching = nullcontext()
         if closes_loops:
-            searching = loop_search(opened, localiser, Settings())
+            searching = loop_search(opened, localiser, settings)
         with localiser, searching as loops:
-            mapper = Mapper(opened.graph, localiser, saver, session, loops=loops)
-            robot = Robot(Front(Settings()), localiser, mapper)
+            mapper = Mapper(opened.graph, localiser, saver, session, settings.mapper, loops)
+            robot = Robot(Front(settings), localiser, mapper)
             steps = [robot.step(seen.logged) for seen in drive]
             mapper.finish()
         saver.finish()
-        writer.commit()
+        writer.commit(settings.placing)
     return Mapped(steps, drive)
 
 

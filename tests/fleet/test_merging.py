@@ -16,7 +16,10 @@ from engram.fleet.download import DownloadOptions, download
 from engram.fleet.merge import Reason, Seed
 from engram.fleet.merge.state import Merge
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
+from engram.graph.placing import PlacingConfig
+from engram.graph.proximity import ProximityConfig
 from engram.localiser import Localiser
+from engram.mapper import MapperConfig
 from engram.maps import Map, check_file, open_map
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
@@ -141,6 +144,32 @@ def test_what_finds_no_place_becomes_a_component_of_its_own(tmp_path, fleet):
     assert report.match_attempts == report.proposed_attempts
     assert 0 < report.match_attempts <= report.taken * OPTIONS.lanes * OPTIONS.rounds
     assert_sound(centre)
+
+
+@pytest.mark.parametrize("apart_m", [20.0, 70.0])
+def test_the_settings_say_how_far_components_stand_apart(tmp_path, fleet, apart_m):
+    settings = Settings(placing=PlacingConfig(apart_m=apart_m))
+    centre, (first, _), (other, mapped) = tmp_path / "centre.engram", fleet["first"], fleet["other"]
+    merged(centre, first, other, settings=settings)
+    with Map.open(centre) as store:
+        new = [store.graph.index(node) for node in mapped.saved]
+        along_m = store.frame.positions[:, 0]
+    gap_m = along_m[new].min() - np.delete(along_m, new).max()
+    assert gap_m == pytest.approx(apart_m, abs=1e-6)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_settings_say_what_dead_reckoning_joins_in_a_merge(tmp_path, fleet, kept):
+    proximity = ProximityConfig() if kept else ProximityConfig(greatest_sigma_m=0.0)
+    settings = Settings(mapper=MapperConfig(proximity=proximity))
+    centre, dusk = tmp_path / "centre.engram", tmp_path / "dusk.engram"
+    robot_map(dusk, np.arange(0, 16, 0.8), np.arange(20) // 10, name="r5", day=5)
+    merged(centre, fleet["first"][0], dusk, settings=settings)
+    with Map.open(centre) as store, Map.open(dusk) as theirs, Map.open(fleet["first"][0]) as own:
+        known = {edge.kind for one in (theirs, own) for edge in one.graph.edges}
+        made = {edge.kind for edge in store.graph.edges}
+    assert EdgeKind.PROXIMITY not in known
+    assert (EdgeKind.PROXIMITY in made) == kept
 
 
 @pytest.mark.parametrize("names", [("first",), ("first", "same"), ("first", "longer", "other")])

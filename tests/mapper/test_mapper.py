@@ -14,8 +14,11 @@ from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntryKind
 from engram.graph.neighbourhood import Search
+from engram.graph.proximity import ProximityConfig
+from engram.mapper import MapperConfig
 from engram.maps import Map
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.robot import Settings
 
 WORLD = World(60.0)
 ROAD = np.arange(0.0, 55.0, 0.7)
@@ -79,6 +82,16 @@ def test_another_appearance_becomes_an_experience_beside_the_known_one(path: Pat
     assert {min(new), max(new)} <= tied  # on both sides
     assert any(edge.kind is EdgeKind.PROXIMITY for edge in graph.edges)
     assert len(set(graph.components().tolist())) == 1
+
+
+def test_the_settings_say_which_nodes_are_joined_by_dead_reckoning(path: Path) -> None:
+    settings = Settings(mapper=MapperConfig(proximity=ProximityConfig(greatest_sigma_m=0.0)))
+    map_simulated(path, drive(WORLD, ROAD), settings=settings)
+    seen = drive(WORLD, ROAD, looks(20, 50), seed=1, start_ns=LATER_NS)
+    map_simulated(path, seen, "r2", settings=settings)
+    kinds = {edge.kind for edge in graph_of(path).edges}
+    assert EdgeKind.TIE in kinds
+    assert EdgeKind.PROXIMITY not in kinds
 
 
 def test_a_parallel_experience_is_in_the_neighbourhood(path: Path) -> None:

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from engram.cli.frame import anchor
+from engram.cli.options import SettingsGiven
 from engram.maps import open_map
 from engram.robot import RobotOptions, map_drive, open_drive
 from engram.robot.anchoring import anchor_map
@@ -28,8 +30,8 @@ def parted(street: Path, tmp_path: Path) -> Path:
     return path
 
 
-def anchored(path: Path, shift_m: float) -> None:
-    """Anchors every node along a circle of latitude; the second part lies off by `shift_m`."""
+def anchors(path: Path, shift_m: float) -> Path:
+    """Anchors of all nodes along a circle of latitude; the second part lies off by `shift_m`."""
     lines = ["node,lat,lon,sigma"]
     with open_map(path) as opened:
         first_ns = min(node.stamp_ns for node in opened.graph.nodes)
@@ -40,12 +42,12 @@ def anchored(path: Path, shift_m: float) -> None:
             lines.append(f"{node.id},50.0,{14 + east_m / METRES_PER_DEGREE:.9f},1.0")
     given = path.with_suffix(".csv")
     given.write_text("\n".join(lines))
-    anchor_map(path, given, author="tests")
+    return given
 
 
 @pytest.mark.parametrize("shift_m", [1.5, 300.0])
 def test_parts_at_one_place_are_joined_by_matches(parted: Path, shift_m: float) -> None:
-    anchored(parted, shift_m)
+    anchor_map(parted, anchors(parted, shift_m), author="tests")
     report = join_islands(parted, "tests", config=IslandsConfig(apart_m=3.0))
     with open_map(parted) as opened:
         parts = len(np.unique(opened.graph.components()))
@@ -63,9 +65,12 @@ def test_without_anchors_nothing_is_compared(parted: Path) -> None:
     assert join_islands(parted, "tests").compared == 0
 
 
-def test_one_match_alone_joins_nothing(parted: Path) -> None:
-    anchored(parted, 0.0)
-    report = join_islands(parted, "tests", config=IslandsConfig(apart_m=100.0))
-    assert report.compared > 0
-    assert report.revision is None
-    assert "none joins" in report.text()
+@pytest.mark.parametrize(("apart_m", "parts"), [(100.0, 2), (3.0, 1)])
+def test_the_verb_goes_by_the_settings_and_one_match_alone_joins_nothing(
+    parted: Path, capsys: pytest.CaptureFixture[str], apart_m: float, parts: int
+) -> None:
+    given = SettingsGiven(changes=[f"islands.apart_m={apart_m}"])
+    anchor(parted, anchors(parted, 0.0), settings=given)
+    with open_map(parted) as opened:
+        assert len(np.unique(opened.graph.components())) == parts
+    assert ("none joins them" in capsys.readouterr().out) == (parts == 2)

@@ -55,6 +55,7 @@ def anchor(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Report residuals and moves; write nothing.")
     ] = False,
+    settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Fit a map's frame to known positions.
@@ -75,8 +76,18 @@ def anchor(
     from engram.robot.anchoring import anchor_map
     from engram.robot.islands import IslandReport, join_islands
 
-    report = anchor_map(map_path, positions, grid=grid, topic=topic, author=user(), dry_run=dry_run)
-    islands = IslandReport() if dry_run else join_islands(map_path, user(), monitor=Bars())
+    chosen, islands = settings.read(), IslandReport()
+    report = anchor_map(
+        map_path,
+        positions,
+        grid=grid,
+        topic=topic,
+        author=user(),
+        dry_run=dry_run,
+        placing=chosen.placing,
+    )
+    if not dry_run:
+        islands = join_islands(map_path, user(), chosen.of_robot(), chosen.islands, Bars())
     if as_json:
         typer.echo(json.dumps({**report.to_dict(), "islands": islands.to_dict()}))
         return

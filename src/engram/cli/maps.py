@@ -176,8 +176,15 @@ def _check_geometry(
     from engram.repair import check_geometry
 
     author = user() if commits else None
-    config = settings.read().repair
-    return check_geometry(map_path, config, author=author, pictures=pictures, monitor=Bars())
+    chosen = settings.read()
+    return check_geometry(
+        map_path,
+        chosen.repair,
+        placing=chosen.placing,
+        author=author,
+        pictures=pictures,
+        monitor=Bars(),
+    )
 
 
 def _print_check(report: dict[str, Any]) -> None:

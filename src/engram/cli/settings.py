@@ -21,6 +21,7 @@ from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.frontend import DescriptorKind
 from engram.measures import Estimator
 from engram.repair.config import RepairConfig
+from engram.robot.islands import IslandsConfig
 from engram.robot.settings import Settings, settings_text
 
 
@@ -131,6 +132,7 @@ class AllSettings(Settings):
     build: BuildSettings = field(default_factory=BuildSettings)
     download: DownloadSettings = field(default_factory=DownloadSettings)
     repair: RepairConfig = field(default_factory=RepairConfig)
+    islands: IslandsConfig = field(default_factory=IslandsConfig)
 
     def of_robot(self, descriptor: str | None = None) -> Settings:
         """The part that maps and results keep.

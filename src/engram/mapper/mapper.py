@@ -20,7 +20,7 @@ from engram.graph.model import (
     node_id,
     path_id,
 )
-from engram.graph.proximity import lay_proximity_edges, tighten_chain
+from engram.graph.proximity import ProximityConfig, lay_proximity_edges, tighten_chain
 from engram.localiser import Hint, Localisation, LocalisationStatus, Localiser, Position
 from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopSearch
@@ -46,6 +46,7 @@ class MapperConfig:
         memory_bytes: largest memory of a drive that saves no nodes, bytes; later frames are not
             remembered. About a day at 20 frames per second.
         votes: when an edge is distrusted that fixes contradict.
+        proximity: which experiences are joined by dead reckoning; merging joins them alike.
     """
 
     save_every_m: float = 1.0
@@ -54,6 +55,7 @@ class MapperConfig:
     checkpoint_every: int = 20
     memory_bytes: int = 256_000_000
     votes: VoteConfig = field(default_factory=VoteConfig)
+    proximity: ProximityConfig = field(default_factory=ProximityConfig)
 
     def __post_init__(self) -> None:
         for name in ("save_every_m", "save_every_rad", "tie_within_m"):
@@ -172,10 +174,9 @@ class Mapper(Memory):
             return []
         self._graph.add_edges(waiting)
         self._joined = True
-        chain = [self._graph.index(node) for node in self._experience]
-        edges = [*waiting, *tighten_chain(self._graph, chain)]
+        edges = [*waiting, *self._tightened(self._experience)]
         for edge in waiting:
-            edges += lay_proximity_edges(self._graph, self._graph.index(edge.b))
+            edges += self._beside(edge.b)
         return edges
 
     def _wait_with(self, edges: list[Edge]) -> None:
@@ -274,7 +275,7 @@ class Mapper(Memory):
                 edges.append(tie)
             edges += self._edge_to_last_saved(position, node.id)
         self._graph.add_edges(edges)
-        edges += lay_proximity_edges(self._graph, self._graph.index(node.id))
+        edges += self._beside(node.id)
         self._experience.append(node.id)
         self._since_saved = Position.at(node.id)
         if not self._waiting:
@@ -287,7 +288,7 @@ class Mapper(Memory):
         self._graph.add_edges(closures)
         for closure in closures:
             self._joined = True
-            edges += lay_proximity_edges(self._graph, self._graph.index(closure.b))
+            edges += self._beside(closure.b)
         return edges
 
     def _edge_to_last_saved(self, position: Position, node: NodeId) -> list[Edge]:
@@ -311,8 +312,14 @@ class Mapper(Memory):
         assert localisation.position is not None
         tie = edge_through_live(self._since_saved, localisation.position, EdgeKind.TIE)
         self._graph.add_edge(tie)
+        return [tie, *self._tightened(experience)]
+
+    def _tightened(self, experience: list[NodeId]) -> list[Edge]:
         chain = [self._graph.index(node) for node in experience]
-        return [tie, *tighten_chain(self._graph, chain)]
+        return tighten_chain(self._graph, chain, self.config.proximity)
+
+    def _beside(self, node: NodeId) -> list[Edge]:
+        return lay_proximity_edges(self._graph, self._graph.index(node), self.config.proximity)
 
 
 def _edge(position: Position, node: NodeId, kind: EdgeKind) -> Edge:

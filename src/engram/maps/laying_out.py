@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from engram.graph.graph import ExperienceGraph
 from engram.graph.marks import Placement
 from engram.graph.model import Edge, Node
-from engram.graph.placing import place, replace_after_removal
+from engram.graph.placing import PlacingConfig, place, replace_after_removal
 from engram.maps.map_frame import MapFrame, changed
 
 if TYPE_CHECKING:
@@ -32,12 +32,15 @@ def frame_of(store: MapReader, revision: int, nodes: int) -> MapFrame:
     return MapFrame(graph, place(graph, store.placements), known)
 
 
-def new_places(store: MapReader, contents: Mapping[str, float]) -> list[Placement]:
+def new_places(
+    store: MapReader, contents: Mapping[str, float], config: PlacingConfig
+) -> list[Placement]:
     """The places that an open revision has to write, around those that nodes have.
 
     Args:
         store: the map, which sees the rows of the revision.
         contents: number of rows that the revision wrote, by table.
+        config: how new nodes are laid out.
     """
     graph = store.grown_graph() if not contents["removals"] else None
     if graph is None:
@@ -46,7 +49,7 @@ def new_places(store: MapReader, contents: Mapping[str, float]) -> list[Placemen
     own = contents["placements"] or contents["hidden"]
     before = store.read_placements() if own else store.placements
     lay_out = replace_after_removal if contents["removals"] else place
-    return changed(before, graph, lay_out(graph, before))
+    return changed(before, graph, lay_out(graph, before, config), config.same_m)
 
 
 def graph_of(nodes: Sequence[Node], edges: Sequence[Edge]) -> ExperienceGraph:

@@ -20,6 +20,7 @@ from engram.frontend import DescriptorKind
 from engram.geometry import SE3, StereoCamera
 from engram.graph.marks import Placement
 from engram.graph.model import Amendable, NodeId, Session, SessionId
+from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.amending import checked_amendments
 from engram.maps.database import Database, Lock, Place
@@ -534,9 +535,9 @@ class Map(MapReader):
         )
         return self._writing
 
-    def _new_places(self, contents: Mapping[str, float]) -> list[Placement]:
+    def _new_places(self, contents: Mapping[str, float], config: PlacingConfig) -> list[Placement]:
         """What the open revision has to write of the layout, which is known then."""
-        found = new_places(self, contents)
+        found = new_places(self, contents, config)
         if contents["placements"] or contents["hidden"]:
             self._laid_out = None
         else:

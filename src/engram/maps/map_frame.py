@@ -15,7 +15,7 @@ from engram.graph.adjusting import Poses
 from engram.graph.graph import ExperienceGraph
 from engram.graph.marks import Goal, Placement
 from engram.graph.model import NodeId
-from engram.graph.placing import DEFAULT_CONFIG
+from engram.graph.placing import DEFAULT_CONFIG as PLACING
 
 # Metres per degree of latitude, and the least movement that is worth a word.
 _DEGREE_M = 111_320.0
@@ -248,23 +248,36 @@ def moves(
     return Moves(len(moved), len(both), median_m, largest_m, far_m, tuple(lost))
 
 
-def changed(before: Mapping[NodeId, SE3], graph: ExperienceGraph, poses: Poses) -> list[Placement]:
-    """The placements that a revision has to write: of new nodes, and of those that moved."""
+def changed(
+    before: Mapping[NodeId, SE3],
+    graph: ExperienceGraph,
+    poses: Poses,
+    same_m: float = PLACING.same_m,
+) -> list[Placement]:
+    """The placements that a revision has to write: of new nodes, and of those that moved.
+
+    Args:
+        before: ``map_from_node`` of the nodes that have a place.
+        graph: the graph.
+        poses: the layout.
+        same_m: see `PlacingConfig`.
+    """
     known = [before.get(node.id) for node in graph.nodes]
     stays = np.array([pose is not None for pose in known], np.bool_)
     placed = [pose for pose in known if pose is not None]
     if placed:
         turns = np.array([pose.rotation for pose in placed]) - poses.rotations[stays]
         shifts = np.array([pose.translation for pose in placed]) - poses.translations[stays]
-        stays[stays] = ~_moved(turns, shifts)
+        stays[stays] = ~_moved(turns, shifts, same_m)
     return [Placement(graph.nodes[at].id, poses.pose(at)) for at in np.flatnonzero(~stays).tolist()]
 
 
-def _moved(turns: NDArray[np.float64], shifts: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _moved(
+    turns: NDArray[np.float64], shifts: NDArray[np.float64], same: float
+) -> NDArray[np.bool_]:
     """(N,): whether the differences (N, 3, 3) of rotations and (N, 3) of positions are large."""
     chords = np.linalg.norm(turns.reshape(-1, 9), axis=1) / np.sqrt(8)
     angles_rad = 2 * np.arcsin(np.minimum(chords, 1.0))
-    same = DEFAULT_CONFIG.same_m
     return np.asarray((np.linalg.norm(shifts, axis=1) > same) | (angles_rad > same))
 
 

@@ -30,6 +30,8 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
+from engram.graph.placing import DEFAULT_CONFIG as PLACING
+from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.attempts import COLUMNS, AttemptTable
 from engram.maps.database import Database
@@ -128,7 +130,7 @@ class RevisionWriter:
         *,
         drive: Resumable | None = None,
         committed_ns: int | None = None,
-        places: Callable[[Mapping[str, float]], Sequence[Mark]] = lambda _: (),
+        places: Callable[[Mapping[str, float], PlacingConfig], Sequence[Mark]] = lambda *_: (),
     ) -> None:
         assert view.own is not None
         self.resumable = drive is not None
@@ -468,8 +470,11 @@ class RevisionWriter:
         self._frames.release(self._held)
         self._clear()
 
-    def commit(self) -> Revision:
+    def commit(self, placing: PlacingConfig = PLACING) -> Revision:
         """Commits the revision: a last checkpoint, then its status.
+
+        Args:
+            placing: how the nodes that are new to the map frame are laid out in it.
 
         Raises:
             StorageFullError: as `checkpoint`.
@@ -477,7 +482,7 @@ class RevisionWriter:
         self.checkpoint()
         contents = self._contents()
         if changes_layout(contents):
-            for one in self._places(contents):
+            for one in self._places(contents, placing):
                 self.add_mark(one)
             self.checkpoint()
             contents = self._contents()

@@ -11,6 +11,8 @@ import numpy as np
 
 from engram.config import to_dict
 from engram.graph.marks import Removal
+from engram.graph.placing import DEFAULT_CONFIG as PLACING
+from engram.graph.placing import PlacingConfig
 from engram.maps import Map, Moves, moves
 from engram.monitor import QUIET, Monitor
 from engram.repair.config import RepairConfig
@@ -79,6 +81,7 @@ def check_geometry(
     path: Path,
     config: RepairConfig | None = None,
     *,
+    placing: PlacingConfig = PLACING,
     author: str | None = None,
     pictures: Path | None = None,
     monitor: Monitor = QUIET,
@@ -88,6 +91,7 @@ def check_geometry(
     Args:
         path: the map.
         config: settings.
+        placing: how what the wrong edges had put in a wrong place is laid out anew.
         author: commits a revision of this author in which the wrong edges no longer count; None
             changes nothing.
         pictures: folder for a picture of both sides of each edge; None for none.
@@ -106,12 +110,16 @@ def check_geometry(
         components = _components(store, found)
         if author is None or not found.wrong:
             return GeometryReport(found, components, pictures=written)
-        revision, moved = remove_edges(store, found.wrong, config, author)
+        revision, moved = remove_edges(store, found.wrong, config, author, placing)
     return GeometryReport(found, components, revision, moved, written)
 
 
 def remove_edges(
-    store: Map, wrong: tuple[Finding, ...], config: RepairConfig, author: str
+    store: Map,
+    wrong: tuple[Finding, ...],
+    config: RepairConfig,
+    author: str,
+    placing: PlacingConfig = PLACING,
 ) -> tuple[int, Moves]:
     """Removes edges in a revision of its own.
 
@@ -130,7 +138,7 @@ def remove_edges(
                 writer.add_mark(
                     Removal(edge.a, edge.b, edge.kind, edge.a_from_b, one.text(), now_ns)
                 )
-            revision = writer.commit()
+            revision = writer.commit(placing)
         store.forget()
         return revision.number, moves(before, store.placements, goals)
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from engram.errors import InputError
 from engram.graph.marks import Anchor
 from engram.graph.model import Clock, Node
-from engram.graph.placing import Anchored, anchor
+from engram.graph.placing import DEFAULT_CONFIG as PLACING
+from engram.graph.placing import Anchored, PlacingConfig, anchor
 from engram.maps import Map, MapFrame, Moves, moves
 from engram.maps.laying_out import ORIGIN
 from engram.maps.map_frame import changed, local_m
@@ -87,6 +88,7 @@ def anchor_map(
     topic: str | None = None,
     author: str,
     dry_run: bool = False,
+    placing: PlacingConfig = PLACING,
 ) -> AnchorReport:
     """Fits the map frame to known positions, in a revision of its own.
 
@@ -98,6 +100,7 @@ def anchor_map(
         grid: ``map.yaml`` of an occupancy grid, whose pixels the positions are.
         author: of the revision.
         dry_run: only report.
+        placing: how the frame is laid out.
 
     Raises:
         InputError: the file cannot be read, names no node of the map, or too few of them.
@@ -118,10 +121,11 @@ def anchor_map(
         ]
         frame = store.frame
         before = {one.node: one.map_from_node for one in frame.placements()}
-        poses = anchor(store.graph, before, _anchored(store, anchors))
+        poses = anchor(store.graph, before, _anchored(store, anchors), placing)
         after = MapFrame(store.graph, poses, origin)
         residuals = _residuals(after, anchors)
-        revision = None if dry_run else _write(store, anchors, after, origin, author, source)
+        about = {"author": author, **_about(source, anchors)}
+        revision = None if dry_run else _write(store, anchors, after, about, placing)
         places = {one.node: one.map_from_node for one in after.placements()}
         moved = moves(before, places, store.goals.values())
     outliers = tuple(
@@ -209,25 +213,27 @@ def _residuals(frame: MapFrame, anchors: list[Anchor]) -> dict[str, float]:
     }
 
 
+def _about(source: Path, anchors: list[Anchor]) -> dict[str, Any]:
+    about = {"anchor": {"source": source.name, "anchors": len(anchors)}}
+    return {"message": f"anchor {len(anchors)} nodes", "configuration": about}
+
+
 def _write(
     store: Map,
     anchors: list[Anchor],
     frame: MapFrame,
-    origin: tuple[float, float] | None,
-    author: str,
-    source: Path,
+    about: dict[str, Any],
+    placing: PlacingConfig,
 ) -> int:
-    about = {"anchor": {"source": source.name, "anchors": len(anchors)}}
-    with store.begin_revision(
-        author=author, message=f"anchor {len(anchors)} nodes", configuration=about
-    ) as writer:
+    origin = frame.origin
+    with store.begin_revision(**about) as writer:
         for one in anchors:
             writer.add_mark(one)
-        for placement in changed(store.placements, store.graph, frame.poses):
+        for placement in changed(store.placements, store.graph, frame.poses, placing.same_m):
             writer.add_mark(placement)
         if origin is not None:
             body = {"latitude_deg": origin[0], "longitude_deg": origin[1]}
             writer.put_statistic(ORIGIN, body)
         elif store.frame.origin is not None:
             writer.put_statistic(ORIGIN, {})
-        return writer.commit().number
+        return writer.commit(placing).number

@@ -114,7 +114,7 @@ def join_islands(
         ) as writer:
             for edge in edges:
                 writer.add_edge(edge)
-            number = writer.commit().number
+            number = writer.commit(resolved.placing).number
         return IslandReport(number, islands.compared, ids)
 
 

@@ -29,7 +29,7 @@ class SavedDrive:
         opened: the map, open for writing; its graph grows.
         writer: writer of the session.
         localiser: localiser of the drive, in the same map.
-        settings: settings of the mapper.
+        settings: settings of the mapper and the map frame.
         words: finds the words of nodes, see `node_words`.
         waits: whether a slow disk slows the drive; else it ends the saving.
 
@@ -48,7 +48,7 @@ class SavedDrive:
         waits: bool = True,
     ) -> None:
         opened.derived(drives_of)[writer.session.id] = writer.session
-        self._writer = writer
+        self._writer, self._placing = writer, settings.placing
         every = settings.mapper.checkpoint_every
         self._saver = Saver(writer, NodeSaver(writer, opened.frames, words), every, waits)
         self._stack = ExitStack()
@@ -80,7 +80,7 @@ class SavedDrive:
         """Makes the session a revision of the map, without the edges that its fixes disproved."""
         for removal in self.mapper.votes.removals:
             self._writer.add_mark(removal)
-        return self._writer.commit()
+        return self._writer.commit(self._placing)
 
 
 def begin_or_resume(

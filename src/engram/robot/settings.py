@@ -12,6 +12,7 @@ from engram.doctor.settings import DoctorConfig
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
+from engram.graph.placing import PlacingConfig
 from engram.localiser import Budget, LocaliserConfig
 from engram.mapper import MapperConfig
 from engram.odometry import GapConfig, OdometryConfig, OutsideConfig
@@ -32,6 +33,7 @@ class Settings:
     doctor: DoctorConfig = field(default_factory=DoctorConfig)
     outside: OutsideConfig = field(default_factory=OutsideConfig)
     gaps: GapConfig = field(default_factory=GapConfig)
+    placing: PlacingConfig = field(default_factory=PlacingConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
         """These settings for a map's kind of descriptor; None keeps their own.

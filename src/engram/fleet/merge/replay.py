@@ -349,7 +349,8 @@ class Replay(Keeper):
             at = _measured(found)
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
             self._merge.add_edge(match)
-        self._merge.write_edges(lay_proximity_edges(self._merge.graph, index))
+        proximity = self._settings.mapper.proximity
+        self._merge.write_edges(lay_proximity_edges(self._merge.graph, index, proximity))
         self._visited = node.id
 
     def _matched(self, node: Node, outcomes: Sequence[Outcome]) -> None:
@@ -374,7 +375,8 @@ class Replay(Keeper):
         """Ends a run of taken nodes and ties its far end."""
         run, self._run = self._run, []
         if run:
-            self._merge.write_edges(tighten_chain(self._merge.graph, run))
+            proximity = self._settings.mapper.proximity
+            self._merge.write_edges(tighten_chain(self._merge.graph, run, proximity))
 
 
 def _measured(found: Localisation) -> Position:

@@ -81,7 +81,7 @@ def merge_one(
     Args:
         centre: the fleet map, open for writing.
         robot: the robot's map.
-        settings: of localiser and mapper.
+        settings: of localiser, mapper and map frame.
         options: policy and budget.
         gates: check the result before it is committed.
         monitor: receives progress; its `check` is called wherever the merge can still be undone.
@@ -110,7 +110,7 @@ def merge_one(
                 merge.writer.checkpoint()
                 gates.check(merge, monitor)
                 monitor.check()
-            report.revision = merge.writer.commit().number
+            report.revision = merge.writer.commit(settings.placing).number
         report.moved = moves(places, centre.placements, goals)
         if options.relocaliser in RECOGNISERS:  # these use the nodes' visual words
             _keep_words(merge, settings.frontend.descriptor)
