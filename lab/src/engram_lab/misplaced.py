@@ -39,10 +39,15 @@ class Kind(StrEnum):
     """What happens to a robot."""
 
     UNDISTURBED = "undisturbed"
+    COLD = "cold start"
     TOLD = "told a wrong place"
     CARRIED = "carried elsewhere"
     GAP = "past a gap"
     LOST = "lost"
+
+
+# Such robots drive to the end.
+_TO_THE_END = frozenset({Kind.UNDISTURBED, Kind.COLD})
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +56,8 @@ class Try:
 
     Attributes:
         kind: what happens to it.
-        first: its first frame, or that after a gap or where it was carried to.
+        first: its first frame, or that after a gap or where it was carried to; undisturbed robots
+            and those that start lost drive on to the end of the drive.
         sigma_m: of a wrong place that it is told; 0 else.
         seed: of where it is told to be, or was carried from.
     """
@@ -162,11 +168,13 @@ class Street:
                 robot.place_at(start)
             for number, frame in enumerate(shown):
                 found = robot.step(self._logged(one, shown, number))
-                counts = one.kind is Kind.UNDISTURBED or number >= len(shown) - FRAMES
+                counts = one.kind in _TO_THE_END or number >= len(shown) - FRAMES
                 yield Looked(found, robot.outcomes, frame, counts)
 
     def tries(self, kind: Kind, count: int, seed: int) -> list[Try]:
-        """So many robots, evenly along the drive."""
+        """So many robots, evenly along the drive; undisturbed ones from its first frame."""
+        if kind is Kind.UNDISTURBED:
+            return [Try(kind, 0, 0.0, seed + k) for k in range(count)]
         last = len(self.frames) - FRAMES
         firsts = np.linspace(_BEFORE + 30, last, count).astype(int)
         sigmas = [SIGMAS_M[k % 3] if kind is Kind.TOLD else 0.0 for k in range(count)]
@@ -178,8 +186,8 @@ class Street:
     def _shown(self, one: Try) -> list[int]:
         """Numbers of the frames that the robot is shown."""
         after = range(one.first, one.first + FRAMES)
-        if one.kind is Kind.UNDISTURBED:
-            return list(range(len(self.frames)))
+        if one.kind in _TO_THE_END:
+            return list(range(one.first, len(self.frames)))
         if one.kind is Kind.CARRIED:
             elsewhere = self._elsewhere(one)
             first = max(elsewhere - _BEFORE, 0)
@@ -191,7 +199,7 @@ class Street:
         return list(after)
 
     def _start(self, one: Try, first: int) -> Position | None:
-        if one.kind is Kind.LOST:
+        if one.kind in {Kind.LOST, Kind.COLD}:
             return None
         if one.kind is not Kind.TOLD:
             return self.nodes.start(self.truth[first])

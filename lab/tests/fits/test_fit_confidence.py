@@ -7,7 +7,7 @@ import pytest
 
 from engram.localiser import Spread
 from engram.localiser.confidence import Evidence, Standing
-from engram_lab.fits.confidence import Row, Rows, fitted, logistic
+from engram_lab.fits.confidence import Row, Rows, fitted, judged, logistic
 
 RNG = np.random.default_rng(3)
 
@@ -65,3 +65,16 @@ def test_look_alikes_do_not_make_every_match_less_likely() -> None:
         before = max(plain.as_anywhere(row.evidence), plain.as_predicted(row.evidence))
         after = max(with_them.as_anywhere(row.evidence), with_them.as_predicted(row.evidence))
         assert after == pytest.approx(before, abs=2.0)
+
+
+def test_wrong_matches_are_counted_against_what_is_claimed() -> None:
+    """Rows of which a known share is wrong, all of one claim: the report counts them."""
+    kinds = ("predicted", "doubted", "told", "anywhere")
+    met = [row for kind in kinds for row in rows(300, kind, right=True)]
+    met += [row for kind in kinds for row in rows(100, kind, right=False)]
+    known = fitted(Rows(met, []), 45)
+    same = [Row(met[0].evidence, 30.0 if number < 25 else 0.1, 0.0) for number in range(500)]
+    figures = {one.name: one.value for one in judged(known, same, met)}
+    claimed = known.as_predicted(met[0].evidence)
+    assert figures["  of them wrong"] == 25
+    assert figures["  by what is claimed"] == pytest.approx(500 / (1 + math.exp(claimed)))
