@@ -110,15 +110,20 @@ def measured(sequence: DriveSequence) -> Iterator[Values]:
         }
 
 
+def _most(threads: bool) -> int | None:
+    """Most threads of a robot; without, all its lanes run on the caller's."""
+    return None if threads else 5
+
+
 def map_one(path: Path, sequence: DriveSequence, *, threads: bool, **how: Any) -> list[Values]:
     """Maps a drive; what was found of each frame."""
-    report = map_drive(path, sequence, Settings(), RobotOptions(threads=threads, **how))
+    report = map_drive(path, sequence, Settings(), RobotOptions(threads=_most(threads), **how))
     return [_found(one, one.motion.odometry.prev_from_curr) for one in report.results]
 
 
 def localise(path: Path, sequence: DriveSequence, *, policy: str, threads: bool) -> list[Values]:
     """Localises a drive by the budget of the command line; what was found of each frame."""
-    options = RobotOptions(policy=policy, threads=threads)
+    options = RobotOptions(policy=policy, threads=_most(threads))
     with open_map(path) as opened:
         found = localise_drive(opened, sequence, Settings(), options)
     return [_found(one, one.motion.odometry.prev_from_curr) for one in found]
@@ -152,7 +157,7 @@ def send(centre: Path, out: Path, **options: Any) -> Values:
 
 def build(centre: Path, drives: list[Path], *, groups: int, threads: bool) -> Values:
     """Builds a centre of drives."""
-    options = BuildOptions(workers=1, groups=groups, mapping=RobotOptions(threads=threads))
+    options = BuildOptions(workers=1, groups=groups, mapping=RobotOptions(threads=_most(threads)))
     report = build_map(centre, [str(path) for path in drives], Settings(), options)
     return {"groups": [" ".join(names) for names in report.groups]}
 

@@ -26,7 +26,7 @@ from engram.live.outside import Outside
 from engram.maps import open_map
 from engram.robot import RobotOptions, map_drive, open_drive
 
-OPTIONS = RobotOptions(lanes=1, rounds=4, threads=False)
+OPTIONS = RobotOptions(lanes=1, rounds=4)
 
 
 class Client(Protocol):

@@ -94,7 +94,7 @@ def test_a_live_robot_is_found_by_its_fix(anchored: Path, street: Path, east_m: 
     fix = {"stamp_ns": frames[0].arrived.stamp_ns, "latitude_deg": 50.0, "sigma_m": 1.0}
     told = {**fix, "longitude_deg": 14.0 + at_m / METRES_PER_DEGREE}
     script = Script([Command("fix", told), Command("fix", {**told, "sigma_m": -1.0}), *frames])
-    options = LiveOptions(anchored, robot=RobotOptions(relocaliser=None, threads=False))
+    options = LiveOptions(anchored, robot=RobotOptions(relocaliser=None, threads=3))
     LiveProcess(script, options).run()
     statuses = [one["status"] for one in script.heard if one["is"] == "seen"]
     assert ("localised" in statuses) == (east_m == 0.0)

@@ -60,6 +60,45 @@ def test_what_a_robot_maps_becomes_a_revision_and_the_next_one_is_localised(path
     assert words.count("localised") > 0.9 * len(AGAIN)
 
 
+def most_tasks(robot: Robot, frames: list[Seen]) -> tuple[int, list[str]]:
+    """Threads that a drive added to the caller's at most, that one included; what was found."""
+    running = Path("/proc/self/task")
+    before, tasks = len(list(running.iterdir())), [0]
+    robot.watch = lambda *_: tasks.append(len(list(running.iterdir())))
+    with robot:
+        found = [one.status.value for one in robot.drive(seen.logged for seen in frames)]
+    return max(tasks) - before + 1, found
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="counts threads as Linux does")
+def test_a_robot_has_no_more_threads_than_it_is_given_and_finds_the_same(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("engram.localiser.localiser.cores", lambda: 8)
+    mapped(path)
+    found = {}
+    for threads, most in ((None, 8), (6, 6), (5, 5)):
+        copy = tmp_path / f"{most}.engram"
+        copy.write_bytes(path.read_bytes())
+        with open_map(copy) as town:
+            robot = town.robot(CAMERA, name="r2", maps=True, lanes=4, threads=threads)
+            tasks, found[most] = most_tasks(robot, AGAIN)
+        assert most - 1 <= tasks <= most  # landmarks that are in memory need no thread
+    assert found[8] == found[6] == found[5]
+
+
+def test_too_few_threads_are_refused_and_nothing_is_begun(path: Path, town: Map) -> None:
+    with pytest.raises(ConfigError, match="threads is 4, must be at least 5 for this robot"):
+        town.robot(CAMERA, name="r1", maps=True, threads=4)
+    with pytest.raises(ConfigError, match=r"must be at least 4 .* decodes images, reads the map"):
+        town.robot(CAMERA, name="r1", remembers=True, threads=3)
+    with pytest.raises(ConfigError, match="threads is 0"):
+        town.robot(CAMERA, threads=0)
+    town.robot(CAMERA, threads=3).close()
+    with town.robot(CAMERA, name="r1", maps=True, threads=5):  # the map is not left locked
+        assert town.node_count() == 0
+
+
 def test_others_see_committed_revisions_only(path: Path, town: Map) -> None:
     with town.robot(CAMERA, name="r1", maps=True) as robot:
         words = run(robot, FIRST)

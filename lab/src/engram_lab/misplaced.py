@@ -159,7 +159,7 @@ class Street:
             budget=self._budget,
             relocaliser="fabmap" if relocalises else None,
             live=self.live.session.id,
-            threads=False,
+            threads=1,
         )
         with Robot(Front(self.settings), localiser) as robot:
             shown = self._shown(one)

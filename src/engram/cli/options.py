@@ -278,12 +278,13 @@ class Effort:
     ] = None
 
     def over(self, settings: AllSettings) -> dict[str, Any]:
-        """Policy, lanes and rounds: as given, else as in the settings."""
+        """Policy, lanes, rounds and threads: as given, else as in the settings."""
         drive = settings.drive
         return {
             "policy": self.ranking or drive.ranking,
             "lanes": self.lanes or drive.lanes,
             "rounds": self.rounds or drive.rounds,
+            "threads": drive.threads,
         }
 
 

@@ -66,6 +66,17 @@ class DriveSettings:
     ] = "recall"
     lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np. [L15] Fig. 3")] = 2
     rounds: Annotated[int, Meta(ge=1, description="rounds of attempts, Nr. [L15] Fig. 3")] = 2
+    threads: (
+        Annotated[
+            int,
+            Meta(
+                ge=1,
+                description="most threads of a robot, that of its loop included; none: one for "
+                "each lane, and 2 to 4 that decode, read ahead, write and close loops",
+            ),
+        ]
+        | None
+    ) = None
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -73,7 +73,8 @@ class Localiser:
             reckoning, within a growing radius.
         config: settings.
         matcher: the first half of an attempt; None matches with the landmarks of `known`.
-        threads: whether lanes run on threads; a given `matcher` runs on the caller's.
+        threads: how many threads the lanes share, the caller's included; None for one each. A
+            given `matcher` runs on the caller's.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class Localiser:
         relocaliser: Relocaliser | None,
         config: LocaliserConfig | None = None,
         matcher: Matcher | None = None,
-        threads: bool = True,
+        threads: int | None = None,
     ) -> None:
         self.config = config or LocaliserConfig()
         self.live = drive.live
@@ -102,7 +103,7 @@ class Localiser:
         self._relocaliser = relocaliser
         self._search = known.search or self._own_search()
         # On one core each hand-over between threads would only cost.
-        lanes = budget.lanes if threads and cores() > 1 else 1
+        lanes = min(budget.lanes, threads or budget.lanes) if cores() > 1 else 1
         self._attempter = Attempter(known.frames, self.config, matcher, lanes)
         self._prover = Prover(known.graph, self.config.acceptance)
         self._hypotheses = Hypotheses(

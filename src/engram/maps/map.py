@@ -148,6 +148,7 @@ class Map(MapReader):
         lanes: int = 2,
         rounds: int = 2,
         relocaliser: str | None = "fabmap",
+        threads: int | None = None,
     ) -> Robot:
         """A robot that localises in this map; see `Robot.step`.
 
@@ -168,12 +169,18 @@ class Map(MapReader):
             lanes: attempts in parallel (Np).
             rounds: rounds of attempts per frame (Nr).
             relocaliser: key of `RELOCALISERS`, for lost robots; None for none.
+            threads: most threads of the robot, the caller's included; None for `lanes` + 2, and
+                one or two more if it remembers or maps. See `Robot`.
+
+        Raises:
+            ConfigError: an option is unknown or out of range, or the threads are too few.
+            MapError: the map cannot be written, or was opened at a named revision.
         """
         from engram.robot.live import Owner
         from engram.robot.settings import RobotOptions, Settings
         from engram.robot.starting import robot_in
 
-        asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser)
+        asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser, threads=threads)
         owner = Owner(name, camera, settings or Settings(), asked)
         return robot_in(self, owner, maps=maps, remembers=remembers)
 

@@ -117,8 +117,14 @@ class Owner:
             return self.settings.frontend.descriptor, Frontend(self.settings.frontend).hash
         return first.frame.descriptor, first.frame.frontend
 
-    def localiser_in(self, opened: Map, *, saves: bool) -> Localiser:
-        """The localiser of the drive; its session begins with the first frame."""
+    def localiser_in(
+        self, opened: Map, *, saves: bool = False, remembers: bool = False
+    ) -> Localiser:
+        """The localiser of the drive; its session begins with the first frame.
+
+        Raises:
+            ConfigError: the robot has too few threads.
+        """
         return localiser_in(
             opened,
             self.camera,
@@ -127,7 +133,7 @@ class Owner:
             budget=self.options.budget,
             relocaliser=self.finder or self.options.relocaliser,
             saves=saves,
-            threads=self.options.threads,
+            threads=self.options.lane_threads(maps=saves, remembers=remembers),
         )
 
     def session(self, first: Arrived) -> Session:
@@ -187,12 +193,13 @@ class IntoMap:
     def __init__(self, owner: Owner, opened: Map) -> None:
         self._owner = owner
         self._opened = opened
-        self._stack = ExitStack()
-        self._stack.enter_context(opened)
-        self._stack.enter_context(opened.writing())
-        self._words = node_words(opened, owner.settings, owner.options.relocaliser)
-        self.localiser: Localiser = owner.localiser_in(opened, saves=True)
         self._drive: SavedDrive | None = None
+        with ExitStack() as stack:
+            stack.enter_context(opened)
+            stack.enter_context(opened.writing())
+            self._words = node_words(opened, owner.settings, owner.options.relocaliser)
+            self.localiser: Localiser = owner.localiser_in(opened, saves=True)
+            self._stack = stack.pop_all()
 
     def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
         """See `Into`."""
@@ -244,7 +251,7 @@ class IntoMemory:
     """
 
     def __init__(self, owner: Owner, opened: Map) -> None:
-        self.localiser = owner.localiser_in(opened, saves=False)
+        self.localiser = owner.localiser_in(opened, remembers=True)
         self._owner = owner
         self._map_path = Path(opened.location)
         self._spool: Spool | None = None

@@ -47,7 +47,7 @@ class LocaliserParts(TypedDict, total=False):
         relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
         live: the live session.
         saves: whether the session is being mapped.
-        threads: whether lanes run on threads.
+        threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
         clock: time zone and location of its stamps; None if unknown.
         path_memory: replaces that of the map.
@@ -59,7 +59,7 @@ class LocaliserParts(TypedDict, total=False):
     live: SessionId
     saves: bool
     matcher: Matcher | None
-    threads: bool
+    threads: int | None
     search: Callable[..., Neighbourhood] | None
     clock: Clocked | None
     path_memory: PathMemory | None
@@ -108,7 +108,7 @@ def localiser_in(
         else relocaliser,
         config=settings.localiser,
         matcher=parts.get("matcher"),
-        threads=parts.get("threads", True),
+        threads=parts.get("threads"),
     )
 
 

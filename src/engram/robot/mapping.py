@@ -113,7 +113,8 @@ def map_drive(
             settings, whichever is known first.
 
     Raises:
-        ConfigError: the frame log or the map has another kind of descriptor than required.
+        ConfigError: the frame log or the map has another kind of descriptor than required, or the
+            threads are too few.
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; the earlier frames are saved.
         UnfitDriveError: the doctor found something fatal, and `options.force` is not set; nothing
@@ -124,6 +125,7 @@ def map_drive(
     if descriptor is not None and isinstance(sequence, FrameLog):
         mend = f"record it again with --features {descriptor}"
         _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
+    options.lane_threads(maps=True)  # refuses too few threads before anything is written
     session = session_of_drive(sequence)
     report = MapReport(session)
     commit_spools(map_path)
@@ -218,7 +220,7 @@ class _Mapping:
             ),
             live=self.report.session.id,
             saves=True,
-            threads=self.options.threads,
+            threads=self.options.lane_threads(maps=True),
             clock=self.report.session,
         )
 

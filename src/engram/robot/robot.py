@@ -57,10 +57,11 @@ class Seen:
 class Robot:
     """One robot on one drive: image pairs in, `Localisation`s out. A context manager.
 
-    One thread at a time calls a robot's methods. A robot runs up to `Budget.lanes` + 2 threads of
-    its own: one for each lane but the first; one that reads ahead in `drive`; and if it keeps its
-    results, one that writes and one that closes loops. Robots in one process share only the map
-    that made them; each may run on its own thread.
+    One thread at a time calls a robot's methods. `RobotOptions.threads` bounds all that work for
+    it: the caller's; one more for each further lane; one that decodes images in `drive`; one that
+    reads the map ahead, which robots in it share; one that writes, if it keeps its results; and
+    one that closes loops, if it maps. Robots in one process share only the map that made them;
+    each may run on its own thread. A flight recorder and OpenCV have their own.
 
     Args:
         front: front-end and odometry.

@@ -68,7 +68,8 @@ class RobotOptions:
         deadline_ms: latest start of an attempt after its frame arrived. With None only the counts
             limit it, so that equal input gives equal results.
         relocaliser: key of `RELOCALISERS`, for a lost robot; None for none.
-        threads: whether the lanes run on threads; without a deadline the results are the same.
+        threads: most threads of the robot, its caller's included; None for one for each lane and
+            those beside. Without a deadline the results are the same with any number.
         author: author of revisions; None for the robot.
         force: whether a drive with a fatal finding of the doctor is mapped all the same.
     """
@@ -78,18 +79,42 @@ class RobotOptions:
     rounds: int = 2
     deadline_ms: float | None = None
     relocaliser: str | None = "fabmap"
-    threads: bool = True
+    threads: int | None = None
     author: str | None = None
     force: bool = False
 
     def __post_init__(self) -> None:
         check_for_robot(self.policy)
         Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)  # checks the values
+        if self.threads is not None and (isinstance(self.threads, bool) or self.threads < 1):
+            raise ConfigError(f"threads is {self.threads}, must be a number of at least 1, or None")
 
     @property
     def budget(self) -> Budget:
         """The budget of each frame."""
         return Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)
+
+    def lane_threads(self, *, remembers: bool = False, maps: bool = False) -> int:
+        """Threads that the lanes share, the caller's included: what the others leave.
+
+        Args:
+            remembers: whether the robot writes what it finds.
+            maps: whether it maps.
+
+        Raises:
+            ConfigError: `threads` is too small for what the robot does.
+        """
+        others = ["decodes images", "reads the map ahead"]
+        others += ["writes"] if remembers or maps else []
+        others += ["closes loops"] if maps else []
+        if self.threads is None:
+            return self.lanes
+        if self.threads <= len(others):
+            raise ConfigError(
+                f"threads is {self.threads}, must be at least {len(others) + 1} for this robot: "
+                f"one that localises, and one each that {', '.join(others)}"
+            )
+        return min(self.lanes, self.threads - len(others))
 
 
 def load_settings(path: Path | None) -> Settings:

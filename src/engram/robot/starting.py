@@ -38,7 +38,7 @@ def robot_on(
         remembers: whether path and attempts are kept as a session; see `Map.robot`.
 
     Raises:
-        ConfigError: the policy or the relocaliser is unknown.
+        ConfigError: the policy or the relocaliser is unknown, or the threads are too few.
         SequenceError: the drive has no usable frame.
     """
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
@@ -56,7 +56,7 @@ def robot_on(
         budget=options.budget,
         relocaliser=finder,
         live=session.id,
-        threads=options.threads,
+        threads=options.lane_threads(),
         clock=sequence.info,
     )
     return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
@@ -80,7 +80,7 @@ def robot_in(
         finder = suggesting(opened, fix, owner.settings, owner.options.relocaliser)
         owner = replace(owner, finder=finder)
     if not (maps or remembers):
-        localiser, deadline_ms = owner.localiser_in(opened, saves=False), owner.options.deadline_ms
+        localiser, deadline_ms = owner.localiser_in(opened), owner.options.deadline_ms
         return Robot(front or Front(owner.settings), localiser, deadline_ms=deadline_ms)
     if owner.name is None:
         raise ConfigError("a robot that keeps its drives needs a name: give name=")
