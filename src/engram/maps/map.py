@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from engram.robot.robot import Robot
     from engram.robot.settings import Settings
 
-
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
@@ -169,12 +168,10 @@ class Map(MapReader):
             lanes: attempts in parallel (Np).
             rounds: rounds of attempts per frame (Nr).
             relocaliser: key of `RELOCALISERS`, for lost robots; None for none.
-            threads: most threads of the robot, the caller's included; None for `lanes` + 2, and
-                one or two more if it remembers or maps. See `Robot`.
+            threads: most threads of the robot, the caller's included; None: `lanes` + 2 to 4.
 
         Raises:
             ConfigError: an option is unknown or out of range, or the threads are too few.
-            MapError: the map cannot be written, or was opened at a named revision.
         """
         from engram.robot.live import Owner
         from engram.robot.settings import RobotOptions, Settings
@@ -516,8 +513,7 @@ class Map(MapReader):
             collect_abandoned(connection)  # since their UUIDs may be used again
             connection.execute(insert(revisions), [sealed(revisions, row)])
         self._keys.forget_nodes()  # some may be hidden since then
-        own = View(self._view.at, row["key"])
-        return self._written(own, drive, committed_ns)
+        return self._written(View(self._view.at, row["key"]), drive, committed_ns)
 
     def _written(
         self, own: View, drive: Resumable | None, committed_ns: int | None = None
@@ -563,9 +559,8 @@ class Map(MapReader):
         self._keys.set_view(view)
 
     def _check_none_open(self) -> None:
-        if self._writing is None:
+        if (writer := self._writing) is None:
             return
-        writer = self._writing
         what = f"session {writer.session.id}" if writer.resumable else "a revision"
         raise RevisionError(f"{what} is being written; commit or abandon it")
 
