@@ -52,10 +52,12 @@ class Caller:
 class Middleware:
     """The middleware at the other end of a socket, with its ring of images."""
 
-    def __init__(self, folder: Path) -> None:
-        self.transport = Served(folder / "socket")
-        self.folder, self.ring = folder, None
-        self.link, self.heard = Link.connect(str(folder / "socket")), []
+    def __init__(self, folder: Path, link: Link | None = None) -> None:
+        self.folder, self.ring, self.heard = folder, None, []
+        if link is None:
+            self.transport = Served(folder / "socket")
+            link = Link.connect(str(folder / "socket"))
+        self.link = link
 
     def give(self, pair: StereoPair, **moved: list[float]) -> None:
         if self.ring is None:
@@ -336,6 +338,37 @@ def test_a_killed_process_leaves_a_socket_that_the_next_one_takes(
     assert path.exists()
     Served(path).__exit__()
     assert not path.exists()
+
+
+@pytest.mark.long
+def test_what_a_killed_process_mapped_is_sealed_and_the_next_one_goes_on_in_it(
+    street: Path, tmp_path: Path
+) -> None:
+    path, pairs = tmp_path / "town.engram", list(open_drive(street))
+    command = [sys.executable, "-c", "from engram.cli import main; main()", "live", str(path)]
+    command += ["--socket", str(tmp_path / "socket"), "--robot", "r1", "--map"]
+    command += ["--set", "mapper.checkpoint_every=1"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+        one = Middleware(tmp_path, connected(tmp_path / "socket", process))
+        found = [seen(one, pair) for pair in pairs[:8]]
+        assert any(said.get("saved") for said in found)
+        os.kill(process.pid, signal.SIGKILL)
+    one.link.close()
+    with open_map(path) as opened:
+        assert opened.node_count() == 0, "nothing is committed yet"
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+        one = Middleware(tmp_path, connected(tmp_path / "socket", process))
+        found = [seen(one, pair) for pair in pairs[6:]]
+        assert [said["status"] for said in found].count("localised") >= 4
+        alive = until(one, lambda said: said["is"] == "alive" and said["recovered"])
+        assert alive["recovered"] == [1]
+        one.ask("stop")
+        ended = until(one, lambda said: said["is"] == "ended")
+        assert "saved before an interruption: revision 1" in ended["text"]
+    one.link.close()
+    with open_map(path) as opened:
+        assert opened.interrupted() == []
+        assert {session.robot for session in opened.sessions.values()} == {"r1"}
 
 
 def connected(path: Path, process: subprocess.Popen[bytes]) -> Link:

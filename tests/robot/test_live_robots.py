@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.mapping_rig import session_for
 from tests.synthetic_world import Seen, World, drive
 
 from engram.doctor import DoctorConfig
@@ -15,7 +16,7 @@ from engram.errors import ConfigError, StorageFullError
 from engram.fleet.merge import merge
 from engram.maps import Map, RevisionWriter, check_file, open_map
 from engram.robot import Robot, Settings
-from engram.robot.live import SavingState
+from engram.robot.saved import SavingState
 
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)
@@ -151,14 +152,95 @@ def test_a_full_disk_ends_saving_and_not_localising(
     assert words.count("localised") > 0
 
 
-def test_a_crash_leaves_a_session_that_can_be_sealed(path: Path, town: Map) -> None:
-    robot = town.robot(CAMERA, Settings(), name="r1", maps=True)
-    run(robot, FIRST)
-    keeper = robot._keeper
-    keeper._into._drive.close()  # all was written; the process dies before it commits
-    keeper._into._stack.close()
+def killed_at_the_end(robot: Robot, frames: list[Seen]) -> Robot:
+    """A robot that maps a drive, of which all was written; the process dies before it commits."""
+    run(robot, frames)
+    into = robot._live._into
+    into._drive.close()
+    into._stack.close()
     robot._live = None
     robot.close()
+    return robot
+
+
+def test_a_killed_robot_goes_on_in_what_it_had_mapped(path: Path, town: Map) -> None:
+    killed_at_the_end(town.robot(CAMERA, name="r1", maps=True), FIRST)
+    with open_map(path) as opened, opened.robot(CAMERA, name="r1", maps=True) as robot:
+        assert robot.saving.recovered == (1,)
+        assert opened.node_count() > 15, "the map that it was asked of sees the sealed nodes, too"
+        words = run(robot, AGAIN)
+    assert words.count("localised") > 0.9 * len(AGAIN)
+    assert "saved before an interruption: revision 1" in robot.saving.text()
+    with open_map(path) as after:
+        assert [one.message for one in after.log()] == ["map r1", "map r1"]
+        assert len(after.sessions) == 2
+        assert after.interrupted() == []
+    assert check_file(path).sound
+
+
+def test_a_drive_that_is_played_again_after_a_kill_is_another_session(path: Path) -> None:
+    for played in range(3):
+        with open_map(path, create=True) as town:
+            robot = town.robot(CAMERA, name="r1", maps=True)
+            assert robot.saving.recovered == ((played,) if played else ())
+            killed_at_the_end(robot, FIRST[: 10 + 5 * played])
+            assert robot.saving.state is SavingState.ON, robot.saving.reason
+    with open_map(path) as town, town.robot(CAMERA, name="r1", maps=True) as robot:
+        words = run(robot, FIRST)
+    assert robot.saving.revision == 4
+    assert words[:20].count("localised") == 20
+    with open_map(path) as town:
+        # Each goes on where the one before was killed, and maps nothing twice.
+        stamps_ns = [node.stamp_ns for node in town.graph.nodes]
+        assert stamps_ns == sorted(set(stamps_ns))
+        assert words.count("saved") > 0
+        assert len(town.sessions) == 4
+
+
+def test_what_others_were_mapping_is_not_sealed(path: Path, town: Map) -> None:
+    killed_at_the_end(town.robot(CAMERA, name="r2", maps=True), FIRST)
+    with open_map(path) as opened, opened.writing():  # as `engram map` leaves it
+        session = session_for(AGAIN, "r1")
+        writer = opened.begin_session(
+            session, CAMERA, descriptor=FIRST[0].frame.descriptor, frontend="f" * 12,
+            author="r1", configuration={},
+        )  # fmt: skip
+        writer.checkpoint()
+    with open_map(path) as opened, opened.robot(CAMERA, name="r1", maps=True) as robot:
+        run(robot, FIRST[:5])
+    assert robot.saving.recovered == ()
+    with open_map(path) as after:
+        assert {one.session.robot for one in after.interrupted()} == {"r1", "r2"}
+
+
+def test_where_nothing_can_be_sealed_the_robot_localises_and_saves_nothing(
+    path: Path, town: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed_at_the_end(town.robot(CAMERA, name="r1", maps=True), FIRST)
+
+    def full(*_: object) -> None:
+        raise StorageFullError("no space is left")
+
+    monkeypatch.setattr(RevisionWriter, "commit", full)
+    with open_map(path) as opened, opened.robot(CAMERA, name="r1", maps=True) as robot:
+        assert set(run(robot, AGAIN[:5])) == {"lost"}
+    assert robot.saving.state is SavingState.FAILED
+    assert "no space is left" in robot.saving.text()
+    monkeypatch.undo()
+    with open_map(path) as opened, opened.robot(CAMERA, name="r1", maps=True) as robot:
+        assert robot.saving.recovered == (1,)
+
+
+def test_a_drive_that_the_map_holds_is_not_saved_again(path: Path) -> None:
+    mapped(path)
+    with open_map(path) as town, town.robot(CAMERA, name="r1", maps=True) as robot:
+        assert run(robot, FIRST).count("localised") > 0.9 * len(FIRST)
+    assert robot.saving.state is SavingState.FAILED
+    assert "holds this drive already" in robot.saving.reason
+
+
+def test_a_crash_leaves_a_session_that_can_be_sealed(path: Path, town: Map) -> None:
+    robot = killed_at_the_end(town.robot(CAMERA, Settings(), name="r1", maps=True), FIRST)
     with open_map(path) as after:
         assert after.node_count() == 0
         (interrupted,) = after.interrupted()
@@ -265,6 +347,10 @@ def test_what_an_unfit_robot_mapped_is_sealed_and_not_committed(path: Path) -> N
         assert town.revision == 0
         (waiting,) = town.interrupted()
         assert waiting.nodes > 15
+        with town.robot(CAMERA, name="r1", maps=True) as robot:  # a later one does not commit it
+            run(robot, AGAIN)
+        assert robot.saving.recovered == ()
+        assert [one.session for one in town.interrupted()] == [waiting.session]
 
 
 def test_an_unfit_robot_stops_mapping_when_the_doctor_has_seen_enough(path: Path) -> None:

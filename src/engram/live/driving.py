@@ -20,8 +20,9 @@ from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
 from engram.robot.fixed import ToldFix
 from engram.robot.front import Arrived, Front
-from engram.robot.live import Owner, Saving, SavingState
+from engram.robot.live import Owner
 from engram.robot.robot import Robot
+from engram.robot.saved import Saving, SavingState
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
 from engram.robot.whereabouts import Whereabouts

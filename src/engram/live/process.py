@@ -185,7 +185,12 @@ class LiveProcess:
 
     def _saving(self) -> Message:
         saving = self._driving.saving
-        return {"saving": saving.state.value, "nodes": saving.nodes, "revision": saving.revision}
+        return {
+            "saving": saving.state.value,
+            "nodes": saving.nodes,
+            "revision": saving.revision,
+            "recovered": list(saving.recovered),
+        }
 
 
 def _found(step: Step) -> Message:

@@ -159,8 +159,8 @@ class Map(MapReader):
             settings: the configuration; None for the defaults.
             name: name of the robot; required if its drives are stored.
             maps: whether it saves frames that it does not localise, on a separate thread with
-                checkpoints. It is the map's only writer until it is closed. After a crash,
-                `engram check --seal` commits the saved part of the session.
+                checkpoints. It is the map's only writer until it is closed. After a crash, the
+                robot's next such drive first commits the saved part (`Saving.recovered`).
             remembers: whether to store its path and match attempts, by which later drives rank;
                 implied by `maps`. They are kept in a file beside the map until the drive ends and
                 no other process writes to the map.

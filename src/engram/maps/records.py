@@ -69,9 +69,11 @@ class InterruptedSession:
 
     Attributes:
         session: the drive.
-        author, host, pid, opened_ns: the writer, its computer and its start (UTC, ns).
+        author, host, pid, opened_ns: the writer, its computer and its start (UTC, ns); `pid` is 0
+            if it left the session on purpose.
         nodes: number of checkpointed nodes.
         last_stamp_ns: stamp of the newest of them; None without nodes.
+        live: whether a live robot mapped it, whose frames do not come again.
     """
 
     session: Session
@@ -81,6 +83,7 @@ class InterruptedSession:
     opened_ns: int
     nodes: int
     last_stamp_ns: int | None
+    live: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from engram.maps.records import InterruptedSession, Revision, RevisionStatus, St
 from engram.maps.rows import (
     Row,
     checked_text,
+    from_json,
     node_from_bytes,
     node_from_row,
     sealed,
@@ -221,6 +222,8 @@ def interrupted_sessions(
 ) -> list[InterruptedSession]:
     """The session of an open revision; none for a revision of another kind."""
     cameras = reading.load_cameras(connection)
+    about = from_json(revision["configuration"], f"revision row {revision['key']}")
+    live = about.get("live") is True
     found = []
     for row in sessions_of(connection, revision["key"]):
         session = session_from_row(row, cameras[row["camera"]].id)
@@ -234,6 +237,7 @@ def interrupted_sessions(
                 opened_ns=revision["opened_ns"],
                 nodes=len(stored.nodes),
                 last_stamp_ns=max((node.stamp_ns for node in stored.nodes), default=None),
+                live=live,
             )
         )
     return found

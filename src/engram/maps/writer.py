@@ -499,6 +499,11 @@ class RevisionWriter:
         self._end()
         return revision
 
+    def leave(self) -> None:
+        """Leaves a drive for `check --seal`: it counts as interrupted on purpose."""
+        with self._database.writing() as connection:
+            change_revision(connection, self._revision_key, pid=0)
+
     def abandon(self) -> None:
         """Abandons the revision: the map is unchanged. No effect after its end."""
         if self._ended:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Protocol
 
@@ -16,6 +16,7 @@ from engram.geometry import StereoCamera
 from engram.graph.model import Clock, Session, SessionId, path_id
 from engram.localiser import (
     KEEPS_NOTHING,
+    UNNAMED_LIVE_SESSION,
     Hint,
     Keeper,
     Localisation,
@@ -27,6 +28,7 @@ from engram.maps import Map, SessionState
 from engram.odometry import Motion
 from engram.robot.front import Arrived
 from engram.robot.localisers import localiser_in
+from engram.robot.saved import Saving, SavingState
 from engram.robot.saving import SavedDrive, begin_or_resume, configuration_of, node_words
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import Spool, commit_spools
@@ -34,61 +36,6 @@ from engram.sequences import SequenceInfo, first_pair_hash, session_of
 
 # Stamps from here (1973) on come from a clock; smaller ones count from the robot's start.
 _CLOCK_FROM_NS = 10**17
-
-
-class SavingState(StrEnum):
-    """State of the saving of a live drive."""
-
-    OFF = "off"
-    ON = "on"
-    FAILED = "failed"
-    SPOOLED = "spooled"
-    COMMITTED = "committed"
-    SEALED = "sealed"
-
-
-@dataclass(slots=True)
-class Saving:
-    """Whether and where a live drive is saved.
-
-    Attributes:
-        state: `FAILED` after a write error: the robot continues to localise, and what it had saved
-            is kept; `SPOOLED` if another process writes to the map, so that the drive's memory
-            waits in a file beside it; `SEALED` if the doctor found something fatal: nothing was
-            committed, and a mapped session waits for ``engram check --seal``.
-        reason: why saving failed or was not committed, or where the memory waits.
-        session: the drive.
-        revision: number of the revision that holds the drive.
-        nodes: number of saved nodes.
-    """
-
-    state: SavingState = SavingState.OFF
-    reason: str = ""
-    session: SessionId | None = None
-    revision: int | None = None
-    nodes: int = 0
-
-    def text(self) -> str:
-        """For people."""
-        match self.state:
-            case SavingState.COMMITTED if self.revision is None:
-                return "the map already remembers this drive, or there was nothing to remember"
-            case SavingState.COMMITTED:
-                return f"kept as revision {self.revision}"
-            case SavingState.SPOOLED:
-                return (
-                    f"another process writes to the map: the drive waits in {self.reason}; the "
-                    "next run that maps or remembers commits it"
-                )
-            case SavingState.FAILED:
-                return f"saving failed: {self.reason}"
-            case SavingState.SEALED:
-                return (
-                    f"not committed, because the drive is unfit: {self.reason}; engram check "
-                    "--seal "
-                    "commits what was mapped anyway"
-                )
-        return f"saving is {self.state}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +49,8 @@ class Owner:
         options: how it localises.
         recorded: the session, if known before the first frame.
         finder: the relocaliser; None for that of the options.
+        known: sessions of the map, where a drive that was interrupted may be played again: what
+            comes is another session.
     """
 
     name: str | None
@@ -110,6 +59,7 @@ class Owner:
     options: RobotOptions
     recorded: Session | None = None
     finder: str | Relocaliser | None = None
+    known: frozenset[SessionId] = frozenset()
 
     def made_by(self, first: Arrived) -> tuple[DescriptorKind, str]:
         """Kind of descriptors and hash of the front-end, those of the log for a logged frame."""
@@ -144,7 +94,9 @@ class Owner:
         clock = Clock.UTC if pair.stamp_ns >= _CLOCK_FROM_NS else Clock.RELATIVE
         info = SequenceInfo(self.name or "live", "live", clock, self.name)
         pixels = first_pair_hash(first) if isinstance(first, StereoPair) else ""
-        return session_of(info, self.camera, pair.stamp_ns, pixels)
+        again = (pixels if n == 1 else f"{pixels}-{n}" for n in count(1))
+        made = (session_of(info, self.camera, pair.stamp_ns, one) for one in again)
+        return next(one for one in made if one.id not in self.known)
 
 
 class Into(Protocol):
@@ -167,13 +119,23 @@ class Into(Protocol):
         """
         ...
 
-    def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
-        """Commits the drive as a revision, unless it is unfit.
+    def end(self, saving: Saving, *, well: bool) -> None:
+        """Commits the drive as a revision.
 
         Args:
             saving: is told what became of it.
             well: whether everything was written so far.
-            unfit: whether the doctor found something fatal.
+
+        Raises:
+            MapError: it cannot be written.
+        """
+        ...
+
+    def leave(self, *, well: bool) -> None:
+        """Ends an unfit drive without committing it.
+
+        Raises:
+            MapError: it cannot be written.
         """
         ...
 
@@ -204,15 +166,18 @@ class IntoMap:
     def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
         """See `Into`."""
         opened, owner = self._opened, self._owner
-        if opened.session_state(session.id) is not SessionState.ABSENT:
+        state = opened.session_state(session.id)
+        if state is SessionState.COMMITTED:
+            raise MapError(f"{opened.location} holds this drive already: session {session.id}")
+        if state is not SessionState.ABSENT:
             raise MapError(
-                f"{opened.location} already holds session {session.id}; give its recording to "
-                "engram map, which resumes an interrupted session"
+                f"{opened.location} holds this drive, interrupted: session {session.id}; engram "
+                "map resumes it, engram check --seal commits what was saved"
             )
         about = {
             "author": session.robot,
             "message": f"map {session.robot}",
-            "configuration": configuration_of(owner.settings, owner.options),
+            "configuration": {**configuration_of(owner.settings, owner.options), "live": True},
         }
         writer = begin_or_resume(opened, session, owner.camera, made_by, about)
         self._drive = SavedDrive(
@@ -220,11 +185,24 @@ class IntoMap:
         )
         return self._drive.mapper
 
-    def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
+    def end(self, saving: Saving, *, well: bool) -> None:
         """See `Into`; commits what was written, even if a later write failed."""
-        drive = self._drive
+        drive = self._ended(well=well)
+        if drive is not None:
+            saving.revision = drive.commit().number
+            saving.state = SavingState.COMMITTED if well else saving.state
+
+    def leave(self, *, well: bool) -> None:
+        """See `Into`."""
+        drive = self._ended(well=well)
+        if drive is not None:
+            drive.leave()
+
+    def _ended(self, *, well: bool) -> SavedDrive | None:
+        """The drive, once all that it saved is written; None if none has begun."""
+        drive, self._drive = self._drive, None
         if drive is None:
-            return
+            return None
         try:
             if well:
                 drive.finish()
@@ -232,10 +210,7 @@ class IntoMap:
         except MapError:
             if well:
                 raise
-        if unfit:
-            return
-        saving.revision = drive.commit().number
-        saving.state = SavingState.COMMITTED if well else saving.state
+        return drive
 
     def close(self) -> None:
         """See `Into`."""
@@ -274,10 +249,31 @@ class IntoMemory:
         self._memory = Memory(self.localiser, self._saver, path_id(session.id))
         return self._memory
 
-    def end(self, saving: Saving, *, well: bool, unfit: bool) -> None:
-        """See `Into`; the memory of an unfit drive is dropped."""
-        if self._saver is None or self._spool is None or self._memory is None:
+    def end(self, saving: Saving, *, well: bool) -> None:
+        """See `Into`."""
+        spool = self._ended(well=well)
+        if spool is None:
             return
+        try:
+            committed = commit_spools(self._map_path)
+        except MapLockedError:
+            saving.state, saving.reason = SavingState.SPOOLED, str(spool.path)
+            return
+        if committed:
+            saving.revision = committed[-1].number
+        saving.state = SavingState.COMMITTED if well else saving.state
+
+    def leave(self, *, well: bool) -> None:
+        """See `Into`; the memory of an unfit drive is dropped."""
+        spool = self._ended(well=well)
+        if spool is not None:
+            spool.path.unlink(missing_ok=True)
+
+    def _ended(self, *, well: bool) -> Spool | None:
+        """The spool, once all is written; None if none has begun."""
+        spool, self._spool = self._spool, None
+        if self._saver is None or spool is None or self._memory is None:
+            return None
         try:
             if well:
                 self._memory.finish()
@@ -286,18 +282,8 @@ class IntoMemory:
             if well:
                 raise
         finally:
-            self._spool.close()
-        if unfit:
-            self._spool.path.unlink(missing_ok=True)
-            return
-        try:
-            committed = commit_spools(self._map_path)
-        except MapLockedError:
-            saving.state, saving.reason = SavingState.SPOOLED, str(self._spool.path)
-            return
-        if committed:
-            saving.revision = committed[-1].number
-        saving.state = SavingState.COMMITTED if well else saving.state
+            spool.close()
+        return spool
 
     def close(self) -> None:
         """See `Into`."""
@@ -311,10 +297,11 @@ class LiveKeeper(Keeper):
     Args:
         owner: the robot.
         into: where the session goes.
+        saving: whether anything is kept, and what became of earlier drives; None to begin.
     """
 
-    def __init__(self, owner: Owner, into: Into) -> None:
-        self.saving = Saving(SavingState.ON)
+    def __init__(self, owner: Owner, into: Into, saving: Saving | None = None) -> None:
+        self.saving = saving or Saving(SavingState.ON)
         self._owner = owner
         self._into = into
         self._keeper = KEEPS_NOTHING
@@ -322,18 +309,24 @@ class LiveKeeper(Keeper):
     def begin(self, first: Arrived) -> None:
         """Begins the drive with this pair or logged frame."""
         session = self._owner.session(first)
-        self._into.localiser.begin(session)
         self.saving.session = session.id
         try:
-            self._keeper = self._into.begin(session, self._owner.made_by(first))
+            if self.saving.state is not SavingState.FAILED:
+                self._keeper = self._into.begin(session, self._owner.made_by(first))
         except MapError as error:
             self._fail(error)
+        if self.saving.state is SavingState.FAILED:
+            # The map may hold this very drive: its nodes are then not the robot's own.
+            session = replace(session, id=UNNAMED_LIVE_SESSION)
+        self._into.localiser.begin(session)
 
     def examined(self, fatal: Sequence[Finding]) -> None:
-        """Stops keeping a drive that the doctor found unfit; `close` does not commit it."""
+        """Stops keeping a drive that the doctor found unfit, and does not commit it."""
         if fatal and not self._owner.options.force and self.saving.state is SavingState.ON:
-            self._keeper = KEEPS_NOTHING
-            self.saving.state, self.saving.reason = SavingState.SEALED, _reasons(fatal)
+            try:
+                self._leave(fatal)
+            except MapError as error:
+                self._fail(error)
 
     def close(self, fatal: Sequence[Finding] = ()) -> None:
         """Ends the drive and commits it as a revision, unless the doctor found it unfit.
@@ -347,10 +340,12 @@ class LiveKeeper(Keeper):
         failed = self.saving.state is SavingState.FAILED
         unfit = bool(fatal) and not self._owner.options.force
         try:
-            if self.saving.session is not None:
-                self._into.end(self.saving, well=not failed, unfit=unfit)
-                if unfit and not failed:
-                    self.saving.state, self.saving.reason = SavingState.SEALED, _reasons(fatal)
+            if unfit and not failed:
+                self._leave(fatal)
+            elif unfit:
+                self._into.leave(well=False)
+            else:
+                self._into.end(self.saving, well=not failed)
         except MapError as error:
             if not failed:
                 self._fail(error)
@@ -383,6 +378,11 @@ class LiveKeeper(Keeper):
     def withdrawn(self, found: Localisation) -> None:
         """See `Keeper`."""
         self._keeper.withdrawn(found)
+
+    def _leave(self, fatal: Sequence[Finding]) -> None:
+        self._keeper = KEEPS_NOTHING
+        self._into.leave(well=True)
+        self.saving.state, self.saving.reason = SavingState.SEALED, _reasons(fatal)
 
     def _fail(self, error: MapError) -> None:
         self._keeper = KEEPS_NOTHING

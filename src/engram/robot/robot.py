@@ -29,8 +29,9 @@ from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot.front import Arrived, Front, arriving, paced, stamp_of
-from engram.robot.live import LiveKeeper, Saving
+from engram.robot.live import LiveKeeper
 from engram.robot.recorder import Recorder
+from engram.robot.saved import Saving
 from engram.sequences.motion import MovedSequence
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.

@@ -15,7 +15,7 @@ from engram.localiser import ByAppearance, FrameMatcher, Localiser
 from engram.localiser.attempts import Attempter
 from engram.localiser.relocalisation import Suggested
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeSaver, Saver
-from engram.maps import Map, Revision, RevisionWriter, SessionState
+from engram.maps import Map, Revision, RevisionWriter, SessionState, StoredSession
 from engram.places import RECOGNISERS
 from engram.places.words import NodeWords, words_of
 from engram.robot.localisers import drives_of
@@ -82,6 +82,10 @@ class SavedDrive:
             self._writer.add_mark(removal)
         return self._writer.commit(self._placing)
 
+    def leave(self) -> None:
+        """Leaves the session uncommitted, for ``engram check --seal`` alone."""
+        self._writer.leave()
+
 
 def begin_or_resume(
     opened: Map,
@@ -107,6 +111,41 @@ def begin_or_resume(
     return opened.begin_session(
         session, camera, descriptor=made_by[0], frontend=made_by[1], **about
     )
+
+
+def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ...]:
+    """Commits what earlier live drives of a robot had saved before their process ended.
+
+    Drives that `engram map` was mapping stay as they are: it resumes them. So do those that the
+    doctor found unfit.
+
+    Args:
+        opened: the map; sees the new revisions.
+        robot: name of the robot.
+        settings: how the map frame is laid out.
+
+    Returns:
+        Numbers of the revisions.
+
+    Raises:
+        MapLockedError: another process writes to the map.
+        MapError: it cannot be written.
+    """
+    waiting = [one for one in opened.interrupted() if one.live and one.pid]
+    mine = [one.session.id for one in waiting if one.session.robot == robot]
+    if not mine:
+        return ()
+    sealed = []
+    with Map.open(opened.location, writes=True) as own:
+        for session in mine:
+            writer = own.resume_session(session)
+            if writer.stored == StoredSession():
+                writer.abandon()  # it ended before it had saved anything
+            else:
+                sealed.append(writer.commit(settings.placing).number)
+    with opened.writing():
+        pass  # shows it the newest revision
+    return tuple(sealed)
 
 
 def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any]:

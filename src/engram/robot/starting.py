@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from engram.errors import ConfigError, RevisionError
+from engram.errors import ConfigError, MapError, MapLockedError, RevisionError
 from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
 from engram.robot.fixed import ToldFix, relocaliser_with_fixes, suggesting
@@ -13,6 +13,8 @@ from engram.robot.front import Front
 from engram.robot.live import Into, IntoMap, IntoMemory, LiveKeeper, Owner
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
+from engram.robot.saved import Saving, SavingState
+from engram.robot.saving import commit_crashed
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import commit_spools
@@ -76,19 +78,44 @@ def robot_in(
     A `front` continues the odometry of the robot before it; a `fix` of satellites proposes nodes.
     """
     owner = replace(owner, settings=owner.settings.for_descriptor(opened.descriptor))
+    saving = None
+    if maps or remembers:
+        saving = _saving_in(opened, owner, maps=maps)
+        if saving.recovered:  # their drives may be played again
+            owner = replace(owner, known=frozenset(opened.sessions))
     if fix is not None:
         finder = suggesting(opened, fix, owner.settings, owner.options.relocaliser)
         owner = replace(owner, finder=finder)
     if not (maps or remembers):
         localiser, deadline_ms = owner.localiser_in(opened), owner.options.deadline_ms
         return Robot(front or Front(owner.settings), localiser, deadline_ms=deadline_ms)
+    if not maps:
+        return _keeping(owner, IntoMemory(owner, opened), front, saving)
+    commit_spools(Path(opened.location))
+    return _keeping(owner, IntoMap(owner, open_map(opened.location)), front, saving)
+
+
+def _saving_in(opened: Map, owner: Owner, *, maps: bool) -> Saving:
+    """The saving of a drive that begins; first seals what a killed robot of the name had mapped.
+
+    Where that cannot be written, the robot localises and saves nothing.
+
+    Raises:
+        ConfigError: the robot has no name.
+        RevisionError: the map was opened at a named revision.
+        MapLockedError: another process writes to the map.
+    """
     if owner.name is None:
         raise ConfigError("a robot that keeps its drives needs a name: give name=")
     _check_newest(opened)
-    if not maps:
-        return _keeping(owner, IntoMemory(owner, opened), front)
-    commit_spools(Path(opened.location))
-    return _keeping(owner, IntoMap(owner, open_map(opened.location)), front)
+    saving = Saving(SavingState.ON)
+    try:
+        saving.recovered = commit_crashed(opened, owner.name, owner.settings) if maps else ()
+    except MapLockedError:
+        raise
+    except MapError as error:
+        saving.state, saving.reason = SavingState.FAILED, str(error)
+    return saving
 
 
 def _check_newest(opened: Map) -> None:
@@ -104,7 +131,9 @@ def _check_newest(opened: Map) -> None:
         )
 
 
-def _keeping(owner: Owner, into: Into, front: Front | None = None) -> Robot:
-    keeper, deadline_ms = LiveKeeper(owner, into), owner.options.deadline_ms
+def _keeping(
+    owner: Owner, into: Into, front: Front | None = None, saving: Saving | None = None
+) -> Robot:
+    keeper, deadline_ms = LiveKeeper(owner, into, saving), owner.options.deadline_ms
     front = front or Front(owner.settings)
     return Robot(front, into.localiser, keeper, deadline_ms=deadline_ms)
