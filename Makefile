@@ -35,6 +35,10 @@ demo: setup
 centre-demo: setup
 	$(BIN)/engram lab fleet-day --out centre-demo
 
+# Tests write maps by the thousand: in memory where Linux has room for them, else on the disk.
+ROOMY := $(shell df -k --output=avail /dev/shm 2>/dev/null | awk 'NR == 2 && $$1 > 4000000')
+export PYTEST_DEBUG_TEMPROOT := $(if $(ROOMY),/dev/shm,$(PYTEST_DEBUG_TEMPROOT))
+
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not long'
 

@@ -1,5 +1,6 @@
 """Fixtures for all tests."""
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -18,6 +19,12 @@ hypothesis.settings.register_profile(
     "thorough", hypothesis.settings.get_profile("engram"), max_examples=300
 )
 hypothesis.settings.load_profile("engram")
+
+
+def pytest_collection_finish() -> None:
+    """What imports made stays to the end: the collector need not look at it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -23,6 +23,17 @@ Row: TypeAlias = dict[str, Any]
 _SHARES = ("share_", "p_gt_", "excess_", "minus_", "expected_missed", "union_", "united_share")
 
 
+def make_folder(out: Path) -> None:
+    """The folder of a report, before minutes go into what could not be kept.
+
+    Raises:
+        InputError: it cannot be made.
+        StorageFullError: no space is left.
+    """
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+
+
 def write_study(
     out: Path,
     tables: Mapping[str, Sequence[Row]],
@@ -31,6 +42,8 @@ def write_study(
     draw: Callable[[Path], list[Path]],
 ) -> list[Path]:
     """Tables, page, configuration and figures; files of an earlier report are replaced.
+
+    The folder is there; see `make_folder`.
 
     Returns:
         The files written.
@@ -41,7 +54,6 @@ def write_study(
         MissingExtraError: Matplotlib is not installed; all but the figures is written by then.
     """
     with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
         for name, rows in tables.items():
             write_csv(out / f"{name}.csv", rows)
         write_json(out / "configuration.json", configuration)

@@ -20,6 +20,7 @@ from engram_lab.studies.pages import (
     Row,
     chosen,
     compared,
+    make_folder,
     pivot,
     rated,
     table,
@@ -75,6 +76,7 @@ def write_report(out: Path, plans: Sequence[Plan]) -> list[Path]:
         MissingExtraError: Matplotlib is not installed; the tables are written by then.
     """
     campaigns = [_with_results(plan) for plan in plans]
+    make_folder(out)
     rows = [row for one in campaigns for row in summary_rows(one)]
     comparisons = [row for one in campaigns for row in comparison_rows(one)] + pooled_rows(
         campaigns

@@ -12,7 +12,7 @@ from engram_lab.studies.fleet.records import read_json
 from engram_lab.studies.fleet.results import ArmResult
 from engram_lab.studies.fleet.stages import stages_path
 from engram_lab.studies.fleet.tables import fleet_rows, order_rows, session_rows
-from engram_lab.studies.pages import COMPARED, Row, chosen, table, write_study
+from engram_lab.studies.pages import COMPARED, Row, chosen, make_folder, table, write_study
 
 _TITLES = {
     7: "Building side by side (Fig. 7)",
@@ -50,6 +50,7 @@ def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
         MissingExtraError: Matplotlib is not installed; the tables are written by then.
     """
     arms = [ArmResult(plan, arm) for plan in plans for arm in plan.arms]
+    make_folder(out)
     tables = {
         "summary": [row for arm in arms for row in fleet_rows(arm)],
         "sessions": [row for arm in arms for row in session_rows(arm)],
