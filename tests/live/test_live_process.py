@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Thread
@@ -381,6 +382,35 @@ def connected(path: Path, process: subprocess.Popen[bytes]) -> Link:
                 continue
     assert process.stderr is not None
     raise AssertionError(process.stderr.read().decode())
+
+
+def test_a_played_drive_waits_until_the_robot_is_ready(
+    street: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = FakeClock()
+    for module in ("engram.live.transport", "engram.robot.front"):
+        monkeypatch.setattr(f"{module}.time", clock)
+    took_s = {0: 30.0, 3: 0.25}  # opening the map; a frame that keeps the robot busy
+    taken = []
+    for event in Played(open_drive(street), lambda _: None, rate_hz=10.0).events():
+        clock.now_s += took_s.get(len(taken), 0.01)
+        taken.append(event)
+    assert [one.dropped for one in taken] == [0] * 4 + [1] + [0] * 6
+    gaps_s = [after.arrived_s - before.arrived_s for before, after in pairwise(taken[1:])]
+    assert gaps_s == pytest.approx([0.1] * 2 + [0.2] + [0.1] * 6)
+
+
+class FakeClock:
+    """In place of the module `time`: sleeping takes no time but its own."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def perf_counter(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
 
 
 def test_a_drive_is_played_in_real_time_without_its_late_frames(street: Path, town: Path) -> None:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import islice
 from threading import Condition
 from typing import Any, Protocol, TypeAlias
 
@@ -124,6 +125,7 @@ class Played:
         sequence: the drive.
         hear: called with each message.
         rate_hz: frames a second, of which late ones are dropped; None plays every frame at once.
+            The first one waits for the robot, which opens its map with it.
     """
 
     def __init__(
@@ -140,6 +142,8 @@ class Played:
         """See `Transport`."""
         dropped = 0
         with closing(arriving(self._sequence)) as entries:
+            for first in islice(entries, 1):  # opens the map: time runs once the robot is ready
+                yield FrameEvent(first, time.perf_counter())
             for due, arrived in paced(entries, self._rate_hz):
                 if self._rate_hz is not None and time.perf_counter() > due + 1 / self._rate_hz:
                     dropped += 1
