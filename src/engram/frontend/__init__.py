@@ -10,7 +10,7 @@ from engram.frontend.frame import (
     Landmarks,
     StereoPair,
 )
-from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.frontend import Frontend, FrontendConfig, check_pair
 from engram.frontend.matching import Match, MatcherConfig, match_frames, matcher_hash, pair_seed
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "Match",
     "MatcherConfig",
     "StereoPair",
+    "check_pair",
     "feature_kind",
     "match_frames",
     "matcher_hash",

@@ -16,6 +16,7 @@ from engram.frontend.features import feature_kind
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
 from engram.frontend.masking import clear_of_body, without_body
 from engram.frontend.quantisation import quantised_landmarks
+from engram.geometry import StereoCamera
 
 # Raise it when equal settings give different landmarks.
 FRONTEND_VERSION = 1
@@ -109,7 +110,7 @@ class Frontend:
             SequenceError: the images are not uint8 arrays of the camera's size, or smaller than
                 64 px.
         """
-        _check_images(pair)
+        check_pair(pair)
         pair, config = without_body(pair), self.config
         kind = feature_kind(config.descriptor)
         found = kind.detect(pair, config, config.landmarks_for(pair.left.size))
@@ -166,13 +167,28 @@ def _settings_hash(config: FrontendConfig) -> str:
     return config_hash(settings)
 
 
-def _check_images(pair: StereoPair) -> None:
+def check_pair(pair: StereoPair) -> None:
+    """Refuses a pair that no front-end can read.
+
+    Raises:
+        SequenceError: the stamp is not an integer of 64 bits, there is no camera, or the images are
+            not uint8 arrays of the camera's size, or smaller than 64 px.
+    """
+    stamp_ns: object = pair.stamp_ns
+    if not isinstance(stamp_ns, int | np.integer) or not -(2**63) <= stamp_ns < 2**63:
+        raise SequenceError(
+            f"stamp_ns is {stamp_ns!r}, must be a whole number of nanoseconds within 64 bits"
+        )
+    if not isinstance(pair.camera, StereoCamera):
+        raise SequenceError(f"camera is {pair.camera!r}, must be an engram.StereoCamera")
     expected = (pair.camera.height, pair.camera.width)
     for name, image in (("left", pair.left), ("right", pair.right)):
+        if not isinstance(image, np.ndarray):
+            raise SequenceError(f"{name} image is of {type(image).__name__}, must be a NumPy array")
         if image.dtype != np.uint8 or image.shape != expected:
             raise SequenceError(
-                f"{name} image at {pair.stamp_ns} ns is {image.dtype} {image.shape}; the camera "
-                f"expects uint8 {expected} (height, width)"
+                f"{name} image at {stamp_ns} ns is {image.dtype} {image.shape}, must be grey: "
+                f"uint8 {expected}, the camera's (height, width)"
             )
         if min(expected) < _SMALLEST_SIDE_PX:
             raise SequenceError(

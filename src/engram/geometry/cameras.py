@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import NewType
 
 import numpy as np
@@ -57,8 +58,13 @@ class StereoCamera:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not 1 <= value <= _MAX_SIDE_PX:
-                raise CalibrationError(f"camera: {name} is {value}, must be 1 to {_MAX_SIDE_PX} px")
+            if not isinstance(value, int | np.integer) or not 1 <= value <= _MAX_SIDE_PX:
+                raise CalibrationError(
+                    f"camera: {name} is {value!r}, must be a whole number, 1 to {_MAX_SIDE_PX} px"
+                )
+        for name in ("fx", "fy", "cx", "cy", "baseline_m"):
+            if not isinstance(getattr(self, name), Real):
+                raise CalibrationError(f"camera: {name} is {getattr(self, name)!r}, not a number")
         for name in ("fx", "fy", "baseline_m"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):

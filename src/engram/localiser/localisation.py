@@ -38,8 +38,9 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("lanes", "rounds", "lost_rounds"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"budget: {name} is {getattr(self, name)}, must be at least 1")
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ConfigError(f"budget: {name} is {value}, must be a whole number, at least 1")
         if self.deadline_ms is not None and not self.deadline_ms > 0:
             raise ConfigError(f"budget: deadline_ms is {self.deadline_ms}, must be > 0")
 

@@ -171,7 +171,7 @@ class Map(MapReader):
             threads: most threads of the robot, the caller's included; None: `lanes` + 2 to 4.
 
         Raises:
-            ConfigError: an option is unknown or out of range, or the threads are too few.
+            InputError: an option is unknown or out of range, or the threads are too few.
         """
         from engram.robot.live import Owner
         from engram.robot.settings import RobotOptions, Settings

@@ -6,6 +6,8 @@ import time
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
+from math import inf
+from numbers import Real
 from queue import Queue
 from threading import Event, Thread
 from typing import TypeAlias, TypeVar
@@ -13,9 +15,11 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from engram.doctor import Diagnosis, Examination, diagnose
-from engram.frontend import Frame, FrameStatus, Frontend, StereoPair
-from engram.geometry import SE3
-from engram.localiser import StageClock
+from engram.errors import IncompatibleError, InputError
+from engram.frontend import Frame, FrameStatus, Frontend, StereoPair, check_pair
+from engram.geometry import SE3, StereoCamera
+from engram.graph.graph import ExperienceGraph
+from engram.localiser import Position, StageClock
 from engram.odometry import (
     GapFiller,
     Motion,
@@ -42,11 +46,16 @@ class Front:
 
     A frame log already contains frame and odometry.
 
+    Args:
+        settings: the resolved configuration.
+        camera: that of all its frames; None if the first one tells.
+
     Attributes:
         examination: what the doctor saw of the first frames.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, camera: StereoCamera | None = None) -> None:
+        self._camera = camera
         self.examination = Examination(settings.doctor)
         self._settings = settings
         self._frontend = Frontend(settings.frontend)
@@ -61,6 +70,36 @@ class Front:
         self._outside = OutsideModel(self._settings.outside)
         self._frozen = _FrozenStream()
         self.examination.begin()
+
+    def check(
+        self, arrived: Arrived, motion: Motion | OutsideMotion | None, deadline_ms: float | None
+    ) -> None:
+        """Refuses what no step of this robot can take, before anything counts it.
+
+        Raises:
+            InputError: an argument is something else.
+            SequenceError: stamp, camera or images are none; see `check_pair`.
+            IncompatibleError: the frame is another camera's.
+        """
+        if isinstance(arrived, StereoPair):
+            check_pair(arrived)
+        elif not isinstance(arrived, LoggedFrame):
+            raise InputError(
+                f"a robot takes an engram.StereoPair, not a value of {type(arrived).__name__}"
+            )
+        if deadline_ms is not None and not (isinstance(deadline_ms, Real) and -inf < deadline_ms):
+            raise InputError(f"deadline_ms is {deadline_ms!r}, must be milliseconds, or None")
+        camera = arrived.camera if isinstance(arrived, StereoPair) else arrived.frame.camera
+        if self._camera is not None and camera != self._camera:
+            raise IncompatibleError(
+                f"the frame at {stamp_of(arrived)} ns is of camera {camera.id[:8]}, the robot's is "
+                f"{self._camera.id[:8]}; give each camera a robot of its own"
+            )
+        if not isinstance(motion, Motion | OutsideMotion | None):
+            raise InputError(
+                f"motion is a value of {type(motion).__name__}, must be an OutsideMotion of wheels "
+                "and gyroscope, or a Motion"
+            )
 
     @property
     def diagnosis(self) -> Diagnosis:
@@ -157,6 +196,27 @@ class _FrozenStream:
         moved = motion.prev_from_curr
         if moved is not None and not motion.guessed_m:
             self._moving = moved.distance_m > _MOVING_M or moved.angle_rad > _MOVING_RAD
+
+
+def check_position(position: Position, graph: ExperienceGraph) -> None:
+    """Refuses a position at which no robot can be.
+
+    Raises:
+        InputError: it is something else, its numbers are not finite, or the graph does not contain
+            its node.
+    """
+    if not isinstance(position, Position):
+        raise InputError(f"the place is a {type(position).__name__}, must be a Position")
+    pose, covariance = position.node_from_live.matrix(), np.asarray(position.covariance)
+    if covariance.shape != (6, 6) or not (
+        np.isfinite(pose).all() and np.isfinite(covariance).all()
+    ):
+        raise InputError("a position's pose and (6, 6) covariance must be finite numbers")
+    if position.node not in graph:
+        raise InputError(
+            f"the map has no node {position.node}; give a position in this map, or none: the robot "
+            "then searches"
+        )
 
 
 def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]]:

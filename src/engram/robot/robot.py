@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_left
-from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -28,7 +27,7 @@ from engram.localiser import (
 from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot.front import Arrived, Front, arriving, paced, stamp_of
+from engram.robot.front import Arrived, Front, arriving, check_position, paced, stamp_of
 from engram.robot.live import LiveKeeper
 from engram.robot.recorder import Recorder
 from engram.robot.saved import Saving
@@ -58,11 +57,11 @@ class Seen:
 class Robot:
     """One robot on one drive: image pairs in, `Localisation`s out. A context manager.
 
-    One thread at a time calls a robot's methods. `RobotOptions.threads` bounds all that work for
-    it: the caller's; one more for each further lane; one that decodes images in `drive`; one that
-    reads the map ahead, which robots in it share; one that writes, if it keeps its results; and
-    one that closes loops, if it maps. Robots in one process share only the map that made them;
-    each may run on its own thread. A flight recorder and OpenCV have their own.
+    One thread at a time calls a robot's methods, all but `pose_at`. `RobotOptions.threads` bounds
+    all that work for it: the caller's; one more for each further lane; one that decodes images in
+    `drive`; one that reads the map ahead, which robots in it share; one that writes, if it keeps
+    its results; and one that closes loops, if it maps. Robots in one process share only the map
+    that made them; each may run on its own thread. A flight recorder and OpenCV have their own.
 
     Args:
         front: front-end and odometry.
@@ -89,7 +88,9 @@ class Robot:
         self._stamp_ns: int | None = None
         # Rising stamps of the newest frames that came too late.
         self._early_ns: list[int] = []
-        self._track: deque[tuple[int, Localisation]] = deque(maxlen=_REMEMBERED)
+        # Replaced, never changed: another thread may ask `pose_at`.
+        self._track: tuple[tuple[int, Localisation], ...] = ()
+        self._closed = False
         self.recorder: Recorder | None = None
         # Called after each step with the frame and its result, such as by a viewer.
         self.watch: Callable[[Seen, Localisation], None] | None = None
@@ -106,6 +107,7 @@ class Robot:
         Raises:
             MapError: it cannot be written, though no earlier write failed; see `saving`.
         """
+        self._closed = True
         live, self._live = self._live, None
         try:
             if live is not None:
@@ -164,11 +166,16 @@ class Robot:
             the frame was matched.
 
         Raises:
+            InputError: the robot is closed, or cannot use an argument: it is as it was before.
+            IncompatibleError: the pair is of another camera; likewise.
             MapError: landmarks cannot be read, or the results cannot be written.
         """
         clock = StageClock(arrived_s)
         if deadline_ms is None:
             deadline_ms = self._deadline_ms
+        if self._closed:
+            raise InputError("the robot is closed; make another one with Map.robot")
+        self._front.check(arrived, motion, deadline_ms)
         if not self._in_order(arrived):
             return self._left_out(arrived)
         frame, motion = self._taken(arrived, motion, clock)
@@ -187,7 +194,7 @@ class Robot:
             self.watch(self.last, found)
         if self.recorder is not None:
             self.recorder.note(arrived, frame, found, self._localiser.outcomes)
-        self._track.append((frame.stamp_ns, found))
+        self._track = (*self._track[1 - _REMEMBERED :], (frame.stamp_ns, found))
         return found
 
     localise = step
@@ -254,7 +261,11 @@ class Robot:
 
         It counts like any position: the nodes around it are tried first, and after too long a
         distance without a match the robot is lost.
+
+        Raises:
+            InputError: no such position; see `check_position`.
         """
+        check_position(hint, self.graph)
         self._localiser.place_at(hint)
 
     def lose(self) -> None:
@@ -266,9 +277,8 @@ class Robot:
 
         The loop calls it for `Localisation.withdraws`, and so may a caller that knows better.
         """
-        self._track = deque(
-            ((at, replace(one, position=None) if one is found else one) for at, one in self._track),
-            _REMEMBERED,
+        self._track = tuple(
+            (at, replace(one, position=None) if one is found else one) for at, one in self._track
         )
         self._keeper.withdrawn(found)
         if self.recorder is not None:
@@ -283,6 +293,8 @@ class Robot:
 
     def pose_at(self, stamp_ns: int) -> Position | None:
         """The position at a time between the robot's last frames, such as that of an image.
+
+        Any thread may ask, even during a `step`.
 
         Args:
             stamp_ns: a time within the robot's last 200 frames, on the clock of their stamps.
@@ -353,7 +365,7 @@ class Robot:
             return False
         self._front.restart()
         self._localiser.lose()
-        self._track.clear()
+        self._track = ()
         return True
 
     def _left_out(self, arrived: Arrived) -> Localisation:

@@ -86,7 +86,7 @@ class RobotOptions:
     def __post_init__(self) -> None:
         check_for_robot(self.policy)
         Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)  # checks the values
-        if self.threads is not None and (isinstance(self.threads, bool) or self.threads < 1):
+        if self.threads is not None and (type(self.threads) is not int or self.threads < 1):
             raise ConfigError(f"threads is {self.threads}, must be a number of at least 1, or None")
 
     @property

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from engram.errors import ConfigError, MapError, MapLockedError, RevisionError
+from engram.errors import ConfigError, InputError, MapError, MapLockedError, RevisionError
+from engram.geometry import StereoCamera
 from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
 from engram.robot.fixed import ToldFix, relocaliser_with_fixes, suggesting
@@ -18,6 +19,7 @@ from engram.robot.saving import commit_crashed
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import commit_spools
+from engram.sequences import check_name
 
 
 def robot_on(
@@ -61,7 +63,8 @@ def robot_on(
         threads=options.lane_threads(),
         clock=sequence.info,
     )
-    return Robot(Front(settings), localiser, deadline_ms=options.deadline_ms)
+    front = Front(settings, sequence.camera)
+    return Robot(front, localiser, deadline_ms=options.deadline_ms)
 
 
 def robot_in(
@@ -77,6 +80,10 @@ def robot_in(
 
     A `front` continues the odometry of the robot before it; a `fix` of satellites proposes nodes.
     """
+    if not isinstance(owner.camera, StereoCamera):
+        raise InputError(f"camera is {owner.camera!r}, must be an engram.StereoCamera")
+    if owner.name is not None:
+        check_name(owner.name)
     owner = replace(owner, settings=owner.settings.for_descriptor(opened.descriptor))
     saving = None
     if maps or remembers:
@@ -88,7 +95,8 @@ def robot_in(
         owner = replace(owner, finder=finder)
     if not (maps or remembers):
         localiser, deadline_ms = owner.localiser_in(opened), owner.options.deadline_ms
-        return Robot(front or Front(owner.settings), localiser, deadline_ms=deadline_ms)
+        front = front or Front(owner.settings, owner.camera)
+        return Robot(front, localiser, deadline_ms=deadline_ms)
     if not maps:
         return _keeping(owner, IntoMemory(owner, opened), front, saving)
     commit_spools(Path(opened.location))
@@ -135,5 +143,5 @@ def _keeping(
     owner: Owner, into: Into, front: Front | None = None, saving: Saving | None = None
 ) -> Robot:
     keeper, deadline_ms = LiveKeeper(owner, into, saving), owner.options.deadline_ms
-    front = front or Front(owner.settings)
+    front = front or Front(owner.settings, owner.camera)
     return Robot(front, into.localiser, keeper, deadline_ms=deadline_ms)

@@ -10,6 +10,7 @@ from engram.sequences.sequence import (
     LoggedFrame,
     SequenceInfo,
     StereoSequence,
+    check_name,
     first_pair_hash,
     session_of,
 )
@@ -28,6 +29,7 @@ __all__ = [
     "SequenceInfo",
     "StereoSequence",
     "TimeRange",
+    "check_name",
     "first_pair_hash",
     "open_sequence",
     "session_of",

@@ -15,6 +15,7 @@ from msgspec import Meta
 from engram.config import check_bounds
 from engram.errors import ConfigError
 from engram.graph.clock import check_longitude, check_zone
+from engram.sequences.sequence import check_name
 
 T = TypeVar("T")
 E = TypeVar("E", bound=StrEnum)
@@ -216,6 +217,10 @@ class OpenOptions:
     motion: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if not isinstance(self.frames, FrameRange):
+            raise ConfigError(f"frames is {self.frames!r}, must be text such as 0:100:2")
+        if self.robot is not None:
+            check_name(self.robot)
         check_longitude(self.longitude_deg)
         check_zone(self.zone)
         check_bounds(self)

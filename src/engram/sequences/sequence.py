@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
+from engram.errors import InputError
 from engram.frontend import Frame, StereoPair
 from engram.geometry import StereoCamera
 from engram.graph.model import Clock, Session, session_id
@@ -102,6 +103,20 @@ def first_pair_hash(pair: StereoPair) -> str:
     return digest.hexdigest()[:32]
 
 
+def check_name(robot: str) -> str:
+    """The name of a robot, as maps store it.
+
+    Raises:
+        InputError: it is empty, or not Unicode text.
+    """
+    try:
+        if robot and robot.encode():
+            return robot
+    except (AttributeError, UnicodeEncodeError):
+        pass
+    raise InputError(f"the robot's name is {robot!r}, must be Unicode text, such as r1")
+
+
 def session_of(
     info: SequenceInfo, camera: StereoCamera, start_ns: int, first_pair_hash: str
 ) -> Session:
@@ -112,8 +127,11 @@ def session_of(
         camera: its camera.
         start_ns: stamp of the first used pair, ns.
         first_pair_hash: `first_pair_hash` of that pair; a frame log has it as a property.
+
+    Raises:
+        InputError: the robot's name is none; see `check_name`.
     """
-    robot = info.robot or UNNAMED_ROBOT
+    robot = check_name(info.robot or UNNAMED_ROBOT)
     return Session(
         id=session_id(robot, camera.id, start_ns, first_pair_hash),
         robot=robot,

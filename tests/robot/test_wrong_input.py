@@ -1,0 +1,139 @@
+"""What a program gives wrongly ends in an error that says so, and leaves the robot as it was."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from uuid import uuid4
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive
+
+from engram.errors import ConfigError, IncompatibleError, InputError, SequenceError
+from engram.frontend import StereoPair
+from engram.geometry import SE3
+from engram.localiser import Position
+from engram.maps import Map, open_map
+from engram.robot import Robot
+
+ROAD = np.arange(0.0, 20.0, 0.7)
+LIVE = drive(World(30.0), ROAD, seed=1, start_ns=10**15)
+CAMERA = LIVE[0].frame.camera
+GREY = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+LATER_NS = 10**18
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
+    path = tmp_path_factory.mktemp("robot") / "town.engram"
+    map_simulated(path, drive(World(30.0), ROAD))
+    with open_map(path) as opened:
+        yield opened
+
+
+@pytest.fixture
+def robot(town: Map) -> Iterator[Robot]:
+    with town.robot(CAMERA, relocaliser=None) as made:
+        made.place_at(Position.at(town.graph.node(0).id))
+        assert made.step(LIVE[0].logged).localised
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("pair", "kind", "words"),
+    [
+        (None, InputError, "takes an engram.StereoPair"),
+        (StereoPair(LATER_NS + 0.5, GREY, GREY, CAMERA), SequenceError, "stamp_ns is"),
+        (StereoPair(2**64, GREY, GREY, CAMERA), SequenceError, "within 64 bits"),
+        (StereoPair(LATER_NS, None, GREY, CAMERA), SequenceError, "left image is of NoneType"),
+        (StereoPair(LATER_NS, GREY, GREY[1:], CAMERA), SequenceError, "right image .* must be"),
+        (StereoPair(LATER_NS, GREY / 255, GREY, CAMERA), SequenceError, "left image .* float64"),
+        (StereoPair(LATER_NS, GREY, GREY, None), SequenceError, "camera is None"),
+        (
+            StereoPair(LATER_NS, GREY, GREY, replace(CAMERA, fx=CAMERA.fx + 1)),
+            IncompatibleError,
+            "give each camera a robot of its own",
+        ),
+    ],
+)
+def test_a_pair_that_cannot_be_used_changes_nothing(robot: Robot, pair, kind, words: str) -> None:
+    with pytest.raises(kind, match=words):
+        robot.step(pair)
+    assert robot.step(LIVE[1].logged).localised
+
+
+@pytest.mark.parametrize(
+    "given", [{"motion": np.eye(4)}, {"deadline_ms": float("nan")}, {"deadline_ms": "40"}]
+)
+def test_a_motion_or_deadline_of_the_wrong_kind_changes_nothing(robot: Robot, given) -> None:
+    with pytest.raises(InputError, match=next(iter(given))):
+        robot.step(LIVE[1].logged, **given)
+    assert robot.step(LIVE[1].logged).localised
+
+
+def test_a_robot_is_placed_only_where_the_map_has_a_node(robot: Robot, town: Map) -> None:
+    node = town.graph.node(0).id
+    for wrong in (
+        None,
+        np.eye(4),
+        Position.at(uuid4()),
+        Position(node, SE3(np.eye(3), np.full(3, np.nan)), np.eye(6)),
+        Position(node, SE3.identity(), np.eye(3)),
+    ):
+        with pytest.raises(InputError):
+            robot.place_at(wrong)
+    assert robot.step(LIVE[1].logged).localised
+
+
+def test_a_closed_robot_says_so(town: Map) -> None:
+    with town.robot(CAMERA) as robot:
+        robot.step(LIVE[0].logged)
+    with pytest.raises(InputError, match=r"closed; make another one with Map\.robot"):
+        robot.step(LIVE[1].logged)
+
+
+@pytest.mark.parametrize(
+    ("camera", "options", "kind"),
+    [
+        (None, {}, InputError),
+        (CAMERA, {"name": ""}, InputError),
+        (CAMERA, {"name": 3}, InputError),
+        (CAMERA, {"name": "caf\udce9"}, InputError),
+        (CAMERA, {"lanes": 1.5}, ConfigError),
+        (CAMERA, {"threads": 5.5}, ConfigError),
+    ],
+)
+def test_what_makes_no_robot_is_named(town: Map, camera, options, kind) -> None:
+    with pytest.raises(kind, match=next(iter(options), "camera")):
+        town.robot(camera, **options)
+
+
+def test_another_thread_may_ask_for_poses_during_a_step(robot: Robot) -> None:
+    stamps_ns = [one.frame.stamp_ns - 1 for one in LIVE]
+    ended, faults = threading.Event(), []
+
+    def ask() -> None:
+        while not ended.is_set():
+            try:
+                for stamp_ns in stamps_ns:
+                    robot.pose_at(stamp_ns)
+            except RuntimeError as fault:
+                faults.append(fault)
+                return
+
+    asking, interval_s = threading.Thread(target=ask), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)  # changes of threads everywhere
+    try:
+        asking.start()
+        for one in LIVE[1:]:
+            robot.step(one.logged)
+    finally:
+        ended.set()
+        asking.join()
+        sys.setswitchinterval(interval_s)
+    assert not faults
+    assert robot.pose_at(stamps_ns[-1]) is not None
