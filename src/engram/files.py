@@ -182,8 +182,13 @@ def naming(path: Path) -> Iterator[None]:
         MapError: it cannot be written.
     """
     taken = InputError(f"{path} exists already; open it, or choose another name")
-    if path.exists() or path.is_symlink():
+    if path.exists():
         raise taken
+    if path.is_symlink():
+        raise InputError(
+            f"{path} is a link to {path.readlink()}, which does not exist; remove the link, or "
+            "name its target"
+        )
     check_parent(path)
     try:
         yield

@@ -7,6 +7,7 @@ write-ahead log while the writer still uses it.
 
 from __future__ import annotations
 
+import os
 import re
 import sqlite3
 import stat
@@ -33,6 +34,7 @@ from engram.errors import (
     MapLockedError,
     StorageFullError,
 )
+from engram.files import check_parent
 
 _OLDEST_SQLITE = (3, 37, 0)  # knows STRICT tables
 _CACHE_KIB = 8192
@@ -104,13 +106,15 @@ class SqliteFile:
 
         Raises:
             EngramError: the kind's `strange`: not a regular file, or an empty one.
-            MapError: the file cannot be read.
+            InputError: the folder of a new file is not there.
+            MapError: the file cannot be read, or made.
         """
         noun, strange = self.kind.noun, self.kind.strange
         try:
             found = self.path.stat()
         except (FileNotFoundError, NotADirectoryError) as error:
             if may_be_new:
+                self._check_place()
                 return
             raise strange(f"{self.path}: there is no such file") from error
         except OSError as error:
@@ -119,8 +123,16 @@ class SqliteFile:
             raise strange(f"{self.path} is a folder, not a {noun}")
         if not stat.S_ISREG(found.st_mode):
             raise strange(f"{self.path} is a pipe, a socket or a device, not a {noun}")
+        if not os.access(self.path, os.R_OK):
+            raise MapError(f"{self.path} cannot be read: permission denied")
         if not found.st_size and not may_be_new:
             raise strange(f"{self.path} is an empty file, not a {noun}")
+
+    def _check_place(self) -> None:
+        """Refuses a new file that cannot be made."""
+        check_parent(self.path)
+        if not os.access(self.path.parent, os.W_OK):
+            raise MapError(f"{self.path} cannot be created: permission denied")
 
     def identify(self, execute: Execute) -> int:
         """Format of the file, read through SQLite, since the log may be newer than the first page.
@@ -194,15 +206,20 @@ class SqliteFile:
             options: of SQLite's URI: ``mode=ro``, ``mode=rw`` or ``mode=rwc``.
 
         Raises:
-            MapError: this Python's SQLite is too old.
+            MapError: this Python's SQLite is too old, or does not take the path.
         """
         if sqlite3.sqlite_version_info < _OLDEST_SQLITE:
             raise MapError(
                 f"this Python comes with SQLite {sqlite3.sqlite_version}; a {self.kind.noun} needs "
                 f"{'.'.join(map(str, _OLDEST_SQLITE))} or newer"
             )
+        place = str(self.path.absolute())
+        try:
+            address = f"file:{quote(place)}?{options}"
+        except UnicodeEncodeError as error:
+            raise MapError(f"{place}: the path is not UTF-8; rename file or folder") from error
         connection = sqlite3.connect(
-            f"file:{quote(str(self.path.absolute()))}?{options}",
+            address,
             uri=True,
             timeout=self.kind.busy_s,
             check_same_thread=False,  # only one thread at a time uses a connection

@@ -1,11 +1,17 @@
 """The command line: each verb parses, calls one function and prints."""
 
+import sys
+
 __all__ = ["main"]
 
 
 def main() -> None:
     """Runs the program."""
-    # Packages that bring verbs import from this one: the program is made when it runs.
-    from engram.cli.app import main as run
+    try:
+        # Packages that bring verbs import from this one: the program is made when it runs.
+        from engram.cli.app import main as run
 
-    run()
+        run()
+    except KeyboardInterrupt:  # while the program starts; verbs have their own words
+        print("engram: interrupted", file=sys.stderr)
+        sys.exit(130)

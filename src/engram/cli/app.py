@@ -12,7 +12,7 @@ import typer
 from engram import __version__
 from engram.cli.endings import EXIT_UNFIT_DRIVE, PartlyDoneError, VerbInterruptedError
 from engram.cli.moved import moved_option
-from engram.cli.screen import screen
+from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.verbs import Program, register
 from engram.errors import EngramError, InputError, UnfitDriveError
 
@@ -50,6 +50,7 @@ register(app)
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+EXIT_READER_LEFT = 141  # as of a program that SIGPIPE ends: `| head -1` is no fault
 
 # What Typer raises for any mistyped command line; of its kinds it exports only this one's child.
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
@@ -57,8 +58,15 @@ _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 
 def main() -> None:
     """Runs the program; an error that Engram foresaw is one line, never a traceback."""
-    with screen():
-        _run()
+    try:
+        with screen():
+            _run()
+    except UnwritableError as error:
+        forget(sys.stdout)
+        if error.reader_left:
+            sys.exit(EXIT_READER_LEFT)
+        print(f"engram: {error}", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
 
 
 def _run() -> None:

@@ -6,10 +6,13 @@ clear or retitle a terminal, or turn the direction of what follows. JSON escapes
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TextIO
 
 from engram.untrusted import printable
@@ -40,12 +43,14 @@ class Screen(io.TextIOBase):
 
     def write(self, text: str) -> int:
         """Writes a text as a terminal may show it."""
-        self.unfiltered.write(printable(text))
+        with _writing():
+            self.unfiltered.write(printable(text))
         return len(text)
 
     def flush(self) -> None:
         """See `io.TextIOBase`."""
-        self.unfiltered.flush()
+        with _writing():
+            self.unfiltered.flush()
 
     def writable(self) -> bool:
         """See `io.TextIOBase`."""
@@ -60,15 +65,47 @@ class Screen(io.TextIOBase):
         return self.unfiltered.fileno()
 
 
+class UnwritableError(Exception):
+    """What is printed cannot be written: the disk is full, or the reader went away."""
+
+    def __init__(self, cause: OSError) -> None:
+        super().__init__(f"the output cannot be written: {cause.strerror}")
+        self.reader_left = cause.errno == errno.EPIPE
+
+
 @contextmanager
-def screen() -> Iterator[None]:
-    """Lets everything that is printed pass through `printable` within the block."""
-    plain = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(Screen, plain)
+def _writing() -> Iterator[None]:
     try:
         yield
-    finally:
-        sys.stdout, sys.stderr = plain
+    except OSError as error:
+        raise UnwritableError(error) from error
+
+
+@contextmanager
+def screen() -> Iterator[None]:
+    """Lets everything that is printed pass through `printable` within the block.
+
+    A stream that the caller closed takes everything and shows nothing.
+
+    Raises:
+        UnwritableError: something cannot be written.
+    """
+    plain = sys.stdout, sys.stderr
+    with Path(os.devnull).open("w") as nowhere:
+        shown, complained = (Screen(stream or nowhere) for stream in plain)
+        sys.stdout, sys.stderr = shown, complained
+        try:
+            yield
+        finally:
+            sys.stdout, sys.stderr = plain
+            shown.flush()
+
+
+def forget(stream: TextIO | None) -> None:
+    """Drops what a stream still holds, so that Python does not complain about it at its end."""
+    if stream is not None:
+        with Path(os.devnull).open("w") as nowhere:
+            os.dup2(nowhere.fileno(), stream.fileno())
 
 
 def drawing(stream: TextIO) -> TextIO:

@@ -23,7 +23,8 @@ def mapped_text(report: Mapping[str, Any], map_path: Path | str) -> str:
     if report["known"]:
         return (
             f"nothing to do: the map already contains this drive (session {report['session']}). "
-            f"To change its zone, start or robot: engram amend {map_path} {report['session'][:8]}"
+            f"To change its zone, start or robot: engram amend {typed(map_path)} "
+            f"{report['session'][:8]}"
         )
     share, saved = report["share_localised"], report["nodes_saved"]
     area = "known area" if share >= _KNOWN else "new area" if share <= _NEW else "partly new area"
@@ -58,8 +59,12 @@ def localised_text(
 
 def undo_text(map_path: Path | str, *revisions: int) -> str:
     """The commands that undo revisions, in this order; "" if there are none."""
-    path = quote(str(map_path))
-    return "\n".join(f"to undo: engram revert {path} {number}" for number in revisions)
+    return "\n".join(f"to undo: engram revert {typed(map_path)} {number}" for number in revisions)
+
+
+def typed(path: Path | str) -> str:
+    """A path as it is typed in a command."""
+    return quote(f"./{path}" if str(path).startswith("-") else str(path))
 
 
 def _lines(*lines: str) -> str:
@@ -112,8 +117,9 @@ def _stages(stages_ms: Mapping[str, Mapping[str, float]]) -> list[str]:
 
 def _after_mapping(report: Mapping[str, Any], map_path: Path | str) -> str:
     if any(one["severity"] == "fatal" for one in report["findings"]):
-        return f"correct the drive, then engram revert {map_path} {report['revision']}"
-    return f"engram localise {map_path} ANOTHER_DRIVE, or engram plot {map_path} map.png"
+        return f"correct the drive, then engram revert {typed(map_path)} {report['revision']}"
+    path = typed(map_path)
+    return f"engram localise {path} ANOTHER_DRIVE, or engram plot {path} map.png"
 
 
 def _after_localising(frames: Sequence[Mapping[str, Any]], map_path: Path | str) -> str:
@@ -123,5 +129,5 @@ def _after_localising(frames: Sequence[Mapping[str, Any]], map_path: Path | str)
         if frame["status"] in {"dead_reckoning", "lost"}
     ]
     if missed:
-        return f"engram localise {map_path} DRIVE --explain {missed[len(missed) // 2]}"
-    return f"engram plot {map_path} map.png"
+        return f"engram localise {typed(map_path)} DRIVE --explain {missed[len(missed) // 2]}"
+    return f"engram plot {typed(map_path)} map.png"

@@ -24,6 +24,7 @@ from engram.sequences.listing import Listing, PairFiles, usable_pairs
 from engram.sequences.motion import motion_of_files
 from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import SequenceInfo
+from engram.untrusted import printable
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,6 +185,7 @@ def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
     return replace(
         info,
         clock=clock,
+        name=printable(info.name),
         robot=info.robot if options.robot is None else options.robot,
         longitude_deg=(
             info.longitude_deg if options.longitude_deg is None else options.longitude_deg

@@ -42,7 +42,7 @@ class FrameLogWriter:
 
     Raises:
         IncompatibleError: the file holds another drive's log, or one made with other settings.
-        SequenceError: the file is not a frame log, or its folder does not exist.
+        InputError: the file is not a frame log, or its folder does not exist.
         MapLockedError: another writer has it open.
         MapError: as `FrameLog`, and `StorageFullError`.
     """
