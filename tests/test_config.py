@@ -1,6 +1,6 @@
 """Settings: strict at any depth."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from msgspec import Meta
 
+from engram.cli.settings import AllSettings, read_settings, settings_toml
 from engram.config import check_bounds, config_hash, load_toml, plain, to_dict
 from engram.errors import ConfigError
+from engram.mapper import MapperConfig
+from engram.robot import Settings, load_settings
+from engram.robot.settings import VERB_TABLES
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,29 @@ def test_what_is_not_said_keeps_its_default() -> None:
 def test_a_misspelt_key_is_an_error_at_any_depth(text: str) -> None:
     with pytest.raises(ConfigError, match="unknown setting"):
         load_toml(text, Outer)
+
+
+def test_tables_that_others_read_are_left_alone_and_named_where_a_name_is_near() -> None:
+    text = "[inner]\nsize = 7\n[fleet]\nwhatever = 1"
+    assert load_toml(text, Outer, {"fleet"}) == Outer(inner=Inner(size=7))
+    with pytest.raises(ConfigError, match=r"unknown setting 'fleet'; known here: inner, "):
+        load_toml(text, Outer)
+    with pytest.raises(ConfigError, match=r"'fleat'; did you mean fleet\? known here: fleet, "):
+        load_toml("[fleat]\nwhatever = 1", Outer, {"fleet"})
+    with pytest.raises(ConfigError, match=r"'inner.fleet'; known here: share, size"):
+        load_toml("[inner.fleet]\nwhatever = 1", Outer, {"fleet"})
+
+
+def test_a_robot_reads_a_file_that_has_tables_of_the_fleet(tmp_path: Path) -> None:
+    verbs = {one.name for one in fields(AllSettings)} - {one.name for one in fields(Settings)}
+    assert verbs == VERB_TABLES
+    path = tmp_path / "fleet.toml"
+    path.write_text(settings_toml(AllSettings()) + "\n[odometri]\n")
+    with pytest.raises(ConfigError, match=r"fleet.toml: .*'odometri'; did you mean odometry\?"):
+        load_settings(path)
+    changed = ["mapper.save_every_m=2", "merge.lanes=3"]
+    path.write_text(settings_toml(read_settings(None, changed)))
+    assert load_settings(path).mapper == MapperConfig(save_every_m=2.0)
 
 
 @pytest.mark.parametrize("text", ["name = 3", "[inner]\nsize = 'three'", "= 3", "inner = 4"])

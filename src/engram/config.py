@@ -7,6 +7,7 @@ A field declares its bounds, meaning, unit and source:
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import functools
 import hashlib
 import json
@@ -16,6 +17,7 @@ import os
 import tomllib
 import types
 import typing
+from collections.abc import Collection
 from typing import Any, TypeVar
 
 import msgspec
@@ -26,8 +28,13 @@ from engram.errors import ConfigError
 T = TypeVar("T")
 
 
-def load_toml(text: str, kind: type[T]) -> T:
+def load_toml(text: str, kind: type[T], ignored: Collection[str] = ()) -> T:
     """Check TOML text against a dataclass and build it.
+
+    Args:
+        text: the text.
+        kind: the dataclass.
+        ignored: tables at the top that others read.
 
     Raises:
         ConfigError: the text is not TOML, a key is unknown at any depth, or a value has the wrong
@@ -37,12 +44,13 @@ def load_toml(text: str, kind: type[T]) -> T:
         values = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also numbers of thousands of digits
         raise ConfigError(f"not valid TOML: {error}") from error
-    return from_dict(values, kind)
+    return from_dict(values, kind, ignored)
 
 
-def from_dict(values: dict[str, Any], kind: type[T]) -> T:
+def from_dict(values: dict[str, Any], kind: type[T], ignored: Collection[str] = ()) -> T:
     """Build a dataclass from plain values; see `load_toml`."""
-    _refuse_unknown_keys(values, kind, where="")
+    _refuse_unknown_keys(values, kind, "", ignored)
+    values = {key: value for key, value in values.items() if key not in ignored}
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
@@ -136,15 +144,21 @@ def config_hash(config: Any) -> str:
     return hashlib.sha256(canonical.encode()).hexdigest()[:12]
 
 
-def _refuse_unknown_keys(values: Any, kind: Any, where: str) -> None:
+def _refuse_unknown_keys(values: Any, kind: Any, where: str, ignored: Collection[str] = ()) -> None:
     if isinstance(kind, types.UnionType):
         kind = next((arm for arm in kind.__args__ if dataclasses.is_dataclass(arm)), None)
     if not (dataclasses.is_dataclass(kind) and isinstance(values, dict)):
         return
     known = typing.get_type_hints(kind)
     for key, value in values.items():
+        if key in ignored:
+            continue
         if key not in known:
+            names = sorted({*known, *ignored})
+            near = "".join(
+                f"did you mean {one}? " for one in difflib.get_close_matches(key, names, 1)
+            )
             raise ConfigError(
-                f"unknown setting '{where}{key}'; known here: {', '.join(sorted(known))}"
+                f"unknown setting '{where}{key}'; {near}known here: {', '.join(names)}"
             )
         _refuse_unknown_keys(value, known[key], f"{where}{key}.")

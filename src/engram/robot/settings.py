@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 
-from engram.config import from_dict, load_toml
+from engram.config import load_toml
 from engram.doctor.settings import DoctorConfig
 from engram.errors import ConfigError
 from engram.frontend import DescriptorKind, FrontendConfig
@@ -20,6 +19,8 @@ from engram.ranking import check_for_robot
 
 # Settings files that ship with the package: the rules of one paper each.
 PAPERS = ("linegar2015", "gadd2016")
+# Tables of a settings file that only the verbs of the command line read.
+VERB_TABLES = frozenset({"drive", "merge", "build", "download", "repair", "islands"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +121,8 @@ class RobotOptions:
 def load_settings(path: Path | None) -> Settings:
     """Settings from a TOML file; with None the defaults.
 
+    The file may hold tables of the command line's verbs, such as ``merge``; they are left alone.
+
     Raises:
         ConfigError: the file cannot be read, or a setting is unknown or out of range.
     """
@@ -130,11 +133,7 @@ def load_settings(path: Path | None) -> Settings:
 def _read_settings(path: Path) -> Settings:
     text = settings_text(path)
     try:
-        if str(path) in PAPERS:  # has rules of the fleet, too
-            own = {one.name for one in fields(Settings)}
-            values = {key: value for key, value in tomllib.loads(text).items() if key in own}
-            return from_dict(values, Settings)
-        return load_toml(text, Settings)
+        return load_toml(text, Settings, VERB_TABLES)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 
