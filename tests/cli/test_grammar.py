@@ -166,7 +166,7 @@ def test_settings_as_toml_are_a_settings_file(engram, tmp_path: Path) -> None:
     ("change", "says"),
     [
         ("mapper", "expected KEY=VALUE"),
-        ("mapper.save_evry_m=2", "unknown setting 'mapper.save_evry_m'; known here: "),
+        ("mapper.save_evry_m=2", "setting 'mapper.save_evry_m'; did you mean save_every_m? known"),
         ("mapper.save_every_m.x=2", "save_every_m"),
         ("mapper.save_every_m=-2", "save_every_m"),
         ("download.latitude_deg=91", "<= 90"),
@@ -216,6 +216,10 @@ def test_goals_far_from_the_map_are_warned_of_and_exported(engram, street, tmp_p
     assert "from the nearest node" in engram("goal", "add", town, "far", "--x", 400, "--y", 1).err
     nodes = engram("info", town, "--json").json["nodes"]
     assert f"{nodes} nodes, 2 goals" in engram("export", town, table).out
+    assert "needs a name" in engram("goal", "remove", town).err
+    assert "has no goal 'dok'; its goals: dock, far" in engram("goal", "remove", town, "dok").err
+    assert "to undo: engram revert" in engram("goal", "remove", town, "far").out
+    assert [one["name"] for one in engram("goal", "list", town, "--json").json["goals"]] == ["dock"]
     assert engram("export", town, tmp_path / "town.tum").out.strip().endswith(f"{nodes} nodes")
     wrong = tmp_path / "wrong.csv"
     wrong.write_text("node,x,y\nffffffff,1,2\n")

@@ -10,12 +10,13 @@ from tests.fleet.robots import merged, rewritten, robot_map
 from tests.sequences.bag_maker import bag, made
 
 from engram.errors import InputError
+from engram.fleet.download import update
 from engram.graph.model import Clock
 from engram.maps import Map, check_file
 from engram.robot.anchoring import anchor_map
 from engram.robot.anchors import read_anchors
 from engram.robot.exporting import Exported, export_map
-from engram.robot.goals import add_goal, list_goals
+from engram.robot.goals import add_goal, list_goals, remove_goal
 from engram.sequences.trajectories import read_tum
 
 PLACES_M = np.arange(0.0, 20.0, 1.0)
@@ -75,6 +76,50 @@ def test_goals_survive_merges_and_say_how_far_they_moved(copy, tmp_path):
     assert (before["x_m"], before["y_m"]) == (after["x_m"], after["y_m"])
     assert not report.moved
     assert check_file(centre).problems == ()
+
+
+def test_a_goal_is_removed_for_good_and_the_removal_can_be_undone(copy):
+    for x_m in (5.0, 6.0):  # the second replaces the first
+        add_goal(copy, "dock", x_m, 1.0, 0.0, author="tests")
+    add_goal(copy, "gate", 9.0, 0.0, 0.0, author="tests")
+    with pytest.raises(InputError, match="no goal 'dck'; its goals: dock, gate"):
+        remove_goal(copy, "dck", author="tests")
+    removed = remove_goal(copy, "dock", author="tests")
+    assert [one["name"] for one in list_goals(copy)] == ["gate"]
+    assert check_file(copy).problems == ()
+    with Map.open(copy) as store:
+        assert store.log()[-1].message == "remove goal dock"
+        assert {one.name for one in store.seen_goals} == {"dock", "gate"}
+        store.revert(removed["revision"], author="tests")
+        assert store.frame.locate(store.goals["dock"]).x_m == pytest.approx(6.0)
+    remove_goal(copy, "dock", author="tests")
+    add_goal(copy, "dock", 5.0, 1.0, 0.0, author="tests")
+    assert [one["name"] for one in list_goals(copy)] == ["dock", "gate"]
+
+
+def test_a_removed_goal_does_not_come_back_with_a_hand_in_but_another_place_does(copy, tmp_path):
+    centre, robot = tmp_path / "centre.engram", tmp_path / "robot.engram"
+    add_goal(copy, "dock", 5.0, 1.0, 0.0, author="tests")
+    merged(centre, copy)
+    remove_goal(centre, "dock", author="tests")
+    robot.write_bytes(copy.read_bytes())
+    robot_map(robot, PLACES_M + 10, name="r1", day=2)
+    merged(centre, robot)
+    assert list_goals(centre) == []
+    add_goal(robot, "dock", 7.0, 1.0, 0.0, author="tests")
+    merged(centre, robot)
+    assert [one["x_m"] for one in list_goals(centre)] == pytest.approx([7.0], abs=0.05)
+
+
+def test_a_goal_that_a_robot_removed_does_not_come_back_with_an_update(copy, tmp_path):
+    centre = tmp_path / "centre.engram"
+    for name, x_m in (("dock", 5.0), ("gate", 9.0)):
+        add_goal(copy, name, x_m, 1.0, 0.0, author="tests")
+    merged(centre, copy)
+    remove_goal(copy, "dock", author="tests")
+    add_goal(centre, "ramp", 7.0, 0.0, 0.0, author="tests")
+    update(centre, copy)
+    assert [one["name"] for one in list_goals(copy)] == ["gate", "ramp"]
 
 
 def test_anchors_move_the_frame_and_not_the_goals(copy, tmp_path):

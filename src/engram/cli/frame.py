@@ -22,6 +22,7 @@ class GoalAction(StrEnum):
 
     ADD = "add"
     LIST = "list"
+    REMOVE = "remove"
 
 
 class ExportFormat(StrEnum):
@@ -96,10 +97,10 @@ def anchor(
 
 
 def goal(
-    action: Annotated[GoalAction, typer.Argument(metavar="ACTION", help="add or list.")],
+    action: Annotated[GoalAction, typer.Argument(metavar="ACTION", help="add, list or remove.")],
     map_path: options.MapPath,
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="add: name of the goal.")
+        str | None, typer.Argument(metavar="NAME", help="add, remove: name of the goal.")
     ] = None,
     *,
     x_m: Annotated[
@@ -117,21 +118,23 @@ def goal(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Store poses in a map, or list where they are.
+    """Store poses in a map, list or remove them.
 
     A goal is stored relative to the nearest node, so it survives merges, downloads and new anchors.
-    Adding a goal under an existing name replaces it.
+    Adding a goal under an existing name replaces it. Each change is a revision that engram revert
+    can undo. A goal that was removed from a fleet map does not come back with a robot's hand-in.
 
     \b
     Examples:
       engram goal add town.engram dock --x 12.5 --y -3 --yaw 90
       engram goal list town.engram
+      engram goal remove town.engram dock
     """
     import math
 
     from engram.cli.history import user
     from engram.errors import InputError
-    from engram.robot.goals import add_goal, list_goals
+    from engram.robot.goals import add_goal, list_goals, remove_goal
 
     if action is GoalAction.LIST:
         found = list_goals(map_path, at)
@@ -139,6 +142,13 @@ def goal(
             print(json.dumps({"goals": found}))
         for one in [] if as_json else found:
             typer.echo(_goal_text(one))
+        return
+    if action is GoalAction.REMOVE:
+        if name is None:
+            raise InputError("remove needs a name: engram goal remove MAP NAME")
+        gone = remove_goal(map_path, name, author=user())
+        undo = undo_text(map_path, gone["revision"])
+        typer.echo(json.dumps(gone) if as_json else f"goal {name} is removed\n{undo}")
         return
     if name is None or x_m is None or y_m is None:
         raise InputError("add needs a name and a position: engram goal add MAP NAME --x X --y Y")

@@ -70,6 +70,7 @@ _SMALL = (
     "removals",
     "seen_removals",
     "goals",
+    "seen_goals",
     "anchors",
     "placements",
     "cameras",
@@ -239,6 +240,11 @@ class MapReader:
         known = self._contents
         whole = known is not None and len(known.graph) == self.node_count()
         return known.graph if known is not None and whole else None
+
+    @cached_property
+    def seen_goals(self) -> tuple[Goal, ...]:
+        """All goals that it ever had, replaced, removed and reverted ones included."""
+        return self._read(marks.seen_goals)
 
     @cached_property
     def anchors(self) -> tuple[Anchor, ...]:

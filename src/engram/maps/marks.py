@@ -110,6 +110,14 @@ def load_goals(connection: Connection, view: View) -> dict[str, Goal]:
     return {row["name"]: goal_from_row(row, ids) for row in rows}
 
 
+def seen_goals(connection: Connection, view: View) -> tuple[Goal, ...]:
+    """All goals that the map ever had, at nodes that it has."""
+    query = select(goals).where(goals.c.revision.in_(view.revision_keys()))
+    rows = list(verified(goals, connection.execute(query.order_by(goals.c.key))))
+    ids = _node_ids(connection, {row["node"] for row in rows})
+    return tuple(goal_from_row(row, ids) for row in rows)
+
+
 def removal_from_row(row: Row, ids: Mapping[int, NodeId]) -> Removal:
     """The removal."""
     what = f"removal {row['key']}"

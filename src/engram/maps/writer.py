@@ -61,6 +61,7 @@ from engram.maps.schema import (
     cameras,
     frames,
     frontends,
+    goals,
     hidden,
     nodes,
     omissions,
@@ -425,6 +426,14 @@ class RevisionWriter:
         self._rows.new(table, **values)
         self._checkpoint_if_due()
 
+    def remove_goal(self, name: str) -> None:
+        """Hides the goals of a name that are visible."""
+        self._check_open()
+        with self._database.reading() as connection:
+            found = [row for row in self._view.rows(connection, goals) if row["name"] == name]
+        for row in found:
+            self._hide(goals, row["key"], hide=True)
+
     def put_statistic(self, name: str, body: Mapping[str, Any]) -> None:
         """Stores plain JSON data under a name; the newest counts."""
         self._check_open()
@@ -582,7 +591,8 @@ class RevisionWriter:
         if again is None:
             return None
         self._shows_again = True
-        self._rows.put(
-            hidden, hidden_row(self._keys, self._revision_key, table, again["key"], hide=False)
-        )
+        self._hide(table, again["key"], hide=False)
         return int(again["key"])
+
+    def _hide(self, table: Table, key: int, *, hide: bool) -> None:
+        self._rows.put(hidden, hidden_row(self._keys, self._revision_key, table, key, hide=hide))

@@ -8,7 +8,12 @@ from typing import Any
 import numpy as np
 
 from engram.errors import InputError
+from engram.graph.marks import Goal
 from engram.maps import Map
+from engram.maps.map_reader import MapReader
+
+# A goal that comes back as near to one that was removed is that goal.
+_SAME_M, _SAME_RAD = 0.2, 0.1
 
 
 def add_goal(
@@ -36,6 +41,38 @@ def add_goal(
         "name": name, "node": str(goal.node), "from_node_m": round(away_m, 3), **where,
         "revision": revision,
     }  # fmt: skip
+
+
+def remove_goal(path: Path, name: str, *, author: str) -> dict[str, Any]:
+    """Removes a goal, in a revision of its own that `Map.revert` undoes.
+
+    Raises:
+        InputError: the map has no such goal.
+        MapError: the map cannot be written.
+    """
+    with Map.open(path, writes=True) as store:
+        if name not in store.goals:
+            known = ", ".join(sorted(store.goals)) or "none"
+            raise InputError(f"{path} has no goal {name!r}; its goals: {known}")
+        with store.begin_revision(
+            author=author, message=f"remove goal {name}", configuration={"removed_goal": name}
+        ) as writer:
+            writer.remove_goal(name)
+            return {"name": name, "revision": writer.commit().number}
+
+
+def had_goal(store: MapReader, goal: Goal) -> bool:
+    """Whether a map ever had a goal of this name at this place, at nodes that it has."""
+    graph = store.graph
+    for one in store.seen_goals:
+        if one.name != goal.name or one.node not in graph or goal.node not in graph:
+            continue
+        way = graph.predict(graph.index(one.node), graph.index(goal.node))
+        if way is not None:
+            apart = one.node_from_goal.inverse() @ way[0] @ goal.node_from_goal
+            if apart.distance_m <= _SAME_M and apart.angle_rad <= _SAME_RAD:
+                return True
+    return False
 
 
 def list_goals(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:

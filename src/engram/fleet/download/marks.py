@@ -10,6 +10,7 @@ from engram.graph.marks import Goal, Mark, Placement
 from engram.graph.model import NodeId
 from engram.maps import Map, RevisionWriter
 from engram.maps.laying_out import ORIGIN
+from engram.robot.goals import had_goal
 
 # The robot's map speaks of the fleet's frame if the nodes of both lie as near as this, metres.
 _SAME_FRAME_M = 0.01
@@ -47,7 +48,9 @@ def lacking_marks(part: Part, own: Map) -> list[Mark]:
         for removal in store.removals
         if {removal.a, removal.b} <= sent and removal.key not in own.seen_removals
     ]
-    lacking += [goal for goal in _goals(part) if goal.name not in own.goals]
+    lacking += [
+        goal for goal in _goals(part) if goal.name not in own.goals and not had_goal(own, goal)
+    ]
     if _one_frame(own.placements, store.placements):
         lacking += [
             Placement(node, store.placements[node])

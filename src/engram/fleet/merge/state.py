@@ -27,6 +27,7 @@ from engram.graph.model import (
 )
 from engram.localiser import Position
 from engram.maps import Map, RevisionWriter, StoredNode
+from engram.robot.goals import had_goal
 
 if TYPE_CHECKING:
     from scipy.cluster.hierarchy import DisjointSet
@@ -146,12 +147,17 @@ class Merge:
                 yield one
 
     def new_goals(self) -> Iterator[Goal]:
-        """The robot's goals at known nodes, by names that the fleet map lacks."""
+        """The robot's goals at known nodes, by names that the fleet map lacks.
+
+        One that was removed from the fleet map stays removed.
+        """
         for goal in self.robot.goals.values():
             position = self.equivalent(goal.node)
             if position is not None and goal.name not in self.centre.goals:
                 node_from_goal = position.node_from_live @ goal.node_from_goal
-                yield Goal(goal.name, position.node, node_from_goal)
+                found = Goal(goal.name, position.node, node_from_goal)
+                if not had_goal(self.centre, found):
+                    yield found
 
     def lacks_omission(self, omitted: NodeId) -> Position | None:
         """Position of a node that the robot's map had omitted; None if the fleet map knows it."""
