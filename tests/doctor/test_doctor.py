@@ -75,6 +75,21 @@ def each(change: Callable[[StereoPair], StereoPair]) -> Callable[..., list[Stere
     return lambda pairs: [change(pair) for pair in pairs]
 
 
+def resized_without_its_calibration(pair: StereoPair) -> StereoPair:
+    smaller = halved(pair, 2.0)
+    camera = replace(pair.camera, width=smaller.camera.width, height=smaller.camera.height)
+    return replace(smaller, camera=camera)
+
+
+def test_a_strip_cut_from_the_images_is_no_other_size(pairs) -> None:
+    def strip(pair: StereoPair) -> StereoPair:
+        rows = 2 * pair.camera.height // 3
+        camera = replace(pair.camera, height=rows)
+        return replace(pair, left=pair.left[:rows], right=pair.right[:rows], camera=camera)
+
+    assert "principal_point_off" not in codes(examined([strip(pair) for pair in pairs]))
+
+
 def numbered(pairs: list[StereoPair]) -> list[StereoPair]:
     return [replace(pair, stamp_ns=10**9 * k) for k, pair in enumerate(pairs)]
 
@@ -122,6 +137,7 @@ FAULTS: dict[str, tuple[str, Callable[[list[StereoPair]], list[StereoPair]]]] = 
         each(lambda one: replace(one, right=brightened(one.right, 0.5))),
     ),
     "blurred": ("blurred", each(lambda one: on_both(one, lambda i: blurred(i, 5)))),
+    "resized alone": ("principal_point_off", each(resized_without_its_calibration)),
     "small": ("low_resolution", each(lambda one: halved(one, 4.0))),
     "numbered": ("stamps_counted", numbered),
     "backwards": ("stamps_backwards", lambda pairs: later(pairs, 8, -0.5)),
@@ -139,7 +155,8 @@ def test_each_fault_is_found(pairs, fault: str) -> None:
     assert code in codes(found)
     (one,) = (finding for finding in found.findings if finding.code == code)
     assert one.cure
-    assert f"{one.limit:.3g}" in one.text()
+    limit = f"{100 * one.limit:.3g}%" if one.unit.startswith("of the") else f"{one.limit:.3g}"
+    assert f", limit {limit})" in one.text()
 
 
 def test_consequences_of_swapped_sides_are_not_findings_of_their_own(pairs) -> None:

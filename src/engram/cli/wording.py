@@ -46,7 +46,7 @@ def localised_text(
 ) -> str:
     """What `engram localise` prints of the values that ``--json`` prints."""
     lines = [
-        f"{summary['frames']} frames over {summary['driven_m']:.1f} m: "
+        f"{_count(summary['frames'], 'frame')} over {summary['driven_m']:.1f} m: "
         f"{summary['share_localised']:.1%} localised, "
         f"{summary['attempts_per_frame']:.2f} attempts per frame",
         *_frames(summary),
@@ -88,6 +88,8 @@ def _frames(summary: Mapping[str, Any]) -> list[str]:
 
 def warnings(summary: Mapping[str, Any]) -> list[str]:
     """What people should look into before they trust a summary; for stderr."""
+    from engram.doctor import measure_text
+
     lines = []
     if damaged := summary["damaged_nodes"]:
         lines.append(
@@ -97,11 +99,8 @@ def warnings(summary: Mapping[str, Any]) -> list[str]:
         )
     for one in summary["findings"]:
         if one["severity"] != "note":
-            unit = f" {one['unit']}" if one["unit"] else ""
-            lines.append(
-                f"warning: {one['code']}: {one['message']} ({one['value']:.3g}{unit}, limit "
-                f"{one['limit']:.3g}). {one['cure']}"
-            )
+            measured = measure_text(one["value"], one["limit"], one["unit"])
+            lines.append(f"warning: {one['code']}: {one['message']} ({measured}). {one['cure']}")
     return lines
 
 

@@ -1,7 +1,7 @@
 """Frames of a drive → what is wrong with it, before anything is mapped."""
 
 from engram.doctor.examination import Evidence, Examination, Facts
-from engram.doctor.findings import Diagnosis, Finding, Severity
+from engram.doctor.findings import Diagnosis, Finding, Severity, measure_text
 from engram.doctor.settings import DoctorConfig
 from engram.doctor.table import CHECKS, Check, diagnose
 
@@ -16,4 +16,5 @@ __all__ = [
     "Finding",
     "Severity",
     "diagnose",
+    "measure_text",
 ]

@@ -45,11 +45,15 @@ class Finding:
 
     def text(self) -> str:
         """For people: two lines."""
-        unit = f" {self.unit}" if self.unit else ""
-        return (
-            f"{self.severity}: {self.code}: {self.message} "
-            f"({self.value:.3g}{unit}, limit {self.limit:.3g}{unit})\n  {self.cure}"
-        )
+        measured = measure_text(self.value, self.limit, self.unit)
+        return f"{self.severity}: {self.code}: {self.message} ({measured})\n  {self.cure}"
+
+
+def measure_text(value: float, limit: float, unit: str) -> str:
+    """A measured value and its limit, shares of something as percentages."""
+    shares = unit.startswith("of the ")
+    shown, most = (f"{100 * one:.3g}%" if shares else f"{one:.3g}" for one in (value, limit))
+    return f"{shown} {unit}".strip() + f", limit {most}"
 
 
 @dataclass(frozen=True, slots=True)

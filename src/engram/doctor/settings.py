@@ -42,6 +42,9 @@ class DoctorConfig:
         least_disparity_px: median disparity of the landmarks, px: below it depth is a guess.
         scale: difference of odometry's scale from that of motion from outside or a map.
         bits: bits of the brightest pixel of 16-bit images.
+        other_size: distance of the principal point from the middle, both down and right, or both
+            up and left, in half images. Real calibrations stay below 0.1; half images with the
+            calibration of whole ones have 1.
     """
 
     frames: Annotated[int, Meta(ge=0)] = 200
@@ -68,6 +71,7 @@ class DoctorConfig:
     least_disparity_px: Annotated[float, Meta(gt=0)] = 2.0
     scale: Annotated[float, Meta(gt=0)] = 0.05
     bits: Annotated[int, Meta(ge=1, le=16)] = 14
+    other_size: Annotated[float, Meta(gt=0)] = 0.25
 
     def __post_init__(self) -> None:
         check_bounds(self)

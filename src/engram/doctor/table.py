@@ -185,6 +185,13 @@ CHECKS: tuple[Check, ...] = (
         below=True,
     ),
     Check(
+        "principal_point_off", _WARNING, optics.other_size, "other_size", "of the half image",
+        "the principal point is far off the middle, as if the calibration were that of images of "
+        "another size",
+        "resize the calibration with the images: fx, fy, cx and cy by the same factor; all is well "
+        "if the images are one corner of larger ones",
+    ),
+    Check(
         "low_resolution", _WARNING, optics.px_per_deg, "least_px_per_deg", "px per degree",
         "few pixels per degree: landmarks further off cannot be told apart",
         "use larger images or a narrower lens",

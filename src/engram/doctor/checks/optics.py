@@ -14,6 +14,19 @@ def px_per_deg(seen: Evidence) -> float | None:
     return None if seen.camera is None else math.radians(seen.camera.fx)
 
 
+def other_size(seen: Evidence) -> float | None:
+    """How far off the middle the principal point is, in half images; 0 where the axes disagree.
+
+    Images that were resized without their calibration shift it alike on both axes; a lens or a
+    strip cut from the image shifts it on one.
+    """
+    if seen.camera is None:
+        return None
+    across = 2 * seen.camera.cx / (seen.camera.width - 1) - 1
+    down = 2 * seen.camera.cy / (seen.camera.height - 1) - 1
+    return min(abs(across), abs(down)) if across * down > 0 else 0.0
+
+
 def disparity_px(seen: Evidence) -> float | None:
     """Median disparity of the landmarks."""
     known = [one for one in seen.disparity_px if one > 0]
