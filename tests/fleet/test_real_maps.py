@@ -21,7 +21,8 @@ from engram.robot import (
     open_map,
     summarise,
 )
-from engram.sequences.trajectories import Trajectory, read_kitti_poses, read_matrix_truth
+from engram.sequences.trajectories import Trajectory
+from engram_lab.truth import read_kitti_poses, read_matrix_truth
 
 pytestmark = pytest.mark.data
 

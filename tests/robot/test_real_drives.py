@@ -19,8 +19,8 @@ from engram.robot import (
     open_map,
     summarise,
 )
-from engram.sequences.trajectories import read_kitti_poses
 from engram.viewing.trajectory import chain_trajectory
+from engram_lab.truth import read_kitti_poses
 
 pytestmark = pytest.mark.data
 

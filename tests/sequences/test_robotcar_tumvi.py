@@ -8,21 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from engram.errors import CalibrationError, SequenceError
+from engram.errors import CalibrationError
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock
 from engram.sequences import ImageSequence, open_sequence, session_of
-from engram.sequences.robotcar import read_ins_truth
-from engram.sequences.trajectories import read_mocap_truth
 
 from .synthetic import HEIGHT, WIDTH, picture, write_image
 
 START_US = 1_400_505_794_000_000  # 2014-05-19 13:23 UTC
 PAIRS = 5
-INS = (
-    "timestamp,ins_status,latitude,longitude,altitude,northing,easting,down,utm_zone,"
-    "velocity_north,velocity_east,velocity_down,roll,pitch,yaw\n"
-)
 
 
 def write_robotcar(folder: Path, shift_px: float = 2.0) -> Path:
@@ -88,26 +82,6 @@ class TestRobotCar:
         with pytest.raises(CalibrationError, match=r"80 bytes, must be 16 for each of 48×32"):
             open_sequence(path)
 
-    def test_truth_from_the_ins(self, tmp_path) -> None:
-        path = tmp_path / "ins.csv"
-        rows = [
-            f"{START_US + 20_000 * k},INS_SOLUTION_GOOD,51.76,-1.26,110,"
-            f"{5735000 + 2 * k},{620000 + k},-110,30U,0,0,0,0,0,{0.1 * k}"
-            for k in range(3)
-        ]
-        path.write_text(INS + "\n".join(rows) + "\n")
-        truth = read_ins_truth(path)
-        np.testing.assert_allclose(truth.world_from_cam[2].translation, [4, 2, 0], atol=1e-9)
-        yaw = np.arctan2(*truth.world_from_cam[2].rotation[[1, 0], 0])
-        assert yaw == pytest.approx(0.2)
-        assert truth.stamps_ns[1] - truth.stamps_ns[0] == 20_000_000
-
-    def test_rtk_has_other_columns_and_a_missing_one_is_named(self, tmp_path) -> None:
-        path = tmp_path / "rtk.csv"
-        path.write_text("timestamp,northing,easting,down,roll,pitch\n1,2,3,4,5,6\n")
-        with pytest.raises(SequenceError, match="no column yaw"):
-            read_ins_truth(path)
-
 
 CAMCHAIN = """cam0:
   camera_model: pinhole
@@ -154,9 +128,3 @@ class TestTumVi:
         assert drive.camera.baseline_m == pytest.approx(0.101)
         assert drive.camera.cam_from_rig is not None
         assert drive.camera.cam_from_rig.translation[0] == pytest.approx(0.05)
-
-    def test_truth_from_motion_capture(self, tmp_path) -> None:
-        file = tmp_path / "data.csv"
-        file.write_text("#timestamp [ns],px,py,pz,qw,qx,qy,qz\n5,1,2,3,1,0,0,0\n9,1,2,4,1,0,0,0\n")
-        truth = read_mocap_truth(file)
-        np.testing.assert_allclose(truth.world_from_cam[1].translation, [1, 2, 4])

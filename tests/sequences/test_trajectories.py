@@ -1,4 +1,4 @@
-"""Trajectories: what is written is read back; other people's files are read as they mean them."""
+"""Trajectories: what is written is read back, and other programs read it."""
 
 import shutil
 import subprocess
@@ -11,19 +11,13 @@ from hypothesis import strategies as st
 
 from engram.errors import InputError, SequenceError
 from engram.geometry import SE3
-from engram.sequences import open_sequence
 from engram.sequences.trajectories import (
     Trajectory,
-    read_euroc_truth,
-    read_kitti_poses,
-    read_matrix_truth,
-    read_truth,
     read_tum,
-    truth_path,
     write_tum,
 )
 
-from .synthetic import only_engram_errors, write_log
+from .synthetic import only_engram_errors
 
 
 def some_trajectory() -> Trajectory:
@@ -84,9 +78,6 @@ def test_any_bytes_give_our_errors_or_a_trajectory(tmp_path_factory, content: by
     path = tmp_path_factory.mktemp("any") / "a.txt"
     path.write_bytes(content)
     only_engram_errors(lambda: read_tum(path))
-    only_engram_errors(lambda: read_matrix_truth(path))
-    only_engram_errors(lambda: read_euroc_truth(path, SE3.identity()))
-    only_engram_errors(lambda: read_kitti_poses(path, [0, 1]))
 
 
 def test_the_nearest_pose_within_the_tolerance_is_found() -> None:
@@ -105,48 +96,6 @@ def test_stamps_of_a_trajectory_must_increase_and_fit() -> None:
         Trajectory(np.array([1, 1]), poses)
     with pytest.raises(InputError, match="2 poses"):
         Trajectory(np.array([1, 2, 3]), poses)
-
-
-def test_euroc_truth_is_that_of_the_camera(tmp_path: Path) -> None:
-    path = tmp_path / "data.csv"
-    path.write_text(
-        "#timestamp, p_RS_R_x [m], ...\n"
-        "1403715273262142976,1,2,3,0.7071067811865476,0,0,0.7071067811865476,9,9,9\n"
-    )
-    body_from_cam = SE3.exp([0.5, 0, 0, 0, 0, 0])
-    trajectory = read_euroc_truth(path, body_from_cam)
-    # The body is turned by 90° about z, so its x axis is the world's y.
-    np.testing.assert_allclose(trajectory.world_from_cam[0].translation, [1, 2.5, 3], atol=1e-12)
-
-
-def test_the_truth_of_a_log_stands_beside_it(tmp_path: Path) -> None:
-    log = write_log(tmp_path / "monday.framelog")
-    assert read_truth(log) is None
-    write_tum(truth_path(log), some_trajectory())
-    assert (tmp_path / "monday.truth.txt").exists()
-    found = read_truth(log)
-    assert found is not None
-    assert len(found) == 5
-
-
-@pytest.mark.data
-def test_kitti_poses_belong_to_the_frames(data_dir: Path) -> None:
-    drive = open_sequence(data_dir / "kitti_odometry/sequences/06")
-    truth = read_kitti_poses(data_dir / "kitti_odometry/poses/06.txt", drive.stamps_ns)
-    np.testing.assert_allclose(truth.world_from_cam[0].matrix(), np.eye(4), atol=1e-6)
-    steps = [
-        (one.inverse() @ other).distance_m
-        for one, other in zip(truth.world_from_cam, truth.world_from_cam[1:], strict=False)
-    ]
-    assert sum(steps) == pytest.approx(59.9, abs=0.05)  # as stated beside the data
-
-
-@pytest.mark.data
-def test_euroc_truth_has_a_pose_for_every_pair(data_dir: Path) -> None:
-    folder = data_dir / "euroc/V1_01_easy_sparse"
-    truth = read_matrix_truth(folder / "poses_world_from_rectified_cam0.txt")
-    stamps_ns = open_sequence(folder).stamps_ns
-    assert truth.stamps_ns.tolist() == stamps_ns.tolist()
 
 
 @pytest.mark.skipif(shutil.which("evo_traj") is None, reason="evo is not installed")

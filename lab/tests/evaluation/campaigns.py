@@ -11,8 +11,9 @@ from engram.graph.model import Clock
 from engram.robot import RobotOptions
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame
 from engram.sequences.sequence import SequenceInfo
-from engram.sequences.trajectories import Trajectory, truth_path, write_tum
+from engram.sequences.trajectories import Trajectory, write_tum
 from engram_lab.studies import DriveSet, RankingOptions, drives_of
+from engram_lab.truth import truth_path
 
 WORLD = World(24.0)
 ROAD = np.arange(0.0, 18.0, 0.9)

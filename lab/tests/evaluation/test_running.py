@@ -11,7 +11,6 @@ from lab.tests.evaluation.campaigns import few_options, write_campaign
 
 from engram.errors import ConfigError, MapLockedError, SequenceError
 from engram.robot import Settings, open_map
-from engram.sequences.trajectories import truth_path
 from engram_lab.studies import (
     UNLIMITED,
     Configuration,
@@ -28,6 +27,7 @@ from engram_lab.studies import (
 )
 from engram_lab.studies.store import read_runs
 from engram_lab.studies.writing import alone_in
+from engram_lab.truth import truth_path
 
 
 @pytest.fixture(scope="module")

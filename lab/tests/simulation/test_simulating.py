@@ -14,10 +14,10 @@ from engram.monitor import Monitor
 from engram.robot import Settings
 from engram.sequences import FrameLog, open_sequence, session_of
 from engram.sequences.sequence import first_pair_hash
-from engram.sequences.trajectories import read_kitti_poses, read_truth
 from engram_lab.town import Campaign, campaign_named
 from engram_lab.town.sequence import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, simulate
+from engram_lab.truth import read_kitti_poses, read_truth
 
 
 @pytest.fixture(scope="module")

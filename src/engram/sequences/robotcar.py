@@ -32,7 +32,6 @@ from engram.sequences.listing import (
 )
 from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import SequenceInfo
-from engram.sequences.trajectories import Trajectory, csv_trajectory
 from engram.untrusted import read_bytes, read_text
 
 # Of the wide pair, between its left and right lens. The models do not state it. Source: data sheet
@@ -67,36 +66,6 @@ def find_robotcar(path: Path, options: OpenOptions) -> ImageDrive:
         zone=_ZONE,
     )
     return ImageDrive(path, info, cameras, _without_lone(places), read=_debayered)
-
-
-def read_ins_truth(path: Path) -> Trajectory:
-    """`gps/ins.csv` or `rtk.csv` as truth: the INS in northing, easting, down from its first row.
-
-    Its columns are taken by name: timestamp (µs), northing, easting, down (m), roll, pitch, yaw
-    (rad). The pose is of the INS, not of the camera; shift it by the kit's `extrinsics/ins.txt`.
-
-    Raises:
-        SequenceError: a column is missing, or a row is malformed.
-    """
-    columns = ("timestamp", "northing", "easting", "down", "roll", "pitch", "yaw")
-
-    def pose(values: list[float]) -> SE3:
-        roll, pitch, yaw = values[3:]
-        rotation = _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
-        return SE3(rotation, np.array(values[:3]))
-
-    absolute = csv_trajectory(path, columns, 1_000, pose)
-    if not len(absolute):
-        raise SequenceError(f"{path}: holds no row")
-    # Coordinates of millions of metres would cost digits.
-    origin = SE3(np.eye(3), -absolute.world_from_cam[0].translation)
-    return Trajectory(absolute.stamps_ns, [origin @ one for one in absolute.world_from_cam])
-
-
-def _about(axis: int, angle_rad: float) -> NDArray[np.float64]:
-    vector = np.zeros(6)
-    vector[3 + axis] = angle_rad
-    return SE3.exp(vector).rotation
 
 
 def _stamped(side: Path) -> list[StampedFile]:

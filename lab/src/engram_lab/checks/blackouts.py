@@ -26,7 +26,8 @@ from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.odometry import OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot import RobotOptions, Settings, map_drive, open_map, robot_on
 from engram.sequences import FrameLog, LoggedFrame, open_sequence
-from engram.sequences.trajectories import Trajectory, read_truth
+from engram.sequences.trajectories import Trajectory
+from engram_lab.truth import read_truth
 
 BLACK_M = 50.0
 SCALE, SCATTER = 1.02, 0.01

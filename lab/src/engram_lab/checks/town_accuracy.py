@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from engram.frontend import Frontend
 from engram.geometry import SE3
 from engram.sequences import FrameLog
-from engram.sequences.trajectories import read_truth
 from engram_lab.programs import command_line
 from engram_lab.town import Campaign, SimulatedDrive, campaign_named
 from engram_lab.town.conditions import Conditions
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
+from engram_lab.truth import read_truth
 
 STRETCHES_M = (100.0, 200.0, 300.0)
 

@@ -22,11 +22,11 @@ from engram.frontend import Frame, Frontend, FrontendConfig, Landmarks
 from engram.geometry import SE3
 from engram.odometry import Odometry, OdometryConfig, WindowConfig
 from engram.sequences import FrameLog
-from engram.sequences.trajectories import read_truth
 from engram_lab.bench.data import load_bench_data
 from engram_lab.checks.accuracy import KITTI_06_TRUTH, kitti_truth, segment_errors
 from engram_lab.checks.town_accuracy import lap_drift
 from engram_lab.programs import Figure, command_line, numbers, report
+from engram_lab.truth import read_truth
 
 
 def poses_by(frames: Sequence[Frame], window: WindowConfig) -> list[SE3]:

@@ -22,7 +22,7 @@ from engram.localiser import Position
 from engram.maps import Map, copy_map
 from engram.monitor import Monitor
 from engram.robot import Beginning, map_drive, open_drive
-from engram.sequences.trajectories import read_truth
+from engram_lab.truth import read_truth
 
 # Rounds in which a hand-in or a download is over. Each broken connection takes one, and what
 # arrived by then stays: 200 kB a round make 40 MB.

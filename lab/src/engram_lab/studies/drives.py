@@ -16,10 +16,11 @@ from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Session
 from engram.robot import Settings, session_of_drive
 from engram.sequences import FrameLog, LoggedFrame
-from engram.sequences.trajectories import Trajectory, read_truth, truth_path
+from engram.sequences.trajectories import Trajectory
 from engram_lab.town import Campaign, Size, campaign_named
 from engram_lab.town.simulating import campaign_folder
 from engram_lab.town.upkeep import Upkeep, bring_up_to_date, first_look
+from engram_lab.truth import read_truth, truth_path
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,10 +24,11 @@ from engram.processes import run_in_processes
 from engram.robot.recording import extract_log
 from engram.robot.settings import Settings
 from engram.sequences import FrameLog
-from engram.sequences.trajectories import truth_path, write_tum
+from engram.sequences.trajectories import write_tum
 from engram_lab.town import WORLD_VERSION, Campaign
 from engram_lab.town.sequence import SimulatedSequence
 from engram_lab.town.upkeep import Upkeep, bring_up_to_date
+from engram_lab.truth import truth_path
 
 
 @dataclass(slots=True)
