@@ -289,7 +289,7 @@ class Localiser:
         """Sets the position to that of the best match; without one, reports the failures."""
         self._outcomes = outcomes
         self._reference = None if self.position is None else self.position.node
-        success = best_success(outcomes)
+        success = best_success(outcomes, self.config.acceptance.rule)
         if success is not None:
             self._settle(live, success)
             return success

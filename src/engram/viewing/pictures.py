@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from engram.errors import InputError
 from engram.frontend import Frame, StereoPair
 from engram.localiser import Localisation
-from engram.localiser.attempts import Outcome, best_success
+from engram.localiser.attempts import Outcome, outcome_at
 from engram.maps.frame_reader import FrameReader
 from engram.robot.robot import Seen
 from engram.viewing import match_picture
@@ -55,7 +55,7 @@ class PictureWriter:
         image = seen.arrived.left if isinstance(seen.arrived, StereoPair) else seen.frame.thumbnail
         if image is None:
             return
-        success = best_success(seen.outcomes)
+        success = outcome_at(seen.outcomes, found.node)
         status = found.status.value
         if success is None:
             nothing = np.zeros((0, 2), dtype=np.float32)

@@ -14,7 +14,7 @@ from engram.frontend import StereoPair
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import SessionId
 from engram.localiser import Localisation, LocalisationStatus
-from engram.localiser.attempts import best_success
+from engram.localiser.attempts import outcome_at
 from engram.maps import Map
 from engram.robot.robot import Robot, Seen
 from engram.robot.whereabouts import Whereabouts
@@ -109,7 +109,7 @@ class Viewer:
             image = rr.Image(seen.arrived.left).compress(jpeg_quality=_JPEG_QUALITY)
             stream.log("live/image", image)
         colour = _STATUS_COLOURS.get(found.status, _GREY)
-        pixels, best = seen.frame.landmarks.pixels, best_success(seen.outcomes)
+        pixels, best = seen.frame.landmarks.pixels, outcome_at(seen.outcomes, found.node)
         stream.log("live/image/landmarks", rr.Points2D(pixels, colors=_GREY, radii=1.0))
         inliers = pixels[:0] if best is None else pixels[best.match.live_rows]
         stream.log("live/image/inliers", rr.Points2D(inliers, colors=colour, radii=2.0))
