@@ -9,7 +9,7 @@ import pytest
 from msgspec import Meta
 
 from engram.cli.settings import AllSettings, read_settings, settings_toml
-from engram.config import check_bounds, config_hash, load_toml, plain, to_dict
+from engram.config import check_bounds, config_hash, from_dict, load_toml, plain, to_dict
 from engram.errors import ConfigError
 from engram.mapper import MapperConfig
 from engram.robot import Settings, load_settings
@@ -109,3 +109,16 @@ def test_plain_values_of_what_json_does_not_know() -> None:
         "worst": None,
         "config": {"radius_m": 8.0, "most": None},
     }
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("abc", "mapper.save_every_m: expected `float`, got `str`"),
+        (-2.0, "mapper: save_every_m is -2.0, must be finite and >= 0"),
+    ],
+)
+def test_a_wrong_value_is_named_by_its_key(value: object, words: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        from_dict({"mapper": {"save_every_m": value}}, Settings)
+    assert str(refused.value) == words.replace("`", "")

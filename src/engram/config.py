@@ -54,7 +54,15 @@ def from_dict(values: dict[str, Any], kind: type[T], ignored: Collection[str] = 
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(_in_words(str(error))) from error
+
+
+def _in_words(fault: str) -> str:
+    """A fault that msgspec found, with the key first; its path adds nothing to one of ours."""
+    what, _, place = fault.partition(" - at `$")
+    if what.startswith("Expected "):
+        return f"{place.strip('.`')}: {what[0].lower()}{what[1:].replace('`', '')}"
+    return what
 
 
 def to_dict(config: Any) -> dict[str, Any]:

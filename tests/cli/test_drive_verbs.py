@@ -12,6 +12,7 @@ from tests.sequences.bag_maker import StereoBag, bag, rectified_infos
 
 from engram.calibration import read_calibration
 from engram.geometry import StereoCamera
+from engram.maps import open_map
 from engram.sequences import open_sequence
 
 
@@ -108,3 +109,45 @@ def test_a_damaged_bag_that_cannot_be_mapped_says_what_was_lost(engram, tmp_path
     assert ran.status == 4, ran.err
     assert "parts of the bag could not be read:" in ran.err
     assert "is cut short" in ran.err
+
+
+def test_settings_that_name_other_features_than_the_map_has_are_refused(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    path, net = tmp_path / "town.engram", ("--set", "frontend.descriptor=net")
+    assert engram("map", path, street, "--frames", "0:3").status == 0
+    for verb in ("localise", "map"):
+        ran = engram(verb, path, street, "--frames", "1:3", *net)
+        assert ran.status == 2
+        assert "has brief features, not net" in ran.err
+        assert "frontend.descriptor" in ran.err
+
+
+def test_localising_in_an_empty_map_says_that_it_is_empty(engram, street: Path, tmp_path) -> None:
+    open_map(tmp_path / "new.engram", create=True).close()
+    ran = engram("localise", tmp_path / "new.engram", street, "--frames", "0:2")
+    assert ran.status == 0
+    assert "warning: the map is empty; begin it with engram map" in ran.err
+
+
+def test_frames_beyond_the_end_of_a_drive_are_named(engram, street: Path, tmp_path: Path) -> None:
+    ran = engram("map", tmp_path / "town.engram", street, "--frames", "500:600")
+    assert ran.status == 2
+    assert "pairs is chosen, 0 to " in ran.err
+    assert "change --frames" in ran.err
+
+
+def test_a_recorder_that_cannot_write_is_refused_before_the_drive(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "town.engram"
+    assert engram("map", path, street, "--frames", "0:3").status == 0
+    ran = engram("localise", path, street, "--frames", "0:3", "--recorder", path / "records")
+    assert ran.status == 2
+    assert "records: cannot be created" in ran.err
+
+
+def test_the_list_of_features_says_what_each_is_good_at(engram) -> None:
+    ran = engram("features")
+    assert "256 bits  night, snow, low sun, other seasons" in ran.out
+    assert "--features KIND" in ran.out

@@ -333,7 +333,7 @@ class TestMostThatFit:
         # From no room for a node to room for all of them and more.
         budget = held_bytes + int(share * taken[-1])
         if measure(1) > budget:
-            with pytest.raises(InputError, match=f"take {measure(1)};"):
+            with pytest.raises(InputError, match=f"take {measure(1)} bytes;"):
                 most_that_fit(measure, np.cumsum(node_bytes), budget)
             return
         written.clear()

@@ -324,7 +324,8 @@ def test_weights_of_another_model_are_not_used(monkeypatch: pytest.MonkeyPatch) 
 
 def test_the_verb_lists_and_checks_kinds() -> None:
     listed = run("features", "list")
-    assert {"kind": NET, "bits": 256} in listed["kinds"]
+    good_at = "night, snow, low sun, other seasons"
+    assert {"kind": NET, "bits": 256, "good_at": good_at} in listed["kinds"]
     assert all(met for _, met, _ in run("features", "check", "net")["checks"][NET])
     ran = CliRunner().invoke(app, ["features", "check", "orb"])
     assert isinstance(ran.exception, IncompatibleError)

@@ -14,6 +14,7 @@ from engram.cli.losses import losses_told
 from engram.errors import ConfigError
 
 if TYPE_CHECKING:
+    from engram.maps import Map
     from engram.robot.settings import Settings
 
 
@@ -54,6 +55,7 @@ def map_(
     given = settings.read()
     asked = RobotOptions(**effort.over(given), force=force)
     resolved = _for_people(given.of_robot(descriptor), no_thumbnails)
+    descriptor = descriptor or _asked_kind(resolved)
     with losses_told(sequence):
         with viewer_for(view) as viewer, Bars().stage("map", len(sequence)) as monitor:
 
@@ -149,6 +151,9 @@ def localise(
             trajectory, pictures, rate, as_json, remember, recorder, not no_images, view
         )
         with losses_told(sequence), open_map(map_path, at) as opened:
+            _follow(opened, resolved)
+            if not opened.node_count():
+                typer.echo(_empty(opened), err=True)
             localise_and_print(opened, sequence, resolved, asked, outputs)
         return
     refused = {
@@ -193,6 +198,39 @@ def record(
             typer.echo(report.text())
         if report.interrupted:
             raise typer.Exit(130)
+
+
+def _asked_kind(settings: Settings) -> str | None:
+    """The kind of features that the settings name; None for the default, which follows a map's."""
+    from engram.frontend import FrontendConfig
+
+    kind = settings.frontend.descriptor
+    return None if kind == FrontendConfig().descriptor else kind
+
+
+def _follow(opened: Map, settings: Settings) -> None:
+    """Refuses settings that name other features than the map's, as nothing would come of them.
+
+    Raises:
+        ConfigError: they do.
+    """
+    asked, found = _asked_kind(settings), opened.descriptor
+    if asked is not None and found is not None and asked != found:
+        raise ConfigError(
+            f"{opened.location} has {found} features, not {asked}; leave out frontend.descriptor, "
+            f"or map the drives into another map with --features {asked.partition('@')[0]}"
+        )
+
+
+def _empty(opened: Map) -> str:
+    """Why nothing can be found in a map without nodes."""
+    begun = [str(one.session.id)[:8] for one in opened.interrupted()]
+    if begun:
+        return (
+            f"warning: the map is empty: session {begun[0]} was interrupted; map its drive again, "
+            "or commit what it saved with engram check --seal"
+        )
+    return "warning: the map is empty; begin it with engram map"
 
 
 def _for_people(settings: Settings, no_thumbnails: bool) -> Settings:

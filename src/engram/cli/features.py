@@ -44,12 +44,18 @@ def features(
 
     asked = [feature_kind(name) for name in kinds] if kinds else known_kinds()
     if action is FeaturesAction.LIST:
-        listed = [{"kind": one.name, "bits": 8 * one.descriptor_bytes} for one in asked]
+        listed = [
+            {"kind": one.name, "bits": 8 * one.descriptor_bytes, "good_at": one.good_at}
+            for one in asked
+        ]
         if as_json:
             print(json.dumps({"kinds": listed}))
             return
         for row in listed:
-            typer.echo(f"{row['kind']:14} {row['bits']} bits")
+            typer.echo(f"{row['kind']:14} {row['bits']} bits  {row['good_at']}".rstrip())
+        typer.echo(
+            "a map keeps the kind it is made with: engram map NEW.engram DRIVE --features KIND"
+        )
         return
     found = {one.name: check_kind(one) for one in asked}
     if as_json:

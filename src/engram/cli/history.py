@@ -13,7 +13,7 @@ import typer
 
 from engram.cli import options
 from engram.cli.wording import undo_text
-from engram.errors import ConfigError
+from engram.errors import ConfigError, RevisionError
 
 Revision = Annotated[str, typer.Argument(metavar="REV", help="A revision: 7, a tag, head, head~2.")]
 Message = Annotated[
@@ -78,7 +78,10 @@ def show(
         found = blame_node(map_path, what)
         typer.echo(json.dumps(found) if as_json else blame_text(found))
         return
-    shown, changed = show_revision(map_path, what)
+    try:
+        shown, changed = show_revision(map_path, what)
+    except RevisionError as error:
+        raise RevisionError(f"{error}; or the beginning of a node's id, 0-9 and a-f") from error
     if as_json:
         print(json.dumps({**shown, "difference": changed.to_dict()}))
         return

@@ -89,6 +89,7 @@ class FeatureKind:
         detect: finds the landmarks.
         describe: describes them, if `detect` does not.
         matcher: suitable matcher settings; they replace those left at their defaults.
+        good_at: what to choose it for, in a few words.
     """
 
     name: DescriptorKind
@@ -96,6 +97,7 @@ class FeatureKind:
     detect: Detect
     describe: Describe
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    good_at: str = ""
 
     def __post_init__(self) -> None:
         if not (0 < self.descriptor_bytes <= 2048 and self.descriptor_bytes % 8 == 0):
@@ -201,9 +203,21 @@ def describe_net(
 FEATURES: dict[DescriptorKind, FeatureKind] = {
     kind.name: kind
     for kind in (
-        FeatureKind(BRIEF, 32, detect_corners_with_brief, describe_brief),
-        FeatureKind(TEBLID, 32, detect_corners, describe_teblid),
-        FeatureKind(NET, 32, detect_corners_with_net, describe_net),
+        FeatureKind(
+            BRIEF,
+            32,
+            detect_corners_with_brief,
+            describe_brief,
+            good_at="the same light, small rooms; cheapest",
+        ),
+        FeatureKind(TEBLID, 32, detect_corners, describe_teblid, good_at="much as brief"),
+        FeatureKind(
+            NET,
+            32,
+            detect_corners_with_net,
+            describe_net,
+            good_at="night, snow, low sun, other seasons",
+        ),
     )
 }
 

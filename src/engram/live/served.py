@@ -222,7 +222,7 @@ def _listening(path: Path) -> socket.socket:
         listening.bind(str(path))
     except OSError as error:
         listening.close()
-        raise InputError(f"{path}: cannot listen there: {error}") from error
+        raise InputError(f"{path}: cannot listen there: {error.strerror or error}") from error
     finally:
         os.umask(before)
     listening.listen(1)

@@ -124,7 +124,7 @@ def map_drive(
     settings, options = settings or Settings(), options or RobotOptions()
     if descriptor is not None and isinstance(sequence, FrameLog):
         mend = f"record it again with --features {descriptor}"
-        _check_descriptor(descriptor, sequence.header.descriptor, sequence.info.name, mend)
+        _check_descriptor(descriptor, sequence.header.descriptor, str(sequence.path), mend)
     options.lane_threads(maps=True)  # refuses too few threads before anything is written
     session = session_of_drive(sequence)
     report = MapReport(session)
@@ -150,7 +150,10 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
         ConfigError: they differ.
     """
     if found is not None and found != feature_kind(asked).name:
-        raise ConfigError(f"{what} has {found} features, not {asked}; omit --features, or {mend}")
+        raise ConfigError(
+            f"{what} has {found} features, not {asked}; leave out --features and "
+            f"frontend.descriptor, or {mend}"
+        )
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def extract_log(
             for pair in pairs:
                 raise_if_asked()
                 if isinstance(pair, LoggedFrame):
-                    raise SequenceError(f"{sequence.info.name}: is already a frame log")
+                    raise SequenceError(f"{sequence.info.name}: the drive is already a frame log")
                 frame, motion = front.take(pair)
                 step = motion.odometry
                 if writer is None:

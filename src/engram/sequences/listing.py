@@ -241,6 +241,11 @@ def usable_pairs(
         raise SequenceError(f"{reasons[0]}{more}; leave them out with --skip-bad")
     pairs = [place for place in chosen if isinstance(place, PairFiles)]
     if not pairs:
+        if places and not chosen:
+            raise SequenceError(
+                f"{where}: none of its {len(places)} pairs is chosen, 0 to {len(places) - 1}; "
+                "change --frames, --from or --to"
+            )
         why = f"; first fault: {reasons[0]}" if reasons else ""
         raise SequenceError(
             f"{where}: no pair is left of {len(places)} in the drive, {len(chosen)} of them "

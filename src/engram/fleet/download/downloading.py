@@ -223,7 +223,7 @@ def most_that_fit(
     if fits_bytes > budget_bytes:
         raise InputError(
             f"not one node fits into {budget_bytes} bytes: the map's vocabulary, statistics and "
-            f"the most useful node with its session take {fits_bytes}; give a larger --budget"
+            f"the most useful node with its session take {fits_bytes} bytes; give a larger --budget"
         )
     too_many, too_many_bytes = len(expected_bytes) + 1, 0
     aimed_bytes = _AIM * budget_bytes

@@ -115,6 +115,11 @@ class FrameLog:
         self._skipped_reasons: list[str] = []
 
     @property
+    def path(self) -> Path:
+        """The log."""
+        return self._path
+
+    @property
     def info(self) -> SequenceInfo:
         """What is known of the drive as a whole; `format` is "framelog"."""
         return replace(self._info, format="framelog")
