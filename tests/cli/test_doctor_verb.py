@@ -39,6 +39,23 @@ def test_pairs_are_drawn(engram, street: Path, tmp_path: Path) -> None:
     assert (first[..., 0] != first[..., 1]).any(), "lines are coloured"
 
 
+def test_pairs_that_map_refuses_are_a_finding(engram, street: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "holes"
+    shutil.copytree(street, folder)
+    left = sorted(folder.glob("left/*.png"))
+    left[3].unlink()
+    left[5].write_bytes(b"cut short")
+    assert engram("map", tmp_path / "town.engram", folder).status == 2
+    ran = engram("doctor", folder, "--json")
+    (bad,) = (one for one in ran.json["findings"] if one["code"] == "bad_pairs")
+    assert bad["value"] == 2
+    assert "image 3 is missing in " in bad["message"]
+    assert "--skip-bad" in bad["cure"]
+    for path in left:
+        path.write_bytes(b"cut short")
+    assert "bad_pairs" in engram("doctor", folder).out
+
+
 def test_ten_bits_in_sixteen_are_found(engram, street: Path, tmp_path: Path) -> None:
     folder = tmp_path / "deep"
     shutil.copytree(street, folder)

@@ -306,7 +306,7 @@ def test_a_client_that_breaks_the_protocol_is_left_and_the_next_one_served(
         one.link.send({"do": "frame", "ticket": 0, "stamp_ns": 1})
         assert "no camera" in until(one, lambda said: said["is"] == "reply")["text"]
         one.link.send({"do": "camera", "ring": "/dev/null", "camera": {"fx": "wide"}})
-        assert "not understood" in until(one, lambda said: said["is"] == "reply")["text"]
+        assert until(one, lambda said: said["is"] == "reply")["text"] == "camera needs 'fy'"
         one.link._socket.sendall(b"hello\n")
         with pytest.raises((EOFError, OSError)):
             until(one, lambda _: False)
@@ -424,3 +424,16 @@ def test_a_drive_is_played_in_real_time_without_its_late_frames(street: Path, to
     except Empty:
         taken = [one for one in messages if one["is"] == "seen"]
     assert 1 <= len(taken) < 6
+
+
+def test_a_stamp_that_no_clock_gives_is_refused_and_the_drive_goes_on(
+    town: Path, pairs: list[StereoPair], tmp_path: Path
+) -> None:
+    with running("socket", tmp_path, LiveOptions(town, robot=OPTIONS)) as one:
+        assert isinstance(one, Middleware)
+        one.give(pairs[0])
+        until(one, lambda said: said["is"] == "seen")
+        one.link.send({"do": "frame", "ticket": 0, "stamp_ns": 2**70})
+        assert "within 64 bits" in until(one, lambda said: said["is"] == "reply")["text"]
+        one.give(pairs[1])
+        assert until(one, lambda said: said["is"] == "seen")["trouble"] == ""

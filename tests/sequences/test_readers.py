@@ -132,7 +132,7 @@ class TestGoodDrives:
         assert [pair.stamp_ns for pair in drive.read(frames=frames)] == drive.stamps_of(*wanted)
 
     def test_frames_beyond_the_end_are_told(self, drive: Drive) -> None:
-        with pytest.raises(SequenceError, match=f"no pair is left of {PAIRS}"):
+        with pytest.raises(SequenceError, match=f"none of its {PAIRS} pairs is chosen"):
             drive.open(frames="100:")
 
     def test_colour_images_become_grey_or_one_channel(self, drive: Drive) -> None:

@@ -127,7 +127,7 @@ def _calibration_lines(
         images = "rectified" if cameras.rectification is None else "raw; rectified by a table"
     mounting = "unknown"
     if camera.cam_from_rig is not None:
-        x, y, z = camera.cam_from_rig.inverse().translation
+        x, y, z = camera.cam_from_rig.inverse().translation + 0.0  # no -0.000
         mounting = f"left camera at ({x:.3f}, {y:.3f}, {z:.3f}) m in the robot's frame"
     return [
         f"drive          {sequence.info.name} ({sequence.info.format})",

@@ -80,6 +80,7 @@ class Evidence:
         matches: left-right matches of every few pairs, and the number of their frame.
         backwards, repeated: frames left out as their stamp is earlier than, or that of, the frame
             before.
+        bad: why other pairs were left out: an image is missing, unreadable or of another size.
         outside: each step as measured by wheels or another source; None where it was not.
         alignments: of some pairs, worked out once at the end; None before.
         aligned: the matches of those pairs.
@@ -99,6 +100,7 @@ class Evidence:
     matches: list[tuple[int, SideMatches]] = field(default_factory=list)
     backwards: int = 0
     repeated: int = 0
+    bad: list[str] = field(default_factory=list)
     outside: list[SE3 | None] = field(default_factory=list)
     alignments: list[Alignment] | None = None
     aligned: list[SideMatches] = field(default_factory=list)

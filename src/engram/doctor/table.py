@@ -22,6 +22,7 @@ class Check:
         unit: of the value.
         message: what is wrong beyond the limit, in words.
         cure: what to do then.
+        example: one of the things that are wrong, for the message.
         below: whether values below the limit are the alarm, not those above.
         needs: what it would take to tell, for the report; "" if nobody need know.
         explains: codes whose findings would only be its consequences.
@@ -34,6 +35,7 @@ class Check:
     unit: str
     message: str
     cure: str
+    example: Callable[[Evidence], str] | None = None
     below: bool = False
     needs: str = ""
     explains: tuple[str, ...] = ()
@@ -44,9 +46,8 @@ class Check:
         limit = getattr(seen.config, self.limit) if isinstance(self.limit, str) else self.limit
         if value is None or not (value < limit if self.below else value > limit):
             return value
-        return Finding(
-            self.code, self.severity, self.message, value, float(limit), self.unit, self.cure
-        )
+        message = self.message + (f", such as: {self.example(seen)}" if self.example else "")
+        return Finding(self.code, self.severity, message, value, float(limit), self.unit, self.cure)
 
 
 _FATAL, _WARNING, _NOTE = Severity
@@ -129,6 +130,12 @@ CHECKS: tuple[Check, ...] = (
         "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",
         "frames repeat the stamp of the frame before",
         "the driver sends frames twice, or the clock is too coarse; they are left out",
+    ),
+    Check(
+        "bad_pairs", _WARNING, pictures.bad_pairs, 0, "pairs",
+        "pairs cannot be used",
+        "mend or remove their images, or leave the pairs out with --skip-bad",
+        example=lambda seen: seen.bad[0],
     ),
     Check(
         "stamp_jump", _WARNING, stamps.jump_s, "jump_s", "s",
@@ -222,7 +229,7 @@ def diagnose(seen: Evidence) -> Diagnosis:
     found: list[Finding] = []
     explained: set[str] = set()
     untold: dict[str, str] = {}
-    for check in CHECKS if len(seen) or seen.backwards else ():
+    for check in CHECKS if len(seen) or seen.backwards or seen.bad else ():
         result = check.finding(seen)
         if result is None and check.needs:
             untold[check.code] = check.needs

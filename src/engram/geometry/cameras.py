@@ -58,7 +58,8 @@ class StereoCamera:
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             value = getattr(self, name)
-            if not isinstance(value, int | np.integer) or not 1 <= value <= _MAX_SIDE_PX:
+            number = isinstance(value, int | float | np.number)
+            if not number or value % 1 != 0 or not 1 <= value <= _MAX_SIDE_PX:
                 raise CalibrationError(
                     f"camera: {name} is {value!r}, must be a whole number, 1 to {_MAX_SIDE_PX} px"
                 )

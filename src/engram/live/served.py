@@ -18,7 +18,7 @@ import numpy as np
 from engram.calibration import Cameras
 from engram.calibration.camera_info import cameras_of_infos, parse_camera_info
 from engram.errors import CalibrationError, InputError
-from engram.frontend import StereoPair
+from engram.frontend import StereoPair, check_pair
 from engram.geometry import SE3, StereoCamera
 from engram.live.link import Link, LinkError, Ring
 from engram.live.outside import Outside
@@ -139,8 +139,10 @@ class Served:
             return act(message)
         except (InputError, LinkError, OSError) as error:
             self._refuse(message, str(error))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            self._refuse(message, f"{message.get('do')} is not understood: {error!r}")
+        except KeyError as error:
+            self._refuse(message, f"{message.get('do')} needs {error}")
+        except (TypeError, ValueError, OverflowError) as error:
+            self._refuse(message, f"{message.get('do')} is not understood: {error}")
         return None
 
     def _refuse(self, message: Message, text: str) -> None:
@@ -183,10 +185,9 @@ class _Images:
                 )
                 for image, table in zip((left, right), tables, strict=True)
             )
-        return (
-            StereoPair(int(message["stamp_ns"]), left, right, self._cameras.camera),
-            _outside(message),
-        )
+        pair = StereoPair(int(message["stamp_ns"]), left, right, self._cameras.camera)
+        check_pair(pair)
+        return pair, _outside(message)
 
     def close(self) -> None:
         """Lets go of the ring."""

@@ -43,7 +43,7 @@ def examine_drive(
 
     Of a bag, which is a stream, the first ones.
 
-    Open the drive with `skip_bad`: then stamps out of order are a finding, not an error.
+    Open the drive with `skip_bad`: then bad pairs and stamps out of order are findings, not errors.
 
     Args:
         sequence: the drive.
@@ -69,6 +69,8 @@ def examine_drive(
         if isinstance(fault, StampFault):
             evidence.backwards += fault.backwards
             evidence.repeated += not fault.backwards
+        else:
+            evidence.bad.append(fault)
     return front.diagnosis
 
 
@@ -78,7 +80,9 @@ def _chosen(
     """The frames that are examined; the front begins anew with each stretch of them."""
     source = sequence.motion()
     runs: Iterable[Iterable[Arrived]] = [islice(sequence, most)]
-    if isinstance(sequence, ImageSequence | FrameLog):
+    if isinstance(sequence, ImageSequence):
+        runs = (sequence.usable(stretch) for stretch in stretches(len(sequence), most))
+    elif isinstance(sequence, FrameLog):
         runs = (map(sequence.read, stretch) for stretch in stretches(len(sequence), most))
     for run in runs:
         front.restart()

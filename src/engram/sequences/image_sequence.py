@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -119,7 +119,15 @@ class ImageSequence:
                 is not set.
         """
         self._reading_faults.clear()
-        for index in range(len(self._pairs)):
+        return self.usable(range(len(self._pairs)))
+
+    def usable(self, indices: Iterable[int]) -> Iterator[StereoPair]:
+        """Decodes some pairs, as iterating decodes all.
+
+        Raises:
+            SequenceError: as for iterating.
+        """
+        for index in indices:
             try:
                 pair = self.read(index)
             except SequenceError as error:

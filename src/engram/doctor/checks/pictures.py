@@ -46,3 +46,8 @@ def bits(seen: Evidence) -> float | None:
 
 def _spoilt(frames: list[bool]) -> float | None:
     return float(np.mean(frames)) if frames else None
+
+
+def bad_pairs(seen: Evidence) -> float | None:
+    """Pairs that were left out because an image cannot be used."""
+    return float(len(seen.bad))
