@@ -54,15 +54,21 @@ def from_dict(values: dict[str, Any], kind: type[T], ignored: Collection[str] = 
     try:
         return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
-        raise ConfigError(_in_words(str(error))) from error
+        raise ConfigError(_in_words(error, values)) from error
 
 
-def _in_words(fault: str) -> str:
-    """A fault that msgspec found, with the key first; its path adds nothing to one of ours."""
-    what, _, place = fault.partition(" - at `$")
-    if what.startswith("Expected "):
-        return f"{place.strip('.`')}: {what[0].lower()}{what[1:].replace('`', '')}"
-    return what
+def _in_words(error: msgspec.ValidationError, values: dict[str, Any]) -> str:
+    """A fault that msgspec found, by key and value; its path adds nothing to a fault of ours."""
+    what, _, place = str(error).partition(" - at `$")
+    if isinstance(error.__cause__, ConfigError):
+        return what
+    key, found = place.strip(".`"), typing.cast("Any", values)
+    for part in key.split("."):
+        found = found.get(part) if isinstance(found, dict) else None
+    wanted = what.partition(", got")[0].replace("Expected ", "must be ").replace("`", "")
+    if wanted.startswith("Invalid enum"):
+        wanted = "not one of its names; engram settings show describes them"
+    return f"{key} is {found!r}: {wanted}"
 
 
 def to_dict(config: Any) -> dict[str, Any]:

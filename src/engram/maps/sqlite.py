@@ -297,13 +297,18 @@ def map_path(location: Path | str) -> Path:
     """The path of a map file.
 
     Raises:
-        InputError: it is the address of a database; not shown, as it may hold a password.
+        InputError: it is the address of a database; not shown, as it may hold a password. Or it is
+            not UTF-8, which SQLite needs.
     """
     if isinstance(location, str) and location.startswith("postgresql"):
         raise InputError(
             "this is the address of a map in PostgreSQL, not a map file; such maps are for "
             "engram centre, which comes with the centre"
         )
+    try:
+        str(location).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{location}: the path is not UTF-8; rename file or folder") from error
     return Path(location)
 
 
