@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 
-from engram.centre.access.enrolment import disable, new_code
+from engram.centre.access.enrolment import add_person, disable, new_code
 from engram.centre.access.roles import Role
 from engram.centre.dreams import Dreams
+from engram.centre.errors import UnknownError
 from engram.centre.serving import Listening
 from engram.centre.store.audit import first_broken
 from engram.centre.store.schema import audit
-from engram.errors import ConfigError
+from engram.errors import ConfigError, InputError
 
 from .conftest import NAME, POLICY, drive
 
@@ -241,3 +242,22 @@ def test_it_listens_elsewhere_only_with_tls_or_on_demand(tmp_path):
     Listening("::1", 1)
     Listening("0.0.0.0", 1, insecure=True)
     Listening("0.0.0.0", 1, tmp_path / "a", tmp_path / "b")
+
+
+def test_a_robot_hands_in_what_makes_the_version_that_it_follows(site):
+    agent = site.robot("r1", follows="stable")
+    drive(agent.live, "r1", 0)
+    agent.hand_in()
+    agent.step()
+    assert agent.trouble is None
+    assert agent.status()["wanted"] == "0"
+    assert [one["state"] for one in agent.status()["outbox"]] == ["sent"]
+
+
+def test_codes_and_tokens_are_made_for_what_can_be(site):
+    with pytest.raises(InputError, match="is not a version to follow"):
+        new_code(site.centre, NAME, "Stable version", "tests")
+    with pytest.raises(UnknownError, match="there is no map"):
+        add_person(site.centre, "alice", "twon", Role.VIEWER)
+    with pytest.raises(InputError, match="the name of a person"):
+        add_person(site.centre, " ", NAME, Role.VIEWER)

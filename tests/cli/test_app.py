@@ -41,6 +41,15 @@ def test_a_mistyped_folder_does_not_become_a_centre(engram, tmp_path) -> None:
     assert not (tmp_path / "twon").exists()
 
 
+@pytest.mark.parametrize("verb", ["jobs", "code", "worker"])
+def test_the_folder_of_something_else_does_not_become_a_centre(engram, tmp_path, verb) -> None:
+    (tmp_path / "notes.txt").write_text("of another program")
+    ran = engram("centre", verb, tmp_path)
+    assert ran.status == 2
+    assert "there is no centre" in ran.err
+    assert [one.name for one in tmp_path.iterdir()] == ["notes.txt"]
+
+
 PROGRAM = "import sys; sys.argv[0] = 'engram'; from engram.cli import main; main()"
 
 

@@ -43,6 +43,9 @@ class Fleet:
     def wanted(self, name: str, robot: str) -> dict[str, Any]:
         """What a robot is to run: its ref, the revision, and what it may forget.
 
+        Where its ref is not made yet, or was removed, that is revision 0: it stays where it is, and
+        hands in, since the first hand-in may be what makes the ref.
+
         Raises:
             UnknownError: it is not a robot of this map.
         """
@@ -51,7 +54,10 @@ class Fleet:
             row = first_row(connection, query)
         if row is None:
             raise UnknownError("you are not a robot of this map; enrol first")
-        revision = Refs(self._centre).revision(name, row["follows"])
+        try:
+            revision = Refs(self._centre).revision(name, row["follows"])
+        except UnknownError:
+            revision = 0
         return {
             "follows": row["follows"],
             "revision": revision,

@@ -19,6 +19,19 @@ HEAD = "head"
 _NAME = re.compile(r"[a-z][a-z0-9._-]{0,39}")
 
 
+def check_followed(followed: str) -> None:
+    """That a robot can follow it: `head`, a number, or the name of a ref, made now or later.
+
+    Raises:
+        InputError: no ref is ever called so.
+    """
+    if not followed.isdecimal() and not _NAME.fullmatch(followed):
+        raise InputError(
+            f"{followed!r:.60} is not a version to follow: head, a number, or a name of a letter, "
+            "then letters, digits, . _ -"
+        )
+
+
 class Refs:
     """The refs of a centre's maps."""
 

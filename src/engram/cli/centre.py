@@ -41,12 +41,12 @@ def _open(folder: Path, database: str | None = None, objects: str | None = None)
     """A centre that is there.
 
     Raises:
-        InputError: no such folder; `serve` and `map` make one, a mistyped name does not.
+        InputError: it is not there; `serve` and `map` make one, a mistyped name does not.
     """
     from engram.centre.service import Centre
     from engram.errors import InputError
 
-    if not folder.is_dir():
+    if not (folder / ("maps" if database else "centre.sqlite")).exists():
         raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
     return Centre(folder, database, objects)
 
@@ -118,6 +118,7 @@ def worker(
     """
     from engram.centre.serving import run_worker
 
+    _open(folder, database, objects).close()
     run_worker(folder, database, objects, scheduler)
 
 

@@ -10,8 +10,9 @@ import secrets
 
 from sqlalchemy import Connection, delete, select, update
 
-from engram.centre.access.roles import Role, Subject
+from engram.centre.access.roles import ALL_MAPS, Role, Subject
 from engram.centre.errors import NotAllowedError, NotKnownError
+from engram.centre.refs import check_followed
 from engram.centre.service import Centre
 from engram.centre.settings import DAY_NS
 from engram.centre.store.audit import note
@@ -24,8 +25,13 @@ _S = 1_000_000_000
 
 
 def new_code(centre: Centre, name: str, follows: str, by: str) -> str:
-    """A code with which one robot enrols on a map."""
+    """A code with which one robot enrols on a map.
+
+    Raises:
+        InputError: no ref can be called what the robot is to follow.
+    """
     centre.map_path(name)
+    check_followed(follows)
     code = secrets.token_urlsafe(12)
     now = centre.now_ns()
     with centre.database.writing() as connection:
@@ -129,7 +135,16 @@ def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
 
 
 def add_person(centre: Centre, name: str, map_name: str, role: Role) -> str:
-    """A token for a person, without end; `engram centre token` makes them."""
+    """A token for a person, without end; `engram centre token` makes them.
+
+    Raises:
+        UnknownError: there is no such map.
+        InputError: no name is given.
+    """
+    if not name.strip():
+        raise InputError("a token needs the name of a person: the audit log shows it")
+    if map_name != ALL_MAPS:
+        centre.map_row(map_name)
     person, now = secrets.token_hex(16), centre.now_ns()
     with centre.database.writing() as connection:
         known = {
