@@ -271,15 +271,16 @@ def test_the_page_shows_every_policy_and_the_sweeps(out: Path) -> None:
     assert lines[at + 2].endswith(" | all (800) |")
 
 
-def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path) -> None:
+@pytest.mark.parametrize("policy", ["path-near", "recall"])
+def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path, policy: str) -> None:
     work = tmp_path / "work"
     work.mkdir()
-    bare = replace(plan, work=work, options=replace(plan.options, policies=("path-near",)))
+    bare = replace(plan, work=work, options=replace(plan.options, policies=(policy,)))
     for fold in plan.folds:
         source = plan.map_path(fold).with_suffix(".json")
         (work / source.name).write_bytes(source.read_bytes())
         for session in fold.held_out:
-            only = [Configuration("path-near", 2), Configuration("path-near", UNLIMITED)]
+            only = [Configuration(policy, 2), Configuration(policy, UNLIMITED)]
             write_runs(bare.runs_path(session, "memo"), made_up_runs(session, only))
     files = {path.name for path in write_report(tmp_path / "out", [bare])}
     assert "fig11_lanes.png" in files

@@ -156,8 +156,10 @@ def _sensitivity(campaign: CampaignResult, own: Sequence[Row]) -> Panel:
     places = list(range(len(some)))
     ticks = [(float(x), str(row["T"])) for x, row in zip(places, some, strict=True)]
     columns = {"P(> 10 m)": "p_gt_10m", "route not localised": "share_not_localised"}
+    if len(some) < 2:  # path-near was not run, or with one T
+        return Panel(campaign.name, "T", "%", [], ticks)
     lines = [row_line(label, some, places, column) for label, column in columns.items()]
-    return Panel(campaign.name, "T", "%", lines if len(some) > 1 else [], ticks)
+    return Panel(campaign.name, "T", "%", lines, ticks)
 
 
 def _draw_costs(out: Path, campaign: CampaignResult, own: Sequence[Row]) -> list[Path]:
