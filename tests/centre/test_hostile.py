@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 
 import msgspec
 import pytest
@@ -183,6 +185,17 @@ def test_admission_ends_at_its_limits(tmp_path, robot):
     wrong = Manifest("00" * 16, manifest.revision, manifest.pages)
     with pytest.raises(MapCorruptError, match="not '0000"):
         admit(wrong, parts, tmp_path / "c.engram", 2**32, 60)
+
+
+def test_admission_runs_under_a_lower_limit_of_the_system():
+    """With ``ulimit -f`` below its own it failed every hand-in, in words of time and memory."""
+    code = (
+        "import resource as r; from engram.centre.worker.admission import confine; "
+        "r.setrlimit(r.RLIMIT_FSIZE, (2**20, 2**20)); confine(2**33, 60, 2**26); "
+        "print(r.getrlimit(r.RLIMIT_FSIZE), r.getrlimit(r.RLIMIT_CPU))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.stdout == "(1048576, 1048576) (60, 65)\n", ran.stderr
 
 
 def test_what_the_gate_refuses_stays_and_a_person_may_merge_it(site, robot, monkeypatch):

@@ -50,6 +50,36 @@ def test_the_folder_of_something_else_does_not_become_a_centre(engram, tmp_path,
     assert [one.name for one in tmp_path.iterdir()] == ["notes.txt"]
 
 
+def test_what_a_map_of_a_centre_is_not_told_stays(engram, tmp_path) -> None:
+    town = tmp_path / "town"
+    engram("centre", "map", town, "fleet", "--moves", "stable", "--quiet", "22-5")
+    kept = engram("centre", "map", town, "fleet", "--set", "merge.rounds=8")
+    assert kept.out == "fleet: gate none, moves stable, quiet 22-5\n"
+    cleared = engram("centre", "map", town, "fleet", "--moves", "none", "--quiet", "none")
+    assert cleared.out == "fleet: gate none, moves none, quiet none\n"
+
+
+def test_a_map_of_a_centre_takes_no_settings_with_which_every_merge_fails(engram, tmp_path) -> None:
+    for given in (["--moves", "head"], ["--moves", "My ref"], ["--gate", tmp_path / "no.framelog"]):
+        ran = engram("centre", "map", tmp_path / "town", "fleet", *given)
+        assert ran.status == 2
+        assert str(given[1]) in ran.err
+
+
+def test_a_centre_where_no_folder_can_be_is_told_in_one_line(engram, tmp_path) -> None:
+    (tmp_path / "file").write_text("")
+    ran = engram("centre", "serve", tmp_path / "file" / "town")
+    assert ran.status == 2
+    assert "cannot hold a centre: Not a directory" in ran.err
+    engram("centre", "map", tmp_path / "town", "fleet")
+    ran = engram("centre", "backup", tmp_path / "town", tmp_path / "file" / "backup")
+    assert ran.status == 2
+    assert "cannot hold a backup" in ran.err
+    ran = engram("centre", "jobs", tmp_path / "town", "--map", "flet")
+    assert ran.status == 2
+    assert "there is no map 'flet'" in ran.err
+
+
 PROGRAM = "import sys; sys.argv[0] = 'engram'; from engram.cli import main; main()"
 
 

@@ -23,7 +23,7 @@ def back_up(centre: Centre, target: Path) -> dict[str, int]:
         The revision of each map that the copy holds: robots may forget what led to it.
 
     Raises:
-        InputError: the folder exists, or the tables name no map.
+        InputError: the folder exists or cannot be made, or the tables name no map.
     """
     if target.exists():
         raise InputError(f"{target} exists already; choose another name")
@@ -32,7 +32,10 @@ def back_up(centre: Centre, target: Path) -> dict[str, int]:
         raise InputError(
             f"{centre.folder} has no maps in its tables; if PostgreSQL has them, give --database"
         )
-    (target / "maps").mkdir(parents=True)
+    try:
+        (target / "maps").mkdir(parents=True)
+    except OSError as error:
+        raise InputError(f"{target} cannot hold a backup: {error.strerror}") from error
     if database is None:
         source = sqlite3.connect(centre.folder / "centre.sqlite")
         copy = sqlite3.connect(target / "centre.sqlite")

@@ -32,6 +32,19 @@ def check_followed(followed: str) -> None:
         )
 
 
+def check_movable(ref: str) -> None:
+    """That a ref can be called so, and moved.
+
+    Raises:
+        InputError: it cannot.
+    """
+    if ref == HEAD or not _NAME.fullmatch(ref):
+        raise InputError(
+            f"{ref!r:.60} is not the name of a movable version: use a letter, then letters, "
+            "digits, . _ -"
+        )
+
+
 class Refs:
     """The refs of a centre's maps."""
 
@@ -97,11 +110,7 @@ class Refs:
             ChangedError: it has another version.
             InputError: the name cannot be one, or there is no such revision.
         """
-        if ref == HEAD or not _NAME.fullmatch(ref):
-            raise InputError(
-                f"{ref!r:.60} is not the name of a movable version: use a letter, then letters, "
-                "digits, . _ -"
-            )
+        check_movable(ref)
         with self._centre.reading(name) as store:
             if not 1 <= revision <= store.revision:
                 raise InputError(f"{name} has revisions 1 to {store.revision}, not {revision}")

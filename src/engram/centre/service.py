@@ -66,6 +66,9 @@ class Centre:
         objects: address of the bucket; None for a folder in the folder.
         settings: limits and times.
         clock: the time, UTC, ns.
+
+    Raises:
+        InputError: the folder cannot be made or written to.
     """
 
     def __init__(
@@ -77,8 +80,11 @@ class Centre:
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
         self.folder = folder
-        for name in ("maps", "objects", "work"):
-            (folder / name).mkdir(parents=True, exist_ok=True)
+        try:
+            for name in ("maps", "objects", "work"):
+                (folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder} cannot hold a centre: {error.strerror}") from error
         self.settings = settings or CentreSettings()
         self.now_ns = clock
         self.addresses = (database, objects)

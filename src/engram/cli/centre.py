@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -35,6 +36,7 @@ Objects: TypeAlias = Annotated[
     typer.Option("--objects", metavar="URL", help="s3://bucket/prefix [default: files in FOLDER]."),
 ]
 _BY = "shell"
+_NONE = "none"
 
 
 def _open(folder: Path, database: str | None = None, objects: str | None = None) -> Centre:
@@ -190,7 +192,7 @@ def map_(
         typer.Option(
             "--gate",
             metavar="DRIVE",
-            help="Held-out drive that must not localise worse; repeatable.",
+            help="Held-out drive that must not localise worse; repeatable; none for no gate.",
         ),
     ] = None,
     moves: Annotated[
@@ -198,13 +200,15 @@ def map_(
         typer.Option(
             "--moves",
             metavar="REF",
-            help="Version that is moved to each merge that passed the gate.",
+            help="Version that is moved to each merge that passed the gate; none for none.",
         ),
     ] = None,
     quiet: Annotated[
         str | None,
         typer.Option(
-            "--quiet", metavar="FROM-TO", help="Hours in which the centre dreams, UTC, as in 22-5."
+            "--quiet",
+            metavar="FROM-TO",
+            help="Hours UTC in which the centre dreams, as 22-5; or none.",
         ),
     ] = None,
     settings: options.SettingsGiven,
@@ -212,30 +216,60 @@ def map_(
 ) -> None:
     """Make a map, or change how its hand-ins are merged.
 
+    What is not given stays as it was.
+
     \b
     Examples:
       engram centre map town campus --gate held-out.framelog --moves stable
       engram centre map town fleet --set merge.rounds=8
     """
-    from engram.centre.service import Centre, MapPolicy
+    from engram.centre.service import Centre
     from engram.cli.fleet import merging_of
 
-    policy = MapPolicy(
-        merging_of(settings.read()),
-        tuple(str(one.absolute()) for one in gate or ()),
-        moves,
-        _hours(quiet),
-    )
+    changes: dict[str, Any] = {}
+    if settings.config is not None or settings.changes:
+        changes["merge"] = merging_of(settings.read())
+    if gate:
+        changes["gate"] = _gate(gate)
+    if moves is not None:
+        changes["moves"] = _movable(moves)
+    if quiet is not None:
+        changes["quiet"] = _hours(quiet)
     with Centre(folder, database) as centre:
         centre.add_map(name, _BY)
+        policy = replace(centre.policy(name), **changes)
         centre.set_policy(name, policy, _BY)
+    typer.echo(
+        f"{name}: gate {', '.join(policy.gate) or _NONE}, moves {policy.moves or _NONE}, "
+        f"quiet {_NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}"
+    )
 
 
-def _hours(text: str | None) -> tuple[float, float] | None:
+def _gate(drives: list[Path]) -> tuple[str, ...]:
+    """Held-out drives, each of which opens: with one that does not, every hand-in would fail."""
+    from engram.robot import open_drive
+
+    if drives == [Path(_NONE)]:
+        return ()
+    for one in drives:
+        open_drive(one)
+    return tuple(str(one.absolute()) for one in drives)
+
+
+def _movable(ref: str) -> str | None:
+    from engram.centre.refs import check_movable
+
+    if ref == _NONE:
+        return None
+    check_movable(ref)
+    return ref
+
+
+def _hours(text: str) -> tuple[float, float] | None:
     """The quiet hours, as FROM-TO."""
     from engram.errors import ConfigError
 
-    if text is None:
+    if text == _NONE:
         return None
     begin, _, end = text.partition("-")
     try:
@@ -301,6 +335,7 @@ def jobs(
     from engram.centre.handins import HandIns
 
     with _open(folder, database) as centre:
+        centre.map_row(map_name)
         handins = HandIns(centre)
         if cancel is not None:
             handins.cancel(handins.get(cancel), _BY)

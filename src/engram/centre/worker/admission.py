@@ -93,9 +93,17 @@ def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) 
 
 def confine(memory_bytes: int, time_s: int, file_bytes: int) -> None:
     """Limits this process for good, and takes its network away where the system allows."""
-    resource.setrlimit(resource.RLIMIT_AS, (memory_bytes, memory_bytes))
-    resource.setrlimit(resource.RLIMIT_CPU, (time_s, time_s + 5))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _lower(resource.RLIMIT_AS, memory_bytes, memory_bytes)
+    _lower(resource.RLIMIT_CPU, time_s, time_s + 5)
+    _lower(resource.RLIMIT_FSIZE, file_bytes, file_bytes)
+    _lower(resource.RLIMIT_CORE, 0, 0)
     ctypes.CDLL(None).unshare(_NEW_USER | _NEW_NETWORK)
     os.nice(5)
+
+
+def _lower(kind: int, soft: int, hard: int) -> None:
+    """Sets a limit; one that the system has set lower stays, since it cannot be raised."""
+    most = resource.getrlimit(kind)[1]
+    if most != resource.RLIM_INFINITY:
+        soft, hard = min(soft, most), min(hard, most)
+    resource.setrlimit(kind, (soft, hard))
