@@ -6,6 +6,7 @@ import pytest
 from tests.centre.conftest import Site, admit_here, drive
 
 from engram.agent import Agent, AgentSettings
+from engram.agent.agent import enrol
 from engram.agent.link import CentreRefusedError, Unreachable
 from engram.centre.backup import back_up
 from engram.centre.worker import merging
@@ -29,6 +30,12 @@ def test_pauses_grow_while_the_link_is_down_and_end_with_it(site):
     assert max(pauses) == agent.settings.longest_retry_s / 2
     assert agent.step() == agent.settings.idle_s
     assert agent.status()["failures"] == 0
+
+
+def test_a_folder_is_never_enrolled_with_a_second_centre(site):
+    agent = site.robot("r1")
+    with pytest.raises(InputError, match=r"belongs to the robot 'r1' of http://centre; give an"):
+        enrol(agent.folder, "http://other", "code", "r1", site.http)
 
 
 def test_a_full_outbox_keeps_the_map_and_says_so(site):

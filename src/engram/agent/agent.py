@@ -49,6 +49,7 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
         CentreRefusedError: the code is not valid.
         Unreachable: the centre does not answer.
     """
+    _check_centre(folder, url)
     for part in _PARTS:
         (folder / part).mkdir(parents=True, exist_ok=True)
     key = folder / "key"
@@ -69,6 +70,20 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
     state.remember(url=url, robot=answer["robot"], map=answer["maps"][0], name=name)
     state.close()
     return str(answer["maps"][0])
+
+
+def _check_centre(folder: Path, url: str) -> None:
+    """That a folder is not an agent's of another centre: what it knows of that would stay."""
+    path = folder / "agent.sqlite"
+    if not path.exists():
+        return
+    state = AgentState(path)
+    known, name = state.fact("url"), state.fact("name")
+    state.close()
+    if known is not None and known != url:
+        raise InputError(
+            f"{folder} belongs to the robot {name!r} of {known}; give another folder for {url}"
+        )
 
 
 class Agent:
