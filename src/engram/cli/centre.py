@@ -216,7 +216,7 @@ def map_(
 ) -> None:
     """Make a map, or change how its hand-ins are merged.
 
-    What is not given stays as it was.
+    What is not given stays as it was; --set and --config give all settings of merging anew.
 
     \b
     Examples:

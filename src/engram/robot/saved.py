@@ -65,7 +65,6 @@ class Saving:
             case SavingState.SEALED:
                 return (
                     f"not committed, because the drive is unfit: {self.reason}; engram check "
-                    "--seal "
-                    "commits what was mapped anyway"
+                    "--seal commits what was mapped anyway"
                 )
         return f"saving is {self.state}"

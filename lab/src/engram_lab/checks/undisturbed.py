@@ -150,7 +150,7 @@ class Asked:
     """How much is asked for of each campaign.
 
     Attributes:
-        maps: how many maps.
+        maps: how many maps are drawn; one that is drawn twice counts once.
         drives: that each is built from.
         seed: of both.
     """
@@ -188,7 +188,7 @@ def _way(
     settings: Settings,
 ) -> Way:  # fmt: skip
     street = Street(path, mapped, live, settings, Budget().lost_rounds)
-    rng = np.random.default_rng([len(path.name), live.session.start_ns % 2**32])
+    rng = np.random.default_rng(live.session.start_ns)
     first = int(rng.integers(len(street.frames) // 2)) if start is Kind.COLD else 0
     try:
         return driven(street, start, first)
@@ -220,7 +220,9 @@ def main() -> None:
     """Runs the program."""
     parser = command_line(__doc__)
     parser.add_argument("campaigns", help="names, joined by commas")
-    parser.add_argument("--maps", type=int, default=8, help="of each campaign")
+    parser.add_argument(
+        "--maps", type=int, default=8, help="drawn of each campaign; one drawn twice counts once"
+    )
     parser.add_argument("--drives", type=int, default=3, help="that each map is built from")
     parser.add_argument("--seed", type=int, default=0, help="of the drives that are mapped")
     parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
