@@ -12,10 +12,22 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from engram.doctor import CHECKS, Diagnosis, DoctorConfig, Examination, Facts, Severity, diagnose
-from engram.doctor.sides import align, match_sides
+from engram.doctor import (
+    CHECKS,
+    Diagnosis,
+    DoctorConfig,
+    Evidence,
+    Examination,
+    Facts,
+    Severity,
+    diagnose,
+)
+from engram.doctor.checks.motion import scale_off
+from engram.doctor.checks.sides import frames_late, upright
+from engram.doctor.examination import Look
+from engram.doctor.sides import SideMatches, align, match_sides
 from engram.frontend import StereoPair
-from engram.geometry import SE3
+from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
 from engram.odometry import OutsideMotion
 from engram.robot import Front, Settings
@@ -169,6 +181,58 @@ def test_the_way_between_the_instants_of_left_and_right_is_measured(pairs) -> No
         found = align(match_sides(replace(pair, right=before.right)), pair.camera)
         ways += [] if found is None else [found.forward_m]
     assert np.median(ways) == pytest.approx(-0.8, abs=0.15)
+
+
+CAMERA = StereoCamera(400.0, 400.0, 255.5, 191.5, 0.2, 512, 384)
+
+
+def matched(points: np.ndarray, noise_px: float = 0.2) -> SideMatches:
+    """Matches of points (N, 3) in the camera's frame, metres."""
+    across, down, far = points.T
+    pixels = np.column_stack([across / far, down / far]) * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
+    shift = np.column_stack([CAMERA.fx * CAMERA.baseline_m / far, np.zeros(len(far))])
+    return SideMatches(pixels, shift + RNG.normal(0, noise_px, shift.shape))
+
+
+def test_a_road_without_a_match_in_the_lower_third_tells_up_from_down() -> None:
+    far = RNG.uniform(12, 40, 60)
+    height = np.where(np.arange(60) < 10, 1.5, RNG.uniform(-4, 1, 60))
+    seen = Evidence(DoctorConfig(), camera=CAMERA)
+    points = np.column_stack([RNG.uniform(-6, 6, 60), height, far])
+    seen.matches = [(k, matched(points)) for k in range(4)]
+    assert (upright(seen) or 0) > 0.5
+
+
+def test_one_wrong_match_is_no_way_forwards_and_no_misalignment() -> None:
+    far = np.column_stack([RNG.uniform(-20, 20, 40), RNG.uniform(-9, 2, 40), np.full(40, 60.0)])
+    sound = matched(far)
+    pixels = np.vstack([sound.pixels, [[300.0, 330.0]]])
+    wrong = SideMatches(pixels, np.vstack([sound.shift, [[60.0, -14.0]]]))
+    found = align(wrong, CAMERA)
+    assert found is not None
+    assert abs(found.forward_m) < max(4 * found.sigma_m, 0.05)
+    assert found.rms_px < 0.5
+
+
+@pytest.mark.parametrize(("late", "moved_m", "found"), [(0, 0.5, 0), (3, 0.5, 3), (3, 0.0, None)])
+def test_a_late_side_shows_in_the_rows_of_a_moving_robot(late: int, moved_m: float, found) -> None:
+    shown = np.cumsum(RNG.normal(0, 1, (30, 48)), axis=0).astype(np.float32)
+    seen = Evidence(DoctorConfig())
+    for k in range(24):
+        rows = shown[[k + late, k]] + RNG.normal(0, 0.5, (2, 48)).astype(np.float32)
+        seen.looks.append(Look((100, 100), 0, 0, (False, False), (40, 40), rows))
+        seen.stamps_ns.append(k * 10**8)
+        seen.first.append(k == 0)
+        seen.moved.append(SE3(np.eye(3), np.array([0, 0, moved_m])) if k else None)
+    assert frames_late(seen) == found
+
+
+@pytest.mark.parametrize(("sigma_m", "off"), [(0.02, 0.12), (0.3, 0.0)])
+def test_odometry_that_is_unsure_of_its_steps_tells_no_scale(sigma_m: float, off: float) -> None:
+    step, told = (SE3(np.eye(3), np.array([0, 0, one])) for one in (0.56, 0.5))
+    seen = Evidence(DoctorConfig(), moved=[step] * 24, outside=[told] * 24)
+    seen.sigma_m = [sigma_m] * 24
+    assert scale_off(seen) == pytest.approx(off)
 
 
 def test_an_unknown_hour_matters_where_missions_by_hour_need_it(pairs) -> None:

@@ -43,7 +43,7 @@ class Facts:
     bits: int | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Look:
     """What one pair looks like; left and right, each from every 64th pixel.
 
@@ -52,6 +52,7 @@ class Look:
         saturated, black: largest share of white and of black pixels.
         repeats: whether the image is exactly that of the pair before.
         contrast: standard deviations, grey levels.
+        rows: (2, R) float32, grey levels: mean of every eighth row, all its pixels.
     """
 
     brightness: tuple[float, float]
@@ -59,6 +60,7 @@ class Look:
     black: float
     repeats: tuple[bool, bool]
     contrast: tuple[float, float]
+    rows: NDArray[np.float32]
 
 
 @dataclass(slots=True)
@@ -74,6 +76,7 @@ class Evidence:
         statuses: of the frames.
         odometry: whether odometry measured the motion, or had none to measure.
         moved: `prev_from_curr`, None where it was not measured.
+        sigma_m: standard deviation of that, m; 0 where it was not measured.
         looks: of the images; empty for a frame log.
         disparity_px: median of the landmarks.
         sharpness: of every few pairs.
@@ -94,6 +97,7 @@ class Evidence:
     statuses: list[FrameStatus] = field(default_factory=list)
     odometry: list[bool] = field(default_factory=list)
     moved: list[SE3 | None] = field(default_factory=list)
+    sigma_m: list[float] = field(default_factory=list)
     looks: list[Look] = field(default_factory=list)
     disparity_px: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)
@@ -166,6 +170,8 @@ class Examination:
         step = motion.odometry
         seen.odometry.append(step.status in {OdometryStatus.OK, OdometryStatus.FIRST})
         seen.moved.append(step.prev_from_curr)
+        way = np.zeros((3, 3)) if step.covariance is None else step.covariance[:3, :3]
+        seen.sigma_m.append(float(np.sqrt(np.trace(way))))
         seen.outside.append(outside)
         disparity_px = frame.landmarks.disparity_px
         seen.disparity_px.append(float(np.median(disparity_px)) if len(disparity_px) else 0.0)
@@ -189,6 +195,7 @@ class Examination:
                 max(float((one <= _BLACK).mean()) for one in small),
                 (False, False) if last is None else _equal(small, last),
                 (float(small[0].std()), float(small[1].std())),
+                np.array([one[::_STEP].mean(1, np.float32) for one in (pair.left, pair.right)]),
             )
         )
         if number % self.evidence.config.every == 0:

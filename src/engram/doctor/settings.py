@@ -22,7 +22,7 @@ class DoctorConfig:
         least_frames: fewest frames of which anything is said.
         negative_share: largest share of left-right matches that lie to the right in the right
             image. Healthy drives stay below 0.2, swapped sides above 0.8.
-        upright: least logarithm of how much nearer the lower part of the image is than the upper.
+        upright: least logarithm of how much further up than down the scene reaches.
         forward_m: way between the instants of left and right image, metres.
         row_jump_px: scatter of the vertical offset from pair to pair, px.
         row_offset_px, slight_row_offset_px: vertical offset of left and right image, px, RMS over

@@ -34,7 +34,10 @@ _AGREE_PX = 1.5
 _LEAST_SCATTER_PX = 0.3
 _SAMPLES = 200
 _FURTHEST_M = 3.0
-_DAMPING = 1e-3
+# Of offset, roll, scale and way forwards; far points alone cannot tell the last two apart.
+_DAMPING = np.diag([0.05, 0.05, 0.5, 0.05])
+# A match that decides the fit by itself is likelier a wrong one.
+_MOST_LEVERAGE = 0.3
 _ROUNDS = 3
 
 
@@ -121,12 +124,13 @@ def align(matches: SideMatches, camera: StereoCamera, seed: int = 0) -> Alignmen
     nearness = (down * disparity - across * offset) / camera.baseline_m
     rows = np.column_stack([np.ones_like(across), across, down, -nearness])
     found = _consensus(rows, offset, np.random.default_rng(seed))
-    damping = _DAMPING * np.eye(4)
     for _ in range(_ROUNDS):
         agree = np.abs(offset - rows @ found) < _AGREE_PX
         if agree.sum() < max(_LEAST_MATCHES, _LEAST_SHARE * len(rows)):
             return None
-        normal = rows[agree].T @ rows[agree] + damping
+        normal = rows[agree].T @ rows[agree] + _DAMPING
+        agree &= np.sum(rows @ np.linalg.inv(normal) * rows, axis=1) < _MOST_LEVERAGE
+        normal = rows[agree].T @ rows[agree] + _DAMPING
         found = np.linalg.solve(normal, rows[agree].T @ offset[agree])
     scatter = max(float(np.std((offset - rows @ found)[agree])), _LEAST_SCATTER_PX)
     sigma = scatter * float(np.sqrt(np.linalg.inv(normal)[3, 3]))

@@ -79,6 +79,12 @@ CHECKS: tuple[Check, ...] = (
         explains=_CONSEQUENCES,
     ),
     Check(
+        "not_synchronised", _FATAL, sides.frames_late, 0, "frames",
+        "left and right are not synchronised: one shows what the other has shown before",
+        "pair the images by their time of exposure; look for a dropped frame",
+        explains=_CONSEQUENCES,
+    ),
+    Check(
         "not_synchronised", _FATAL, sides.forward_m, "forward_m", "m",
         "left and right are not synchronised: the robot moved between them",
         "trigger both cameras at once, or pair by the time of exposure; check for a dropped frame",
@@ -115,7 +121,7 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "upside_down", _WARNING, sides.upside_down, "upright", "",
-        "the camera hangs upside down: near things are above far ones",
+        "the camera hangs upside down: the scene ends above it like ground",
         "this works if all drives of the map are like this; otherwise turn the images",
         below=True,
     ),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from engram.doctor.examination import Evidence, Look
@@ -48,18 +50,26 @@ def frozen_frames(seen: Evidence) -> float | None:
 
 
 def scale_off(seen: Evidence) -> float | None:
-    """How far odometry's scale is from that of motion from outside, as a share."""
-    ratios: list[float] = []
-    measured, outside = SE3.identity(), SE3.identity()
-    for step, told in zip(seen.moved, seen.outside, strict=True):
+    """How far odometry's scale is from that of motion from outside, as a share.
+
+    0 within odometry's own standard deviation of a way: in rain its steps are uncertain, and short.
+    """
+    ways: list[tuple[float, float]] = []
+    nowhere = SE3.identity(), SE3.identity(), 0.0
+    measured, outside, variance = nowhere
+    for step, sigma_m, told in zip(seen.moved, seen.sigma_m, seen.outside, strict=True):
         if step is None or told is None:
-            measured, outside = SE3.identity(), SE3.identity()
+            measured, outside, variance = nowhere
             continue
-        measured, outside = measured @ step, outside @ told
+        measured, outside, variance = measured @ step, outside @ told, variance + sigma_m**2
         if outside.distance_m >= _WAY_M:
-            ratios.append(measured.distance_m / outside.distance_m)
-            measured, outside = SE3.identity(), SE3.identity()
-    return float(abs(np.median(ratios) - 1)) if len(ratios) >= _LEAST_WAYS else None
+            way_m = outside.distance_m
+            ways.append((measured.distance_m / way_m, math.sqrt(variance) / way_m))
+            measured, outside, variance = nowhere
+    if len(ways) < _LEAST_WAYS:
+        return None
+    ratio, sigma = np.median(ways, axis=0)
+    return float(abs(ratio - 1)) if abs(ratio - 1) > sigma else 0.0
 
 
 def _repeats(look: Look, side: int) -> bool:

@@ -12,11 +12,16 @@ _ALIGNED = 24
 _LEAST_PAIRS = 4
 # Disparities below this have no sign.
 _NO_DISPARITY_PX = 1.0
-# Part of the image, at its top and bottom, whose nearness is compared, and the share of its matches
-# that may be nearer: at the top the sky's edge is far, at the bottom all is road.
-_PART = 0.3
-_FAR_SHARE = 0.1
-_LEAST_IN_PART = 40
+# The scene reaches as far up, or down, as this share of the matches there; and the fewest of them.
+_REACH = 0.9
+_LEAST_REACHING = 20
+_LEAST_CLEAR = 80
+# Most frames that a side may be late, by how much the sides' changes then correlate better than
+# at once, and the fewest steps of a moving robot that tell.
+_MOST_LATE = 5
+_CLEARER = 0.25
+_LEAST_STEPS = 15
+_AT_REST_M = 0.02
 # A pair shows a way forwards beyond this many standard deviations.
 _SIGNIFICANT = 4.0
 
@@ -25,18 +30,21 @@ def negative_share(seen: Evidence) -> float | None:
     """Share of matches that lie further right in the right image."""
     disparity = _agreeing(seen)[:, 0]
     clear = disparity[np.abs(disparity) > _NO_DISPARITY_PX]
-    return float((clear < 0).mean()) if len(clear) >= 2 * _LEAST_IN_PART else None
+    return float((clear < 0).mean()) if len(clear) >= _LEAST_CLEAR else None
 
 
 def upright(seen: Evidence) -> float | None:
-    """Logarithm of how much nearer the lower part of the image is than the upper one."""
-    matches = _agreeing(seen)
-    near, rows = np.abs(matches[:, 0]), matches[:, 1]
-    top, bottom = near[rows < _PART], near[rows > 1 - _PART]
-    if min(len(top), len(bottom)) < _LEAST_IN_PART:
+    """Logarithm of how much further up than down the scene reaches, from the camera's axis.
+
+    The ground ends it below, in all light; above nothing does.
+    """
+    disparity, down = _agreeing(seen).T
+    # In baselines; far things count less, as their distance is uncertain.
+    reach = down / (np.abs(disparity) + _NO_DISPARITY_PX)
+    above, below = -reach[down < 0], reach[down > 0]
+    if min(len(above), len(below)) < _LEAST_REACHING:
         return None
-    far = [float(np.quantile(one, _FAR_SHARE)) + 1.0 for one in (bottom, top)]
-    return float(np.log(far[0] / far[1]))
+    return float(np.log(np.quantile(above, _REACH) / np.quantile(below, _REACH)))
 
 
 def swapped(seen: Evidence) -> float | None:
@@ -55,6 +63,27 @@ def upside_down(seen: Evidence) -> float | None:
     if negative is None or negative > seen.config.negative_share:
         return None
     return upright(seen)
+
+
+def frames_late(seen: Evidence) -> float | None:
+    """Frames by which one side shows what the other has shown before; 0 if both are at once.
+
+    What a moving robot sees in a row of the image changes in both sides alike, whatever the
+    disparities: the changes correlate best at the lag between the sides. In rain and in the dark,
+    too, where few corners match.
+    """
+    if not seen.looks or len(seen.looks) != len(seen):
+        return None
+    change = np.diff([one.rows for one in seen.looks], axis=0)
+    change -= change.mean(axis=2, keepdims=True)  # exposure
+    change[np.array(seen.first[1:], np.bool_) | (seen.moved_m[1:] < _AT_REST_M)] = 0
+    if np.count_nonzero(change.any(axis=(1, 2))) < _LEAST_STEPS:
+        return None
+    left, right = change.swapaxes(0, 1)
+    late = [_alike(left, right, lag) for lag in range(_MOST_LATE + 1)]
+    early = [_alike(right, left, lag) for lag in range(_MOST_LATE + 1)]
+    alike = np.maximum(late, early)
+    return float(alike.argmax()) if alike.max() > max(alike[0], 0) + _CLEARER else 0.0
 
 
 def forward_m(seen: Evidence) -> float | None:
@@ -93,18 +122,25 @@ def _if_upright(seen: Evidence, value: float | None, *, wanted: bool) -> float |
     return value if (way_up >= 0) is wanted else 0.0
 
 
+def _alike(ahead: Array, behind: Array, lag: int) -> float:
+    """Correlation of the changes of one side with those of the other some frames later."""
+    ahead, behind = ahead[: len(ahead) - lag], behind[lag:]
+    size = float(np.linalg.norm(ahead) * np.linalg.norm(behind))
+    return float((ahead * behind).sum()) / max(size, 1e-9)
+
+
 def _samples(seen: Evidence) -> list[SideMatches]:
     return [one for _, one in seen.matches]
 
 
 def _agreeing(seen: Evidence) -> Array:
-    """(M, 2) disparity, px, and row, as a share of the height, of matches that fit their pair."""
+    """(M, 2) px: disparity and rows below the principal point, of matches that fit their pair."""
     if seen.camera is None:
         return np.zeros((0, 2))
     parts = [np.zeros((0, 2))]
     for aligned, matches in zip(_alignments(seen), seen.aligned, strict=True):
-        rows = matches.pixels[aligned.agree, 1] / seen.camera.height
-        parts.append(np.column_stack([matches.shift[aligned.agree, 0], rows]))
+        down = matches.pixels[aligned.agree, 1] - seen.camera.cy
+        parts.append(np.column_stack([matches.shift[aligned.agree, 0], down]))
     return np.concatenate(parts)
 
 
