@@ -33,6 +33,7 @@ from engram.odometry import OutsideMotion
 from engram.robot import Front, Settings
 from engram.robot.examining import LookedAhead, stretches
 from engram.robot.front import stamp_of
+from engram.viewing.sides import side_picture
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
     Frozen,
@@ -233,6 +234,19 @@ def test_odometry_that_is_unsure_of_its_steps_tells_no_scale(sigma_m: float, off
     seen = Evidence(DoctorConfig(), moved=[step] * 24, outside=[told] * 24)
     seen.sigma_m = [sigma_m] * 24
     assert scale_off(seen) == pytest.approx(off)
+
+
+def test_a_picture_shows_in_red_what_is_wrong_and_no_chance_matches(pairs) -> None:
+    left, right = pairs[0].left.copy(), pairs[0].right.copy()
+    left[40:120, 300:460] = right[70:150, 700:860] = RNG.integers(0, 255, (80, 160))
+
+    def red(pair: StereoPair) -> bool:
+        return bool(
+            (side_picture(pair)[..., 2].astype(int) - side_picture(pair)[..., 0] > 99).any()
+        )
+
+    assert not red(replace(pairs[0], left=left, right=right))
+    assert red(exchanged(pairs[0]))
 
 
 def test_an_unknown_hour_matters_where_missions_by_hour_need_it(pairs) -> None:

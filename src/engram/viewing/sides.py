@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.doctor.sides import match_sides
+from engram.doctor.sides import align, match_sides
 from engram.frontend import StereoPair
 
 _LINES = 40
@@ -16,13 +16,17 @@ _GOOD, _BAD = (120, 220, 120), (70, 70, 255)
 
 
 def side_picture(pair: StereoPair) -> NDArray[np.uint8]:
-    """Left above right, (2h, w, 3) uint8 BGR; lines join what both show, red if that is wrong."""
-    matches = match_sides(pair)
-    height = pair.camera.height
+    """Left above right, (2h, w, 3) uint8 BGR; lines join what both show, red if that is wrong.
+
+    Matches that contradict the pair's alignment are left out, as the doctor leaves them out.
+    """
+    matches, height = match_sides(pair), pair.camera.height
+    aligned = align(matches, pair.camera)
+    kept = np.arange(len(matches)) if aligned is None else np.flatnonzero(aligned.agree)
     both = np.concatenate([pair.left, pair.right])
     picture = cv2.cvtColor(both, cv2.COLOR_GRAY2BGR)
-    chosen = np.linspace(0, len(matches) - 1, min(_LINES, len(matches))).astype(int)
-    for k in chosen.tolist():
+    chosen = np.linspace(0, len(kept) - 1, min(_LINES, len(kept))).astype(int)
+    for k in kept[chosen].tolist():
         pixel, shift = matches.pixels[k], matches.shift[k]
         bad = abs(shift[1]) > _OFF_PX or shift[0] < -_OFF_PX
         right = pixel - shift + [0, height]
