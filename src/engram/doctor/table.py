@@ -130,7 +130,7 @@ CHECKS: tuple[Check, ...] = (
         "focal length or baseline is wrong: the distance by odometry differs from the one "
         "measured outside",
         "calibrate again; check the baseline with a ruler",
-        needs="motion from outside: --motion TOPIC or FILE",
+        needs="motion from outside, --motion TOPIC or FILE, and odometry that is sure of its steps",
     ),
     Check(
         "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",

@@ -52,7 +52,7 @@ def frozen_frames(seen: Evidence) -> float | None:
 def scale_off(seen: Evidence) -> float | None:
     """How far odometry's scale is from that of motion from outside, as a share.
 
-    0 within odometry's own standard deviation of a way: in rain its steps are uncertain, and short.
+    None where odometry is less sure of a way than that: in rain its steps are uncertain, and short.
     """
     ways: list[tuple[float, float]] = []
     nowhere = SE3.identity(), SE3.identity(), 0.0
@@ -69,7 +69,8 @@ def scale_off(seen: Evidence) -> float | None:
     if len(ways) < _LEAST_WAYS:
         return None
     ratio, sigma = np.median(ways, axis=0)
-    return float(abs(ratio - 1)) if abs(ratio - 1) > sigma else 0.0
+    off = float(abs(ratio - 1))
+    return off if max(off, seen.config.scale) > sigma else None
 
 
 def _repeats(look: Look, side: int) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import compress
+
 import numpy as np
 
 from engram.doctor.examination import Array, Evidence
 from engram.doctor.sides import Alignment, SideMatches, align, rows_off
+from engram.geometry import SE3
 
 # Pairs whose alignment is worked out: more add nothing.
 _ALIGNED = 24
@@ -68,15 +71,19 @@ def upside_down(seen: Evidence) -> float | None:
 def frames_late(seen: Evidence) -> float | None:
     """Frames by which one side shows what the other has shown before; 0 if both are at once.
 
-    What a moving robot sees in a row of the image changes in both sides alike, whatever the
+    What a robot that drives sees in a row of the image changes in both sides alike, whatever the
     disparities: the changes correlate best at the lag between the sides. In rain and in the dark,
-    too, where few corners match.
+    too, where few corners match. Not at rest, nor while a camera looks sideways: there one side
+    comes to where the other was a moment before.
     """
     if not seen.looks or len(seen.looks) != len(seen):
         return None
+    rests = seen.moved_m < _AT_REST_M
+    if sum(map(_aside, compress(seen.moved, ~rests))) > 0.5 * np.count_nonzero(~rests):
+        return None
     change = np.diff([one.rows for one in seen.looks], axis=0)
     change -= change.mean(axis=2, keepdims=True)  # exposure
-    change[np.array(seen.first[1:], np.bool_) | (seen.moved_m[1:] < _AT_REST_M)] = 0
+    change[np.array(seen.first[1:], np.bool_) | rests[1:]] = 0
     if np.count_nonzero(change.any(axis=(1, 2))) < _LEAST_STEPS:
         return None
     left, right = change.swapaxes(0, 1)
@@ -120,6 +127,10 @@ def _if_upright(seen: Evidence, value: float | None, *, wanted: bool) -> float |
     if value is None or way_up is None:
         return value if wanted else None
     return value if (way_up >= 0) is wanted else 0.0
+
+
+def _aside(moved: SE3 | None) -> bool:
+    return moved is not None and bool(abs(moved.translation[0]) > abs(moved.translation[2]))
 
 
 def _alike(ahead: Array, behind: Array, lag: int) -> float:
