@@ -86,7 +86,6 @@ class Evidence:
         bad: why other pairs were left out: an image is missing, unreadable or of another size.
         outside: each step as measured by wheels or another source; None where it was not.
         alignments: of some pairs, worked out once at the end; None before.
-        aligned: the matches of those pairs.
     """
 
     config: DoctorConfig
@@ -107,7 +106,6 @@ class Evidence:
     bad: list[str] = field(default_factory=list)
     outside: list[SE3 | None] = field(default_factory=list)
     alignments: list[Alignment] | None = None
-    aligned: list[SideMatches] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

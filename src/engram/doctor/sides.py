@@ -93,14 +93,14 @@ class Alignment:
         slope_px: (2,) change of that over the width and the height of the image: roll and scale.
         forward_m: way forwards from where the left image was taken to where the right one was.
         sigma_m: standard deviation of that.
-        agree: (M,) bool, which matches agree.
+        agreeing: the matches that agree.
     """
 
     offset_px: float
     slope_px: tuple[float, float]
     forward_m: float
     sigma_m: float
-    agree: NDArray[np.bool_]
+    agreeing: SideMatches
 
     @property
     def rms_px(self) -> float:
@@ -138,7 +138,8 @@ def align(matches: SideMatches, camera: StereoCamera, seed: int = 0) -> Alignmen
         float(found[1]) * camera.width / camera.fx,
         float(found[2]) * camera.height / camera.fy,
     )
-    return Alignment(float(found[0]), slope_px, float(found[3]), sigma, agree)
+    agreeing = SideMatches(matches.pixels[agree], matches.shift[agree])
+    return Alignment(float(found[0]), slope_px, float(found[3]), sigma, agreeing)
 
 
 def _consensus(rows: Array, values: Array, rng: np.random.Generator) -> Array:

@@ -22,11 +22,11 @@ def side_picture(pair: StereoPair) -> NDArray[np.uint8]:
     """
     matches, height = match_sides(pair), pair.camera.height
     aligned = align(matches, pair.camera)
-    kept = np.arange(len(matches)) if aligned is None else np.flatnonzero(aligned.agree)
+    matches = matches if aligned is None else aligned.agreeing
     both = np.concatenate([pair.left, pair.right])
     picture = cv2.cvtColor(both, cv2.COLOR_GRAY2BGR)
-    chosen = np.linspace(0, len(kept) - 1, min(_LINES, len(kept))).astype(int)
-    for k in kept[chosen].tolist():
+    chosen = np.linspace(0, len(matches) - 1, min(_LINES, len(matches))).astype(int)
+    for k in chosen.tolist():
         pixel, shift = matches.pixels[k], matches.shift[k]
         bad = abs(shift[1]) > _OFF_PX or shift[0] < -_OFF_PX
         right = pixel - shift + [0, height]

@@ -7,7 +7,7 @@ from itertools import compress
 import numpy as np
 
 from engram.doctor.examination import Array, Evidence
-from engram.doctor.sides import Alignment, SideMatches, align, rows_off
+from engram.doctor.sides import Alignment, align, rows_off
 from engram.geometry import SE3
 
 # Pairs whose alignment is worked out: more add nothing.
@@ -52,12 +52,12 @@ def upright(seen: Evidence) -> float | None:
 
 def swapped(seen: Evidence) -> float | None:
     """The share of negative disparities, if the images are not upside down."""
-    return _if_upright(seen, negative_share(seen), wanted=True)
+    return 0.0 if (upright(seen) or 0) < 0 else negative_share(seen)
 
 
 def rotated(seen: Evidence) -> float | None:
     """The share of negative disparities, if the images are upside down."""
-    return _if_upright(seen, negative_share(seen), wanted=False)
+    return negative_share(seen) if (upright(seen) or 0) < 0 else 0.0
 
 
 def upside_down(seen: Evidence) -> float | None:
@@ -119,14 +119,7 @@ def row_offset_px(seen: Evidence) -> float | None:
     if seen.camera is None or jump is None or jump > seen.config.row_jump_px:
         return None
     whole = float(np.median([one.rms_px for one in _alignments(seen)]))
-    return max(whole, rows_off(_samples(seen), seen.camera) or 0.0)
-
-
-def _if_upright(seen: Evidence, value: float | None, *, wanted: bool) -> float | None:
-    way_up = upright(seen)
-    if value is None or way_up is None:
-        return value if wanted else None
-    return value if (way_up >= 0) is wanted else 0.0
+    return max(whole, rows_off([one for _, one in seen.matches], seen.camera) or 0.0)
 
 
 def _aside(moved: SE3 | None) -> bool:
@@ -140,19 +133,12 @@ def _alike(ahead: Array, behind: Array, lag: int) -> float:
     return float((ahead * behind).sum()) / max(size, 1e-9)
 
 
-def _samples(seen: Evidence) -> list[SideMatches]:
-    return [one for _, one in seen.matches]
-
-
 def _agreeing(seen: Evidence) -> Array:
     """(M, 2) px: disparity and rows below the principal point, of matches that fit their pair."""
-    if seen.camera is None:
-        return np.zeros((0, 2))
-    parts = [np.zeros((0, 2))]
-    for aligned, matches in zip(_alignments(seen), seen.aligned, strict=True):
-        down = matches.pixels[aligned.agree, 1] - seen.camera.cy
-        parts.append(np.column_stack([matches.shift[aligned.agree, 0], down]))
-    return np.concatenate(parts)
+    middle = 0.0 if seen.camera is None else seen.camera.cy
+    parts = [one.agreeing for one in _alignments(seen)]
+    both = [np.column_stack([one.shift[:, 0], one.pixels[:, 1] - middle]) for one in parts]
+    return np.concatenate([np.zeros((0, 2)), *both])
 
 
 def _alignments(seen: Evidence) -> list[Alignment]:
@@ -161,7 +147,6 @@ def _alignments(seen: Evidence) -> list[Alignment]:
         return []
     if seen.alignments is None:
         at = np.unique(np.linspace(0, len(seen.matches) - 1, _ALIGNED).round().astype(int))
-        tried = [(align(seen.matches[k][1], seen.camera, seed=int(k)), k) for k in at]
-        seen.aligned = [seen.matches[k][1] for one, k in tried if one is not None]
-        seen.alignments = [one for one, _ in tried if one is not None]
+        tried = [align(seen.matches[k][1], seen.camera, seed=int(k)) for k in at]
+        seen.alignments = [one for one in tried if one is not None]
     return seen.alignments
