@@ -120,9 +120,16 @@ def check_bounds(config: Any) -> None:
         value = getattr(config, one.name)
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"{_prose(kind)}: {one.name} is {value}, must be finite")
-        for bound in getattr(hints[one.name], "__metadata__", ()):
+        for bound in _bounds(hints[one.name]):
             if value is not None and (says := _broken(value, bound)):
                 raise ConfigError(f"{_prose(kind)}: {one.name} is {value}, must be {says}")
+
+
+def _bounds(hint: Any) -> tuple[Any, ...]:
+    """What is declared of a field, or of what it is unless it is None."""
+    if typing.get_origin(hint) in {typing.Union, types.UnionType}:
+        hint = hint.__args__[0]
+    return getattr(hint, "__metadata__", ())
 
 
 @functools.cache

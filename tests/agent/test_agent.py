@@ -10,7 +10,8 @@ from engram.agent.agent import enrol
 from engram.agent.link import CentreRefusedError, Unreachable
 from engram.centre.backup import back_up
 from engram.centre.worker import merging
-from engram.errors import InputError, StorageFullError
+from engram.config import load_toml
+from engram.errors import ConfigError, InputError, StorageFullError
 from engram.maps import Map
 
 
@@ -167,3 +168,15 @@ def test_what_the_centre_cannot_make_is_told_apart_from_a_broken_link(site):
         wrong.state.remember(staged=None)
         wrong.step()
         assert isinstance(wrong.trouble, CentreRefusedError)
+
+
+def test_settings_of_an_agent_are_read_from_a_file():
+    text = "bytes_per_s = 250000\n[download]\npolicy = 'budget'\nbudget_bytes = 1\n"
+    read = load_toml(text, AgentSettings)
+    assert (read.bytes_per_s, read.download["policy"]) == (250_000.0, "budget")
+    for wrong in (
+        lambda: load_toml("bytes_per_s = -1", AgentSettings),
+        lambda: AgentSettings(bytes_per_s=-1.0),
+    ):
+        with pytest.raises(ConfigError, match="bytes_per_s"):
+            wrong()

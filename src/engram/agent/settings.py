@@ -19,7 +19,7 @@ class AgentSettings:
     """
 
     download: dict[str, Any] = field(default_factory=dict)
-    bytes_per_s: Annotated[float | None, Meta(gt=0, description="of the link; null: all")] = None
+    bytes_per_s: Annotated[float, Meta(gt=0, description="of the link; none: all")] | None = None
     outbox_bytes: Annotated[
         int, Meta(ge=0, description="disk for hand-ins that the centre has not kept yet, bytes")
     ] = 10 * 2**30

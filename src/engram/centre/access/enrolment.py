@@ -32,7 +32,7 @@ def new_code(centre: Centre, name: str, follows: str, by: str) -> str:
     """
     centre.map_path(name)
     check_followed(follows)
-    code = secrets.token_urlsafe(12)
+    code = secrets.token_hex(12)  # on a command line: a first - would be an option
     now = centre.now_ns()
     with centre.database.writing() as connection:
         row = {
