@@ -284,7 +284,7 @@ class SqliteFile:
         primary, noun = code & 0xFF, self.kind.noun
         error: type[EngramError] = MapError
         fact = f"cannot be read or written: {cause}"
-        if code in _FULL:
+        if is_full(cause):
             error = StorageFullError
             fact = (
                 f"cannot grow ({cause}); free some space or raise the limit and try again: "
@@ -309,6 +309,11 @@ class SqliteFile:
     @staticmethod
     def _pragma(execute: Execute, name: str) -> int:
         return int(execute(f"PRAGMA {name}").fetchone()[0])
+
+
+def is_full(cause: object) -> bool:
+    """Whether an error of SQLite means that no space is left."""
+    return getattr(cause, "sqlite_errorcode", 0) in _FULL
 
 
 class _FileDialect(SQLiteDialect_pysqlite):

@@ -10,7 +10,7 @@ from typing import Any, TypedDict, get_type_hints
 import msgspec
 from sqlalchemy import delete, select, update
 
-from engram.centre.errors import ConflictError, UnknownError
+from engram.centre.errors import ConflictError, StoreError, UnknownError
 from engram.centre.keeping import ASKED, FAILED, READY
 from engram.centre.refs import Refs
 from engram.centre.service import Centre
@@ -21,7 +21,7 @@ from engram.centre.store.packs import PACK_BYTES
 from engram.centre.store.schema import artifact_grants, artifacts
 from engram.centre.store.waking import ring
 from engram.config import to_dict
-from engram.errors import ConfigError, EngramError
+from engram.errors import ConfigError, EngramError, StorageFullError
 from engram.fleet.download import DownloadOptions, download
 from engram.transfers import Manifest, PartHash, split
 from engram.transfers.join import blobs_named
@@ -148,9 +148,15 @@ class Downloads:
             self._centre.objects.delete(f"artifacts/{row['map']}/{row['id']}.engram")
 
     def make(self, row: dict[str, Any]) -> None:
-        """Makes an artifact; done twice, or half done before, it is the same."""
+        """Makes an artifact; done twice, or half done before, it is the same.
+
+        Raises:
+            StorageFullError, StoreError: the centre has no room for it now, and makes it later.
+        """
         try:
             change = self._made(row)
+        except (StorageFullError, StoreError):
+            raise
         except EngramError as error:
             change = {"state": FAILED, "error": self._centre.words_of(error)}
         with self._centre.database.writing() as connection:

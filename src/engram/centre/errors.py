@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from engram.errors import EngramError
+from engram.errors import EngramError, MapError
 
 
 class CentreError(EngramError):
@@ -59,3 +59,14 @@ class QuotaError(CentreError):
 
     status = 429
     title = "More than is granted"
+
+
+class TooLargeError(CentreError):
+    """More than is ever taken."""
+
+    status = 413
+    title = "Too large"
+
+
+class StoreError(MapError):
+    """The centre's own database or objects cannot be read or written now: try again later."""

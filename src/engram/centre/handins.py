@@ -28,6 +28,8 @@ from engram.transfers import Manifest, PartHash, WireManifest
 from engram.transfers.manifest import decode_manifest, encode_manifest
 from engram.transfers.pages import decode_page
 
+_LONGEST_PROGRESS = 300
+
 
 def handin_id(name: str, robot: str, manifest: str) -> str:
     """The name of a hand-in, which both sides know without asking."""
@@ -288,12 +290,11 @@ class HandIns:
                 update(handins).where(handins.c.id == row["id"]).values(tries=handins.c.tries + 1)
             )
 
-    def put_off(self, row: dict[str, Any]) -> None:
+    def put_off(self, row: dict[str, Any], why: str) -> None:
         """Takes back a try that found no room or no free lock: it is no fault of the hand-in."""
+        change = {"tries": row["tries"], "progress": f"waits: {why}"[:_LONGEST_PROGRESS]}
         with self._centre.database.writing() as connection:
-            connection.execute(
-                update(handins).where(handins.c.id == row["id"]).values(tries=row["tries"])
-            )
+            connection.execute(update(handins).where(handins.c.id == row["id"]).values(**change))
 
     def heartbeat(self, key: str, progress: str) -> bool:
         """Notes how far a job is; whether it is to be cancelled."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import URL, select
 
 from engram.centre.errors import UnknownError
 from engram.centre.resident import ResidentMaps
@@ -79,7 +79,7 @@ class Centre:
         settings: CentreSettings | None = None,
         clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        self.folder = folder
+        self.folder = folder.resolve()  # as maps name it in what their errors say
         try:
             for name in ("maps", "objects", "work"):
                 (folder / name).mkdir(parents=True, exist_ok=True)
@@ -88,9 +88,10 @@ class Centre:
         self.settings = settings or CentreSettings()
         self.now_ns = clock
         self.addresses = (database, objects)
-        self.database = ServiceDatabase(database or f"sqlite:///{folder / 'centre.sqlite'}")
+        here = URL.create("sqlite", database=str(self.folder / "centre.sqlite"))
+        self.database = ServiceDatabase(database or here)
         self.objects: Objects = (
-            FolderObjects(folder / "objects") if objects is None else BucketObjects(objects)
+            FolderObjects(self.folder / "objects") if objects is None else BucketObjects(objects)
         )
         self._packs: dict[str, Packs] = {}
         self._resident = ResidentMaps()

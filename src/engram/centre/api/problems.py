@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from engram.centre.api.models import Problem
-from engram.centre.errors import CentreError
+from engram.centre.errors import CentreError, StoreError
 from engram.errors import (
     EngramError,
     IncompatibleError,
@@ -36,6 +36,7 @@ _STATUS: tuple[tuple[type[EngramError], int], ...] = (
     (RevisionError, 404),
     (IncompatibleError, 409),
     (StorageFullError, 507),
+    (StoreError, 503),
     (InputError, 422),
 )
 

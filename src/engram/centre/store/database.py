@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from sqlalchemy import (
+    URL,
     Connection,
     Engine,
     Select,
@@ -25,12 +26,15 @@ from sqlalchemy.dialects.postgresql import insert as insert_postgresql
 from sqlalchemy.dialects.sqlite import insert as insert_sqlite
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
+from engram.centre.errors import StoreError
 from engram.centre.store.schema import VERSION, centre, metadata
-from engram.errors import FormatVersionError, InputError, MapError, MissingExtraError
+from engram.errors import FormatVersionError, InputError, MissingExtraError, StorageFullError
+from engram.sqlite import is_full
 
 _BUSY_S = 30.0
 # One writer at a time on PostgreSQL too: numbers of the audit and of completion have no gaps.
 _WRITERS = 0x456E6772
+_DISK_FULL = "53100"  # of PostgreSQL
 
 
 class ServiceDatabase:
@@ -42,10 +46,10 @@ class ServiceDatabase:
     Raises:
         InputError: the address is not one.
         FormatVersionError: a newer Engram wrote it.
-        MapError: it cannot be reached.
+        StoreError: it cannot be reached.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str | URL) -> None:
         self._engine = _engine(url)
         self._sqlite = self._engine.dialect.name == "sqlite"
         # Threads queue here: those that SQLite turns away sleep ever longer, and starve.
@@ -70,7 +74,8 @@ class ServiceDatabase:
 
         Raises:
             InputError: a value that no table takes.
-            MapError: the database cannot be written to.
+            StorageFullError: no space is left for it.
+            StoreError: the database cannot be written to.
         """
         with self._turn, _errors(), self._engine.connect() as connection:
             if self._sqlite:
@@ -162,7 +167,7 @@ class _SharedSync:
         """Returns once all that was committed before the call is on the disk.
 
         Raises:
-            MapError: the disk does not take it.
+            StoreError: the disk does not take it.
         """
         with self._count:
             self._asked += 1
@@ -174,7 +179,8 @@ class _SharedSync:
             try:
                 self._sync_file()
             except OSError as error:
-                raise MapError(f"the centre's database: {self._path}: {error.strerror}") from error
+                fact = f"the centre's database: {self._path}: {error.strerror}"
+                raise StoreError(fact) from error
             self._done = served
 
     def _sync_file(self) -> None:
@@ -188,7 +194,7 @@ class _SharedSync:
             os.close(file)
 
 
-def _engine(url: str) -> Engine:
+def _engine(url: str | URL) -> Engine:
     try:
         engine = create_engine(url, pool_size=8, max_overflow=-1)
     except ArgumentError as error:
@@ -216,4 +222,6 @@ def _errors() -> Iterator[None]:
     except DataError as error:  # a NUL, or a number beyond 64 bits, which no column takes
         raise InputError(f"a value that no table takes: {error.orig}") from error
     except DBAPIError as error:
-        raise MapError(f"the centre's database: {error.orig}") from error
+        full = is_full(error.orig) or getattr(error.orig, "sqlstate", None) == _DISK_FULL
+        kind = StorageFullError if full else StoreError
+        raise kind(f"the centre's database: {error.orig}") from error

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
-from engram.errors import MapError, MissingExtraError
+from engram.centre.errors import StoreError
+from engram.errors import MapError, MissingExtraError, storage_full
 from engram.monitor import write_whole
 
 
@@ -15,7 +17,12 @@ class Objects(Protocol):
     """Immutable objects by key. A key is written once, or again with the same content."""
 
     def put(self, key: str, body: bytes) -> None:
-        """Stores an object, durable when it returns."""
+        """Stores an object, durable when it returns.
+
+        Raises:
+            StorageFullError: no space is left.
+            StoreError: it cannot be stored now.
+        """
         ...
 
     def put_file(self, key: str, path: Path) -> None:
@@ -51,20 +58,26 @@ class FolderObjects:
 
     def put(self, key: str, body: bytes) -> None:
         """See `Objects`."""
-        path = self._path(key)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with write_whole(path) as draft:
+        with self._storing(key) as draft:
             draft.write_bytes(body)
-        sync_folder(path.parent)
 
     def put_file(self, key: str, path: Path) -> None:
         """See `Objects`."""
-        target = self._path(key)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with write_whole(target) as draft, path.open("rb") as source, draft.open("wb") as copy:
+        with self._storing(key) as draft, path.open("rb") as source, draft.open("wb") as copy:
             while piece := source.read(2**20):
                 copy.write(piece)
-        sync_folder(target.parent)
+
+    @contextmanager
+    def _storing(self, key: str) -> Iterator[Path]:
+        path = self._path(key)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with write_whole(path) as draft:
+                yield draft
+            sync_folder(path.parent)
+        except OSError as error:
+            full = storage_full(error, f"object {key}")
+            raise full or StoreError(f"object {key} cannot be kept: {error.strerror}") from error
 
     def get(self, key: str, start: int = 0, size: int | None = None) -> bytes:
         """See `Objects`."""
@@ -111,39 +124,50 @@ class BucketObjects:
             ) from error
         self._store = from_url(url)
 
+    @contextmanager
+    def _errors(self, key: str) -> Iterator[None]:
+        from obstore.exceptions import BaseError
+
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise MapError(f"object {key} is missing") from error
+        except BaseError as error:
+            raise StoreError(f"object {key}: the bucket does not answer well: {error}") from error
+
     def put(self, key: str, body: bytes) -> None:
         """See `Objects`."""
-        self._store.put(key, body)
+        with self._errors(key):
+            self._store.put(key, body)
 
     def put_file(self, key: str, path: Path) -> None:
         """See `Objects`."""
-        self._store.put(key, path)
+        with self._errors(key):
+            self._store.put(key, path)
 
     def get(self, key: str, start: int = 0, size: int | None = None) -> bytes:
         """See `Objects`."""
-        try:
+        with self._errors(key):
             if size is None:
                 return bytes(self._store.get(key).bytes())[start:]
             return bytes(self._store.get_range(key, start=start, length=size)) if size else b""
-        except FileNotFoundError as error:
-            raise MapError(f"object {key} is missing") from error
 
     def size(self, key: str) -> int:
         """See `Objects`."""
-        try:
+        with self._errors(key):
             return int(self._store.head(key)["size"])
-        except FileNotFoundError as error:
-            raise MapError(f"object {key} is missing") from error
 
     def delete(self, key: str) -> None:
         """See `Objects`."""
-        self._store.delete(key)
+        with self._errors(key):
+            self._store.delete(key)
 
     def keys(self, prefix: str) -> Iterator[str]:
         """See `Objects`."""
-        for some in self._store.list(prefix):
-            for one in some:
-                yield str(one["path"])
+        with self._errors(prefix):
+            for some in self._store.list(prefix):
+                for one in some:
+                    yield str(one["path"])
 
 
 def sync_folder(folder: Path) -> None:

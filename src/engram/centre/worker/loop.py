@@ -2,34 +2,49 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 
 from engram.centre.downloads import Downloads
 from engram.centre.handins import HandIns
 from engram.centre.service import Centre
 from engram.centre.worker.dreaming import dream_a_while
-from engram.centre.worker.merging import merge_hand_in
+from engram.centre.worker.merging import WaitsError, merge_hand_in
 from engram.centre.worker.sweeping import sweep_all
+from engram.errors import EngramError
 
+_log = logging.getLogger(__name__)
+# A full disk takes a person: until then the same job is not tried four times a second.
+_AGAIN_S = 10.0
 _HOUR_NS = 3_600_000_000_000
 
 
 def work_off(centre: Centre) -> int:
-    """Does what there is to do; returns the number of settled jobs."""
+    """Does what there is to do; returns the number of settled jobs.
+
+    Raises:
+        EngramError: what hinders the centre; of each map, after all of them had their turn. Jobs
+            wait.
+    """
     downloads, handins = Downloads(centre), HandIns(centre)
-    settled = 0
+    settled, hindered = 0, []
     handins.expire()
     downloads.expire()
     for name in centre.map_names():
         if not handins.waiting(name):
             continue
-        with centre.lane(name) as is_ours:
-            for row in handins.waiting(name) if is_ours else ():
-                settled += _make_downloads(downloads)
-                if not merge_hand_in(centre, row):
-                    break  # somebody writes to this map by hand
-                settled += 1
-    return settled + _make_downloads(downloads)
+        try:
+            with centre.lane(name) as is_ours:
+                for row in handins.waiting(name) if is_ours else ():
+                    settled += _make_downloads(downloads)
+                    merge_hand_in(centre, row)
+                    settled += 1
+        except WaitsError as error:  # the next map may have its disk and its drives
+            hindered.append(error)
+    settled += _make_downloads(downloads)
+    if hindered:
+        raise hindered[0]
+    return settled
 
 
 def work(
@@ -48,14 +63,19 @@ def work(
     """
     swept_ns = 0
     while not stopped():
-        if work_off(centre):
-            continue
-        if centre.now_ns() - swept_ns >= centre.settings.sweep_h * _HOUR_NS:
-            swept_ns = centre.now_ns()
-            sweep_all(centre)
-        if dream_a_while(centre, wait, stopped, scheduler):
-            continue
-        wait(centre.settings.poll_s)
+        try:
+            if work_off(centre):
+                continue
+            if centre.now_ns() - swept_ns >= centre.settings.sweep_h * _HOUR_NS:
+                swept_ns = centre.now_ns()
+                sweep_all(centre)
+            if dream_a_while(centre, wait, stopped, scheduler):
+                continue
+        except (EngramError, OSError) as error:
+            _log.error("%s; tried again in %g s", centre.words_of(error), _AGAIN_S)
+            wait(_AGAIN_S)
+        else:
+            wait(centre.settings.poll_s)
 
 
 def _make_downloads(downloads: Downloads) -> int:

@@ -12,29 +12,44 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from engram.centre.errors import StoreError
 from engram.centre.handins import HandIns, MissingPartsError
 from engram.centre.keeping import HandInState
 from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
 from engram.centre.worker.admission import admit
 from engram.centre.worker.watching import Watching
-from engram.errors import EngramError, MapLockedError, RefusedError, StorageFullError
+from engram.errors import (
+    EngramError,
+    MapLockedError,
+    RefusedError,
+    SequenceError,
+    StorageFullError,
+)
 from engram.fleet.merge import MergeReport, merge
 from engram.maps import Map
 from engram.robot import Settings
 
+# A held-out drive that cannot be read is a SequenceError: robots hand in no drives.
+_OF_THE_CENTRE = (StorageFullError, StoreError, MapLockedError, SequenceError)
 
-def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
+
+class WaitsError(EngramError):
+    """A hand-in waits for the centre."""
+
+
+def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
     """Merges one complete hand-in.
 
-    Returns:
-        Whether it is settled; False if another worker has the map.
+    Raises:
+        EngramError: what lies with the centre, and not with the hand-in, which waits: no space, a
+            map that somebody writes to, a held-out drive that is gone.
     """
     handins = HandIns(centre)
     if row["tries"] >= centre.settings.merge_tries:
-        fact = f"its worker died {row['tries']} times"
+        fact = f"its worker died {row['tries']} times; an operator may have it merged anyway"
         handins.end(row, HandInState.FAILED, error=fact)
-        return True
+        return
     handins.begun(row)
     thin = centre.folder / "work" / f"{row['id']}.engram"
     try:
@@ -45,9 +60,10 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
         handins.end(row, HandInState.OPEN)
     except RefusedError as error:
         handins.end(row, HandInState.REFUSED, error=centre.words_of(error))
-    except (MapLockedError, StorageFullError):
-        handins.put_off(row)
-        return False
+    except (*_OF_THE_CENTRE, OSError) as error:
+        fact = centre.words_of(error)
+        handins.put_off(row, fact)
+        raise WaitsError(f"{row['map']}: hand-in {row['id'][:8]} waits: {fact}") from error
     except KeyboardInterrupt:
         if not handins.get(row["id"])["cancelled"]:
             raise
@@ -56,7 +72,6 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> bool:
         handins.end(row, HandInState.FAILED, error=centre.words_of(error))
     else:
         _settle(centre, handins, row, outcome)
-    return True
 
 
 def _admit(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> None:

@@ -1,0 +1,135 @@
+"""A centre that is hindered, by a full disk say: jobs wait, nothing is refused, it says why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from engram.centre import downloads
+from engram.centre.handins import HandIns
+from engram.centre.service import Centre
+from engram.centre.store.database import _errors
+from engram.centre.worker import loop, merging
+from engram.errors import EngramError, MapCorruptError, StorageFullError
+
+from .conftest import NAME, POLICY, drive
+
+pytestmark = pytest.mark.usefixtures("in_process")
+
+
+def handed(site) -> dict:
+    """A complete hand-in."""
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    agent.step()
+    return HandIns(site.centre).waiting(NAME)[0]
+
+
+def full(*_, **__):
+    raise StorageFullError("no space is left")
+
+
+def test_a_hand_in_waits_for_a_full_disk_and_says_so(site, monkeypatch):
+    row = handed(site)
+    with monkeypatch.context() as patch:
+        patch.setattr(merging, "merge", full)
+        for _ in range(site.centre.settings.merge_tries + 1):
+            with pytest.raises(EngramError, match=r"fleet: hand-in .* waits: no space is left"):
+                site.work()
+    row = HandIns(site.centre).get(row["id"])
+    assert (row["state"], row["progress"]) == ("complete", "waits: no space is left")
+    site.settle()
+    assert HandIns(site.centre).get(row["id"])["state"] == "merged"
+
+
+def test_a_held_out_drive_that_is_gone_refuses_no_hand_in(site, tmp_path):
+    row = handed(site)
+    gone = replace(POLICY, gate=(str(tmp_path / "gone.framelog"),))
+    site.centre.set_policy(NAME, gone, "tests")
+    with pytest.raises(EngramError, match=r"gone\.framelog"):
+        site.work()
+    site.centre.set_policy(NAME, POLICY, "tests")
+    site.work()
+    assert HandIns(site.centre).get(row["id"])["state"] == "merged"
+
+
+def test_a_map_that_is_hindered_hinders_no_other(site, monkeypatch):
+    handed(site)
+    merged = []
+
+    def of_one(centre, row):
+        if row["map"] == NAME:
+            raise merging.WaitsError("its disk is full")
+        merged.append(row["map"])
+
+    monkeypatch.setattr(loop, "merge_hand_in", of_one)
+    site.centre.add_map("town", "tests", POLICY)
+    monkeypatch.setattr(HandIns, "waiting", lambda _, name: [{"map": name}])
+    with pytest.raises(merging.WaitsError):
+        site.work()
+    assert merged == ["town"]
+
+
+def test_a_download_is_made_when_there_is_room_again(site, monkeypatch):
+    handed(site)
+    site.work()
+    robot = site.robot("r2")
+    robot.step()
+    with monkeypatch.context() as patch:
+        patch.setattr(downloads, "download", full)
+        with pytest.raises(StorageFullError):
+            site.work()
+    site.settle()
+    assert robot.status()["staged"] is not None
+
+
+def test_a_worker_goes_on_after_what_hindered_it_and_tells_it(site, monkeypatch, caplog):
+    row, waits = handed(site), []
+    monkeypatch.setattr(merging, "merge", full)
+
+    def wait(seconds):
+        waits.append(seconds)
+        monkeypatch.undo()
+
+    monkeypatch.setattr(merging, "admit", lambda *_: full())
+    loop.work(site.centre, wait, lambda: len(waits) == 1)
+    assert waits == [loop._AGAIN_S]
+    assert f"hand-in {row['id'][:8]} waits: no space is left; tried again in" in caplog.text
+
+
+def test_a_full_disk_of_the_tables_is_told_apart():
+    engine = create_engine("sqlite://")
+    with engine.connect() as connection:
+        connection.execute(text("PRAGMA max_page_count = 1"))
+        with pytest.raises(StorageFullError, match="database or disk is full"), _errors():
+            connection.execute(text("CREATE TABLE x (y)"))
+
+
+def test_robots_learn_that_the_centre_is_full_and_send_again(site, monkeypatch):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    with monkeypatch.context() as patch:
+        patch.setattr(type(site.centre.objects), "put", full)
+        agent.step()
+        assert "(507): no space is left" in str(agent.trouble)
+        assert [row["state"] for row in agent.status()["outbox"]] == ["queued"]
+    site.settle()
+    assert [row["state"] for row in agent.status()["outbox"]] == ["settled"]
+
+
+def test_errors_do_not_say_where_the_centre_lies(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "to?wn").symlink_to(tmp_path / "elsewhere")
+    with Centre(tmp_path / "elsewhere") as centre:
+        centre.add_map(NAME, "tests")
+    with Centre(Path("to?wn")) as centre:
+        assert centre.map_names() == [NAME]
+        with centre.reading(NAME) as store, pytest.raises(EngramError) as told:
+            store.resolve(9)
+        assert centre.words_of(told.value).startswith("maps/fleet.engram has revisions")
+        assert centre.words_of(MapCorruptError("x")) == "x"
