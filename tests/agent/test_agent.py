@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import httpx
 import pytest
 from tests.centre.conftest import Site, admit_here, drive
 
@@ -11,8 +12,10 @@ from engram.agent.link import CentreRefusedError, Unreachable
 from engram.centre.backup import back_up
 from engram.centre.worker import merging
 from engram.config import load_toml
-from engram.errors import ConfigError, InputError, StorageFullError
+from engram.errors import ConfigError, IncompatibleError, InputError, StorageFullError
 from engram.maps import Map
+from engram.transfers import Manifest, PartHash, part_hash
+from engram.transfers.manifest import encode_manifest
 
 
 @pytest.fixture
@@ -180,3 +183,96 @@ def test_settings_of_an_agent_are_read_from_a_file():
     ):
         with pytest.raises(ConfigError, match="bytes_per_s"):
             wrong()
+
+
+def test_a_robot_whose_disk_is_full_says_so_and_goes_on(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000, 20)
+    pages = agent.state._connection.execute("PRAGMA page_count").fetchone()[0]
+    agent.state._connection.execute(f"PRAGMA max_page_count = {pages}")
+    with pytest.raises(StorageFullError, match=r"agent\.sqlite cannot grow"):
+        agent.hand_in()
+    assert agent.step() > 0
+    agent.state._connection.execute("PRAGMA max_page_count = 100000")
+    assert agent.hand_in() is not None
+    site.settle()
+    assert [row["state"] for row in agent.status()["outbox"]] == ["settled"]
+
+
+def test_what_does_not_fit_the_robots_map_is_trouble_and_is_fetched_once(site, monkeypatch):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    drive(second.live, "r2", 2_000)
+    first.hand_in()
+    for _ in range(2):
+        first.step()
+        second.step()
+        site.work()
+
+    def unfit(*_):
+        raise IncompatibleError("net does not fit brief")
+
+    monkeypatch.setattr(Agent, "_stage", unfit)
+    assert second.step() > 0
+    assert str(second.trouble) == second.status()["trouble"] == "net does not fit brief"
+    received = second.link.received_bytes
+    second.step()
+    assert second.link.received_bytes - received < 1_000
+    monkeypatch.undo()
+    second.step()
+    assert second.trouble is None
+    assert second.status()["staged"] is not None
+    assert [one.name for one in (second.folder / "next").glob("*.engram")] == ["map.engram"]
+
+
+def test_a_hand_in_that_is_no_map_is_not_sent_again_and_holds_up_nothing(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    page = part_hash(b"no page")
+    manifest = encode_manifest(Manifest("00" * 16, 1, {"nodes": (page,)}))
+    agent.state.queue("bad", manifest, {page: b"no page"})
+    agent.hand_in()
+    site.settle()
+    bad, good = agent.status()["outbox"]
+    assert (bad["state"], good["state"]) == ("failed", "settled")
+    assert "(422)" in bad["error"]
+    sent = agent.link.sent_bytes
+    agent.step()
+    assert agent.link.sent_bytes - sent < 400  # its report alone
+
+
+def test_what_the_centre_did_not_take_makes_room_in_a_full_outbox(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.state.queue("bad", b"{}", {PartHash(b"x" * 32): bytes(100_000)})
+    agent.state.set_outbox("bad", "failed", None, "no map")
+    limits = AgentSettings(outbox_bytes=100_000)
+    with Agent(agent.folder, limits, client=site.link) as small:
+        assert small.hand_in() is not None
+        assert [row["state"] for row in small.status()["outbox"]] == ["queued"]
+
+
+def test_a_login_page_on_the_way_is_no_centre(tmp_path):
+    page = httpx.MockTransport(lambda _: httpx.Response(200, text="<html>Log in"))
+    client = httpx.Client(transport=page, base_url="http://wifi")
+    with pytest.raises(Unreachable, match="no centre answers at http://wifi/v1/robots/enrol"):
+        enrol(tmp_path, "http://wifi", "code", "r1", client)
+
+
+def test_an_agent_that_runs_tells_what_it_does(site, caplog):
+    caplog.set_level("INFO", "engram.agent")
+    first, second = site.robot("r1"), site.robot("r2")
+    first.introduce()
+    site.link.fates = ["lost"]
+    first.step()
+    drive(first.live, "r1", 1_000)
+    key = first.hand_in()[:12]
+    site.settle()
+    assert second.switch()
+    told = [record.getMessage() for record in caplog.records if "engram.agent" in record.name]
+    assert told[0] == "robot r1 of map fleet at http://centre: runs version none, outbox 0"
+    assert told[1] == "the centre cannot be reached: ConnectError('lost'); tried again in 1 s"
+    assert f"hand-in {key}: sent" in told
+    assert f"hand-in {key}: settled, in revision 1" in told
+    version = second.status()["runs"]
+    assert f"version {version} is ready: the robot takes it when it is parked" in told

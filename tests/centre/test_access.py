@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import socket
 from dataclasses import replace
 
 import pytest
 
+from engram.agent.agent import enrol
+from engram.agent.link import CentreRefusedError
 from engram.centre.access.enrolment import add_person, disable, new_code
 from engram.centre.access.roles import Role
 from engram.centre.dreams import Dreams
 from engram.centre.errors import UnknownError
-from engram.centre.serving import Listening
+from engram.centre.fleet import Fleet
+from engram.centre.serving import Listening, serve
 from engram.centre.store.audit import first_broken
 from engram.centre.store.schema import audit
 from engram.errors import ConfigError, InputError
@@ -235,6 +239,18 @@ def test_the_audit_log_shows_what_was_changed_in_it(site):
         assert first_broken(connection) == 2
 
 
+def test_an_address_that_is_taken_and_a_certificate_that_is_gone_are_named(site, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(
+            InputError, match=rf"listen at 127\.0\.0\.1:{port}: Address already in use"
+        ):
+            serve(site.centre, Listening("127.0.0.1", port), worker=False)
+    gone = tmp_path / "gone.pem"
+    with pytest.raises(InputError, match=r"TLS cannot be had with .*gone\.pem"):
+        serve(site.centre, Listening("127.0.0.1", 0, gone, gone), worker=False)
+
+
 def test_it_listens_elsewhere_only_with_tls_or_on_demand(tmp_path):
     with pytest.raises(ConfigError, match="unencrypted"):
         Listening("0.0.0.0", 1)
@@ -261,3 +277,18 @@ def test_codes_and_tokens_are_made_for_what_can_be(site):
         add_person(site.centre, "alice", "twon", Role.VIEWER)
     with pytest.raises(InputError, match="the name of a person"):
         add_person(site.centre, " ", NAME, Role.VIEWER)
+
+
+def test_a_robot_that_enrols_again_has_its_new_name_and_one_taken_away_is_told(site):
+    agent = site.robot("r1")
+
+    def again() -> None:
+        code = new_code(site.centre, NAME, "head", "tests")
+        assert code.isalnum()  # on a command line - would begin an option
+        enrol(agent.folder, "http://centre/", code, "renamed", site.http)
+
+    again()
+    assert [one["name"] for one in Fleet(site.centre).all(NAME)] == ["renamed"]
+    disable(site.centre, agent.state.fact("robot"), "tests")
+    with pytest.raises(CentreRefusedError, match=r"\(403\): this robot was taken away for good"):
+        again()

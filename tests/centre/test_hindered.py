@@ -79,10 +79,14 @@ def test_a_download_is_made_when_there_is_room_again(site, monkeypatch):
     site.work()
     robot = site.robot("r2")
     robot.step()
+    drive(robot.live, "r2", 2_000)
+    robot.hand_in()
+    robot.step()
     with monkeypatch.context() as patch:
         patch.setattr(downloads, "download", full)
         with pytest.raises(StorageFullError):
             site.work()
+    assert not HandIns(site.centre).waiting(NAME)  # a merge takes less room
     site.settle()
     assert robot.status()["staged"] is not None
 
@@ -133,3 +137,18 @@ def test_errors_do_not_say_where_the_centre_lies(tmp_path, monkeypatch):
             store.resolve(9)
         assert centre.words_of(told.value).startswith("maps/fleet.engram has revisions")
         assert centre.words_of(MapCorruptError("x")) == "x"
+
+
+def test_a_hand_in_that_expired_is_open_again_when_its_robot_is_back(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    site.link.fates = ["well", "well", "well", "well", "lost"]  # begun, and no part arrives
+    agent.step()
+    (row,) = HandIns(site.centre).listed(NAME, None, None, 2**62, 2)
+    assert row["state"] == "open"
+    site.clock.forward(15 * 86_400)
+    site.work()
+    assert HandIns(site.centre).get(row["id"])["state"] == "cancelled"
+    site.settle()
+    assert HandIns(site.centre).get(row["id"])["state"] == "merged"

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 import shutil
@@ -21,11 +22,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from engram.agent.fetching import Fetch
-from engram.agent.link import CentreRefusedError, Link, Unreachable, new_client
+from engram.agent.link import Link, new_client
 from engram.agent.sending import FAILED, QUEUED, SENT, Outbox
 from engram.agent.settings import AgentSettings
 from engram.agent.state import AgentState
-from engram.errors import EngramError, InputError, MapError, StorageFullError
+from engram.errors import (
+    EngramError,
+    InputError,
+    MapCorruptError,
+    MapError,
+    StorageFullError,
+    storage_full,
+)
 from engram.files import WriterLock
 from engram.maps import Map, check_file, copy_map
 from engram.monitor import write_whole
@@ -35,6 +43,7 @@ if TYPE_CHECKING:
     import httpx
 
 MAP = "map.engram"
+_log = logging.getLogger(__name__)
 _PARTS = ("live", "base", "next")
 
 
@@ -49,6 +58,7 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
         CentreRefusedError: the code is not valid.
         Unreachable: the centre does not answer.
     """
+    url = url.rstrip("/")
     _check_centre(folder, url)
     for part in _PARTS:
         (folder / part).mkdir(parents=True, exist_ok=True)
@@ -80,7 +90,7 @@ def _check_centre(folder: Path, url: str) -> None:
     state = AgentState(path)
     known, name = state.fact("url"), state.fact("name")
     state.close()
-    if known is not None and known != url:
+    if known is not None and known.rstrip("/") != url:
         raise InputError(
             f"{folder} belongs to the robot {name!r} of {known}; give another folder for {url}"
         )
@@ -121,6 +131,7 @@ class Agent:
         self.settings = settings or AgentSettings()
         self.state = AgentState(folder / "agent.sqlite")
         self.trouble: EngramError | None = None
+        self._failures: int = self.state.fact("failures", 0)
         self._chance = chance
         self._owns_client = client is None
         self.live = folder / "live" / MAP
@@ -183,7 +194,7 @@ class Agent:
         return True
 
     def step(self, *, fetch: bool = True) -> float:
-        """One round: report, send, fetch. Never raises for the link's sake.
+        """One round: report, send, fetch. What fails is `trouble`, and is tried again.
 
         Args:
             fetch: whether to fetch the wanted version; False while the next mission is not known.
@@ -193,15 +204,34 @@ class Agent:
         """
         try:
             busy = self._round(fetch)
-        except (Unreachable, CentreRefusedError, MapError) as error:
-            self.trouble = error
-            failures = self.state.fact("failures", 0) + 1
-            self.state.remember(failures=failures, trouble=str(error))
-            longest: float = self.settings.first_retry_s * 2.0 ** min(failures - 1, 40)
-            return min(longest, self.settings.longest_retry_s) * (0.5 + self._chance() / 2)
-        self.trouble = None
-        self.state.remember(failures=0, trouble="")
+            self.state.remember(failures=0, trouble="")
+        except (EngramError, OSError) as error:
+            return self._failed(error)
+        self.trouble, self._failures = None, 0
         return 0.0 if busy else self.settings.idle_s
+
+    def introduce(self) -> None:
+        """Logs whose agent this is, and what it has."""
+        known = self.status()
+        _log.info(
+            "robot %s of map %s at %s: runs version %s, outbox %d",
+            *(known["name"], known["map"], known["url"]),
+            *(known["runs"] or "none", len(known["outbox"])),
+        )
+
+    def _failed(self, error: EngramError | OSError) -> float:
+        """Notes why a round failed; returns seconds until the next one."""
+        if isinstance(error, OSError):
+            fact = f"{self.folder} cannot be read or written: {error.strerror}"
+            error = storage_full(error, self.folder) or MapError(fact)
+        self.trouble = error
+        self._failures += 1
+        with suppress(MapError):  # of a full disk: what it would not note is told below
+            self.state.remember(failures=self._failures, trouble=str(error))
+        longest: float = self.settings.first_retry_s * 2.0 ** min(self._failures - 1, 40)
+        pause_s = min(longest, self.settings.longest_retry_s) * (0.5 + self._chance() / 2)
+        _log.info("%s; tried again in %.0f s", error, pause_s)
+        return pause_s
 
     def _round(self, fetch: bool) -> bool:
         wanted = self.link.ask("PUT", f"/v1/maps/{self._map}/robots/me/report", self._report())
@@ -226,10 +256,20 @@ class Agent:
         if revision == 0 or version in known:
             return False
         path = self.folder / "next" / "download.engram"
-        fetch = Fetch(self.state, self._map, self.live)
-        if not fetch.fetch(self.link, revision, self.settings.download, path):
-            return False
-        self._stage(version, path)
+        fetched = [version, self.settings.download]
+        if self.state.fact("fetched") != fetched or not path.exists():
+            fetch = Fetch(self.state, self._map, self.live)
+            if not fetch.fetch(self.link, revision, self.settings.download, path):
+                return False
+            self.state.remember(fetched=fetched)
+            _log.info("fetched version %s: %d bytes received", version, self.link.received_bytes)
+        try:
+            self._stage(version, path)
+        except MapCorruptError:  # of the file: it is fetched again
+            path.unlink()
+            raise
+        path.unlink(missing_ok=True)
+        _log.info("version %s is ready: the robot takes it when it is parked", version)
         return True
 
     def _stage(self, version: str, download: Path) -> None:

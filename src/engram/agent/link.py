@@ -123,7 +123,7 @@ class Link:
             self._token = ""
             answer = self._request(method, path, options())
         self._refuse(answer)
-        return answer.json() if answer.content else None
+        return _content(answer) if answer.content else None
 
     def _request(self, method: str, path: str, options: dict[str, Any]) -> httpx.Response:
         import httpx
@@ -155,7 +155,7 @@ class Link:
         except httpx.HTTPError as error:
             raise Unreachable(f"the centre cannot be reached: {error!r}") from error
         self._refuse(answer)
-        return answer.json()
+        return _content(answer)
 
     def _paced(self, pieces: Iterator[bytes]) -> Iterator[bytes]:
         for piece in pieces:
@@ -169,11 +169,28 @@ class Link:
 
     @staticmethod
     def _refuse(answer: httpx.Response) -> None:
-        if answer.status_code in {502, 503, 504}:
-            raise Unreachable(f"the centre is unavailable now (status {answer.status_code})")
-        if answer.status_code >= 400:
-            try:
-                detail = str(answer.json().get("detail", ""))
-            except (ValueError, AttributeError):
-                detail = answer.text[:200]
-            raise CentreRefusedError(answer.status_code, detail)
+        status = answer.status_code
+        if status < 400:
+            return
+        try:
+            detail = str(answer.json().get("detail", ""))
+        except (ValueError, AttributeError):
+            detail = answer.text[:200]
+        if status in {502, 503, 504}:
+            raise Unreachable(f"the centre is unavailable now (status {status}): {detail}")
+        raise CentreRefusedError(status, detail)
+
+
+def _content(answer: httpx.Response) -> Any:
+    """What an answer says.
+
+    Raises:
+        Unreachable: something else answers, as the login page of a network does.
+    """
+    try:
+        return answer.json()
+    except ValueError as error:
+        raise Unreachable(
+            f"no centre answers at {answer.url} (status {answer.status_code}, not JSON); check "
+            "the address, and proxies on the way"
+        ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -15,6 +16,9 @@ from engram.transfers.manifest import decode_manifest, encode_manifest
 
 QUEUED, SENT, SETTLED, FAILED = "queued", "sent", "settled", "failed"
 _ENDED_BADLY = {"failed", "cancelled"}
+# By this a centre refuses a hand-in for what it holds; whatever else hinders it may pass.
+_MALFORMED = 422
+_log = logging.getLogger(__name__)
 
 
 class Outbox:
@@ -47,8 +51,8 @@ class Outbox:
             return None
         names = [*taken.pages, *taken.blobs]
         parts = dict(zip(names, taken.parts(names), strict=True))
-        kept = sum(one["bytes"] for one in self._state.outbox())
         size = sum(map(len, parts.values()))
+        kept = self._make_room(size)
         if kept + size > self._limit_bytes:
             raise StorageFullError(
                 f"the outbox would hold {kept + size} bytes, more than {self._limit_bytes}: hand "
@@ -58,19 +62,48 @@ class Outbox:
         self._state.remember(last_queued=key)
         return key
 
+    def _make_room(self, size: int) -> int:
+        """Drops what the centre did not take, oldest first, as far as needed; bytes then kept."""
+        rows = self._state.outbox()
+        kept: int = sum(one["bytes"] for one in rows)
+        for one in rows:
+            refused = one["state"] in {FAILED, SETTLED} and one["revision"] is None
+            if refused and kept + size > self._limit_bytes:
+                self._state.forget_outbox(one["id"])
+                _log.info("hand-in %s, not taken by the centre, makes room", one["id"][:12])
+                kept -= one["bytes"]
+        return kept
+
     def send(self, link: Link, durable_revision: int) -> bool:
         """Sends what is queued, oldest first; whether something was handed in.
 
-        What the centre does not know, as after a restored backup, is sent again.
+        What the centre does not know, as after a restored backup, is sent again. What it refuses
+        for what it holds is not, and holds up nothing else.
 
         Raises:
+            CentreRefusedError: for reasons of the centre: it is sent again.
             Unreachable: the link broke. What arrived need not be sent again.
         """
         changed = False
         for row in self._state.outbox():
-            if row["state"] == QUEUED or not self._look(link, row, durable_revision):
+            never_taken = row["state"] == FAILED and row["id"] not in self._handins()
+            if never_taken or (row["state"] != QUEUED and self._look(link, row, durable_revision)):
+                continue
+            try:
                 changed = self._send(link, row) or changed
+            except CentreRefusedError as error:
+                if error.status != _MALFORMED:
+                    raise
+                self._note(row, FAILED, None, str(error))
         return changed
+
+    def _note(self, row: dict[str, Any], state: str, revision: int | None, why: Any) -> None:
+        """Notes how far a hand-in is, and tells it if that is new."""
+        if (row["state"], row["revision"], row["error"]) == (state, revision, why):
+            return
+        self._state.set_outbox(row["id"], state, revision, why)
+        told = "" if revision is None else f", in revision {revision}"
+        _log.info("hand-in %s: %s%s%s", row["id"][:12], state, told, f": {why}" if why else "")
 
     def _queued(self) -> set[PartHash]:
         return {
@@ -87,15 +120,14 @@ class Outbox:
             before = answer["wanted"]
             answer = link.send(f"/v1/handins/{key}/parts", partial(self._parts, row, wanted))
             if answer["wanted"] and set(answer["wanted"]) == set(before):
-                error = f"{len(wanted)} parts are no longer on this robot"
-                self._state.set_outbox(row["id"], FAILED, None, error)
+                self._note(row, FAILED, None, f"{len(wanted)} parts are no longer on this robot")
                 return False
         link.ask("POST", f"/v1/handins/{key}/complete")
         self._state.share([*manifest.hashes(), *self._state.waiting_hashes(row["id"])])
         self._state.remember(
             base=row["manifest"].decode(), handin={**self._handins(), row["id"]: key}
         )
-        self._state.set_outbox(row["id"], SENT, None, None)
+        self._note(row, SENT, None, None)
         return True
 
     def _begin(self, link: Link, manifest: Manifest) -> dict[str, Any]:
@@ -108,7 +140,7 @@ class Outbox:
                     link.ask("POST", path, _json(manifest, decode_manifest(base.encode())))
                 )
             except CentreRefusedError as error:
-                if error.status != 422:
+                if error.status != _MALFORMED:
                     raise
         return _as_dict(link.ask("POST", path, _json(manifest, None)))
 
@@ -142,10 +174,14 @@ class Outbox:
         revision = answer["revision"]
         if answer["state"] == "merged" and revision is not None and revision <= durable_revision:
             self._state.forget_outbox(row["id"])
+            _log.info("hand-in %s: in a backup, no longer kept here", row["id"][:12])
         elif answer["state"] in _ENDED_BADLY:
-            self._state.set_outbox(row["id"], FAILED, None, answer["error"])
+            self._note(row, FAILED, None, answer["error"])
         elif answer["state"] in {"merged", "refused"}:
-            self._state.set_outbox(row["id"], SETTLED, revision, answer["error"])
+            self._note(row, SETTLED, revision, answer["error"])
+        else:
+            waits = answer["progress"] if answer["progress"].startswith("waits") else None
+            self._note(row, SENT, None, waits)
         return True
 
     def _handins(self) -> dict[str, str]:

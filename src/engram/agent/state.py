@@ -9,7 +9,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import MetaData
+
+from engram.errors import MapError
+from engram.sqlite import FileKind, SqliteFile
 from engram.transfers import PartHash
+
+_FILE = FileKind(
+    noun="file of an agent",
+    application_id=0,
+    format_version=0,
+    metadata=MetaData(),
+    strange=MapError,
+    cure="remove it and enrol the robot again: its map is whole and is handed in again",
+    busy_s=30.0,
+)
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS facts (name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
@@ -29,13 +43,21 @@ class AgentState:
 
     Args:
         path: the file; made where there is none.
+
+    Raises:
+        StorageFullError: of this and every method that writes: no space is left.
+        MapError: the file cannot be read or written.
     """
 
     def __init__(self, path: Path) -> None:
-        self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-        self._connection.execute("PRAGMA journal_mode=WAL")
-        self._connection.execute("PRAGMA synchronous=FULL")
-        self._connection.executescript(_TABLES)
+        self._errors = SqliteFile(path, _FILE).errors
+        with self._errors():
+            self._connection = sqlite3.connect(
+                path, _FILE.busy_s, isolation_level=None, check_same_thread=False
+            )
+            self._connection.execute("PRAGMA journal_mode=WAL")
+            self._connection.execute("PRAGMA synchronous=FULL")
+            self._connection.executescript(_TABLES)
 
     def close(self) -> None:
         """Closes the file."""
@@ -43,21 +65,27 @@ class AgentState:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        self._connection.execute("BEGIN IMMEDIATE")
-        try:
-            yield self._connection
-        except BaseException:
-            self._connection.execute("ROLLBACK")
-            raise
-        self._commit()
+        with self._errors():
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield self._connection
+                self._commit()
+            except BaseException:
+                if self._connection.in_transaction:  # a full disk ends it by itself
+                    self._connection.execute("ROLLBACK")
+                raise
 
     def _commit(self) -> None:
         self._connection.execute("COMMIT")
 
+    def _rows(self, query: str, *values: Any) -> list[Any]:
+        with self._errors():
+            return self._connection.execute(query, values).fetchall()
+
     def fact(self, name: str, default: Any = None) -> Any:
         """A remembered value; plain data."""
-        row = self._connection.execute("SELECT value FROM facts WHERE name = ?", [name]).fetchone()
-        return default if row is None else json.loads(row[0])
+        rows = self._rows("SELECT value FROM facts WHERE name = ?", name)
+        return json.loads(rows[0][0]) if rows else default
 
     def remember(self, **facts: Any) -> None:
         """Remembers values, all or none."""
@@ -87,7 +115,7 @@ class AgentState:
     def outbox(self) -> list[dict[str, Any]]:
         """The hand-ins that are kept, oldest first."""
         names = ("id", "place", "manifest", "state", "bytes", "revision", "error")
-        rows = self._connection.execute("SELECT * FROM outbox ORDER BY place").fetchall()
+        rows = self._rows("SELECT * FROM outbox ORDER BY place")
         return [dict(zip(names, row, strict=True)) for row in rows]
 
     def set_outbox(self, key: str, state: str, revision: int | None, error: str | None) -> None:
@@ -106,14 +134,12 @@ class AgentState:
 
     def waiting(self, key: str, part: PartHash) -> bytes | None:
         """A part of a hand-in in the outbox."""
-        row = self._connection.execute(
-            "SELECT body FROM waiting WHERE outbox = ? AND hash = ?", [key, part]
-        ).fetchone()
-        return None if row is None else row[0]
+        rows = self._rows("SELECT body FROM waiting WHERE outbox = ? AND hash = ?", key, part)
+        return rows[0][0] if rows else None
 
     def waiting_hashes(self, key: str) -> list[PartHash]:
         """All parts of a hand-in in the outbox."""
-        rows = self._connection.execute("SELECT hash FROM waiting WHERE outbox = ?", [key])
+        rows = self._rows("SELECT hash FROM waiting WHERE outbox = ?", key)
         return [PartHash(row[0]) for row in rows]
 
     # -- parts
@@ -126,7 +152,7 @@ class AgentState:
 
     def shared(self) -> set[PartHash]:
         """Parts that the centre has."""
-        return {PartHash(row[0]) for row in self._connection.execute("SELECT hash FROM shared")}
+        return {PartHash(row[0]) for row in self._rows("SELECT hash FROM shared")}
 
     def arrive(self, parts: Collection[tuple[PartHash, bytes]]) -> None:
         """Keeps parts of a download that is not complete yet."""
@@ -135,12 +161,12 @@ class AgentState:
 
     def arrived(self, part: PartHash) -> bytes | None:
         """A part that has arrived."""
-        row = self._connection.execute("SELECT body FROM arrived WHERE hash = ?", [part]).fetchone()
-        return None if row is None else row[0]
+        rows = self._rows("SELECT body FROM arrived WHERE hash = ?", part)
+        return rows[0][0] if rows else None
 
     def arrived_hashes(self) -> set[PartHash]:
         """All parts that have arrived."""
-        return {PartHash(row[0]) for row in self._connection.execute("SELECT hash FROM arrived")}
+        return {PartHash(row[0]) for row in self._rows("SELECT hash FROM arrived")}
 
     def clear_arrived(self) -> None:
         """Drops them: the download is complete."""

@@ -61,11 +61,8 @@ class QuotaError(CentreError):
     title = "More than is granted"
 
 
-class TooLargeError(CentreError):
-    """More than is ever taken."""
-
-    status = 413
-    title = "Too large"
+class MissingPartsError(MapError):
+    """A job lacks parts: the fleet map has changed since they were asked for."""
 
 
 class StoreError(MapError):

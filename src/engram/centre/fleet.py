@@ -53,7 +53,7 @@ class Fleet:
             query = select(robots).where(robots.c.map == name, robots.c.robot == robot)
             row = first_row(connection, query)
         if row is None:
-            raise UnknownError("you are not a robot of this map; enrol first")
+            raise UnknownError(f"{name} has no robot {robot!r:.40}; enrol it first")
         try:
             revision = Refs(self._centre).revision(name, row["follows"])
         except UnknownError:
@@ -69,13 +69,11 @@ class Fleet:
         """Keeps what a robot runs and has localised with; returns what it is to run."""
         now = self._centre.now_ns()
         with self._centre.database.writing(durable=False) as connection:
-            changed = connection.execute(
+            connection.execute(
                 update(robots)
                 .where(robots.c.map == name, robots.c.robot == robot)
                 .values(report=json.dumps(told), reported_ns=now)
             )
-        if not changed.rowcount:
-            raise UnknownError("you are not a robot of this map; enrol first")
         return self.wanted(name, robot)
 
     def follow(self, name: str, robot: str, ref: str, by: str) -> None:

@@ -13,7 +13,13 @@ from typing import Any
 
 from sqlalchemy import Connection, func, or_, select, update
 
-from engram.centre.errors import ConflictError, MalformedError, QuotaError, UnknownError
+from engram.centre.errors import (
+    ConflictError,
+    MalformedError,
+    MissingPartsError,
+    QuotaError,
+    UnknownError,
+)
 from engram.centre.keeping import ENDED, HandInState, manifest_key, needed_manifests
 from engram.centre.service import Centre, kept_since_ns
 from engram.centre.settings import DAY_NS
@@ -22,13 +28,11 @@ from engram.centre.store.database import first_row, rows_of
 from engram.centre.store.packs import given_by
 from engram.centre.store.schema import artifact_grants, artifacts, handins, usage
 from engram.centre.store.waking import ring
-from engram.errors import MapCorruptError, MapError
+from engram.errors import InputError, MapCorruptError
 from engram.maps.schema import frames, nodes, vocabularies
 from engram.transfers import Manifest, PartHash, WireManifest
 from engram.transfers.manifest import decode_manifest, encode_manifest
 from engram.transfers.pages import decode_page
-
-_LONGEST_PROGRESS = 300
 
 
 def handin_id(name: str, robot: str, manifest: str) -> str:
@@ -57,7 +61,7 @@ class HandIns:
         with self._centre.database.reading() as connection:
             known = first_row(connection, select(handins).where(handins.c.id == key))
         if known is not None:
-            return known
+            return self._reopened(known)
         self._centre.objects.put(manifest_key(name, manifest.id), encode_manifest(manifest))
         row = {
             "id": key,
@@ -67,17 +71,10 @@ class HandIns:
             "base": sent.base,
             "content_hash": manifest.content_hash,
             "state": str(HandInState.OPEN),
-            "bytes": 0,
             "begun_ns": now,
-            "place": None,
-            "ended_ns": None,
-            "revision": None,
-            "tries": 0,
-            "cancelled": 0,
-            "ungated": 0,
             "progress": "",
-            "report": None,
-            "error": None,
+            **dict.fromkeys(("bytes", "tries", "cancelled", "ungated"), 0),
+            **dict.fromkeys(("place", "ended_ns", "revision", "report", "error")),
         }
         with self._centre.database.writing() as connection:
             self._check_open(connection, name, robot)
@@ -85,6 +82,13 @@ class HandIns:
             if self._centre.database.add(connection, handins, [row]):
                 note(connection, now, robot, "hand-in", name, handin=key)
         return self.get(key)
+
+    def _reopened(self, row: dict[str, Any]) -> dict[str, Any]:
+        """An expired one, open again, without what it continued: that may be swept by now."""
+        if row["state"] != HandInState.CANCELLED or row["cancelled"]:
+            return row
+        self.end(row, HandInState.OPEN, begun_ns=self._centre.now_ns(), base=None, error=None)
+        return self.get(row["id"])
 
     def get(self, key: str) -> dict[str, Any]:
         """The row of a hand-in.
@@ -127,7 +131,8 @@ class HandIns:
 
         Raises:
             ConflictError: it is complete or has ended.
-            QuotaError: more than the robot may hand in.
+            InputError: it is larger than any may be.
+            QuotaError: more than the robot may hand in today.
         """
         if row["state"] != HandInState.OPEN:
             raise ConflictError(f"hand-in {row['id']} is {row['state']} and takes no more parts")
@@ -141,7 +146,7 @@ class HandIns:
                 f"{used + size} bytes today; {limits.bytes_a_day} are granted: continue tomorrow"
             )
         if whole is not None and whole["bytes"] + size > limits.handin_bytes:
-            raise QuotaError(
+            raise InputError(
                 f"the hand-in is larger than {limits.handin_bytes} bytes; hand in more often"
             )
         new = self._centre.packs(row["map"]).add(some, now, row["robot"])
@@ -251,16 +256,17 @@ class HandIns:
             raise ConflictError(
                 f"hand-in {row['id']} is {row['state']}; only a refused one is tried again"
             )
-        again = {
-            "state": str(HandInState.COMPLETE),
+        again: dict[str, Any] = {
             "ungated": 1,
             "cancelled": 0,
             "tries": 0,
             "error": None,
             "ended_ns": None,
         }
+        again["state"] = str(HandInState.COMPLETE)
+        of_it = handins.c.id == row["id"]
         with self._centre.database.writing() as connection:
-            connection.execute(update(handins).where(handins.c.id == row["id"]).values(**again))
+            connection.execute(update(handins).where(of_it).values(**again))
             now = self._centre.now_ns()
             note(connection, now, by, "merge-anyway", row["map"], handin=row["id"])
             ring(connection)
@@ -292,7 +298,7 @@ class HandIns:
 
     def put_off(self, row: dict[str, Any], why: str) -> None:
         """Takes back a try that found no room or no free lock: it is no fault of the hand-in."""
-        change = {"tries": row["tries"], "progress": f"waits: {why}"[:_LONGEST_PROGRESS]}
+        change = {"tries": row["tries"], "progress": f"waits: {why}"}
         with self._centre.database.writing() as connection:
             connection.execute(update(handins).where(handins.c.id == row["id"]).values(**change))
 
@@ -338,7 +344,7 @@ class HandIns:
     def _refuse_foreign(self, row: dict[str, Any], some: list[PartHash]) -> None:
         lacking = self._not_given(row, some)
         if lacking:
-            raise MissingPartsError(lacking)
+            raise MissingPartsError(f"{len(lacking)} parts are missing")
 
     def _not_given(self, row: dict[str, Any], some: list[PartHash]) -> list[PartHash]:
         with self._centre.database.reading() as connection:
@@ -385,13 +391,6 @@ class HandIns:
         count = connection.execute(query).scalar_one()
         if count >= self._centre.settings.open_handins:
             raise QuotaError(f"{count} hand-ins are open; complete or cancel some")
-
-
-class MissingPartsError(MapError):
-    """A job lacks parts: the fleet map has changed since they were asked for."""
-
-    def __init__(self, lacking: list[PartHash]) -> None:
-        super().__init__(f"{len(lacking)} parts are missing")
 
 
 def _used(connection: Connection, robot: str, now_ns: int) -> int:

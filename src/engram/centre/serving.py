@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,8 @@ from typing import Any
 from engram.centre.service import Centre
 from engram.centre.store.waking import Waker
 from engram.centre.worker.loop import work
-from engram.errors import ConfigError, MissingExtraError
+from engram.errors import ConfigError, InputError, MissingExtraError
+from engram.logs import logging_to_stderr
 from engram.processes import end_with_parent
 
 _RESTART_S = 1.0
@@ -54,6 +57,7 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
 
     Raises:
         MissingExtraError: the extra `centre` is not installed.
+        InputError: it cannot listen there, or not with this certificate and key.
     """
     try:
         import uvicorn
@@ -72,12 +76,33 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
         log_level="warning",
         server_header=False,
     )
+    try:
+        config.load()
+    except OSError as error:  # SSL's, too
+        files = f"{listening.certificate} and {listening.key}"
+        raise InputError(f"TLS cannot be had with {files}: {error.strerror or error}") from error
     server = _telling(uvicorn.Server)(config)
-    if not worker:
-        server.run()
-        return
-    with _supervised_worker(centre):
-        server.run()
+    beside = _supervised_worker(centre) if worker else nullcontext()
+    with _listening_at(listening) as taken, logging_to_stderr(), beside:
+        server.run(sockets=[taken])
+
+
+def _listening_at(listening: Listening) -> socket.socket:
+    """The socket at which to listen.
+
+    Raises:
+        InputError: it is taken, or not this machine's.
+    """
+    where = f"{listening.host}:{listening.port}"
+    family = socket.AF_INET6 if ":" in listening.host else socket.AF_INET
+    try:
+        return socket.create_server((listening.host, listening.port), family=family, backlog=2048)
+    except OSError as error:
+        fact = (error.strerror or str(error)).partition(" (while")[0]
+        cure = "give an address of this machine as --host and a port above 1023 as --port"
+        if error.errno == errno.EADDRINUSE:
+            cure = "another program, such as another centre, listens there: end it, or give --port"
+        raise InputError(f"cannot listen at {where}: {fact}; {cure}") from error
 
 
 def _telling(kind: type[Any]) -> type[Any]:
@@ -88,9 +113,8 @@ def _telling(kind: type[Any]) -> type[Any]:
             await super().startup(sockets=sockets)
             if self.started:
                 scheme = "https" if self.config.is_ssl else "http"
-                print(
-                    f"engram centre at {scheme}://{self.config.host}:{self.config.port}", flush=True
-                )
+                host, port = self.config.host, sockets[0].getsockname()[1]
+                print(f"engram centre at {scheme}://{host}:{port}", flush=True)
 
     return Telling
 
@@ -101,7 +125,11 @@ def run_worker(
     """Works until SIGTERM or Ctrl-C; Dask's workers dream where a scheduler is given."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    with Centre(folder, database, objects) as centre, Waker(database, stop.wait) as waker:
+    with (
+        logging_to_stderr(),
+        Centre(folder, database, objects) as centre,
+        Waker(database, stop.wait) as waker,
+    ):
         work(centre, waker.wait, stop.is_set, scheduler)
 
 

@@ -63,15 +63,19 @@ def enrol(
 def run(folder: Folder, *, config: Config = None) -> None:
     """Send and fetch maps until stopped.
 
-    Sends what is queued and fetches the version that the centre wants on this robot.
+    Sends what is queued and fetches the version that the centre wants on this robot. Tells what it
+    does on stderr, a line for each event.
 
     \b
     Examples:
       engram agent run r1
       engram agent run r1 --config agent.toml
     """
+    from engram.logs import logging_to_stderr
+
     waiting = threading.Event()
-    with _open(folder, config) as agent:
+    with logging_to_stderr(), _open(folder, config) as agent:
+        agent.introduce()
         while True:
             waiting.wait(agent.step())
 

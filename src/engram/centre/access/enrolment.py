@@ -48,16 +48,20 @@ def new_code(centre: Centre, name: str, follows: str, by: str) -> str:
 
 
 def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: bytes) -> Subject:
-    """Enrols a robot; again with the same code and key it is the same robot.
+    """Enrols a robot; again with the same key it is the same robot, with its new name.
 
     Raises:
-        NotAllowedError: the code is unknown, expired, or used by another robot, or the signature
-            is not of this key.
+        NotAllowedError: the code is unknown, expired, or used by another robot, or the robot was
+            taken away.
+        InputError: the signature is not of this key.
     """
     check_signature(public_key, signature, enrolment_text(code))
     robot, now = hashlib.sha256(public_key).hexdigest()[:32], centre.now_ns()
     with centre.database.writing() as connection:
         row = first_row(connection, select(codes).where(codes.c.hash == _hash(code)))
+        gone = select(subjects.c.id).where(subjects.c.id == robot, subjects.c.disabled != 0)
+        if connection.execute(gone).first() is not None:
+            raise NotAllowedError("this robot was taken away for good; enrol it from a new folder")
         if row is None or row["expires_ns"] < now or row["used_by"] not in {None, robot}:
             raise NotAllowedError("the code is unknown, expired or used; ask for a new one")
         if row["used_by"] is None:
@@ -65,6 +69,7 @@ def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: by
                 update(codes).where(codes.c.hash == row["hash"]).values(used_by=robot)
             )
             _add_robot(centre, connection, robot, name, public_key, row)
+            connection.execute(update(subjects).where(subjects.c.id == robot).values(name=name))
             note(connection, now, robot, "enrol", row["map"], name=name)
         return _subject(connection, robot)
 
@@ -124,7 +129,9 @@ def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
         row = first_row(connection, query)
         connection.execute(delete(nonces).where(nonces.c.nonce == nonce))
         known = first_row(connection, select(subjects).where(subjects.c.id == robot))
-    refused = NotAllowedError("no token: ask for a nonce again, and sign it with the robot's key")
+    refused = NotAllowedError(
+        "no token: the robot is not known here, was taken away, or signed a nonce that has ended"
+    )
     if row is None or row["expires_ns"] < now or known is None or known["disabled"]:
         raise refused
     try:

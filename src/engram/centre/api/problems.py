@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from http import HTTPStatus
 from typing import Any
 
@@ -23,6 +24,7 @@ from engram.errors import (
 )
 
 MEDIA = "application/problem+json"
+_log = logging.getLogger(__name__)
 # For the description of the API: any request can fail in this way.
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     "4XX": {
@@ -55,9 +57,13 @@ def add_problems(app: FastAPI) -> None:
     def foreseen(request: Request, error: EngramError) -> JSONResponse:
         told = request.app.state.centre.words_of(error)
         if isinstance(error, CentreError):
-            return problem(error.status, error.title, told)
-        status = next((code for kind, code in _STATUS if isinstance(error, kind)), 500)
-        return problem(status, HTTPStatus(status).phrase, told)
+            status, title = error.status, error.title
+        else:
+            status = next((code for kind, code in _STATUS if isinstance(error, kind)), 500)
+            title = HTTPStatus(status).phrase
+        if status != HTTPStatus.UNAUTHORIZED:  # a token that has ended is nobody's fault
+            _log.info("%s %s: %d %s", request.method, request.url.path, status, told)
+        return problem(status, title, told)
 
     @app.exception_handler(HTTPException)
     def refused(_: Request, error: HTTPException) -> JSONResponse:

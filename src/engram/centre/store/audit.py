@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from typing import Any
 
 from sqlalchemy import Connection, Select, insert, select
 
 from engram.centre.store.database import rows_of
-from engram.centre.store.schema import audit
+from engram.centre.store.schema import audit, subjects
+
+_log = logging.getLogger(__name__)
 
 
 def note(
@@ -39,6 +42,10 @@ def note(
         "detail": json.dumps(detail, sort_keys=True),
     }
     connection.execute(insert(audit).values(**row, hash=_hash(before, row)))
+    if _log.isEnabledFor(logging.INFO):
+        known = connection.execute(select(subjects.c.name).where(subjects.c.id == subject)).scalar()
+        told = "".join(f" {key}={value}" for key, value in detail.items())
+        _log.info("%s: %s by %s%s", name or "centre", action, known or subject, told)
 
 
 def events_after(

@@ -6,12 +6,13 @@ import logging
 from collections.abc import Callable
 
 from engram.centre.downloads import Downloads
+from engram.centre.errors import StoreError
 from engram.centre.handins import HandIns
 from engram.centre.service import Centre
 from engram.centre.worker.dreaming import dream_a_while
 from engram.centre.worker.merging import WaitsError, merge_hand_in
 from engram.centre.worker.sweeping import sweep_all
-from engram.errors import EngramError
+from engram.errors import EngramError, StorageFullError
 
 _log = logging.getLogger(__name__)
 # A full disk takes a person: until then the same job is not tried four times a second.
@@ -27,7 +28,7 @@ def work_off(centre: Centre) -> int:
             wait.
     """
     downloads, handins = Downloads(centre), HandIns(centre)
-    settled, hindered = 0, []
+    settled, hindered = 0, list[EngramError]()
     handins.expire()
     downloads.expire()
     for name in centre.map_names():
@@ -36,12 +37,12 @@ def work_off(centre: Centre) -> int:
         try:
             with centre.lane(name) as is_ours:
                 for row in handins.waiting(name) if is_ours else ():
-                    settled += _make_downloads(downloads)
+                    settled += _make_downloads(downloads, hindered)
                     merge_hand_in(centre, row)
                     settled += 1
         except WaitsError as error:  # the next map may have its disk and its drives
             hindered.append(error)
-    settled += _make_downloads(downloads)
+    settled += _make_downloads(downloads, hindered)
     if hindered:
         raise hindered[0]
     return settled
@@ -78,8 +79,14 @@ def work(
             wait(centre.settings.poll_s)
 
 
-def _make_downloads(downloads: Downloads) -> int:
-    asked = downloads.asked()
-    for row in asked:
-        downloads.make(row)
-    return len(asked)
+def _make_downloads(downloads: Downloads, hindered: list[EngramError]) -> int:
+    """Makes what robots asked for, unless something hinders it: merging may take less room."""
+    made = 0
+    for row in downloads.asked():
+        if not hindered:
+            try:
+                downloads.make(row)
+                made += 1
+            except (StorageFullError, StoreError) as error:
+                hindered.append(error)
+    return made

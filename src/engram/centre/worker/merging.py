@@ -6,14 +6,16 @@ one merges again: what was committed is found by the content hash that its revis
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from engram.centre.errors import StoreError
-from engram.centre.handins import HandIns, MissingPartsError
+from engram.centre.errors import MissingPartsError, StoreError
+from engram.centre.handins import HandIns
 from engram.centre.keeping import HandInState
 from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
@@ -30,6 +32,7 @@ from engram.fleet.merge import MergeReport, merge
 from engram.maps import Map
 from engram.robot import Settings
 
+_log = logging.getLogger(__name__)
 # A held-out drive that cannot be read is a SequenceError: robots hand in no drives.
 _OF_THE_CENTRE = (StorageFullError, StoreError, MapLockedError, SequenceError)
 
@@ -51,6 +54,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
         handins.end(row, HandInState.FAILED, error=fact)
         return
     handins.begun(row)
+    begun_s = time.monotonic()
     thin = centre.folder / "work" / f"{row['id']}.engram"
     try:
         with _scratch(thin):
@@ -72,6 +76,8 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
         handins.end(row, HandInState.FAILED, error=centre.words_of(error))
     else:
         _settle(centre, handins, row, outcome)
+        took_s = time.monotonic() - begun_s
+        _log.info("%s: hand-in %s took %.1f s of work", row["map"], row["id"][:8], took_s)
 
 
 def _admit(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> None:
