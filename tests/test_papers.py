@@ -64,10 +64,11 @@ PROOFS = {
     "localiser.lost_after_m": "test_a_robot_relocalises_once_it_drove_as_far_as_is_set",
     "localiser.acceptance.doubt_after": "test_a_robot_that_is_told_a_place_looks_elsewhere_at_once_"
     "only_by_our_default",
+    "mapper.sure_inliers": "tests.mapper.test_mapper:"
+    "test_a_frame_that_matches_weakly_is_saved_unless_as_published",
     "merge.ranking": "test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper",
     "merge.relocaliser": "test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper",
-    "merge.sure_inliers": "tests.fleet.test_merging:"
-    "test_what_other_drives_rely_on_is_omitted_only_for_a_sure_match",
+    "merge.sure_inliers": "tests.fleet.test_merging:test_a_node_is_omitted_only_for_a_sure_match",
     "merge.unit": "test_a_segment_is_omitted_or_taken_as_a_whole",
     "merge.seed": "test_segments_are_seeded_by_place_recognition_alone_where_the_paper_says_so",
     "build.max_gap_m": "test_orders_are_judged_by_the_measure_of_their_paper",

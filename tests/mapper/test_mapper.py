@@ -64,6 +64,22 @@ def test_while_localisation_succeeds_nothing_is_saved(path: Path) -> None:
     assert errors.max() < 0.3
 
 
+@pytest.mark.parametrize(("sure_inliers", "share"), [(0, 0.0), (10_000, 0.5)])
+def test_a_frame_that_matches_weakly_is_saved_unless_as_published(
+    path: Path, sure_inliers: int, share: float
+) -> None:
+    settings = Settings(mapper=MapperConfig(sure_inliers=sure_inliers))
+    first = map_simulated(path, drive(WORLD, ROAD), settings=settings)
+    seen = drive(WORLD, ROAD + 0.3, seed=1, start_ns=LATER_NS)
+    again = map_simulated(path, seen, "r2", settings=settings)
+    assert again.statuses.count("localised") == len(ROAD)
+    assert len(again.saved) == pytest.approx(share * len(ROAD), abs=2)
+    assert np.median(errors_m(again.steps, again.drive, first.saved)) < 0.03
+    graph = graph_of(path)
+    tied = {edge.b for edge in graph.edges if edge.kind is EdgeKind.TIE and edge.a in first.saved}
+    assert set(again.saved) <= tied
+
+
 def test_another_appearance_becomes_an_experience_beside_the_known_one(path: Path) -> None:
     map_simulated(path, drive(WORLD, ROAD))
     seen = drive(WORLD, ROAD, looks(20, 50), seed=1, start_ns=LATER_NS)

@@ -35,7 +35,7 @@ def map_(
 ) -> None:
     """Add a drive to a map.
 
-    Creates the map if it does not exist. Where the drive localises in the map, nothing is saved;
+    Creates the map if it does not exist. Where the drive matches the map well, nothing is saved;
     elsewhere it becomes a new experience. The same command resumes an interrupted drive. A drive
     with a fatal fault (see engram doctor) is refused with exit status 4; nothing is written.
 

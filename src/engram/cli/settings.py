@@ -37,8 +37,8 @@ class MergeSettings:
     ] = "fabmap"
     sure_inliers: Annotated[
         int,
-        Meta(ge=0, description="inliers needed to drop a node that other drives use; 0: any match"),
-    ] = 40
+        Meta(ge=0, description="inliers needed to drop a node; 0: any match. Source: [G16] §V-A"),
+    ] = 60
     unit: Annotated[
         Unit,
         Meta(

@@ -40,6 +40,9 @@ class MapperConfig:
     Attributes:
         save_every_m, save_every_rad: motion since the last saved node after which a frame that
             did not localise is saved. Source: method §5.
+        sure_inliers: a frame that matched with fewer inliers is saved all the same: the place has
+            come to look different, and frames that match this one need not match its old nodes. 0
+            saves none of them, as published. Source: lab/reports/trust.md.
         tie_within_m: a new experience is also tied to the session's last saved node within this
             distance, metres. Source: the search radius, method §3.
         checkpoint_every: live frames between two checkpoints of the map.
@@ -51,6 +54,7 @@ class MapperConfig:
 
     save_every_m: float = 1.0
     save_every_rad: float = float(np.deg2rad(15.0))
+    sure_inliers: int = 60
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
     memory_bytes: int = 256_000_000
@@ -62,12 +66,14 @@ class MapperConfig:
             value = getattr(self, name)
             if not 0 <= value < np.inf:
                 raise ConfigError(f"mapper: {name} is {value}, must be finite and >= 0")
+        if self.sure_inliers < 0:
+            raise ConfigError(f"mapper: sure_inliers is {self.sure_inliers}, must be >= 0")
         if self.checkpoint_every < 1:
             raise ConfigError(f"mapper: checkpoint_every is {self.checkpoint_every}, must be >= 1")
 
 
 class Mapper(Memory):
-    """Maps one session: saves nothing while localisation succeeds, else grows an experience.
+    """Maps one session: saves nothing while frames match well, else grows an experience.
 
     It also remembers the drive's path and attempts. Frames that an interrupted run had mapped are
     only followed; mapping continues after the last saved node or match, whichever is later.
@@ -136,7 +142,7 @@ class Mapper(Memory):
         return not certain or self._loops is None
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """Saves a frame that was not localised; ties experiences to their neighbours.
+        """Saves a frame that did not match, or weakly; ties experiences to their neighbours.
 
         Raises:
             MapError: an earlier frame could not be written.
@@ -148,8 +154,8 @@ class Mapper(Memory):
         visit = match_of(found)
         if found.localised:
             edges += self._join(found)
-        elif self._worth_saving(live, found.motion):
-            saved, laid = self._save(live, found.position)
+        if self._looks_new(found) and self._worth_saving(live, found.motion):
+            saved, laid = self._save(live, found)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
         self._put(live, Records(node=saved, frame=live if saved else None, edges=edges), visit)
@@ -237,6 +243,12 @@ class Mapper(Memory):
                 motion.prev_from_curr, motion.covariance
             )
 
+    def _looks_new(self, found: Localisation) -> bool:
+        """Whether the map lacks what the frame shows; a match on trial does not tell."""
+        if not found.localised:
+            return True
+        return found.inliers < self.config.sure_inliers and not self._localiser.on_trial
+
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
         """Whether a frame is usable and far enough from the last saved one (method §5).
 
@@ -252,7 +264,7 @@ class Mapper(Memory):
             or moved.angle_rad >= self.config.save_every_rad
         )
 
-    def _save(self, live: Frame, position: Position | None) -> tuple[Node, list[Edge]]:
+    def _save(self, live: Frame, found: Localisation) -> tuple[Node, list[Edge]]:
         """Saves the frame as a node, chained to the experience or tied to where it began."""
         node = Node(
             node_id(self._session.id, live.stamp_ns),
@@ -263,7 +275,8 @@ class Mapper(Memory):
         )
         self._graph.add_node(node)
         edges = []
-        if self._since_saved is None:
+        position = found.position
+        if self._since_saved is None and not found.localised:
             self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
@@ -278,7 +291,7 @@ class Mapper(Memory):
         edges += self._beside(node.id)
         self._experience.append(node.id)
         self._since_saved = Position.at(node.id)
-        if not self._waiting:
+        if not self._waiting and not found.localised:
             self._localiser.settle_in(node.id)
         return node, edges
 

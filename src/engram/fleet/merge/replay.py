@@ -104,7 +104,7 @@ class Replay(Keeper):
     def segment(self, session: Session, segment: Segment) -> SegmentReport:
         """Replays one segment: omits nodes that localise, takes the rest (method §7.3).
 
-        Also takes nodes that other drives use and that match only weakly; see `MergeOptions`.
+        Also takes nodes that match only weakly; see `MergeOptions`.
         """
         self._visited, self._kept = None, []
         seed = self._find_start(session, segment)
@@ -299,7 +299,7 @@ class Replay(Keeper):
         for one in held:
             node, found = one.stored.node, one.found
             self._remember(node, found, one.attempts)
-            reason = self._reason(node, one.live, found)
+            reason = self._reason(one.live, found)
             if reason is None:
                 # The fleet map covers this place already.
                 self._merge.omit(node.id, _measured(found), one.stored.landmark_hash)
@@ -323,15 +323,14 @@ class Replay(Keeper):
             entry = PathEntry(path, 0, found.node, kind, node.stamp_ns)
             self.entries[node.session].append(entry)
 
-    def _reason(self, node: Node, frame: Frame, found: Localisation) -> Reason | None:
+    def _reason(self, frame: Frame, found: Localisation) -> Reason | None:
         """Why a node is taken; None if its match can replace it for all drives that use it."""
         if self._omits is not None:
             omitted = self._omits and found.position is not None
             return None if omitted else Reason.WHOLE_SEGMENT
         if found.localised:
             is_sure = found.inliers >= self._options.sure_inliers
-            relied_on = node.id in self._merge.relied_on
-            return Reason.WEAK_MATCH if relied_on and not is_sure else None
+            return None if is_sure else Reason.WEAK_MATCH
         if frame.status is not FrameStatus.OK:
             return Reason.UNUSABLE_FRAME
         if found.candidates:

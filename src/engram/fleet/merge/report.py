@@ -42,7 +42,7 @@ _WORDS = {
     Reason.NOTHING_NEAR: "no known node nearby",
     Reason.NO_PLACE: "no similar place in the map",
     Reason.NO_MATCH: "nearby nodes do not match",
-    Reason.WEAK_MATCH: "weak match of a node that other drives use",
+    Reason.WEAK_MATCH: "weak matches",
     Reason.WHOLE_SEGMENT: "segments that do not localise as a whole",
 }
 

@@ -36,11 +36,11 @@ class MergeOptions:
         int,
         msgspec.Meta(
             ge=0,
-            description="inliers needed before omitting a node that other drives in the robot's "
-            "map matched: frames that match the node need not match another that the node itself "
-            "barely matches. 0 omits on every match, as [G16] does",
+            description="inliers needed before omitting a node: frames that match the node need "
+            "not match another that the node itself barely matches. 0 omits on every match, as "
+            "[G16] does",
         ),
-    ] = 40
+    ] = 60
     unit: Annotated[
         Unit,
         msgspec.Meta(

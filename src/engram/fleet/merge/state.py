@@ -23,7 +23,6 @@ from engram.graph.model import (
     PathEntryKind,
     PathId,
     SessionId,
-    path_id,
 )
 from engram.localiser import Position
 from engram.maps import Map, RevisionWriter, StoredNode
@@ -95,18 +94,6 @@ class Merge:
         """The robot's edges at a node, by their keys."""
         graph = self.robot.graph
         return sorted(graph.edges_of(graph.index(node)), key=_edge_key)
-
-    @cached_property
-    def relied_on(self) -> frozenset[NodeId]:
-        """Nodes of the robot's map that a drive other than their own matched."""
-        graph, paths = self.robot.graph, self.robot.path_memory
-        return frozenset(
-            entry.node
-            for path in paths.paths
-            for entry in paths.entries(path)
-            if entry.kind is not PathEntryKind.SAVED
-            and path_id(graph.node(graph.index(entry.node)).session) != path
-        )
 
     # -- new records of the robot
 
