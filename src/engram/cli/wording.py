@@ -27,7 +27,9 @@ def mapped_text(report: Mapping[str, Any], map_path: Path | str) -> str:
             f"{report['session'][:8]}"
         )
     share, saved = report["share_localised"], report["nodes_saved"]
-    area = "known area" if share >= _KNOWN else "new area" if share <= _NEW else "partly new area"
+    area = "new area" if share <= _NEW else "partly new area"
+    if share >= _KNOWN:
+        area = "known area that looks different" if saved else "known area"
     head = f"{area}: {_count(saved, 'node')} saved"
     if report["resumed"]:
         head = f"resumed; {head}"

@@ -42,7 +42,7 @@ class MapperConfig:
             did not localise is saved. Source: method §5.
         sure_inliers: a frame that matched with fewer inliers is saved all the same: the place has
             come to look different, and frames that match this one need not match its old nodes. 0
-            saves none of them, as published. Source: lab/reports/trust.md.
+            saves none of them, as published. Source: lab/reports/constants.md.
         tie_within_m: a new experience is also tied to the session's last saved node within this
             distance, metres. Source: the search radius, method §3.
         checkpoint_every: live frames between two checkpoints of the map.
