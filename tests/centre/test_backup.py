@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from engram.centre import backup
 from engram.centre.backup import back_up
 from engram.centre.service import Centre
-from engram.errors import InputError
+from engram.errors import InputError, StorageFullError
 from engram.maps import Map
 
 from .conftest import NAME, drive
@@ -33,3 +34,18 @@ def test_tables_that_name_no_map_are_those_of_another_centre(tmp_path):
     with Centre(tmp_path / "centre") as centre, pytest.raises(InputError, match="give --database"):
         back_up(centre, tmp_path / "backup")
     assert not (tmp_path / "backup").exists()
+
+
+def test_a_backup_that_does_not_fit_leaves_nothing_and_robots_forget_nothing(
+    site, in_process, tmp_path, monkeypatch
+):
+    def full(*_):
+        raise StorageFullError("no space is left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(backup, "copy_map", full)
+        with pytest.raises(StorageFullError):
+            back_up(site.centre, tmp_path / "held" / "backup")
+    assert list((tmp_path / "held").iterdir()) == []
+    assert site.centre.map_row(NAME)["durable_revision"] == 0
+    assert back_up(site.centre, tmp_path / "held" / "backup") == {NAME: 0}
