@@ -9,7 +9,7 @@ import pytest
 
 from engram.agent.agent import enrol
 from engram.agent.link import CentreRefusedError
-from engram.centre.access.enrolment import add_person, disable, new_code
+from engram.centre.access.enrolment import add_person, disable, new_code, take_away
 from engram.centre.access.roles import Role
 from engram.centre.dreams import Dreams
 from engram.centre.errors import UnknownError
@@ -292,3 +292,22 @@ def test_a_robot_that_enrols_again_has_its_new_name_and_one_taken_away_is_told(s
     disable(site.centre, agent.state.fact("robot"), "tests")
     with pytest.raises(CentreRefusedError, match=r"\(403\): this robot was taken away for good"):
         again()
+
+
+def test_a_person_or_robot_is_taken_away_by_name(site):
+    token = {"Authorization": f"Bearer {add_person(site.centre, 'Åsa', NAME, Role.ADMIN)}"}
+    assert site.http.get("/v1/me", headers=token).status_code == 200
+    take_away(site.centre, "Åsa", "tests")
+    assert site.http.get("/v1/me", headers=token).status_code == 401
+    with pytest.raises(UnknownError, match="nobody called 'Åsa'"):
+        take_away(site.centre, "Åsa", "tests")
+    first, second = site.robot("r1"), site.robot("r2")
+    code = new_code(site.centre, NAME, "head", "tests")
+    enrol(second.folder, "http://centre", code, "r1", site.http)
+    with pytest.raises(InputError, match="2 robots are called 'r1'"):
+        take_away(site.centre, "r1", "tests")
+    take_away(site.centre, first.state.fact("robot"), "tests")
+    first.step()
+    second.step()
+    assert "was taken away" in str(first.trouble)
+    assert second.trouble is None

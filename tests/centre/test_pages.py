@@ -6,6 +6,10 @@ import re
 
 import pytest
 
+from engram.agent.agent import enrol
+from engram.centre.access.enrolment import add_person, new_code
+from engram.centre.access.roles import Role
+
 from .conftest import NAME, drive
 
 PAGES = ["map", "history", "fleet", "queue", "health"]
@@ -29,6 +33,8 @@ def cookie(site, role="viewer"):
 def test_a_page_needs_a_token_and_takes_names_as_text(visited, page):
     url = f"/maps/{NAME}/{page}"
     assert visited.http.get(url).status_code == 401
+    login = visited.http.get(url, headers={"Accept": "text/html,*/*"}, follow_redirects=False)
+    assert (login.status_code, login.headers["location"]) == (303, "/")
     answer = visited.http.get(url, headers=cookie(visited))
     assert answer.status_code == 200
     assert "<script>x" not in answer.text
@@ -72,3 +78,27 @@ def test_health_shows_the_newest_change_first(visited):
     assert len(numbers) > 5
     assert numbers == sorted(numbers, reverse=True)
     assert "changed at row" not in page
+
+
+def test_pages_name_people_and_tell_robots_of_one_name_apart(visited):
+    token = add_person(visited.centre, "Åsa", NAME, Role.OPERATOR)
+    who = {"Authorization": f"Bearer {token}"}
+    visited.http.put(f"/v1/maps/{NAME}/refs/stable", json={"revision": 1}, headers=who)
+    code = new_code(visited.centre, NAME, "head", "tests")
+    enrol(visited.folder / "twin", "http://centre", code, "<script>x</script>", visited.http)
+    for page in ("history", "health"):
+        assert "<td>Åsa</td>" in visited.http.get(f"/maps/{NAME}/{page}", headers=who).text
+    fleet = visited.http.get(f"/maps/{NAME}/fleet", headers=who).text
+    assert len(set(re.findall(r"<small>(\w{8})</small>", fleet))) == 2
+
+
+def test_a_download_that_cannot_be_made_is_on_the_page_health_with_its_reason(visited):
+    who = cookie(visited)
+    headers = {**who, "X-Engram": "page"}
+    asked = {"ref": "head", "options": {"policy": "budget", "budget_bytes": 1}}
+    visited.http.post(f"/v1/maps/{NAME}/downloads", json=asked, headers=headers)
+    visited.work()
+    assert (
+        "not one node fits into 1 bytes"
+        in visited.http.get(f"/maps/{NAME}/health", headers=who).text
+    )

@@ -164,7 +164,8 @@ class Downloads:
                 update(artifacts).where(artifacts.c.id == row["id"]).values(**change)
             )
             now = self._centre.now_ns()
-            note(connection, now, "worker", change["state"], row["map"], artifact=row["id"])
+            why = {"error": change["error"]} if "error" in change else {}
+            note(connection, now, "worker", change["state"], row["map"], artifact=row["id"], **why)
 
     def _made(self, row: dict[str, Any]) -> dict[str, Any]:
         centre = self._centre

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from engram.cli import options
+from engram.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from engram.centre.service import Centre
@@ -46,7 +47,6 @@ def _open(folder: Path, database: str | None = None, objects: str | None = None)
         InputError: it is not there; `serve` and `map` make one, a mistyped name does not.
     """
     from engram.centre.service import Centre
-    from engram.errors import InputError
 
     if not (folder / ("maps" if database else "centre.sqlite")).exists():
         raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
@@ -156,7 +156,7 @@ def token(
     *,
     name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the person.")],
     role: Annotated[
-        str, typer.Option("--role", metavar="ROLE", help="viewer, operator or admin.")
+        str, typer.Option("--role", metavar="ROLE", help="viewer, operator, admin or none.")
     ] = "viewer",
     map_name: Annotated[
         str, typer.Option("--map", metavar="NAME", help="Which map; * for all.")
@@ -165,21 +165,24 @@ def token(
 ) -> None:
     """Print a token for a person.
 
-    It signs in to the centre's pages and to its HTTP interface.
+    It signs in to the centre's pages and its HTTP interface. The role none takes NAME away.
 
     \b
     Examples:
       engram centre token town --name alice --role operator
+      engram centre token town --name alice --role none
     """
-    from engram.centre.access.enrolment import add_person
+    from engram.centre.access.enrolment import add_person, take_away
     from engram.centre.access.roles import Role
-    from engram.errors import ConfigError
 
     roles = [str(one) for one in Role if one is not Role.ROBOT]
-    if role not in roles:
-        raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}")
+    if role not in {*roles, _NONE}:
+        raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {_NONE}")
     with _open(folder, database) as centre:
-        print(add_person(centre, name, map_name, Role(role)))
+        if role == _NONE:
+            typer.echo(f"{name} is taken away: {', '.join(take_away(centre, name, _BY))}")
+        else:
+            print(add_person(centre, name, map_name, Role(role)))
 
 
 @centre_group.command("map")
@@ -267,8 +270,6 @@ def _movable(ref: str) -> str | None:
 
 def _hours(text: str) -> tuple[float, float] | None:
     """The quiet hours, as FROM-TO."""
-    from engram.errors import ConfigError
-
     if text == _NONE:
         return None
     begin, _, end = text.partition("-")

@@ -11,7 +11,7 @@ import secrets
 from sqlalchemy import Connection, delete, select, update
 
 from engram.centre.access.roles import ALL_MAPS, Role, Subject
-from engram.centre.errors import NotAllowedError, NotKnownError
+from engram.centre.errors import NotAllowedError, NotKnownError, UnknownError
 from engram.centre.refs import check_followed
 from engram.centre.service import Centre
 from engram.centre.settings import DAY_NS
@@ -189,6 +189,35 @@ def disable(centre: Centre, robot: str, by: str) -> None:
         connection.execute(update(subjects).where(subjects.c.id == robot).values(disabled=1))
         connection.execute(delete(tokens).where(tokens.c.subject == robot))
         note(connection, centre.now_ns(), by, "disable", "", robot=robot)
+
+
+def take_away(centre: Centre, name: str, by: str) -> list[str]:
+    """Takes all tokens of the people of a name, or of the robot of a name or id, for good.
+
+    Returns:
+        Their ids.
+
+    Raises:
+        UnknownError: nobody is called so.
+        InputError: several robots are.
+    """
+    called = (subjects.c.name == name) | (subjects.c.id == name)
+    with centre.database.reading() as connection:
+        found = rows_of(connection, select(subjects).where(called, subjects.c.disabled == 0))
+    alike = [one["id"] for one in found if one["kind"] == "robot"]
+    if len(alike) > 1:
+        raise InputError(f"{len(alike)} robots are called {name!r}; name one by its id: {alike}")
+    if not found:
+        raise UnknownError(f"nobody called {name!r:.60} has a token")
+    for one in found:
+        disable(centre, one["id"], by)
+    return [one["id"] for one in found]
+
+
+def names_of(centre: Centre) -> dict[str, str]:
+    """Names of all robots and people, by id."""
+    with centre.database.reading() as connection:
+        return {row["id"]: row["name"] for row in rows_of(connection, select(subjects))}
 
 
 def _issue(centre: Centre, subject: str, expires_ns: int | None) -> str:

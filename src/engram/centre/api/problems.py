@@ -8,7 +8,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
@@ -54,14 +54,17 @@ def add_problems(app: FastAPI) -> None:
     """Lets an application answer errors with problem details."""
 
     @app.exception_handler(EngramError)
-    def foreseen(request: Request, error: EngramError) -> JSONResponse:
+    def foreseen(request: Request, error: EngramError) -> Response:
         told = request.app.state.centre.words_of(error)
         if isinstance(error, CentreError):
             status, title = error.status, error.title
         else:
             status = next((code for kind, code in _STATUS if isinstance(error, kind)), 500)
             title = HTTPStatus(status).phrase
-        if status != HTTPStatus.UNAUTHORIZED:  # a token that has ended is nobody's fault
+        if status == HTTPStatus.UNAUTHORIZED:  # a token that has ended is nobody's fault
+            if request.headers.get("accept", "").startswith("text/html"):  # somebody at a browser
+                return RedirectResponse("/", 303)
+        else:
             _log.info("%s %s: %d %s", request.method, request.url.path, status, told)
         return problem(status, title, told)
 

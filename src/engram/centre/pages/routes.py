@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from datetime import UTC, datetime
 from importlib.resources import files
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from engram.centre.access.enrolment import subject_of
+from engram.centre.access.enrolment import names_of, subject_of
 from engram.centre.access.roles import Role, Subject
 from engram.centre.api.context import COOKIE, Asking, CentreHere, takes, who_asks
 from engram.centre.downloads import Downloads
@@ -150,6 +151,7 @@ def history(name: str, centre: CentreHere, who: Asking) -> Response:
         maps=_maps(centre, who),
         log=map_log(centre.map_path(name))[:_SHOWN],
         refs=Refs(centre).all(name),
+        names=names_of(centre),
         reports=reports,
         may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
     )
@@ -158,13 +160,14 @@ def history(name: str, centre: CentreHere, who: Asking) -> Response:
 @router.get("/maps/{name}/fleet", dependencies=VIEWERS)
 def robots(name: str, centre: CentreHere, who: Asking) -> Response:
     """What every robot runs, and wants."""
-    rows = []
+    rows, named = [], Counter[str]()
     for row in Fleet(centre).all(name):
         try:
             revision = Refs(centre).revision(name, row["follows"])
             wanted = Refs(centre).version(name, revision)
         except UnknownError:
             revision, wanted = None, None
+        named[row["name"]] += 1
         rows.append({**row, "wanted": revision, "up_to_date": row["report"].get("runs") == wanted})
     return _page(
         "robots",
@@ -172,6 +175,7 @@ def robots(name: str, centre: CentreHere, who: Asking) -> Response:
         map=name,
         maps=_maps(centre, who),
         robots=rows,
+        named=named,
         refs=[one["name"] for one in Refs(centre).all(name)],
         may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
     )
@@ -215,7 +219,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         size_bytes=path.stat().st_size,
         row=centre.map_row(name),
         silent=[one for one in fleet if one["reported_ns"] is None],
-        names={one["robot"]: one["name"] for one in fleet},
+        names=names_of(centre),
     )
 
 
