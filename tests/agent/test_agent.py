@@ -276,3 +276,15 @@ def test_an_agent_that_runs_tells_what_it_does(site, caplog):
     assert f"hand-in {key}: settled, in revision 1" in told
     version = second.status()["runs"]
     assert f"version {version} is ready: the robot takes it when it is parked" in told
+
+
+def test_after_a_fall_back_only_what_is_new_is_handed_in(site):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    drive(second.live, "r2", 2_000)
+    first.hand_in()
+    assert second.hand_in() is not None
+    site.settle()
+    assert second.switch()
+    second.fall_back()
+    assert second.hand_in() is None

@@ -135,6 +135,14 @@ def test_a_robots_map_is_put_together_with_what_it_got_from_the_fleet(site, in_p
         assert len(list(store.frames.stored(store.load().nodes))) == len(live.load().nodes)
 
 
+def test_what_a_killed_dream_left_goes_when_it_is_not_dreamt_again(site):
+    left = site.centre.folder / "work" / "dream-gone"
+    left.mkdir()
+    (left / "0000.engram").write_bytes(b"a copy")
+    assert not dream_a_while(site.centre, lambda _: None, lambda: False)
+    assert not left.exists()
+
+
 class DreamMachine(RuleBasedStateMachine):
     """The model: what was dreamt of. The dreams themselves are of a moment."""
 

@@ -47,7 +47,10 @@ class Outbox:
         """
         taken = split(self._live, known=self._state.shared() | self._queued())
         key = taken.manifest.id
-        if key == self._state.fact("last_queued"):
+        if key == self._state.fact("last_queued") or key in {
+            one["id"]
+            for one in self._state.outbox()  # handed in before a fall-back
+        }:
             return None
         names = [*taken.pages, *taken.blobs]
         parts = dict(zip(names, taken.parts(names), strict=True))

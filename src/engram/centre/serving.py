@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import ipaddress
+import logging
 import multiprocessing
 import os
 import signal
@@ -22,6 +23,7 @@ from engram.errors import ConfigError, InputError, MissingExtraError
 from engram.logs import logging_to_stderr
 from engram.processes import end_with_parent
 
+_log = logging.getLogger(__name__)
 _RESTART_S = 1.0
 # The worker's priority below the service's: a merge that takes a core delays no answer.
 _WORKER_NICE = 5
@@ -145,6 +147,8 @@ def _supervised_worker(centre: Centre) -> Iterator[None]:
             process.start()
             while process.is_alive() and not stop.wait(_RESTART_S):
                 pass
+            if not stop.is_set():
+                _log.error("the worker ended, exit code %s; another one goes on", process.exitcode)
             process.terminate()
             process.join()
 

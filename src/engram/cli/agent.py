@@ -147,6 +147,7 @@ def fall_back(folder: Folder) -> None:
     """
     with _open(folder) as agent:
         agent.fall_back()
+    typer.echo("went back to the last good map")
 
 
 @agent_group.command()

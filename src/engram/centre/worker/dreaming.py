@@ -52,12 +52,22 @@ def dream_a_while(
     """
     dreams = Dreams(centre)
     dreams.ask_quietly()
-    for row in dreams.due():
+    due = dreams.due()
+    _clear_left(centre, due)
+    for row in due:
         with centre.lane(row["map"]) as is_ours:
             if is_ours and not _is_asked_for(centre):
                 _dream_beside(centre, row, wait, stopped, scheduler)
                 return True
     return False
+
+
+def _clear_left(centre: Centre, due: list[dict[str, Any]]) -> None:
+    """Removes what killed dreams left that will not go on: copies of all robots' maps."""
+    names = {f"dream-{row['id']}" for row in due}
+    for folder in (centre.folder / "work").glob("dream-*"):
+        if folder.name not in names:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _dream_beside(
