@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import queue
 import socket
+import threading
 from dataclasses import replace
 
+import httpx
 import pytest
+import uvicorn
 
 from engram.agent.agent import enrol
 from engram.agent.link import CentreRefusedError
+from engram.centre import serving
 from engram.centre.access.enrolment import add_person, disable, new_code, take_away
 from engram.centre.access.roles import Role
 from engram.centre.dreams import Dreams
@@ -311,3 +316,25 @@ def test_a_person_or_robot_is_taken_away_by_name(site):
     second.step()
     assert "was taken away" in str(first.trouble)
     assert second.trouble is None
+
+
+def test_a_service_ends_although_somebody_follows_its_events(site, monkeypatch):
+    started: queue.Queue = queue.Queue()
+
+    class Told(uvicorn.Server):
+        async def startup(self, sockets=None) -> None:
+            await super().startup(sockets=sockets)
+            started.put((self, sockets[0].getsockname()[1]))
+
+    monkeypatch.setattr(serving, "_telling", lambda _: Told)
+    monkeypatch.setattr(serving, "_GRACE_S", 0)
+    given = (site.centre, Listening("127.0.0.1", 0))
+    service = threading.Thread(target=serve, args=given, kwargs={"worker": False}, daemon=True)
+    service.start()
+    server, port = started.get(timeout=30)
+    url = f"http://127.0.0.1:{port}/v1/maps/{NAME}/events"
+    with httpx.stream("GET", url, headers=site.token("viewer")) as answer:
+        assert next(answer.iter_lines()) == ": events"
+        server.should_exit = True
+        service.join(30)
+        assert not service.is_alive()

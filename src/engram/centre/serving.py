@@ -25,6 +25,8 @@ from engram.processes import end_with_parent
 
 _log = logging.getLogger(__name__)
 _RESTART_S = 1.0
+# Who follows the events stays for ever: an ending service waits so long for requests under way.
+_GRACE_S = 5
 # The worker's priority below the service's: a merge that takes a core delays no answer.
 _WORKER_NICE = 5
 
@@ -76,6 +78,7 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
         ssl_certfile=listening.certificate,
         ssl_keyfile=listening.key,
         log_level="warning",
+        timeout_graceful_shutdown=_GRACE_S,
         server_header=False,
     )
     try:
