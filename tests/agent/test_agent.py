@@ -6,11 +6,12 @@ import httpx
 import pytest
 from tests.centre.conftest import Site, admit_here, drive
 
-from engram.agent import Agent, AgentSettings
-from engram.agent.agent import enrol
+from engram.agent import Agent, AgentSettings, enrol
 from engram.agent.link import CentreRefusedError, Unreachable
+from engram.agent.state import AgentState
 from engram.centre.backup import back_up
 from engram.centre.worker import merging
+from engram.cli.agent import _open
 from engram.config import load_toml
 from engram.errors import ConfigError, IncompatibleError, InputError, StorageFullError
 from engram.maps import Map
@@ -288,3 +289,21 @@ def test_after_a_fall_back_only_what_is_new_is_handed_in(site):
     assert second.switch()
     second.fall_back()
     assert second.hand_in() is None
+
+
+def test_a_settings_file_that_is_gone_is_named(tmp_path):
+    with pytest.raises(ConfigError, match=r"none\.toml: the file is missing"):
+        _open(tmp_path, tmp_path / "none.toml")
+
+
+def test_half_an_enrolment_a_lost_key_and_a_file_in_the_way_are_named(site, tmp_path):
+    agent = site.robot("r1")
+    AgentState(tmp_path / "agent.sqlite").close()
+    with pytest.raises(InputError, match="engram agent enrol"):
+        Agent(tmp_path)
+    (agent.folder / "key").write_bytes(b"")
+    with pytest.raises(InputError, match=r"key is not a robot's key .*; remove it and enrol"):
+        Agent(agent.folder)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="file cannot hold an agent: Not a directory"):
+        enrol(tmp_path / "file", "http://centre", "code", "r1", site.http)

@@ -11,7 +11,7 @@ import httpx
 import pytest
 import uvicorn
 
-from engram.agent.agent import enrol
+from engram.agent import enrol
 from engram.agent.link import CentreRefusedError
 from engram.centre import serving
 from engram.centre.access.enrolment import add_person, disable, new_code, take_away

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from engram.agent.agent import enrol
+from engram.agent import enrol
 from engram.centre.access.enrolment import add_person, new_code
 from engram.centre.access.roles import Role
 

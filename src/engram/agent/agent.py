@@ -21,11 +21,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from engram.agent.enrolment import PARTS, enrolled, signer_of
 from engram.agent.fetching import Fetch
 from engram.agent.link import Link, new_client
 from engram.agent.sending import FAILED, QUEUED, SENT, Outbox
 from engram.agent.settings import AgentSettings
-from engram.agent.state import AgentState
 from engram.errors import (
     EngramError,
     InputError,
@@ -36,64 +36,12 @@ from engram.errors import (
 )
 from engram.files import WriterLock
 from engram.maps import Map, check_file, copy_map
-from engram.monitor import write_whole
-from engram.transfers.signing import Signer, enrolment_text
 
 if TYPE_CHECKING:
     import httpx
 
 MAP = "map.engram"
 _log = logging.getLogger(__name__)
-_PARTS = ("live", "base", "next")
-
-
-def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | None = None) -> str:
-    """Enrols a robot with a centre; the key pair is made here and never leaves the folder.
-
-    Returns:
-        The name of its map.
-
-    Raises:
-        InputError: the folder has an agent of another centre already.
-        CentreRefusedError: the code is not valid.
-        Unreachable: the centre does not answer.
-    """
-    url = url.rstrip("/")
-    _check_centre(folder, url)
-    for part in _PARTS:
-        (folder / part).mkdir(parents=True, exist_ok=True)
-    key = folder / "key"
-    if not key.exists():
-        with write_whole(key) as draft:
-            draft.touch(mode=0o600)
-            draft.write_bytes(Signer.new_key())
-    signer = Signer(key.read_bytes())
-    link = Link(client or new_client(url), "", signer, None, lambda _: None)
-    body = {
-        "code": code,
-        "name": name,
-        "public_key": signer.public_key.hex(),
-        "signature": signer.sign(enrolment_text(code)).hex(),
-    }
-    answer = link.bare("/v1/robots/enrol", body)
-    state = AgentState(folder / "agent.sqlite")
-    state.remember(url=url, robot=answer["robot"], map=answer["maps"][0], name=name)
-    state.close()
-    return str(answer["maps"][0])
-
-
-def _check_centre(folder: Path, url: str) -> None:
-    """That a folder is not an agent's of another centre: what it knows of that would stay."""
-    path = folder / "agent.sqlite"
-    if not path.exists():
-        return
-    state = AgentState(path)
-    known, name = state.fact("url"), state.fact("name")
-    state.close()
-    if known is not None and known.rstrip("/") != url:
-        raise InputError(
-            f"{folder} belongs to the robot {name!r} of {known}; give another folder for {url}"
-        )
 
 
 class Agent:
@@ -122,22 +70,17 @@ class Agent:
         wait: Callable[[float], object] = lambda _: None,
         chance: Callable[[], float] = random.random,
     ) -> None:
-        if not (folder / "agent.sqlite").exists():
-            raise InputError(
-                f"{folder} is not the folder of an enrolled robot; enrol it: engram agent enrol "
-                f"{folder} URL CODE --name NAME"
-            )
         self.folder = folder
         self.settings = settings or AgentSettings()
-        self.state = AgentState(folder / "agent.sqlite")
+        self.state = enrolled(folder)
         self.trouble: EngramError | None = None
         self._failures: int = self.state.fact("failures", 0)
         self._chance = chance
         self._owns_client = client is None
         self.live = folder / "live" / MAP
-        for part in _PARTS:
+        for part in PARTS:
             (folder / part).mkdir(exist_ok=True)
-        signer = Signer((folder / "key").read_bytes())
+        signer = signer_of(folder / "key")
         self._map = self.state.fact("map")
         self.link = Link(
             client or new_client(self.state.fact("url")),

@@ -33,8 +33,11 @@ _LOOK_S = 0.5
 def _open(folder: Path, config: Path | None = None) -> Agent:
     from engram.agent import Agent, AgentSettings
     from engram.config import load_toml
+    from engram.errors import ConfigError
+    from engram.untrusted import read_text
 
-    settings = AgentSettings() if config is None else load_toml(config.read_text(), AgentSettings)
+    text = "" if config is None else read_text(config, ConfigError)
+    settings = load_toml(text, AgentSettings)
     return Agent(folder, settings, wait=threading.Event().wait)
 
 
