@@ -218,19 +218,37 @@ def test_one_wrong_match_is_no_way_forwards_and_no_misalignment() -> None:
 AHEAD, ASIDE, AT_REST = np.array([[0.1, 0.0, 0.5], [0.5, 0.0, 0.1], [0.0, 0.0, 0.0]])
 
 
+def late_rows(frames: int, moved: np.ndarray) -> Evidence:
+    """24 frames, the right side some frames late."""
+    shown = np.cumsum(RNG.normal(0, 1, (30, 48)), axis=0).astype(np.float32)
+    seen = Evidence(DoctorConfig(), camera=CAMERA, odometry=[True] * 24, sigma_m=[0.0] * 24)
+    seen.outside = [None] * 24
+    for k in range(24):
+        rows = shown[[k + frames, k]] + RNG.normal(0, 0.5, (2, 48)).astype(np.float32)
+        seen.looks.append(Look((100, 100), 0, 0, (False, False), (40, 40), rows))
+        seen.stamps_ns.append(k * 10**8 + 7)
+        seen.first.append(k == 0)
+        seen.moved.append(SE3(np.eye(3), moved) if k else None)
+    return seen
+
+
 @pytest.mark.parametrize(
     ("late", "moved", "found"), [(0, AHEAD, 0), (3, AHEAD, 3), (3, ASIDE, None), (3, AT_REST, None)]
 )
 def test_a_late_side_shows_in_the_rows_of_a_robot_that_drives(late: int, moved, found) -> None:
-    shown = np.cumsum(RNG.normal(0, 1, (30, 48)), axis=0).astype(np.float32)
-    seen = Evidence(DoctorConfig())
-    for k in range(24):
-        rows = shown[[k + late, k]] + RNG.normal(0, 0.5, (2, 48)).astype(np.float32)
-        seen.looks.append(Look((100, 100), 0, 0, (False, False), (40, 40), rows))
-        seen.stamps_ns.append(k * 10**8)
-        seen.first.append(k == 0)
-        seen.moved.append(SE3(np.eye(3), moved) if k else None)
-    assert frames_late(seen) == found
+    assert frames_late(late_rows(late, moved)) == found
+
+
+def test_rows_that_are_misaligned_tell_no_lag() -> None:
+    seen = late_rows(1, AHEAD)
+    assert codes(diagnose(seen)) == {"not_synchronised"}
+    points = np.column_stack(
+        [RNG.uniform(-9, 9, 60), RNG.uniform(-4, 1, 60), RNG.uniform(9, 30, 60)]
+    )
+    for k in range(4):
+        sound = matched(points)
+        seen.matches.append((k, SideMatches(sound.pixels, sound.shift + np.array([0.0, 3.0]))))
+    assert codes(diagnose(seen)) == {"rows_misaligned"}
 
 
 @pytest.mark.parametrize(("sigma_m", "off"), [(0.02, 0.12), (0.3, None)])

@@ -79,12 +79,6 @@ CHECKS: tuple[Check, ...] = (
         explains=_CONSEQUENCES,
     ),
     Check(
-        "not_synchronised", _FATAL, sides.frames_late, 0, "frames",
-        "left and right are not synchronised: one shows what the other has shown before",
-        "pair the images by their time of exposure; look for a dropped frame",
-        explains=_CONSEQUENCES,
-    ),
-    Check(
         "not_synchronised", _FATAL, sides.forward_m, "forward_m", "m",
         "left and right are not synchronised: the robot moved between them",
         "trigger both cameras at once, or pair by the time of exposure; check for a dropped frame",
@@ -100,7 +94,14 @@ CHECKS: tuple[Check, ...] = (
         "rows_misaligned", _FATAL, sides.row_offset_px, "row_offset_px", "px",
         "rows of left and right are not aligned",
         "calibrate again; raw images need a [raw] calibration, so that they are rectified",
-        explains=("no_odometry", "rows_slightly_off"),
+        # In rows that do not correspond, motion down the image looks like a lag.
+        explains=("no_odometry", "rows_slightly_off", "not_synchronised"),
+    ),
+    Check(
+        "not_synchronised", _FATAL, sides.frames_late, 0, "frames",
+        "left and right are not synchronised: one shows what the other has shown before",
+        "pair the images by their time of exposure; look for a dropped frame",
+        explains=_CONSEQUENCES,
     ),
     Check(
         "frozen_stream", _FATAL, motion.frozen_frames, "frozen_frames", "images in a row",
