@@ -18,8 +18,9 @@ _LONG = 30
 # Ways are compared over stretches of this length, metres, and at least so many of them.
 _WAY_M = 3.0
 _LEAST_WAYS = 3
-# Their difference counts beyond so many standard deviations of one of them.
-_SIGNIFICANT = 2.0
+# Their median counts beyond so many standard deviations of it, and beyond one of a single way: in
+# rain all err alike.
+_SIGNIFICANT = 4.0
 
 
 def without_odometry(seen: Evidence) -> float | None:
@@ -54,7 +55,7 @@ def frozen_frames(seen: Evidence) -> float | None:
 def scale_off(seen: Evidence) -> float | None:
     """How far odometry's scale is from that of motion from outside, as a share.
 
-    None where odometry is too unsure of a way to tell: in rain its steps are uncertain, and short.
+    None where odometry is too unsure to tell: in rain its steps are uncertain, and short.
     """
     ways: list[tuple[float, float]] = []
     nowhere = SE3.identity(), SE3.identity(), 0.0
@@ -71,8 +72,8 @@ def scale_off(seen: Evidence) -> float | None:
     if len(ways) < _LEAST_WAYS:
         return None
     ratio, sigma = np.median(ways, axis=0)
-    off = float(abs(ratio - 1))
-    return off if max(off, seen.config.scale) > _SIGNIFICANT * sigma else None
+    off, unsure = float(abs(ratio - 1)), sigma * max(_SIGNIFICANT / math.sqrt(len(ways)), 1.0)
+    return off if max(off, seen.config.scale) > unsure else None
 
 
 def _repeats(look: Look, side: int) -> bool:
