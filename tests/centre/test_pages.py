@@ -55,6 +55,12 @@ def test_the_map_page_gets_every_node_with_its_revision(visited):
     assert visited.http.get(f"/maps/{NAME}/nodes/{node}/picture").status_code == 401
 
 
+def test_a_map_that_nobody_handed_in_to_says_so(site):
+    page = site.http.get(f"/maps/{NAME}/history", headers=cookie(site)).text
+    assert "1970" not in page
+    assert "no robot has handed in" in page
+
+
 def test_logging_in_sets_a_cookie_that_only_the_server_reads(visited):
     token = visited.token("viewer")["Authorization"].removeprefix("Bearer ")
     answer = visited.http.post("/login", data={"token": token}, follow_redirects=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from engram.transfers import Manifest, PartHash, Split, join, split
 from engram.transfers.join import blobs_named
 from engram.transfers.manifest import decode_manifest
 
+_log = logging.getLogger(__name__)
 # Parts are kept as often as this much of them has arrived.
 _KEEP_BYTES = 256 * 1024
 # Hashes in one request: 33 kB, so that a link that breaks often lets it pass.
@@ -52,6 +54,7 @@ class Fetch:
         key = artifact["id"]
         sent = link.ask("GET", f"/v1/artifacts/{key}/manifest")
         manifest = _manifest(sent)
+        _log.info("fetching revision %d", revision)
         own = split(self._live) if self._live.exists() else None
         self._receive(link, key, list(manifest.hashes()), own)
         blobs = self._blobs(manifest, own)

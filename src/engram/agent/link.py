@@ -132,7 +132,7 @@ class Link:
         try:
             answer = self._client.request(method, path, headers=headers, **options)
         except httpx.HTTPError as error:
-            raise Unreachable(f"the centre cannot be reached: {error!r}") from error
+            raise _out_of_reach(error) from error
         self.received_bytes += len(answer.content)
         self.sent_bytes += int(answer.request.headers.get("content-length", 0))
         return answer
@@ -153,7 +153,7 @@ class Link:
         try:
             answer = self._client.post(path, json=body)
         except httpx.HTTPError as error:
-            raise Unreachable(f"the centre cannot be reached: {error!r}") from error
+            raise _out_of_reach(error) from error
         self._refuse(answer)
         return _content(answer)
 
@@ -179,6 +179,13 @@ class Link:
         if status in {502, 503, 504}:
             raise Unreachable(f"the centre is unavailable now (status {status}): {detail}")
         raise CentreRefusedError(status, detail)
+
+
+def _out_of_reach(error: Exception) -> Unreachable:
+    fact = f"the centre cannot be reached: {error!r}"
+    if "CERTIFICATE_VERIFY_FAILED" in fact:
+        fact += "; SSL_CERT_FILE can name the certificate of a centre that signs for itself"
+    return Unreachable(fact)
 
 
 def _content(answer: httpx.Response) -> Any:

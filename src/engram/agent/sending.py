@@ -118,6 +118,8 @@ class Outbox:
         manifest = decode_manifest(row["manifest"])
         answer = self._begin(link, manifest)
         key = answer["id"]
+        if answer["wanted"]:
+            _log.info("hand-in %s: sending", row["id"][:12])
         while answer["wanted"]:
             wanted = [PartHash(bytes.fromhex(one)) for one in answer["wanted"]]
             before = answer["wanted"]

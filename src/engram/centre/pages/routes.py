@@ -48,7 +48,7 @@ _templates = Environment(
 
 
 def _when(stamp_ns: int | None) -> str:
-    if stamp_ns is None:
+    if not stamp_ns:
         return "never"
     text = datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
     return Markup(f"<time>{text}</time>")  # digits and our own words
