@@ -91,6 +91,24 @@ def test_a_download_is_made_when_there_is_room_again(site, monkeypatch):
     assert robot.status()["staged"] is not None
 
 
+def test_two_workers_do_not_make_the_same_download(site, monkeypatch):
+    handed(site)
+    site.work()
+    robot, real, made = site.robot("r2"), downloads.download, []
+    robot.step()
+
+    def beside_another_worker(*given, **options):
+        made.append(given)
+        assert site.work() == 0
+        return real(*given, **options)
+
+    monkeypatch.setattr(downloads, "download", beside_another_worker)
+    site.work()
+    assert len(made) == 1
+    site.settle()
+    assert robot.status()["staged"] is not None
+
+
 def test_a_worker_goes_on_after_what_hindered_it_and_tells_it(site, monkeypatch, caplog):
     row, waits = handed(site), []
     monkeypatch.setattr(merging, "merge", full)

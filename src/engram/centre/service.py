@@ -148,7 +148,7 @@ class Centre:
 
     @contextmanager
     def lane(self, name: str) -> Iterator[bool]:
-        """Whether this worker has a map to itself; its death frees the map."""
+        """Whether this worker has a map, or its downloads, to itself; its death frees them."""
         try:
             lock = WriterLock(self.folder / "maps" / f"{name}.lane")
         except MapLockedError:

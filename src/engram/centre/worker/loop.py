@@ -27,22 +27,22 @@ def work_off(centre: Centre) -> int:
         EngramError: what hinders the centre; of each map, after all of them had their turn. Jobs
             wait.
     """
-    downloads, handins = Downloads(centre), HandIns(centre)
+    handins = HandIns(centre)
     settled, hindered = 0, list[EngramError]()
     handins.expire()
-    downloads.expire()
+    Downloads(centre).expire()
     for name in centre.map_names():
         if not handins.waiting(name):
             continue
         try:
             with centre.lane(name) as is_ours:
                 for row in handins.waiting(name) if is_ours else ():
-                    settled += _make_downloads(downloads, hindered)
+                    settled += _make_downloads(centre, hindered)
                     merge_hand_in(centre, row)
                     settled += 1
         except WaitsError as error:  # the next map may have its disk and its drives
             hindered.append(error)
-    settled += _make_downloads(downloads, hindered)
+    settled += _make_downloads(centre, hindered)
     if hindered:
         raise hindered[0]
     return settled
@@ -79,14 +79,17 @@ def work(
             wait(centre.settings.poll_s)
 
 
-def _make_downloads(downloads: Downloads, hindered: list[EngramError]) -> int:
+def _make_downloads(centre: Centre, hindered: list[EngramError]) -> int:
     """Makes what robots asked for, unless something hinders it: merging may take less room."""
-    made = 0
-    for row in downloads.asked():
-        if not hindered:
-            try:
-                downloads.make(row)
-                made += 1
-            except (StorageFullError, StoreError) as error:
-                hindered.append(error)
+    downloads, made = Downloads(centre), 0
+    for name in {row["map"] for row in downloads.asked()}:
+        with centre.lane(f"{name}.downloads") as is_ours:
+            for row in downloads.asked() if is_ours else ():  # again: others made some meanwhile
+                if row["map"] != name or hindered:
+                    continue
+                try:
+                    downloads.make(row)
+                    made += 1
+                except (StorageFullError, StoreError) as error:
+                    hindered.append(error)
     return made
