@@ -13,6 +13,7 @@ from engram.centre.handins import HandIns
 from engram.centre.service import Centre
 from engram.centre.store.database import _errors
 from engram.centre.worker import loop, merging
+from engram.centre.worker.admission import KilledError
 from engram.errors import EngramError, MapCorruptError, StorageFullError
 
 from .conftest import NAME, POLICY, drive
@@ -89,6 +90,22 @@ def test_a_download_is_made_when_there_is_room_again(site, monkeypatch):
     assert not HandIns(site.centre).waiting(NAME)  # a merge takes less room
     site.settle()
     assert robot.status()["staged"] is not None
+
+
+def test_a_check_that_is_killed_is_made_again_but_not_for_ever(site, monkeypatch):
+    row = handed(site)
+
+    def killed(*_):
+        raise KilledError("the check was killed")
+
+    monkeypatch.setattr(merging, "admit", killed)
+    for _ in range(site.centre.settings.merge_tries):
+        with pytest.raises(EngramError, match="waits: the check was killed"):
+            site.work()
+    site.work()
+    row = HandIns(site.centre).get(row["id"])
+    assert row["state"] == "failed"
+    assert "died 3 times; an operator may have it merged anyway" in row["error"]
 
 
 def test_two_workers_do_not_make_the_same_download(site, monkeypatch):

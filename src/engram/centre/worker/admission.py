@@ -10,6 +10,7 @@ import ctypes
 import multiprocessing
 import os
 import resource
+import signal
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -20,6 +21,10 @@ from engram.transfers import Manifest, PartHash, join
 
 _NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 _SHOWN_PROBLEMS = 5
+
+
+class KilledError(WorkerError):
+    """Something killed the process that checks a map."""
 
 
 def admit(
@@ -37,7 +42,8 @@ def admit(
     Raises:
         MapCorruptError: the parts make no sound map.
         StorageFullError: there is no room for it now.
-        WorkerError: the limits ended the process.
+        KilledError: something else than the limits ended the process.
+        WorkerError: the limits ended it.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
@@ -52,6 +58,10 @@ def admit(
         outcome = pipe.recv()
     except (EOFError, OSError):
         process.join()
+        if process.exitcode == -signal.SIGKILL:  # limits end it in other ways
+            raise KilledError(
+                "the check of the map was killed, as by a system that is out of memory"
+            ) from None
         raise WorkerError(
             f"the map took more than {memory_bytes} bytes or {time_s} s to check, exit code "
             f"{process.exitcode}"

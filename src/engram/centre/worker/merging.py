@@ -19,7 +19,7 @@ from engram.centre.handins import HandIns
 from engram.centre.keeping import HandInState
 from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
-from engram.centre.worker.admission import admit
+from engram.centre.worker.admission import KilledError, admit
 from engram.centre.worker.watching import Watching
 from engram.errors import (
     EngramError,
@@ -64,6 +64,8 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
         handins.end(row, HandInState.OPEN)
     except RefusedError as error:
         handins.end(row, HandInState.REFUSED, error=centre.words_of(error))
+    except KilledError as error:  # this try counts: the map may be what takes the memory
+        raise WaitsError(f"{row['map']}: hand-in {row['id'][:8]} waits: {error}") from error
     except (*_OF_THE_CENTRE, OSError) as error:
         fact = centre.words_of(error)
         handins.put_off(row, fact)
