@@ -30,6 +30,17 @@ def test_a_backup_holds_the_folder_and_robots_may_forget(site, in_process, tmp_p
         back_up(site.centre, tmp_path / "backup")
 
 
+def test_a_map_whose_file_is_gone_is_not_made_anew(site):
+    site.centre.close()
+    path = site.centre.map_path(NAME)
+    path.unlink()
+    with pytest.raises(InputError, match=r"fleet\.engram is missing, .*: serve a backup"):
+        site.centre.add_map(NAME, "tests")
+    assert not path.exists()
+    health = site.http.get(f"/maps/{NAME}/health", headers=site.token("viewer"))
+    assert "the file of the map is gone" in health.text
+
+
 def test_tables_that_name_no_map_are_those_of_another_centre(tmp_path):
     with Centre(tmp_path / "centre") as centre, pytest.raises(InputError, match="give --database"):
         back_up(centre, tmp_path / "backup")

@@ -121,7 +121,7 @@ class Centre:
         """Makes an empty map; one that is there stays.
 
         Raises:
-            InputError: the name cannot be one.
+            InputError: the name cannot be one, or the file of a map is gone.
         """
         if not _NAME.fullmatch(name):
             raise InputError(
@@ -130,6 +130,11 @@ class Centre:
             )
         path = self.folder / "maps" / f"{name}.engram"
         if not path.exists():
+            if name in self.map_names():
+                raise InputError(
+                    f"{path} is missing, and the tables say what was merged into it: serve a "
+                    "backup of this centre, or put the file back"
+                )
             Map.create(path).close()
         row = {
             "name": name,

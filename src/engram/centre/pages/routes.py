@@ -216,7 +216,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         broken=broken,
         events=events,
         waiting=waiting,
-        size_bytes=path.stat().st_size,
+        size_bytes=path.stat().st_size if path.exists() else 0,
         row=centre.map_row(name),
         silent=[one for one in fleet if one["reported_ns"] is None],
         names=names_of(centre),
