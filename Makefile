@@ -77,4 +77,4 @@ docs: setup
 	@echo "build/docs/index.html"
 
 clean:
-	rm -rf $(VENV) build lab/build demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) build lab/build demo centre-demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
