@@ -78,6 +78,9 @@ def test_a_frame_that_matches_weakly_is_saved_unless_as_published(
     graph = graph_of(path)
     tied = {edge.b for edge in graph.edges if edge.kind is EdgeKind.TIE and edge.a in first.saved}
     assert set(again.saved) <= tied
+    # Matched all along, they need no dead reckoning to be neighbours of what is there.
+    assert all(edge.kind is not EdgeKind.PROXIMITY for edge in graph.edges)
+    assert len(set(graph.experiences.tolist())) == 1 + bool(again.saved)
 
 
 def test_another_appearance_becomes_an_experience_beside_the_known_one(path: Path) -> None:

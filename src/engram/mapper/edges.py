@@ -38,7 +38,7 @@ def match_edges(
         and (covariance := outcome.match.covariance) is not None
     ]
     edges = [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
-    return [edge for edge in edges if _fits(graph, edge, config)]
+    return [edge for edge in edges if fits(graph, edge, config)]
 
 
 def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
@@ -49,7 +49,7 @@ def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
     return Edge(a.node, b.node, kind, a_from_b, covariance)
 
 
-def _fits(graph: ExperienceGraph, edge: Edge, config: AcceptanceConfig) -> bool:
+def fits(graph: ExperienceGraph, edge: Edge, config: AcceptanceConfig) -> bool:
     """Whether an edge agrees with the known path between its ends; True without a path."""
     known = graph.predict(graph.index(edge.a), graph.index(edge.b))
     if known is None:

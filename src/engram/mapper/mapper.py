@@ -22,7 +22,7 @@ from engram.graph.model import (
 )
 from engram.graph.proximity import ProximityConfig, lay_proximity_edges, tighten_chain
 from engram.localiser import Hint, Localisation, LocalisationStatus, Localiser, Position
-from engram.mapper.edges import edge_through_live, match_edges
+from engram.mapper.edges import edge_through_live, fits, match_edges
 from engram.mapper.loops import LoopSearch
 from engram.mapper.memory import Memory, match_of
 from engram.mapper.saver import Records, Saver
@@ -155,7 +155,8 @@ class Mapper(Memory):
         if found.localised:
             edges += self._join(found)
         if self._looks_new(found) and self._worth_saving(live, found.motion):
-            saved, laid = self._save(live, found)
+            save = self._save_matched if found.localised else self._save
+            saved, laid = save(live, found.position)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
         self._put(live, Records(node=saved, frame=live if saved else None, edges=edges), visit)
@@ -264,19 +265,11 @@ class Mapper(Memory):
             or moved.angle_rad >= self.config.save_every_rad
         )
 
-    def _save(self, live: Frame, found: Localisation) -> tuple[Node, list[Edge]]:
+    def _save(self, live: Frame, position: Position | None) -> tuple[Node, list[Edge]]:
         """Saves the frame as a node, chained to the experience or tied to where it began."""
-        node = Node(
-            node_id(self._session.id, live.stamp_ns),
-            self._session.id,
-            live.stamp_ns,
-            live.camera.id,
-            self._localiser.driven_m,
-        )
-        self._graph.add_node(node)
+        node = self._node_of(live)
         edges = []
-        position = found.position
-        if self._since_saved is None and not found.localised:
+        if self._since_saved is None:
             self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
@@ -286,14 +279,42 @@ class Mapper(Memory):
                 self._wait_with([tie])
             else:
                 edges.append(tie)
-            edges += self._edge_to_last_saved(position, node.id)
+            edges += self._edge_to_last_saved(position, node.id, EdgeKind.TIE)
         self._graph.add_edges(edges)
         edges += self._beside(node.id)
         self._experience.append(node.id)
         self._since_saved = Position.at(node.id)
-        if not self._waiting and not found.localised:
+        if not self._waiting:
             self._localiser.settle_in(node.id)
         return node, edges
+
+    def _save_matched(self, live: Frame, position: Position | None) -> tuple[Node, list[Edge]]:
+        """Saves a frame that matched weakly: tied by its match, and chained to the last one."""
+        assert position is not None
+        node = self._node_of(live)
+        tie = _edge(position, node.id, EdgeKind.TIE)
+        self._graph.add_edge(tie)
+        acceptance = self._localiser.config.acceptance
+        chained = [
+            edge
+            for edge in self._edge_to_last_saved(position, node.id, EdgeKind.ODOMETRY)
+            if fits(self._graph, edge, acceptance)
+        ]
+        self._graph.add_edges(chained)
+        self._since_saved = Position.at(node.id)
+        return node, [tie, *chained]
+
+    def _node_of(self, live: Frame) -> Node:
+        """Adds the frame to the graph."""
+        node = Node(
+            node_id(self._session.id, live.stamp_ns),
+            self._session.id,
+            live.stamp_ns,
+            live.camera.id,
+            self._localiser.driven_m,
+        )
+        self._graph.add_node(node)
+        return node
 
     def _close_loops(self, closures: list[Edge]) -> list[Edge]:
         """Adds edges to recognised places; the nodes around them become candidates."""
@@ -304,7 +325,7 @@ class Mapper(Memory):
             edges += self._beside(closure.b)
         return edges
 
-    def _edge_to_last_saved(self, position: Position, node: NodeId) -> list[Edge]:
+    def _edge_to_last_saved(self, position: Position, node: NodeId, kind: EdgeKind) -> list[Edge]:
         """Also ties a new experience to this session's last one if that is still near.
 
         In between the robot was localised only briefly, perhaps in a distant node: without this
@@ -315,7 +336,7 @@ class Mapper(Memory):
             return []
         if last.node_from_live.distance_m > self.config.tie_within_m:
             return []
-        return [_edge(last, node, EdgeKind.TIE)]
+        return [_edge(last, node, kind)]
 
     def _end_experience(self, localisation: Localisation) -> list[Edge]:
         """Ties the last node of the experience to the matched node."""

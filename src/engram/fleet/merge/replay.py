@@ -348,8 +348,9 @@ class Replay(Keeper):
             at = _measured(found)
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
             self._merge.add_edge(match)
-        proximity = self._settings.mapper.proximity
-        self._merge.write_edges(lay_proximity_edges(self._merge.graph, index, proximity))
+        else:
+            proximity = self._settings.mapper.proximity
+            self._merge.write_edges(lay_proximity_edges(self._merge.graph, index, proximity))
         self._visited = node.id
 
     def _matched(self, node: Node, outcomes: Sequence[Outcome]) -> None:
