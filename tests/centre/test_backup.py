@@ -6,9 +6,11 @@ import pytest
 
 from engram.centre import backup
 from engram.centre.backup import back_up
+from engram.centre.refs import Refs
 from engram.centre.service import Centre
+from engram.centre.store.schema import maps
 from engram.errors import InputError, StorageFullError
-from engram.maps import Map
+from engram.maps import Map, copy_map
 
 from .conftest import NAME, drive
 
@@ -39,6 +41,37 @@ def test_a_map_whose_file_is_gone_is_not_made_anew(site):
     assert not path.exists()
     health = site.http.get(f"/maps/{NAME}/health", headers=site.token("viewer"))
     assert "the file of the map is gone" in health.text
+
+
+def test_robots_hand_in_again_what_an_older_file_that_was_put_back_lacks(
+    site, in_process, tmp_path
+):
+    agent = site.robot("r1", follows="stable")
+    drive(agent.live, "r1", 1_000)
+    agent.hand_in()
+    site.settle()
+    path = site.centre.map_path(NAME)
+    copy_map(path, tmp_path / "older.engram")
+    drive(agent.live, "r1", 2_000)
+    agent.hand_in()
+    site.settle()
+    Refs(site.centre).move(NAME, "stable", 2, "tests", None)
+    row = {**site.centre.map_row(NAME), "durable_revision": 2}
+    with site.centre.database.writing() as connection:
+        site.centre.database.put(connection, maps, row)
+    site.centre.close()
+    for one in path.parent.glob(f"{path.name}*"):
+        one.unlink()
+    (tmp_path / "older.engram").rename(path)
+    site.restart()
+    site.centre.add_map(NAME, "tests")
+    assert site.centre.map_row(NAME)["durable_revision"] == 1
+    assert Refs(site.centre).revision(NAME, "stable") == 1
+    site.settle()
+    with Map.open(path) as store:
+        assert {one.start_ns for one in store.sessions.values()} == {1_000, 2_000}
+    states = [row["state"] for row in site.agents["r1"].status()["outbox"]]
+    assert states == ["settled"]  # the first is in a backup
 
 
 def test_tables_that_name_no_map_are_those_of_another_centre(tmp_path):

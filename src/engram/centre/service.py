@@ -12,16 +12,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import URL, select
+from sqlalchemy import URL, Connection, select, update
 
 from engram.centre.errors import UnknownError
+from engram.centre.keeping import HandInState
 from engram.centre.resident import ResidentMaps
 from engram.centre.settings import DAY_NS, CentreSettings
 from engram.centre.store.audit import note
 from engram.centre.store.database import ServiceDatabase, first_row, rows_of
 from engram.centre.store.objects import BucketObjects, FolderObjects, Objects
 from engram.centre.store.packs import Packs
-from engram.centre.store.schema import maps
+from engram.centre.store.schema import handins, maps, refs
 from engram.config import from_dict, to_dict
 from engram.errors import InputError, MapLockedError
 from engram.files import WriterLock
@@ -145,6 +146,27 @@ class Centre:
         with self.database.writing() as connection:
             if self.database.add(connection, maps, [row]):
                 note(connection, self.now_ns(), by, "map", name)
+            self._follow_file(connection, name, by)
+
+    def _follow_file(self, connection: Connection, name: str, by: str) -> None:
+        """Makes the tables of a map say what its file holds, if an older one was put back.
+
+        Hand-ins merged into later revisions are open again, so that their robots send them again.
+        """
+        with Map.open(self.folder / "maps" / f"{name}.engram") as store:
+            head, now = store.revision, self.now_ns()
+        late = (handins.c.map == name) & (handins.c.revision > head)
+        lost = dict.fromkeys(("base", "place", "ended_ns", "revision", "report"))
+        again = (
+            update(handins).where(late).values(state=str(HandInState.OPEN), begun_ns=now, **lost)
+        )
+        ahead = (refs.c.map == name) & (refs.c.revision > head)
+        back = update(refs).where(ahead).values(revision=head, version=refs.c.version + 1)
+        kept = (maps.c.name == name) & (maps.c.durable_revision > head)
+        durable = update(maps).where(kept).values(durable_revision=head)
+        changed = [connection.execute(one).rowcount for one in (again, back, durable)]
+        if any(changed):
+            note(connection, now, by, "older-file", name, revision=head, handins=changed[0])
 
     def map_names(self) -> list[str]:
         """All maps."""
