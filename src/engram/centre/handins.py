@@ -278,6 +278,8 @@ class HandIns:
         if "report" in change:
             change["report"] = json.dumps(change["report"])
         ended = now if state in ENDED else None
+        if state == HandInState.OPEN:  # what it lacks is no death of a worker
+            change["tries"] = 0
         with self._centre.database.writing() as connection:
             connection.execute(
                 update(handins)

@@ -133,8 +133,8 @@ class Centre:
         if not path.exists():
             if name in self.map_names():
                 raise InputError(
-                    f"{path} is missing, and the tables say what was merged into it: serve a "
-                    "backup of this centre, or put the file back"
+                    f"{path} is missing, and the tables say what was merged into it: put it back "
+                    "from a backup, and robots hand in again what that lacks"
                 )
             Map.create(path).close()
         row = {
@@ -156,10 +156,9 @@ class Centre:
         with Map.open(self.folder / "maps" / f"{name}.engram") as store:
             head, now = store.revision, self.now_ns()
         late = (handins.c.map == name) & (handins.c.revision > head)
-        lost = dict.fromkeys(("base", "place", "ended_ns", "revision", "report"))
-        again = (
-            update(handins).where(late).values(state=str(HandInState.OPEN), begun_ns=now, **lost)
-        )
+        lost: dict[str, Any] = dict.fromkeys(("base", "place", "ended_ns", "revision", "report"))
+        lost |= {"state": str(HandInState.OPEN), "begun_ns": now, "tries": 0}
+        again = update(handins).where(late).values(**lost)
         ahead = (refs.c.map == name) & (refs.c.revision > head)
         back = update(refs).where(ahead).values(revision=head, version=refs.c.version + 1)
         kept = (maps.c.name == name) & (maps.c.durable_revision > head)
