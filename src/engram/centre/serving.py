@@ -88,7 +88,7 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
         raise InputError(f"TLS cannot be had with {files}: {error.strerror or error}") from error
     server = _telling(uvicorn.Server)(config)
     beside = _supervised_worker(centre) if worker else nullcontext()
-    with _listening_at(listening) as taken, logging_to_stderr(), beside:
+    with _listening_at(listening) as taken, beside:
         server.run(sockets=[taken])
 
 

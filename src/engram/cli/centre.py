@@ -89,14 +89,14 @@ def serve(
       engram centre serve town
       engram centre serve town --host 0.0.0.0 --tls-certificate town.pem --tls-key town.key
     """
+    from engram.centre import serving
     from engram.centre.service import Centre
-    from engram.centre.serving import Listening
-    from engram.centre.serving import serve as run
+    from engram.logs import logging_to_stderr
 
-    listening = Listening(host, port, certificate, key, insecure=insecure)
-    with Centre(folder, database, objects) as centre:
+    listening = serving.Listening(host, port, certificate, key, insecure=insecure)
+    with logging_to_stderr(), Centre(folder, database, objects) as centre:
         centre.add_map(map_name, _BY)
-        run(centre, listening, worker=worker)
+        serving.serve(centre, listening, worker=worker)
 
 
 @centre_group.command()
