@@ -7,7 +7,7 @@ from engram_lab.checks.undisturbed import Driven, Kept, Way, events_of, figures,
 
 def driven(drive: str, metres: float, events: int) -> Driven:
     way = Way(metres, 100, 80, 3, 2 * events, events, 1.5)
-    return Driven("town", (0, 2), drive, "cold start", "brief", 11, way)
+    return Driven("town", (0, 2), drive, "cold start", "brief", 11, 60, way)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
     python -m engram_lab.checks.undisturbed keble                       # 8 maps of 3 drives each
     python -m engram_lab.checks.undisturbed keble,oxford --maps 20 --drives 2 --json events.json
+    python -m engram_lab.checks.undisturbed keble --mapped 0,2,6 --live 4,1 --sure 0
 
 Of each campaign maps are built from drives drawn at random, and every other drive is driven in each
 map to its end: once from its first frame, told its place, and once from a frame drawn at random,
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -25,10 +26,11 @@ from scipy.stats import chi2
 from engram.cli.progress import Bars
 from engram.frontend import BRIEF, DescriptorKind
 from engram.localiser import METHOD_VERSION, Budget
+from engram.mapper import MapperConfig
 from engram.monitor import Monitor
 from engram.robot import Settings
 from engram_lab.misplaced import Kind, Street, Try
-from engram_lab.programs import Figure, command_line, report
+from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
 from engram_lab.town import campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
@@ -69,7 +71,8 @@ class Driven:
     """One such robot.
 
     Attributes:
-        campaign, mapped, drive, start, kind, method: what was driven, in which map, and how.
+        campaign, mapped, drive, start, kind, method, sure: what was driven, in which map, and how;
+            frames that match with fewer inliers than `sure` were saved.
         way: what came of it.
     """
 
@@ -79,12 +82,14 @@ class Driven:
     start: str
     kind: str
     method: int
+    sure: int
     way: Way
 
     @property
     def key(self) -> tuple[object, ...]:
         """What tells it apart."""
-        return self.campaign, self.mapped, self.drive, self.start, self.kind, self.method
+        how = self.start, self.kind, self.method, self.sure
+        return self.campaign, self.mapped, self.drive, *how
 
     @staticmethod
     def of(line: str) -> Driven:
@@ -153,11 +158,15 @@ class Asked:
         maps: how many maps are drawn; one that is drawn twice counts once.
         drives: that each is built from.
         seed: of both.
+        mapped: the drives of a single map instead; empty to draw.
+        live: the drives that are driven there; empty for all others.
     """
 
     maps: int
     drives: int
     seed: int
+    mapped: tuple[int, ...] = ()
+    live: tuple[int, ...] = ()
 
 
 def campaign_rows(
@@ -165,17 +174,22 @@ def campaign_rows(
 ) -> Iterator[Driven]:
     """All robots of a campaign; renders and maps what is not there yet."""
     campaign, folder = campaign_named(name), towns_folder(settings)
-    simulate(campaign, folder, settings=settings, monitor=monitor)
-    drives = drives_of(campaign_logs(campaign, folder))
-    kind = str(settings.frontend.descriptor)
-    for mapped in maps_of(len(drives), asked.maps, asked.drives, asked.seed):
+    every = range(len(campaign.sessions))
+    needed = {*asked.mapped, *asked.live} if asked.live else set(every)
+    simulate(campaign, folder, sessions=sorted(needed), settings=settings, monitor=monitor)
+    logs = campaign_logs(campaign, folder)
+    shown = drives_of([logs[k] for k in sorted(needed)])
+    drives = dict(zip(sorted(needed), shown, strict=True))
+    kind, sure = str(settings.frontend.descriptor), settings.mapper.sure_inliers
+    drawn = maps_of(len(every), asked.maps, asked.drives, asked.seed)
+    for mapped in [asked.mapped] if asked.mapped else drawn:
         path = campaign_folder(folder, campaign) / (
-            f"map{'-'.join(map(str, mapped))}-{METHOD_VERSION}.engram"
+            f"map{'-'.join(map(str, mapped))}-{METHOD_VERSION}-{sure}.engram"
         )
         some = [drives[k] for k in mapped]
-        others = [drive for k, drive in enumerate(drives) if k not in mapped]
+        others = [drives[k] for k in asked.live or every if k not in mapped]
         for live, start in product(others, _STARTS):
-            what = (name, mapped, live.name, start.value, kind, METHOD_VERSION)
+            what = (name, mapped, live.name, start.value, kind, METHOD_VERSION, sure)
             row = kept.get(what)
             if row is None:
                 row = Driven(*what, _way(path, some, live, start, settings))
@@ -226,10 +240,19 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=3, help="that each map is built from")
     parser.add_argument("--seed", type=int, default=0, help="of the drives that are mapped")
     parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
+    parser.add_argument("--mapped", type=numbers, default=[], help="drives of one map instead")
+    parser.add_argument("--live", type=numbers, default=[], help="drives that are driven there")
+    parser.add_argument(
+        "--sure", type=int, default=MapperConfig().sure_inliers, help="mapper.sure_inliers"
+    )
     parser.add_argument("--out", type=Path, default=campaigns_folder() / "undisturbed.jsonl")
     given = parser.parse_args()
-    settings = Settings().for_descriptor(given.kind)
-    asked, kept, rows = Asked(given.maps, given.drives, given.seed), Kept(given.out), []
+    if given.live and not given.mapped:
+        parser.error("--live needs --mapped")
+    plain = Settings().for_descriptor(given.kind)
+    settings = replace(plain, mapper=replace(plain.mapper, sure_inliers=given.sure))
+    which = tuple(given.mapped), tuple(given.live)
+    asked, kept, rows = Asked(given.maps, given.drives, given.seed, *which), Kept(given.out), []
     for name in given.campaigns.split(","):
         for row in campaign_rows(name, asked, settings, kept, Bars()):
             rows.append(row)
