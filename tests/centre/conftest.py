@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -137,11 +139,18 @@ def s3():
 @pytest.fixture(params=KINDS)
 def site(request, tmp_path):
     """A centre in a folder; and one on PostgreSQL and a bucket where ENGRAM_TEST_POSTGRES says."""
+    with opened_site(request, tmp_path) as found:
+        yield found
+
+
+@contextmanager
+def opened_site(request, folder: Path) -> Iterator[Site]:
+    """A site of the kind that is the request's parameter."""
     options = {}
     if request.param == "services":
         options["objects"] = f"{request.getfixturevalue('s3')}/{uuid.uuid4().hex}"
         options["database"] = new_database()
-    found = Site(tmp_path, **options)
+    found = Site(folder, **options)
     yield found
     found.close()
     if request.param == "services":

@@ -9,19 +9,26 @@ import pytest
 from engram.agent import enrol
 from engram.centre.access.enrolment import add_person, new_code
 from engram.centre.access.roles import Role
+from engram.centre.worker import merging
 
-from .conftest import NAME, drive
+from .conftest import KINDS, NAME, admit_here, drive, opened_site
 
 PAGES = ["map", "history", "fleet", "queue", "health"]
 
 
-@pytest.fixture
-def visited(site, in_process):
-    evil = site.robot("<script>x</script>")
-    drive(evil.live, "<img src=x>", 1_000)
-    evil.hand_in()
-    site.settle()
-    return site
+@pytest.fixture(scope="module", params=KINDS)
+def visited(request, tmp_path_factory):
+    """A centre that a robot with an evil name has visited; made once: no test takes it away."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        opened_site(request, tmp_path_factory.mktemp("pages")) as site,
+    ):
+        patch.setattr(merging, "admit", admit_here)
+        evil = site.robot("<script>x</script>")
+        drive(evil.live, "<img src=x>", 1_000)
+        evil.hand_in()
+        site.settle()
+        yield site
 
 
 def cookie(site, role="viewer"):
