@@ -11,7 +11,8 @@ from engram.agent.link import CentreRefusedError, Unreachable
 from engram.agent.state import AgentState
 from engram.centre.backup import back_up
 from engram.centre.worker import merging
-from engram.cli.agent import _open
+from engram.cli.agent import _open, sync
+from engram.cli.endings import PartlyDoneError
 from engram.config import load_toml
 from engram.errors import ConfigError, IncompatibleError, InputError, StorageFullError
 from engram.maps import Map
@@ -303,6 +304,16 @@ def test_after_a_fall_back_only_what_is_new_is_handed_in(site):
 def test_a_settings_file_that_is_gone_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"none\.toml: the file is missing"):
         _open(tmp_path, tmp_path / "none.toml")
+
+
+def test_a_sync_that_failed_tells_scripts_so(site, capsys):
+    agent = site.robot("r1")
+    agent.state.remember(url="http://127.0.0.1:9")
+    with pytest.raises(PartlyDoneError) as told:
+        sync(agent.folder)
+    assert isinstance(told.value.error, Unreachable)
+    assert told.value.done["failures"] == 1
+    assert "failures: 1" in capsys.readouterr().out
 
 
 def test_half_an_enrolment_a_lost_key_and_a_file_in_the_way_are_named(site, tmp_path):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from engram.cli import options
+from engram.cli.endings import PartlyDoneError
 
 if TYPE_CHECKING:
     from engram.agent import Agent
@@ -98,6 +99,8 @@ def sync(
 ) -> None:
     """Send and fetch maps once, as far as the link allows.
 
+    What could not be done is told by exit status 2; the next sync or run does it.
+
     \b
     Examples:
       engram agent sync r1
@@ -108,7 +111,10 @@ def sync(
         until_s = time.monotonic() + wait_s
         while (pause_s := agent.step()) == 0 or (agent.waits and time.monotonic() < until_s):
             waiting.wait(min(pause_s, _LOOK_S))
-        _print(agent, as_json=as_json)
+        if agent.trouble is None or not as_json:
+            _print(agent, as_json=as_json)
+        if agent.trouble is not None:
+            raise PartlyDoneError(agent.trouble, agent.status())
 
 
 @agent_group.command("hand-in")
