@@ -143,7 +143,9 @@ def switch(folder: Folder) -> None:
       engram agent switch r1
     """
     with _open(folder) as agent:
-        typer.echo("switched" if agent.switch() else "nothing to switch to; after a drive, sync first")
+        typer.echo(
+            "switched" if agent.switch() else "nothing to switch to; after a drive, sync first"
+        )
 
 
 @agent_group.command("fall-back")
