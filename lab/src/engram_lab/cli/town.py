@@ -50,7 +50,7 @@ def _show(report: DemoReport) -> None:
     from rich.table import Table
 
     console = Console(file=drawing(sys.stdout))
-    grown = Table("drive", title="The map grows where a drive does not know the place")
+    grown = Table("drive", title="The map grows where a place is new or looks different")
     for column in ("localised", "new nodes"):
         grown.add_column(column, justify="right")
     for condition, mapped in zip(report.conditions, report.mapped, strict=False):
