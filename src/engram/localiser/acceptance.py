@@ -66,7 +66,7 @@ class AcceptanceConfig:
     rule: Rule = Rule.CONFIDENCE
     min_confidence: float = 4.25
     min_confidence_told: float = 5.0
-    min_confidence_lost: float = 6.5
+    min_confidence_lost: float = 6.0
     sure_confidence: float = 8.5
     settle_after_m: float = 10.0
     doubt_after: float = 3.0

@@ -19,7 +19,7 @@ from engram.ranking.lessons import LessonsConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 15
+METHOD_VERSION = 14
 
 
 class NeighbourhoodSearch(StrEnum):
