@@ -454,7 +454,7 @@ def test_a_segment_is_omitted_or_taken_as_a_whole(handed_in, tmp_path, name):
 def test_segments_are_seeded_by_place_recognition_alone_where_the_paper_says_so(
     handed_in, tmp_path
 ):
-    places = replace(OPTIONS, seed=SeedFrom.PLACES, relocaliser=None)
+    places = replace(OPTIONS, seed=SeedFrom.PLACES, relocaliser="none")
     centre = tmp_path / "centre.engram"
     merged(centre, handed_in / "first.engram")
     (report,) = merged(centre, handed_in / "half.engram", asked=places)

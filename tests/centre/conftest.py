@@ -29,7 +29,7 @@ from .faults import FlakyClient
 
 NAME = "fleet"
 # Random descriptors match nothing: what is tested here is who has what, not where.
-POLICY = MapPolicy(merge=MergeOptions(relocaliser=None))
+POLICY = MapPolicy(merge=MergeOptions(relocaliser="none"))
 
 
 class Clock:

@@ -290,7 +290,7 @@ class TestReported:
     ):
         again, town = tmp_path / "again.engram", tmp_path / "town.engram"
         robot_map(again, np.arange(0, 24, 0.8), 1, name="r5", day=5)
-        apart = MergeOptions(relocaliser=None)
+        apart = MergeOptions(relocaliser="none")
         merge(town, [fleet["other"][0], again], apart)
         (report,) = merged(centre, town)
         assert report.omitted
@@ -299,7 +299,7 @@ class TestReported:
 
     def test_a_drive_of_which_a_part_was_not_found(self, tmp_path, centre, fleet):
         mixed = tmp_path / "mixed.engram"
-        apart = MergeOptions(relocaliser=None)
+        apart = MergeOptions(relocaliser="none")
         merge(mixed, [fleet["other"][0], fleet["longer"][0]], apart)
         (report,) = merged(centre, mixed)
         (note,) = [note for note in report.notes if "not connected to the existing map" in note]
@@ -658,5 +658,5 @@ def test_a_centre_with_an_interrupted_session_of_that_robot_says_so(tmp_path, fl
 
 def test_an_unknown_policy_is_refused_before_anything_is_made(tmp_path, fleet):
     with pytest.raises(InputError, match="nonsense"):
-        merge(tmp_path / "c.engram", [fleet["first"][0]], MergeOptions(policy="nonsense"))
+        merge(tmp_path / "c.engram", [fleet["first"][0]], MergeOptions(ranking="nonsense"))
     assert not (tmp_path / "c.engram").exists()

@@ -48,7 +48,7 @@ class Town:
 @pytest.fixture
 def town(tmp_path: Path) -> Iterator[Town]:
     with Centre(tmp_path / "centre") as centre:
-        centre.add_map("fleet", "tests", MapPolicy(merge=MergeOptions(relocaliser=None)))
+        centre.add_map("fleet", "tests", MapPolicy(merge=MergeOptions(relocaliser="none")))
         with listening(centre) as port, cutting(port, 30_000) as link:
             yield Town(tmp_path, centre, link)
 

@@ -26,7 +26,7 @@ from engram.centre.store.schema import handins, maps, refs
 from engram.config import from_dict, to_dict
 from engram.errors import InputError, MapLockedError
 from engram.files import WriterLock
-from engram.fleet.merge import MergeOptions
+from engram.fleet.merge import NO_RELOCALISER, MergeOptions
 from engram.maps import Map
 
 _HOUR_NS = DAY_NS // 24
@@ -223,7 +223,7 @@ class Centre:
 
     def policy(self, name: str) -> MapPolicy:
         """How a map takes hand-ins."""
-        return from_dict(json.loads(self.map_row(name)["options"]), MapPolicy)
+        return from_dict(_renamed(json.loads(self.map_row(name)["options"])), MapPolicy)
 
     def set_policy(self, name: str, policy: MapPolicy, by: str) -> None:
         """Changes how a map takes hand-ins."""
@@ -245,6 +245,15 @@ class Centre:
         with self.database.writing() as connection:
             self.database.put(connection, maps, row)
             note(connection, self.now_ns(), by, "durable", name, revision=revision)
+
+
+def _renamed(policy: dict[str, Any]) -> dict[str, Any]:
+    """A stored `MapPolicy`, with the settings' names in place of those that it was stored by."""
+    merge = dict(policy["merge"])
+    if "policy" in merge:
+        merge["ranking"] = merge.pop("policy")
+        merge["relocaliser"] = merge["relocaliser"] or NO_RELOCALISER
+    return {**policy, "merge": merge}
 
 
 def kept_since_ns(centre: Centre) -> int:

@@ -125,18 +125,7 @@ def merging_of(settings: AllSettings) -> MergeOptions:
     """How the settings say that maps are merged."""
     from engram.fleet.merge import MergeOptions
 
-    given = settings.merge
-    return MergeOptions(
-        policy=given.ranking,
-        lanes=given.lanes,
-        rounds=given.rounds,
-        relocaliser=None if given.relocaliser == "none" else given.relocaliser,
-        author=os.environ.get(AUTHOR),
-        sure_inliers=given.sure_inliers,
-        unit=given.unit,
-        segment_share=given.segment_share,
-        seed=given.seed,
-    )
+    return MergeOptions.of(settings.merge, os.environ.get(AUTHOR))
 
 
 def download(
@@ -336,10 +325,10 @@ def build(
         grouping=how,
         seed=seed,
         mapping=RobotOptions(
-            policy=merging.policy,
+            policy=merging.ranking,
             lanes=merging.lanes,
             rounds=merging.rounds,
-            relocaliser=merging.relocaliser,
+            relocaliser=merging.relocaliser_name,
             author=merging.author,
         ),
         merging=merging,

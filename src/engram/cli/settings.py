@@ -17,44 +17,12 @@ from msgspec import Meta
 
 from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import ConfigError
-from engram.fleet.merge.whole_segments import SeedFrom, Unit
+from engram.fleet.merge.settings import MergeSettings
 from engram.frontend import DescriptorKind
 from engram.measures import Estimator
 from engram.repair.config import RepairConfig
 from engram.robot.islands import IslandsConfig
 from engram.robot.settings import Settings, settings_text
-
-
-@dataclass(frozen=True, slots=True)
-class MergeSettings:
-    """How `merge` and `build` replay what robots hand in."""
-
-    ranking: Annotated[str, Meta(description="key of POLICIES")] = "recall"
-    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np")] = 2
-    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr")] = 4
-    relocaliser: Annotated[
-        str, Meta(description="places segments without a known neighbour: key of RELOCALISERS")
-    ] = "fabmap"
-    sure_inliers: Annotated[
-        int,
-        Meta(ge=0, description="inliers needed to drop a node; 0: any match. Source: [G16] §V-A"),
-    ] = 60
-    unit: Annotated[
-        Unit,
-        Meta(
-            description="what is omitted or taken at once: frame or segment. Source: [G16] Fig. 4"
-        ),
-    ] = Unit.FRAME
-    segment_share: Annotated[
-        float, Meta(ge=0, le=1, description="share of a segment that must localise to omit it")
-    ] = 0.5
-    seed: Annotated[
-        SeedFrom,
-        Meta(description="start of a segment's replay: neighbour or places. Source: [G16] §V-A"),
-    ] = SeedFrom.NEIGHBOUR
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -267,7 +267,7 @@ def faults(folder: Path, day: Day) -> Iterator[str]:
         yield "a hand-in made two revisions"
     merged = sorted((row for row in rows if row["state"] == "merged"), key=lambda row: row["place"])
     files = [folder / "copies" / f"{row['content_hash']}.engram" for row in merged]
-    merge(folder / "files.engram", files, MergeOptions(relocaliser=None))
+    merge(folder / "files.engram", files, MergeOptions(relocaliser="none"))
     with Map.open(folder / "files.engram") as store:
         if store.content_hash() != content:
             yield "the files make another map"

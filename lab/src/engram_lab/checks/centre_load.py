@@ -53,7 +53,7 @@ def made_centre(folder: Path, nodes: int) -> Centre:
     if nodes:
         places = [range(at, at + SESSION_NODES) for at in range(0, nodes, SESSION_NODES)]
         write_map(folder / "maps" / f"{_MAP}.engram", "fleet", places, None)
-    centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser=None)))
+    centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser="none")))
     return centre
 
 

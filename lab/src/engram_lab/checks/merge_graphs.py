@@ -67,7 +67,7 @@ from engram_lab.synthetic_places import (
 )
 
 Item = TypeVar("Item")
-OPTIONS = MergeOptions(policy="distance", lanes=1, rounds=8, relocaliser="exhaustive")
+OPTIONS = MergeOptions(ranking="distance", lanes=1, rounds=8, relocaliser="exhaustive")
 # Turn about: every match omits; as by default; what other drives rely on is never omitted.
 SURE_INLIERS = (0, OPTIONS.sure_inliers, 1_000)
 PLACES, APPEARANCES, LANDMARKS = 6, 2, 70

@@ -96,7 +96,7 @@ def robot_places(nodes: int, centre: int) -> list[range]:
 
 def merge_once(centre: str, robot: str, words: str) -> None:
     """In a process of its own: the merge, then its figures as JSON."""
-    options = MergeOptions() if words == "words" else MergeOptions(relocaliser=None)
+    options = MergeOptions() if words == "words" else MergeOptions(relocaliser="none")
     started = time.perf_counter()
     (report,) = merge(Path(centre), [Path(robot)], options)
     seconds = time.perf_counter() - started

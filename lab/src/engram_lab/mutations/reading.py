@@ -27,7 +27,7 @@ from engram_lab.mutations.case import Case, Subject
 Held = dict[str, list[tuple[Any, ...]]]
 
 # What a map of other records cannot take: without a relocaliser, as random landmarks match nothing.
-_MERGING = MergeOptions(relocaliser=None)
+_MERGING = MergeOptions(relocaliser="none")
 _FOUND = re.compile(r"make a map of content ([0-9a-f]{32})")
 # Follow from other rows, or tell nothing of the map.
 _DERIVED = frozenset({"words"})

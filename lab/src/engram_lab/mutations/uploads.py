@@ -40,7 +40,7 @@ class Site:
     def __init__(self, folder: Path, samples: Samples) -> None:
         limits = CentreSettings(token_s=86_400, admission_bytes=2**30, admission_s=30)
         self.centre = Centre(folder / "centre", settings=limits)
-        self.centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser=None)))
+        self.centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser="none")))
         self.http = TestClient(create_app(self.centre), raise_server_exceptions=False)
         self.answers: Counter[int] = Counter()
         self._samples = samples

@@ -200,7 +200,7 @@ class Replay(Keeper):
     @cached_property
     def _relocaliser(self) -> Relocaliser | None:
         """One for all segments, since indexing all nodes is slow."""
-        name, descriptor = self._options.relocaliser, self._settings.frontend.descriptor
+        name, descriptor = self._options.relocaliser_name, self._settings.frontend.descriptor
         return None if name is None else relocaliser_in(self._merge.centre, name, descriptor)
 
     def _localiser_of(
@@ -211,7 +211,7 @@ class Replay(Keeper):
             centre,
             robot.cameras[segment.nodes[0].camera],
             self._settings,
-            policy=options.policy,
+            policy=options.ranking,
             # A lost robot gets no more attempts, since the next node tries again.
             # Source: lab/reports/constants-fleet.md.
             budget=Budget(options.lanes, options.rounds, lost_rounds=options.rounds),

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated
 
-import msgspec
+from msgspec import Meta
 
 from engram.config import check_bounds
 from engram.errors import ConfigError
@@ -13,63 +13,71 @@ from engram.fleet.merge.whole_segments import SeedFrom, Unit
 from engram.localiser import RELOCALISERS, Budget
 from engram.ranking import check_for_robot
 
+NO_RELOCALISER = "none"
+
 
 @dataclass(frozen=True, slots=True)
-class MergeOptions:
-    """How maps are merged.
+class MergeSettings:
+    """How what robots hand in is replayed: the table `merge` of a settings file.
 
     Attributes:
-        policy: key of `POLICIES`.
         lanes, rounds: the budget of each replayed frame, lost or not: a count, so that the same
             input gives the same map.
-        relocaliser: key of `RELOCALISERS`, for segments without a known neighbour; None for none.
-        author: who merges; None for the robots whose drives bring something new.
-        sure_inliers, unit, segment_share, seed: see their descriptions.
+        ranking, relocaliser, sure_inliers, unit, segment_share, seed: see their descriptions.
     """
 
-    policy: str = "recall"
-    lanes: int = 2
-    rounds: int = 4
-    relocaliser: str | None = "fabmap"
-    author: str | None = None
+    ranking: Annotated[str, Meta(description="key of POLICIES")] = "recall"
+    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np")] = 2
+    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr")] = 4
+    relocaliser: Annotated[
+        str, Meta(description="places segments without a known neighbour: key of RELOCALISERS")
+    ] = "fabmap"
     sure_inliers: Annotated[
         int,
-        msgspec.Meta(
-            ge=0,
-            description="inliers needed before omitting a node: frames that match the node need "
-            "not match another that the node itself barely matches. 0 omits on every match, as "
-            "[G16] does",
-        ),
+        Meta(ge=0, description="inliers needed to drop a node; 0: any match. Source: [G16] §V-A"),
     ] = 60
     unit: Annotated[
         Unit,
-        msgspec.Meta(
-            description="what is omitted or taken at once: each frame, or a whole segment, as "
-            "[G16] Fig. 4 draws it"
+        Meta(
+            description="what is omitted or taken at once: frame or segment. Source: [G16] Fig. 4"
         ),
     ] = Unit.FRAME
     segment_share: Annotated[
-        float,
-        msgspec.Meta(
-            ge=0,
-            le=1,
-            description="unit segment: share of its frames that must localise for it to be "
-            "omitted; [G16] gives none",
-        ),
+        float, Meta(ge=0, le=1, description="share of a segment that must localise to omit it")
     ] = 0.5
     seed: Annotated[
         SeedFrom,
-        msgspec.Meta(
-            description="where the replay of a segment starts: at a neighbour that the fleet map "
-            "knows, or always by place recognition, as [G16] §V-A does"
-        ),
+        Meta(description="start of a segment's replay: neighbour or places. Source: [G16] §V-A"),
     ] = SeedFrom.NEIGHBOUR
+
+    @property
+    def relocaliser_name(self) -> str | None:
+        """Key of `RELOCALISERS`; None for none."""
+        return None if self.relocaliser == NO_RELOCALISER else self.relocaliser
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        check_for_robot(self.policy)
+        check_for_robot(self.ranking)
         Budget(self.lanes, self.rounds)  # refuses an invalid budget
-        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
+        if self.relocaliser not in {NO_RELOCALISER, *RELOCALISERS}:
             raise ConfigError(
-                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
+                f"relocaliser {self.relocaliser!r} is unknown; known: "
+                f"{', '.join(RELOCALISERS)}, {NO_RELOCALISER}"
             )
+
+
+@dataclass(frozen=True, slots=True)
+class MergeOptions(MergeSettings):
+    """The settings of a merge, and who merges.
+
+    Attributes:
+        author: who merges; None for the robots whose drives bring something new.
+    """
+
+    author: str | None = None
+
+    @classmethod
+    def of(cls, settings: MergeSettings, author: str | None = None) -> MergeOptions:
+        """These settings, merged in somebody's name."""
+        values = {one.name: getattr(settings, one.name) for one in fields(MergeSettings)}
+        return cls(**values, author=author)

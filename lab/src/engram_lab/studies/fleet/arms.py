@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from engram.fleet.merge import MergeOptions
+from engram.fleet.merge import NO_RELOCALISER, MergeOptions
 from engram.robot import RobotOptions
 from engram_lab.studies.configurations import UNLIMITED, Configuration
 
@@ -38,7 +38,7 @@ class Arm:
             self.policy,
             self.lanes,
             self.rounds,
-            relocaliser,
+            relocaliser or NO_RELOCALISER,
             sure_inliers=self.sure_inliers,
         )
 
