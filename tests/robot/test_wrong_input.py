@@ -18,6 +18,7 @@ from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.localiser import Position
 from engram.maps import Map, open_map
+from engram.odometry import Motion, OutsideMotion
 from engram.robot import Robot
 
 ROAD = np.arange(0.0, 20.0, 0.7)
@@ -72,6 +73,28 @@ def test_a_pair_that_cannot_be_used_changes_nothing(robot: Robot, pair, kind, wo
 def test_a_motion_or_deadline_of_the_wrong_kind_changes_nothing(robot: Robot, given) -> None:
     with pytest.raises(InputError, match=next(iter(given))):
         robot.step(LIVE[1].logged, **given)
+    assert robot.step(LIVE[1].logged).localised
+
+
+MOVED = SE3(np.eye(3), np.array([0.0, 0.0, 0.7]))
+
+
+@pytest.mark.parametrize(
+    "motion",
+    [
+        OutsideMotion(SE3(np.eye(3), np.array([0.0, np.nan, 0.7])), 0.1),
+        OutsideMotion(SE3(2 * np.eye(3), np.zeros(3)), 0.1),
+        OutsideMotion(SE3(np.eye(3), np.array([0.0, 0.0, 1e300])), 0.1),
+        OutsideMotion(np.eye(4), 0.1),
+        OutsideMotion(MOVED, np.nan),
+        OutsideMotion(MOVED, 0.1, True, np.zeros(4)),
+        OutsideMotion(MOVED, 0.1, False, np.full(3, np.inf)),
+        Motion(LIVE[1].odometry, MOVED, np.eye(3)),
+    ],
+)
+def test_a_motion_that_no_robot_makes_changes_nothing(robot: Robot, motion) -> None:
+    with pytest.raises(InputError):
+        robot.step(LIVE[1].logged, motion=motion)
     assert robot.step(LIVE[1].logged).localised
 
 

@@ -133,6 +133,14 @@ class BagMaker:
         )
         self.write(topic, "nav_msgs/msg/Odometry", message, stamp_ns)
 
+    def twist(self, topic: str, stamp_ns: int, forward_m_s: float, turn_rad_s: float) -> None:
+        vector = self.types["geometry_msgs/msg/Vector3"]
+        twist = self.types["geometry_msgs/msg/Twist"](
+            vector(forward_m_s, 0.0, 0.0), vector(0.0, 0.0, turn_rad_s)
+        )
+        stamped = self.types["geometry_msgs/msg/TwistStamped"](self.header(stamp_ns, "rig"), twist)
+        self.write(topic, "geometry_msgs/msg/TwistStamped", stamped, stamp_ns)
+
     def fix(self, topic: str, stamp_ns: int, place: tuple[float, float], status: int = 0) -> None:
         types = self.types
         message = types["sensor_msgs/msg/NavSatFix"](

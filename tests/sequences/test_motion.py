@@ -146,6 +146,19 @@ class TestTopics:
         assert_moves(drive.motion())
         assert_moves(drive.motion())  # a second pass
 
+    def test_what_is_not_finite_is_no_measurement_of_a_robot_at_rest(self, tmp_path) -> None:
+        with bag(tmp_path / "b", "mcap") as maker:
+            for side, topic in enumerate((LEFT, RIGHT)):
+                info = topic.replace("image_raw", "camera_info")
+                maker.info(info, START_NS, rectified_infos(camera())[side])
+                for index in range(PAIRS):
+                    maker.image(topic, stamp_ns(index), picture(index, side))
+            for number, stamp in enumerate(samples()):
+                speed_m_s = float("nan") if number % 3 else SPEED_M_S
+                maker.twist("/odom", stamp, speed_m_s, TURN_RAD_S)
+        drive = open_sequence(made(tmp_path / "b", "mcap"), motion=["/odom"])
+        assert_moves(drive.motion())
+
     def test_the_gyroscope_replaces_the_wheels_turn(self, path) -> None:
         motion = open_sequence(path, motion=["/odom", "/imu/data"]).motion()
         assert motion is not None

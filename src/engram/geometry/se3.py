@@ -67,11 +67,18 @@ class SE3:
 
     @staticmethod
     def from_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> SE3:
-        """From a quaternion (4,) in the order w, x, y, z (normalised here) and a (3,) position."""
+        """From a quaternion (4,) in the order w, x, y, z (normalised here) and a (3,) position.
+
+        Raises:
+            InputError: a shape is wrong, a value is not finite, or the quaternion is zero.
+        """
         quaternion = np.asarray(wxyz, dtype=np.float64)
+        position = np.array(translation, dtype=np.float64)
         norm = np.linalg.norm(quaternion)
         if quaternion.shape != (4,) or not np.isfinite(norm) or norm < 1e-9:
             raise InputError("a quaternion is four finite numbers w, x, y, z, not all zero")
+        if position.shape != (3,) or not np.isfinite(position).all():
+            raise InputError("a position is three finite numbers")
         w, x, y, z = quaternion / norm
         rotation = np.array(
             [
@@ -80,7 +87,7 @@ class SE3:
                 [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
             ]
         )
-        return SE3(rotation, np.array(translation, dtype=np.float64))
+        return SE3(rotation, position)
 
     @staticmethod
     def exp(tangent: ArrayLike) -> SE3:

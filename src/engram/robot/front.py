@@ -39,6 +39,8 @@ _READ_AHEAD = 8
 # A robot that moves more than this between two frames does not see the same image twice.
 _MOVING_M = 0.02
 _MOVING_RAD = float(np.deg2rad(0.2))
+# No robot moves further between two frames.
+_FARTHEST_M = 1e5
 
 
 class Front:
@@ -100,6 +102,8 @@ class Front:
                 f"motion is a value of {type(motion).__name__}, must be an OutsideMotion of wheels "
                 "and gyroscope, or a Motion"
             )
+        if motion is not None:
+            check_motion(motion)
 
     @property
     def diagnosis(self) -> Diagnosis:
@@ -196,6 +200,31 @@ class _FrozenStream:
         moved = motion.prev_from_curr
         if moved is not None and not motion.guessed_m:
             self._moving = moved.distance_m > _MOVING_M or moved.angle_rad > _MOVING_RAD
+
+
+def check_motion(motion: Motion | OutsideMotion) -> None:
+    """Refuses a motion that no robot makes: its position would rest on it from then on.
+
+    Raises:
+        InputError: it is no rigid motion, too long, or a number beside it is not finite.
+    """
+    if isinstance(motion, OutsideMotion):
+        number, array, shape = motion.seconds, motion.rates_rad_s, (3,)
+    else:
+        number, array, shape = motion.guessed_m, motion.covariance, (6, 6)
+    pose = motion.prev_from_curr
+    if pose is not None or isinstance(motion, OutsideMotion):
+        if not isinstance(pose, SE3):
+            raise InputError(f"motion.prev_from_curr is a {type(pose).__name__}, must be an SE3")
+        way_m = np.abs(SE3.from_matrix(pose.matrix()).translation).max()
+        if way_m > _FARTHEST_M:
+            raise InputError(f"motion is {way_m:g} m long, at most {_FARTHEST_M:g}; give metres")
+    given = np.zeros(shape) if array is None else np.asarray(array)
+    if not 0 <= number < inf or given.shape != shape or not np.isfinite(given).all():
+        raise InputError(
+            f"motion: seconds or guessed_m is {number}, must be at least 0; rates are (3,), "
+            "covariances (6, 6) finite numbers"
+        )
 
 
 def check_position(position: Position, graph: ExperienceGraph) -> None:

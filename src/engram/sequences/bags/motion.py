@@ -116,21 +116,22 @@ class BagMotion:
             if stamp_ns <= last_ns:
                 continue
             if topic.type == IMU:
-                yield Sample(stamp_ns, None, _vector(message.angular_velocity))
+                sample = Sample(stamp_ns, None, _vector(message.angular_velocity))
             else:
                 pose = _pose(message) if topic.type == ODOMETRY else None
-                sample = _wheels(message, topic.type, stamp_ns)
-                still = not (sample.velocity_m_s is not None and sample.velocity_m_s.any())
+                twist = message.twist.twist if topic.type == ODOMETRY else message.twist
+                velocity = _vector(twist.linear)
+                sample = Sample(stamp_ns, velocity, _vector(twist.angular))
+                still = not np.nan_to_num(velocity).any()
                 if still and pose is not None and last_pose is not None:
                     sample = _between(last_pose, last_ns, pose, stamp_ns)
-                yield sample
                 last_pose = pose
             last_ns = stamp_ns
-
-
-def _wheels(message: Any, kind: str, stamp_ns: int) -> Sample:
-    twist = message.twist.twist if kind == ODOMETRY else message.twist
-    return Sample(stamp_ns, _vector(twist.linear), _vector(twist.angular))
+            way = 0.0 if sample.velocity_m_s is None else sample.velocity_m_s
+            if np.isfinite(np.r_[way, sample.rates_rad_s]).all():
+                yield sample
+            else:  # not a robot at rest: nothing was measured
+                self._bag.note(f"{name}: a measurement is not finite; left out")
 
 
 def _pose(message: Any) -> SE3 | None:
@@ -148,5 +149,4 @@ def _between(before: SE3, before_ns: int, pose: SE3, stamp_ns: int) -> Sample:
 
 
 def _vector(value: Any) -> Any:
-    found = np.array([value.x, value.y, value.z], dtype=np.float64)
-    return found if np.isfinite(found).all() else np.zeros(3)
+    return np.array([value.x, value.y, value.z], dtype=np.float64)
