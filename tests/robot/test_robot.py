@@ -159,6 +159,17 @@ def test_a_pose_between_two_frames_lies_between_them(localiser: Localiser) -> No
     assert robot.pose_at(found[0].stamp_ns - 1) is None
 
 
+def test_no_pose_is_known_beside_a_frame_that_was_only_followed(localiser: Localiser) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    for seen in LIVE[:4]:
+        robot.step(seen.logged)
+    robot.follow(LIVE[4].logged)
+    after = robot.step(LIVE[5].logged)
+    assert robot.pose_at(after.stamp_ns) is after.position
+    # Its motion began at the followed frame, not at the one before.
+    assert robot.pose_at(LIVE[3].frame.stamp_ns + 1) is None
+
+
 def test_a_robot_is_placed_and_lost_again(localiser: Localiser) -> None:
     robot = Robot(Front(Settings()), localiser)
     known = robot.step(LIVE[0].logged)

@@ -242,6 +242,7 @@ class Robot:
         if self._in_order(arrived):
             _, motion = self._front.take(arrived, motion)
             self._localiser.move(motion)
+            self._track = ()  # the next motion begins at this frame, not at one in it
 
     def record(self, reason: str = "asked") -> Path:
         """Writes the last seconds as a flight record; see `Recorder.record`.
@@ -277,9 +278,12 @@ class Robot:
 
         The loop calls it for `Localisation.withdraws`, and so may a caller that knows better.
         """
-        self._track = tuple(
-            (at, replace(one, position=None) if one is found else one) for at, one in self._track
-        )
+        track, rests = [], False
+        for at_ns, one in self._track:
+            rests = at_ns == found.stamp_ns or (rests and not one.localised)
+            track.append((at_ns, replace(one, position=None) if rests else one))
+            rests = rests and one.saved is None  # from there on it is seen from that node
+        self._track = tuple(track)
         self._keeper.withdrawn(found)
         if self.recorder is not None:
             self.recorder.withdrew()
