@@ -208,6 +208,7 @@ def check_motion(motion: Motion | OutsideMotion) -> None:
     Raises:
         InputError: it is no rigid motion, too long, or a number beside it is not finite.
     """
+    shape: tuple[int, ...]
     if isinstance(motion, OutsideMotion):
         number, array, shape = motion.seconds, motion.rates_rad_s, (3,)
     else:
