@@ -56,7 +56,7 @@ test-ros: setup
 # PostgreSQL of this machine, in a folder of its own, for the length of the run.
 test-services: setup
 	$(BIN)/python -m pip install --quiet -c constraints.txt --group services
-	tests/with_postgres $(BIN)/python -m pytest -q tests/centre tests/maps -m 'not long'
+	tests/with_postgres $(BIN)/python -m pytest -q tests/centre -m 'not long'
 
 goldens: setup
 	$(BIN)/python -m tests.goldens check --all

@@ -255,9 +255,7 @@ def hide_session(store: Map, drive) -> None:
             f"WHERE p.uuid = x'{path_id(drive).hex}'",
         }
         for record, query in tables.items():
-            postgresql = store._database.name.startswith("postgresql")
-            text = query.replace("x'", "'\\x") if postgresql else query
-            for key in connection.exec_driver_sql(text).scalars().all():
+            for key in connection.exec_driver_sql(query).scalars().all():
                 row = {
                     "key": store._keys.next(hidden),
                     "revision": writer._revision_key,

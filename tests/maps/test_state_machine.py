@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import tempfile
 from pathlib import Path
 
@@ -18,12 +17,10 @@ from hypothesis.stateful import (
     rule,
 )
 
-from engram.centre.postgresql import PostgresMap
 from engram.errors import RevisionError
 from engram.graph.model import EdgeKind
 from engram.maps import Map, RevisionWriter, SessionState, check_file
 
-from .conftest import drop_postgres_map, new_postgres_map
 from .frames import assert_same_landmarks
 from .maps import Drive, assert_same_edges, begin, edge, session
 
@@ -39,17 +36,14 @@ class MapMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.location: Path | PostgresMap = self.new_location()
+        self.folder = tempfile.TemporaryDirectory()
+        self.location = Path(self.folder.name) / "town.engram"
         self.committed: list[tuple[Drive, dict]] = []
         self.interrupted: dict[str, tuple[Drive, dict]] = {}
         self.writing: tuple[Drive, dict] | None = None
         self.durable: tuple[Drive, dict] | None = None
         self.writer: RevisionWriter | None = None
         self.seed = 0
-
-    def new_location(self) -> Path | PostgresMap:
-        self.folder = tempfile.TemporaryDirectory()
-        return Path(self.folder.name) / "town.engram"
 
     @initialize()
     def create(self) -> None:
@@ -188,27 +182,10 @@ class MapMachine(RuleBasedStateMachine):
     def teardown(self) -> None:
         if hasattr(self, "store"):
             self.store.close()
-        self.drop_location()
-
-    def drop_location(self) -> None:
         self.folder.cleanup()
-
-
-class PostgresMachine(MapMachine):
-    """The same map in PostgreSQL."""
-
-    def new_location(self) -> PostgresMap:
-        self.address, place = new_postgres_map()
-        return place
-
-    def drop_location(self) -> None:
-        drop_postgres_map(self.address)
 
 
 TestFileMachine = MapMachine.TestCase
 TestFileMachine.settings = settings(
     max_examples=8, stateful_step_count=20, suppress_health_check=list(HealthCheck)
 )
-if os.environ.get("ENGRAM_TEST_POSTGRES"):
-    TestPostgresMachine = PostgresMachine.TestCase
-    TestPostgresMachine.settings = TestFileMachine.settings

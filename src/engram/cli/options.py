@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def map_file(text: str) -> Path:
-    """A map as it is typed: a file; maps in PostgreSQL have addresses, which no verb takes.
+    """A map as it is typed: a file, never the address of a database.
 
     Raises:
         BadParameter: it is an address.

@@ -23,7 +23,6 @@ from engram.frontend.blobs import (
 from engram.geometry import StereoCamera
 from engram.graph.model import NodeId, PathEntryKind, SessionId
 from engram.maps.attempts import unpack
-from engram.maps.database import Database
 from engram.maps.keys import LARGEST_KEY
 from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.records import CheckReport, Problem
@@ -68,6 +67,7 @@ from engram.maps.schema import (
     vocabularies,
     words,
 )
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.tally import check_tally
 from engram.maps.words import decode_words
 
@@ -91,7 +91,7 @@ _NOBODY = NodeId(UUID(int=0))
 _NO_SESSION = SessionId(UUID(int=0))
 
 
-def check(database: Database, *, thin: bool = False) -> CheckReport:
+def check(database: SqliteDatabase, *, thin: bool = False) -> CheckReport:
     """Verifies the file's structure, every row, every blob and every reference.
 
     Args:
@@ -111,7 +111,7 @@ def check(database: Database, *, thin: bool = False) -> CheckReport:
 class _Checking:
     """The state of a check."""
 
-    database: Database
+    database: SqliteDatabase
     thin: bool = False
     problems: list[Problem] = field(default_factory=list)
     rows: int = 0

@@ -13,8 +13,6 @@ from typing import Any, TypeAlias
 from sqlalchemy import Select, Table, insert, select
 
 from engram.files import new_file
-from engram.maps.database import Database
-from engram.maps.map_files import open_database
 from engram.maps.rows import verified
 from engram.maps.schema import KEYED, VERSIONED, cameras, frontends, nodes, revisions, tags, words
 from engram.maps.sqlite import SqliteDatabase
@@ -43,7 +41,7 @@ class MapRows:
     """
 
     def __init__(self, location: Path, at: int | None = None) -> None:
-        self._database: Database = open_database(location)
+        self._database = SqliteDatabase(location)
         with self._database.reading() as connection:
             self.revision = head(connection) if at is None else at
 

@@ -17,11 +17,12 @@ from engram.frontend import DescriptorKind, Frame, FrameStatus
 from engram.frontend.blobs import blob_hash, decode_landmarks, decode_thumbnail, is_intact
 from engram.geometry import StereoCamera
 from engram.graph.model import Node, NodeId
-from engram.maps.database import Database, reading_rows
+from engram.maps.database import reading_rows
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.records import StoredNode
 from engram.maps.rows import Row, verified
 from engram.maps.schema import frames, nodes
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.view import View
 
 DEFAULT_CACHE_BYTES = 256 * 2**20
@@ -42,7 +43,7 @@ class FrameReader:
     """
 
     def __init__(
-        self, database: Database, view: View, cache_bytes: int = DEFAULT_CACHE_BYTES
+        self, database: SqliteDatabase, view: View, cache_bytes: int = DEFAULT_CACHE_BYTES
     ) -> None:
         self._database = database
         self._cache_bytes = cache_bytes

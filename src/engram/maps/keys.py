@@ -6,8 +6,8 @@ from sqlalchemy import Table, func, select
 
 from engram.errors import MapCorruptError
 from engram.graph.model import NodeId
-from engram.maps.database import Database
 from engram.maps.schema import KEYED, nodes
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.view import View
 
 # Of 64 bits, with room left: no writer comes near it.
@@ -20,7 +20,7 @@ class KeyBook:
     Only for the holder of the writer lock, so that no other process assigns keys.
     """
 
-    def __init__(self, database: Database, view: View) -> None:
+    def __init__(self, database: SqliteDatabase, view: View) -> None:
         self._database = database
         self._view = view
         self._nodes: dict[bytes, int] | None = None  # read on first use

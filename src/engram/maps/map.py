@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, insert
 
 from engram.errors import IncompatibleError, InputError, RevisionError
-from engram.files import Holder
+from engram.files import Holder, WriterLock
 from engram.frontend import DescriptorKind
 from engram.geometry import SE3, StereoCamera
 from engram.graph.marks import Placement
@@ -23,12 +23,10 @@ from engram.graph.model import Amendable, NodeId, Session, SessionId
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.amending import checked_amendments
-from engram.maps.database import Database, Lock, Place
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.keys import KeyBook
 from engram.maps.laying_out import new_places
-from engram.maps.map_files import open_database
 from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision, RevisionStatus, SessionState
 from engram.maps.revisions import (
@@ -79,13 +77,13 @@ class Map(MapReader):
 
     def __init__(
         self,
-        database: Database,
+        database: SqliteDatabase,
         *,
         at: int | str | None = None,
         writes: bool = False,
         cache_bytes: int = DEFAULT_CACHE_BYTES,
     ) -> None:
-        self._lock: Lock | None = database.lock_for_writing() if writes else None
+        self._lock: WriterLock | None = database.lock_for_writing() if writes else None
         try:
             super().__init__(database, at=at, cache_bytes=cache_bytes)
             self._key_book = KeyBook(database, self._view) if writes else None
@@ -96,22 +94,19 @@ class Map(MapReader):
         self._laid_out: dict[NodeId, SE3] | None = None  # once the open revision is committed
 
     @staticmethod
-    def create(location: Path | str | Place) -> Map:
+    def create(location: Path | str) -> Map:
         """Creates an empty map and opens it for writing.
 
         Raises:
             InputError: the file exists already, or its folder does not.
             MapError: it cannot be written.
         """
-        if isinstance(location, Path | str):
-            SqliteDatabase.create(map_path(location))
-        else:
-            location.create()
+        SqliteDatabase.create(map_path(location))
         return Map.open(location, writes=True)
 
     @staticmethod
     def open(
-        location: Path | str | Place,
+        location: Path | str,
         *,
         at: int | str | None = None,
         writes: bool = False,
@@ -120,7 +115,7 @@ class Map(MapReader):
         """Opens an existing map.
 
         Args:
-            location: path of the map file, or the place of a map in another database.
+            location: path of the map file.
             at: number or name of the revision to see (`resolve`); None for the newest, 0 for the
                 map before the first.
             writes: lock it for writing until `close`.
@@ -133,7 +128,9 @@ class Map(MapReader):
             MapLockedError: another process writes to it; names process and host.
             RevisionError: it has no such revision.
         """
-        return Map(open_database(location), at=at, writes=writes, cache_bytes=cache_bytes)
+        return Map(
+            SqliteDatabase(map_path(location)), at=at, writes=writes, cache_bytes=cache_bytes
+        )
 
     def robot(
         self,
@@ -370,7 +367,7 @@ class Map(MapReader):
                 raise InputError(f"words: node {node} is not in the map")
             rows.append(words_row(key, vocabulary, shown))
         with self._database.writing() as connection:
-            write_words(connection, self._database, rows)
+            write_words(connection, rows)
 
     @_writes
     def put_vocabulary(

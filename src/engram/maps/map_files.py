@@ -9,17 +9,9 @@ from pathlib import Path
 from engram.errors import MapCorruptError
 from engram.files import current_holder
 from engram.maps.checking import check
-from engram.maps.database import Database, Place
 from engram.maps.records import CheckReport, Problem
 from engram.maps.sqlite import SqliteDatabase, map_path
 from engram.maps.write_ahead import log_problems
-
-
-def open_database(location: Path | str | Place) -> Database:
-    """The database of an existing map."""
-    if isinstance(location, Path | str):
-        return SqliteDatabase(map_path(location))
-    return location.open()
 
 
 def copy_map(source: Path, target: Path) -> None:
@@ -56,7 +48,7 @@ def publish_map(draft: Path, target: Path) -> None:
     SqliteDatabase.publish(draft, target)
 
 
-def check_file(location: Path | str | Place, *, thin: bool = False) -> CheckReport:
+def check_file(location: Path | str, *, thin: bool = False) -> CheckReport:
     """Verifies every byte of a map file, even of one too damaged to open.
 
     Args:
@@ -67,9 +59,10 @@ def check_file(location: Path | str | Place, *, thin: bool = False) -> CheckRepo
         NotAMapError: the file does not exist or is not a map.
         FormatVersionError: a newer Engram wrote it.
     """
-    lost = [] if not isinstance(location, Path | str) else _log_problems(map_path(location))
+    path = map_path(location)
+    lost = _log_problems(path)
     try:
-        database = open_database(location)
+        database = SqliteDatabase(path)
     except MapCorruptError as error:
         return CheckReport((*lost, Problem("file", "", str(error))), 0, 0, (), 0)
     with closing(database):

@@ -33,7 +33,7 @@ from engram.maps import marks, reading
 from engram.maps.checking import check
 from engram.maps.collector import no_collections
 from engram.maps.content import content_hash, record_hashes
-from engram.maps.database import Database, reading_rows
+from engram.maps.database import reading_rows
 from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import FrameReader
 from engram.maps.laying_out import frame_of, graph_of
@@ -53,6 +53,7 @@ from engram.maps.revisions import (
 )
 from engram.maps.rows import Row, verified
 from engram.maps.schema import revisions
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.tags import Tag, load_tags, resolve
 from engram.maps.view import View
 from engram.maps.words import load_words
@@ -118,7 +119,7 @@ class MapReader:
         frames: the frames of its nodes: a `LandmarkSource`.
     """
 
-    def __init__(self, database: Database, *, at: int | str | None, cache_bytes: int) -> None:
+    def __init__(self, database: SqliteDatabase, *, at: int | str | None, cache_bytes: int) -> None:
         self._database = database
         with database.reading() as connection:
             self._view = View(resolve(connection, at, database.name))

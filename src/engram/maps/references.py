@@ -12,12 +12,12 @@ from engram.frontend import DescriptorKind
 from engram.geometry import StereoCamera
 from engram.graph.model import NodeId
 from engram.maps import reading
-from engram.maps.database import Database
 from engram.maps.keys import KeyBook
 from engram.maps.records import StoredNode
 from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import camera_row
 from engram.maps.schema import cameras, frontends, path_entries, paths, sessions
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.view import View
 
 
@@ -34,7 +34,9 @@ class References:
         paths: key by the path's UUID.
     """
 
-    def __init__(self, database: Database, keys: KeyBook, view: View, rows: RowBuffer) -> None:
+    def __init__(
+        self, database: SqliteDatabase, keys: KeyBook, view: View, rows: RowBuffer
+    ) -> None:
         self._database = database
         self._keys = keys
         self._view = view

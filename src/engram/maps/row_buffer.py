@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Table, delete, insert, select
 
 from engram.graph.model import Edge
 from engram.maps.attempts import AttemptTable, concatenate, pack, unpack
-from engram.maps.database import Database
+from engram.maps.database import upsert
 from engram.maps.keys import KeyBook
 from engram.maps.rows import Row, edge_row, sealed, verified
 from engram.maps.schema import (
@@ -67,7 +67,6 @@ class RowBuffer:
     """Unwritten rows of a revision.
 
     Args:
-        database: the database to write to.
         keys: gives the keys of the rows.
         revision_key: of the revision.
 
@@ -76,8 +75,7 @@ class RowBuffer:
         size_bytes: approximate size of the buffer in memory.
     """
 
-    def __init__(self, database: Database, keys: KeyBook, revision_key: int) -> None:
-        self._database = database
+    def __init__(self, keys: KeyBook, revision_key: int) -> None:
         self._keys = keys
         self._revision_key = revision_key
         self.clear()
@@ -131,8 +129,8 @@ class RowBuffer:
                 connection.execute(insert(table), rows)
         if self._edges:
             key = ("a", "b", "kind", "revision")
-            connection.execute(self._database.replace(edges, key), list(self._edges.values()))
-        write_words(connection, self._database, list(self._words.values()))
+            connection.execute(upsert(edges, key), list(self._edges.values()))
+        write_words(connection, list(self._words.values()))
         for session, tables in self._attempts.items():
             self._write_attempts(connection, session, tables)
 

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 from sqlalchemy import (
     REAL,
-    BigInteger,
     Column,
-    Double,
     Index,
     Integer,
     LargeBinary,
@@ -27,8 +25,8 @@ from sqlalchemy.types import TypeEngine
 FORMAT_VERSION = 6
 
 # SQLite's INTEGER and REAL are 64 bits wide.
-_INT64: TypeEngine[int] = BigInteger().with_variant(Integer(), "sqlite")
-_FLOAT64: TypeEngine[float] = Double().with_variant(REAL(), "sqlite")
+_INT64: TypeEngine[int] = Integer()
+_FLOAT64: TypeEngine[float] = REAL()
 
 metadata = MetaData()
 

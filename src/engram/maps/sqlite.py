@@ -18,7 +18,6 @@ from typing import Any
 
 from sqlalchemy import Connection, Engine, Select, Table, event
 from sqlalchemy.dialects import sqlite as sqlite_dialect
-from sqlalchemy.dialects.sqlite import Insert
 from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.compiler import SQLCompiler
 
@@ -28,7 +27,6 @@ from engram.maps.database import (
     damage_named,
     raise_tables,
     reading_rows,
-    replaced,
     write_format,
 )
 from engram.maps.schema import FORMAT_VERSION, metadata, missing_in
@@ -175,13 +173,6 @@ class SqliteDatabase:
         """The current writer; None without one."""
         return current_holder(self.path)
 
-    def replace(self, table: Table, key: tuple[str, ...]) -> Insert:
-        """An upsert."""
-        statement = Insert(table)
-        return statement.on_conflict_do_update(
-            index_elements=list(key), set_=replaced(statement.excluded, key)
-        )
-
     def integrity_problems(self) -> list[str]:
         """Faults that `PRAGMA integrity_check` reports."""
         try:
@@ -302,8 +293,8 @@ def map_path(location: Path | str) -> Path:
     """
     if isinstance(location, str) and location.startswith("postgresql"):
         raise InputError(
-            "this is the address of a map in PostgreSQL, not a map file; such maps are for "
-            "engram centre, which comes with the centre"
+            "this is the address of a PostgreSQL database, not a map file; the database of a "
+            "centre is given with --database of engram centre"
         )
     try:
         str(location).encode()

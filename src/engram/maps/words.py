@@ -15,7 +15,7 @@ from sqlalchemy import Connection, select
 
 from engram.errors import InputError, MapCorruptError
 from engram.graph.model import NodeId
-from engram.maps.database import Database
+from engram.maps.database import upsert
 from engram.maps.rows import Row, node_from_bytes, sealed, verified
 from engram.maps.schema import nodes, words
 
@@ -54,10 +54,10 @@ def words_row(node_key: int, vocabulary: bytes, found: NDArray[Any]) -> Row:
     return sealed(words, row)
 
 
-def write_words(connection: Connection, database: Database, rows: list[Row]) -> None:
+def write_words(connection: Connection, rows: list[Row]) -> None:
     """Stores words, replacing those of the same nodes by another vocabulary."""
     if rows:
-        connection.execute(database.replace(words, ("node",)), rows)
+        connection.execute(upsert(words, ("node",)), rows)
 
 
 def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:

@@ -34,7 +34,6 @@ from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.attempts import COLUMNS, AttemptTable
-from engram.maps.database import Database
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.maps.keys import KeyBook
@@ -72,6 +71,7 @@ from engram.maps.schema import (
     statistics,
     vocabularies,
 )
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.view import View
 
 # Most bytes in memory of a revision that is not resumable.
@@ -123,7 +123,7 @@ class RevisionWriter:
 
     def __init__(
         self,
-        database: Database,
+        database: SqliteDatabase,
         keys: KeyBook,
         frame_reader: FrameReader,
         view: View,
@@ -140,7 +140,7 @@ class RevisionWriter:
         self.stored = stored or StoredSession()
         self._database = database
         self._keys = keys
-        self._rows = RowBuffer(database, keys, view.own)
+        self._rows = RowBuffer(keys, view.own)
         self._known = References(database, keys, view, self._rows)
         self._frames = frame_reader
         self._view = view
