@@ -335,14 +335,16 @@ def test_a_closed_robot_leaves_no_threads(path: Path) -> None:
     assert threading.active_count() == before
 
 
-def test_what_an_unfit_robot_mapped_is_sealed_and_not_committed(path: Path) -> None:
+def test_what_an_unfit_robot_mapped_waits_and_is_not_committed(path: Path) -> None:
     with (
         open_map(path, create=True) as town,
         town.robot(CAMERA, name="r1", maps=True) as robot,
     ):
         run(robot, [*FIRST[:12], FIRST[3], *FIRST[12:]])
-    assert robot.saving.state is SavingState.SEALED
+    assert robot.saving.state is SavingState.UNCOMMITTED
+    assert robot.saving.state == "uncommitted"
     assert "stamps run backwards" in robot.saving.text()
+    assert "engram check --seal" in robot.saving.text()
     with open_map(path) as town:
         assert town.revision == 0
         (waiting,) = town.interrupted()
@@ -360,7 +362,7 @@ def test_an_unfit_robot_stops_mapping_when_the_doctor_has_seen_enough(path: Path
         town.robot(CAMERA, settings, name="r1", maps=True) as robot,
     ):
         words = run(robot, [*FIRST[:12], FIRST[3], *FIRST[12:]])
-        assert robot.saving.state is SavingState.SEALED
+        assert robot.saving.state is SavingState.UNCOMMITTED
     assert "saved" in words[:14]
     assert "saved" not in words[16:]
     with open_map(path) as town:
@@ -372,8 +374,9 @@ def test_what_an_unfit_robot_remembers_is_dropped(path: Path) -> None:
     mapped(path)
     with open_map(path) as town, town.robot(CAMERA, name="r2", remembers=True) as robot:
         run(robot, [*AGAIN[:12], AGAIN[3], *AGAIN[12:]])
-    assert robot.saving.state is SavingState.SEALED
+    assert robot.saving.state is SavingState.UNCOMMITTED
     assert "stamps run backwards" in robot.saving.reason
+    assert "--seal" not in robot.saving.text()
     with open_map(path) as town:
         assert town.revision == 1
     assert not list(path.parent.glob("*-memory-*"))

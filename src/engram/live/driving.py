@@ -33,7 +33,7 @@ _AGAIN_AFTER_S = 2.0
 # A stamp that is earlier by less is a frame that came late; by more, a clock that was set back.
 _LATE_FRAME_NS = 1_000_000_000
 # What a robot found is then no longer kept.
-_KEEPS_NO_MORE = {SavingState.FAILED, SavingState.SEALED}
+_KEEPS_NO_MORE = {SavingState.FAILED, SavingState.UNCOMMITTED}
 # Added to a position that was kept over a restart: wide enough that it proposes and proves nothing.
 _KEPT_SIGMA_M, _KEPT_SIGMA_RAD = 2.0, 0.3
 

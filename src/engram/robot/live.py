@@ -382,7 +382,7 @@ class LiveKeeper(Keeper):
     def _leave(self, fatal: Sequence[Finding]) -> None:
         self._keeper = KEEPS_NOTHING
         self._into.leave(well=True)
-        self.saving.state, self.saving.reason = SavingState.SEALED, _reasons(fatal)
+        self.saving.state, self.saving.reason = SavingState.UNCOMMITTED, _reasons(fatal)
 
     def _fail(self, error: MapError) -> None:
         self._keeper = KEEPS_NOTHING

@@ -16,7 +16,7 @@ class SavingState(StrEnum):
     FAILED = "failed"
     SPOOLED = "spooled"
     COMMITTED = "committed"
-    SEALED = "sealed"
+    UNCOMMITTED = "uncommitted"
 
 
 @dataclass(slots=True)
@@ -26,8 +26,8 @@ class Saving:
     Attributes:
         state: `FAILED` after a write error: the robot continues to localise, and what it had saved
             is kept; `SPOOLED` if another process writes to the map, so that the drive's memory
-            waits in a file beside it; `SEALED` if the doctor found something fatal: nothing was
-            committed, and a mapped session waits for ``engram check --seal``.
+            waits in a file beside it; `UNCOMMITTED` if the doctor found something fatal: a mapped
+            session then waits for ``engram check --seal``.
         reason: why saving failed or was not committed, or where the memory waits.
         session: the drive.
         revision: number of the revision that holds the drive.
@@ -62,9 +62,7 @@ class Saving:
                 )
             case SavingState.FAILED:
                 return f"saving failed: {self.reason}"
-            case SavingState.SEALED:
-                return (
-                    f"not committed, because the drive is unfit: {self.reason}; engram check "
-                    "--seal commits what was mapped anyway"
-                )
+            case SavingState.UNCOMMITTED:
+                kept = "; engram check --seal commits what was mapped anyway" if self.nodes else ""
+                return f"not committed, because the drive is unfit: {self.reason}{kept}"
         return f"saving is {self.state}"

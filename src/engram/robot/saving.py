@@ -135,17 +135,17 @@ def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ..
     mine = [one.session.id for one in waiting if one.session.robot == robot]
     if not mine:
         return ()
-    sealed = []
+    numbers = []
     with Map.open(opened.location, writes=True) as own:
         for session in mine:
             writer = own.resume_session(session)
             if writer.stored == StoredSession():
                 writer.abandon()  # it ended before it had saved anything
             else:
-                sealed.append(writer.commit(settings.placing).number)
+                numbers.append(writer.commit(settings.placing).number)
     with opened.writing():
         pass  # shows it the newest revision
-    return tuple(sealed)
+    return tuple(numbers)
 
 
 def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any]:
