@@ -287,6 +287,21 @@ def test_a_memory_waits_while_another_writes_and_is_committed_by_the_next(path: 
         assert {one.robot for one in town.sessions.values()} == {"r1", "r2", "r3"}
 
 
+def test_a_drive_without_a_memory_does_not_pass_off_anothers_as_its_own(path: Path) -> None:
+    mapped(path)
+    with open_map(path) as town, open_map(path) as writer:
+        with writer.writing(), town.robot(CAMERA, name="r2", remembers=True) as robot:
+            run(robot, AGAIN[:5])
+            robot.close()
+        assert robot.saving.state is SavingState.SPOOLED
+        elsewhere = drive(World(10.0, seed=9), ROAD[:3], start_ns=2 * 10**15)
+        with town.robot(CAMERA, name="r3", remembers=True) as other:
+            assert run(other, elsewhere).count("localised") == 0
+    assert other.saving.revision is None
+    with open_map(path) as town:
+        assert [one.author for one in town.log()] == ["r1", "r2"]
+
+
 def test_a_torn_memory_is_committed_as_far_as_it_is_whole(path: Path) -> None:
     mapped(path)
     with (

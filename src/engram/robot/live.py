@@ -259,8 +259,8 @@ class IntoMemory:
         except MapLockedError:
             saving.state, saving.reason = SavingState.SPOOLED, str(spool.path)
             return
-        if committed:
-            saving.revision = committed[-1].number
+        if spool.path in committed:
+            saving.revision = committed[spool.path].number
         saving.state = SavingState.COMMITTED if well else saving.state
 
     def leave(self, *, well: bool) -> None:

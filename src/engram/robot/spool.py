@@ -118,8 +118,8 @@ class Spool:
             os.fsync(self._file.fileno())
 
 
-def commit_spools(map_path: Path) -> list[Revision]:
-    """Commits the memories beside a map, each as a session without nodes.
+def commit_spools(map_path: Path) -> dict[Path, Revision]:
+    """Commits the memories beside a map, each as a session without nodes; says by which revisions.
 
     Memories of running drives are left alone. Entries and attempts of nodes that the map no longer
     shows are left out.
@@ -130,15 +130,15 @@ def commit_spools(map_path: Path) -> list[Revision]:
     """
     spools = sorted(map_path.parent.glob(f"{glob.escape(map_path.name)}-memory-*"))
     if not spools:
-        return []
-    committed = []
+        return {}
+    committed = {}
     with open_map(map_path) as opened, opened.writing():
         for path in spools:
             with suppress(BlockingIOError, FileNotFoundError), _opened(path, os.O_RDONLY) as file:
                 revision = _commit(opened, _chunks(file, path), path)
                 path.unlink()
                 if revision is not None:
-                    committed.append(revision)
+                    committed[path] = revision
     return committed
 
 
