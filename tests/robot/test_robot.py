@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -157,6 +158,24 @@ def test_a_pose_between_two_frames_lies_between_them(localiser: Localiser) -> No
     assert between.sigma_m >= before.position.sigma_m
     assert robot.pose_at(after.stamp_ns + 10**9) is None
     assert robot.pose_at(found[0].stamp_ns - 1) is None
+
+
+def test_ctrl_c_waits_for_the_end_of_a_step(
+    localiser: Localiser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = Robot(Front(Settings()), localiser)
+    robot.step(LIVE[0].logged)
+    move = localiser.move
+
+    def interrupted(motion) -> None:
+        signal.raise_signal(signal.SIGINT)
+        move(motion)
+
+    monkeypatch.setattr(localiser, "move", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        robot.step(LIVE[1].logged)
+    assert robot.pose_at(LIVE[1].frame.stamp_ns) is localiser.position
+    assert localiser.driven_m == pytest.approx(0.7, abs=0.05)
 
 
 def test_no_pose_is_known_beside_a_frame_that_was_only_followed(localiser: Localiser) -> None:

@@ -169,6 +169,7 @@ class Robot:
             InputError: the robot is closed, or cannot use an argument: it is as it was before.
             IncompatibleError: the pair is of another camera; likewise.
             MapError: landmarks cannot be read, or the results cannot be written.
+            KeyboardInterrupt: Ctrl-C, once the frame is done: no motion is left out.
         """
         clock = StageClock(arrived_s)
         if deadline_ms is None:
@@ -176,25 +177,28 @@ class Robot:
         if self._closed:
             raise InputError("the robot is closed; make another one with Map.robot")
         self._front.check(arrived, motion, deadline_ms)
-        if not self._in_order(arrived):
-            return self._left_out(arrived)
-        frame, motion = self._taken(arrived, motion, clock)
-        deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
-        self._localiser.move(motion)
-        found = self._known(frame, motion)
-        if found is None:
-            found = self._localiser.localise(frame, deadline, self._keeper, clock)
-        for stamp_ns in found.withdraws:
-            self._withdraw_at(stamp_ns)
-        found = self._keeper.keep(frame, found)
-        if deadline is not None and time.perf_counter() > deadline:
-            found = replace(found, late=True)
-        self.last = Seen(arrived, frame, self._localiser.outcomes)
-        if self.watch is not None:
-            self.watch(self.last, found)
-        if self.recorder is not None:
-            self.recorder.note(arrived, frame, found, self._localiser.outcomes)
-        self._track = (*self._track[1 - _REMEMBERED :], (frame.stamp_ns, found))
+        with deferred_interrupt() as raise_if_asked:
+            if not self._in_order(arrived):
+                raise_if_asked()
+                return self._left_out(arrived)
+            frame, motion = self._taken(arrived, motion, clock)
+            deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
+            self._localiser.move(motion)
+            found = self._known(frame, motion)
+            if found is None:
+                found = self._localiser.localise(frame, deadline, self._keeper, clock)
+            for stamp_ns in found.withdraws:
+                self._withdraw_at(stamp_ns)
+            found = self._keeper.keep(frame, found)
+            if deadline is not None and time.perf_counter() > deadline:
+                found = replace(found, late=True)
+            self.last = Seen(arrived, frame, self._localiser.outcomes)
+            if self.watch is not None:
+                self.watch(self.last, found)
+            if self.recorder is not None:
+                self.recorder.note(arrived, frame, found, self._localiser.outcomes)
+            self._track = (*self._track[1 - _REMEMBERED :], (frame.stamp_ns, found))
+        raise_if_asked()
         return found
 
     localise = step
