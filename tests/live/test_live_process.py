@@ -157,6 +157,9 @@ def test_it_is_never_silent(client: Client) -> None:
 def test_unknown_and_incomplete_commands_are_answered(client: Client) -> None:
     assert "not a command" in answered(client, "dance")["text"]
     assert "switch needs 'map'" in answered(client, "switch")["text"]
+    assert "None is not a str" in answered(client, "switch", map=None)["text"]
+    assert "'off' is not a bool" in answered(client, "map", on="off")["text"]
+    assert "too large" in answered(client, "here", x_m=10**400, y_m=0, yaw_rad=0)["text"]
 
 
 def test_a_person_says_where_it_is_and_a_match_decides(
@@ -307,6 +310,9 @@ def test_a_client_that_breaks_the_protocol_is_left_and_the_next_one_served(
         assert "no camera" in until(one, lambda said: said["is"] == "reply")["text"]
         one.link.send({"do": "camera", "ring": "/dev/null", "camera": {"fx": "wide"}})
         assert until(one, lambda said: said["is"] == "reply")["text"] == "camera needs 'fy'"
+        sides = {"do": "camera", "ring": "/dev/null", "camera": {"left": None, "right": "wide"}}
+        one.link.send(sides)
+        assert "not understood" in until(one, lambda said: said["is"] == "reply")["text"]
         one.link._socket.sendall(b"hello\n")
         with pytest.raises((EOFError, OSError)):
             until(one, lambda _: False)

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import Any, TypeVar
 from uuid import UUID
 
 import numpy as np
@@ -24,6 +24,8 @@ from engram.live.track import Track
 from engram.live.transport import Command, FrameEvent, Message, Transport
 from engram.localiser import Position
 from engram.sequences.bags.fixes import Fix
+
+T = TypeVar("T")
 
 # Between two messages that the process is alive.
 _HEARTBEAT_S = 0.2
@@ -72,9 +74,9 @@ class LiveProcess:
         self._health = Health()
         self._track = Track()
         self._answers: dict[str, Callable[[Message], str]] = {
-            "map": lambda given: self._driving.map_on(bool(given.get("on", True))),
+            "map": lambda given: self._driving.map_on(_of(bool, given.get("on", True))),
             "save": lambda _: self._driving.pause() or "nothing was to be saved",
-            "switch": lambda given: self._driving.switch(Path(str(given["map"]))),
+            "switch": lambda given: self._driving.switch(Path(_of(str, given["map"]))),
             "relocalise": lambda _: self._driving.lose(),
             "place": lambda given: self._driving.place(_position(given)),
             "fix": lambda given: self._driving.fixed(_fix(given)),
@@ -152,7 +154,7 @@ class LiveProcess:
                 done, text = False, str(error)
             except KeyError as error:
                 done, text = False, f"{command.do} needs {error}"
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 done, text = False, f"{command.do} is not understood: {error}"
         reply = {"is": "reply", "id": command.id, "do": command.do, "ok": done, "text": text}
         self._transport.tell(reply)
@@ -212,6 +214,13 @@ def _found(step: Step) -> Message:
         said["node_from_live"] = _flat(found.position.node_from_live.matrix())
         said["covariance"] = _flat(found.position.covariance)
     return said
+
+
+def _of(kind: type[T], value: Any) -> T:
+    """A value of a message that must be of this kind: "off" is no false."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{value!r} is not a {kind.__name__}")
+    return value
 
 
 def _position(given: Message) -> Position:

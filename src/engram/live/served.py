@@ -156,7 +156,7 @@ class _Images:
     def __init__(self, message: Mapping[str, Any]) -> None:
         given = message["camera"]
         if "left" in given:
-            left, right = (parse_camera_info(given[side]) for side in ("left", "right"))
+            left, right = (parse_camera_info(dict(given[side])) for side in ("left", "right"))
             self._cameras = cameras_of_infos(left, right, rectified=bool(given.get("rectified")))
             size = left.width, left.height
         else:
