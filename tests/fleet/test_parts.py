@@ -1,6 +1,8 @@
 """What hangs together with the centre while a merge goes on, against counting components."""
 
 import random
+from collections.abc import Iterator
+from pathlib import Path
 from unittest.mock import Mock
 from uuid import UUID
 
@@ -13,13 +15,19 @@ from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.maps import Map
 
 
+@pytest.fixture
+def merge(tmp_path: Path) -> Iterator[Merge]:
+    with Map.create(tmp_path / "empty.engram") as store:
+        found = Merge(store, store)
+        found.writer = Mock()
+        yield found
+
+
 @pytest.mark.parametrize("seed", range(20))
-def test_a_node_is_apart_while_no_edges_lead_from_it_to_what_was_there(seed: int, tmp_path) -> None:
+def test_a_node_is_apart_while_no_edges_lead_from_it_to_what_was_there(
+    seed: int, merge: Merge
+) -> None:
     rng = random.Random(seed)
-    Map.create(tmp_path / "empty.engram").close()
-    with Map.open(tmp_path / "empty.engram") as store:
-        merge = Merge(store, store)
-    merge.writer = Mock()
     session = SessionId(UUID(int=1))
     ids = [NodeId(UUID(int=number)) for number in range(2, 22)]
     nodes = [Node(one, session, at, "camera", float(at)) for at, one in enumerate(ids)]

@@ -1,4 +1,4 @@
-"""What every map store must do, whatever database it lies in."""
+"""What a map does."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import insert
 from tests.worlds import attempts_of
 
-from engram.errors import IncompatibleError, InputError, MapLockedError, RevisionError
+from engram.errors import IncompatibleError, InputError, MapError, MapLockedError, RevisionError
 from engram.frontend import BRIEF, TEBLID
 from engram.geometry import StereoCamera
 from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind, path_id
@@ -447,3 +447,35 @@ class TestCheck:
         report = check_file(location)
         assert report.abandoned_rows == 0
         assert report.sound
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda store, _: store.robot(CAMERA),
+        lambda store, _: store.robot(CAMERA, name="r1", maps=True),
+        lambda store, _: store.graph,
+        lambda store, _: store.log(),
+        lambda store, _: store.info(),
+        lambda store, _: store.load(),
+        lambda store, node: store.frames.frame(node),
+        lambda store, _: store.check(),
+        lambda store, _: store.begin_revision(author="me", message="", configuration={}),
+        lambda store, _: store.tag("first", author="me"),
+        lambda store, _: store.clean(),
+    ],
+)
+@pytest.mark.parametrize("writes", [False, True])
+def test_a_closed_map_refuses_whatever_needs_its_file(store, location, asked, writes):
+    writer = begin(store, session("r1"))
+    node = write_drive(writer, 2).nodes[0].id
+    writer.commit()
+    store.close()
+    closed = Map.open(location, writes=writes)
+    assert len(closed.graph) == 2  # known before it is closed
+    closed.close()
+    closed.close()
+    with pytest.raises(MapError, match=r"town\.engram is closed: open the map again"):
+        asked(closed, node)
+    with Map.open(location, writes=True):
+        pass  # it holds no lock

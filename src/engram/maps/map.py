@@ -169,11 +169,13 @@ class Map(MapReader):
 
         Raises:
             InputError: an option is unknown or out of range, or the threads are too few.
+            MapError: the map is closed.
         """
         from engram.robot.live import Owner
         from engram.robot.settings import RobotOptions, Settings
         from engram.robot.starting import robot_in
 
+        self._database.check_open()
         asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser, threads=threads)
         owner = Owner(name, camera, settings or Settings(), asked)
         return robot_in(self, owner, maps=maps, remembers=remembers)
@@ -477,7 +479,7 @@ class Map(MapReader):
             return collect_abandoned(connection)
 
     def close(self) -> None:
-        """Closes files and threads, and releases the lock.
+        """Closes files and threads, and releases the lock. Whatever needs the file is then refused.
 
         A session that is still open becomes interrupted.
         """
@@ -493,6 +495,7 @@ class Map(MapReader):
 
     @property
     def _keys(self) -> KeyBook:
+        self._database.check_open()
         if self._key_book is None:
             raise RevisionError(f"{self.location} is open for reading; open it with writes=True")
         return self._key_book

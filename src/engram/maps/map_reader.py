@@ -480,6 +480,7 @@ class MapReader:
             return load(connection, self._view)
 
     def _read_contents(self) -> _Contents:
+        self._database.check_open()
         with self._contents_lock:
             if self._contents is None:
                 with no_collections(), reading_rows(self.location):

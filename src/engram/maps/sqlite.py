@@ -68,6 +68,7 @@ class SqliteDatabase:
         self._as_opened = _state(self.path) if nobody_writes else None
         self._reader = self._file.engine(self._options, self._prepare_reader)
         self._writer: Engine | None = None
+        self._closed = False
         self._compiled: dict[Select[Any], tuple[str, tuple[str, ...]]] = {}
         self._idle: deque[sqlite3.Connection] = deque()  # one for each concurrent thread
         missing = {table.name for table in missing_in(self.format_version)}
@@ -98,6 +99,15 @@ class SqliteDatabase:
         """The path."""
         return str(self.path)
 
+    def check_open(self) -> None:
+        """Refuses whatever needs the file once it is closed.
+
+        Raises:
+            MapError: it is closed.
+        """
+        if self._closed:
+            raise MapError(f"{self.name} is closed: open the map again")
+
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection for selects."""
@@ -115,6 +125,7 @@ class SqliteDatabase:
 
         SQLite would then mix old and new pages, which looks like damage or goes unnoticed.
         """
+        self.check_open()
         try:
             yield
         except MapError as error:
@@ -152,6 +163,7 @@ class SqliteDatabase:
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """One transaction, durable at the end of the block."""
+        self.check_open()
         if self._writer is None:
             self._writer = _writing_engine(self._file, "mode=rw")
         with damage_named(self.name), self._file.errors(), self._writer.begin() as connection:
@@ -159,6 +171,7 @@ class SqliteDatabase:
 
     def lock_for_writing(self) -> WriterLock:
         """Locks the map for writing."""
+        self.check_open()
         if not os.access(self.path, os.W_OK):
             raise MapError(f"{self.path} is read-only; copy it to a writable folder")
         lock = WriterLock(self.path)
@@ -236,7 +249,8 @@ class SqliteDatabase:
         return sum(file.stat().st_size for file in files if file.exists())
 
     def close(self) -> None:
-        """Close all connections; the last one to close empties the write-ahead log."""
+        """Closes all connections; the last one to close empties the write-ahead log."""
+        self._closed = True
         self._end_readers()
         if self._writer is not None:
             with self._file.errors():
