@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from engram.live import LiveProcess
 from engram.localiser import Localiser
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
@@ -294,6 +295,21 @@ def test_ctrl_c_keeps_what_was_localised_and_ends_with_130(
     assert ran.status == 130
     assert ran.json["summary"]["interrupted"]
     assert ran.json["summary"]["frames"] == len(ran.json["frames"]) == frames
+
+
+def test_ctrl_c_at_a_live_process_says_where_the_drive_is_kept(
+    engram, street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take, taken = LiveProcess._take, []
+
+    def interrupted(*arguments):
+        taken.append(take(*arguments))
+        if len(taken) == 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(LiveProcess, "_take", interrupted)
+    ran = engram("live", tmp_path / "town.engram", "--play", street, "--map")
+    assert (ran.status, ran.err) == (130, "engram: interrupted; kept as revision 1\n")
 
 
 def test_ctrl_c_before_there_is_a_result_is_said_in_json_too(

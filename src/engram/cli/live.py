@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from engram.cli import options
+from engram.cli.endings import VerbInterruptedError
 from engram.errors import ConfigError
 
 
@@ -63,7 +64,7 @@ def live(
       engram live town.engram --socket /run/engram/r1.sock --map --deadline 40
       engram live town.engram --play drives/tuesday --rate 20
     """
-    from engram.live import LiveOptions, LiveProcess, Played, Served
+    from engram.live import LiveOptions, LiveProcess, Played, Served, Transport
     from engram.robot import RobotOptions, open_drive
     from engram.viewing.viewer import viewer_for
 
@@ -78,12 +79,18 @@ def live(
     resolved = LiveOptions(map_path, name, maps, given.of_robot(), asked)
     with ExitStack() as stack:
         viewer = stack.enter_context(viewer_for(view))
-        if socket is not None:
-            serving = stack.enter_context(Served(socket, once=once))
-            LiveProcess(serving, resolved, watcher=viewer).run()
-        elif play is not None:
+        transport: Transport
+        if play is not None:
             transport = Played(open_drive(play), _print, rate)
-            LiveProcess(transport, resolved, watcher=viewer).run()
+        else:
+            assert socket is not None
+            transport = stack.enter_context(Served(socket, once=once))
+        process = LiveProcess(transport, resolved, watcher=viewer)
+        try:
+            process.run()
+        except KeyboardInterrupt:
+            told = f"interrupted; {process.saving.text()}"
+            raise VerbInterruptedError(told) from None
 
 
 def _print(message: dict[str, Any]) -> None:

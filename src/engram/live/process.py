@@ -23,6 +23,7 @@ from engram.live.driving import Driving, LiveOptions, Step, Watcher
 from engram.live.track import Track
 from engram.live.transport import Command, FrameEvent, Message, Transport
 from engram.localiser import Position
+from engram.robot.saved import Saving
 from engram.sequences.bags.fixes import Fix
 
 T = TypeVar("T")
@@ -84,6 +85,11 @@ class LiveProcess:
                 *(float(given[name]) for name in ("x_m", "y_m", "yaw_rad"))
             ),
         }
+
+    @property
+    def saving(self) -> Saving:
+        """Whether and where the drive is saved."""
+        return self._driving.saving
 
     def run(self) -> None:
         """Serves frames and commands; on leaving, what was mapped is committed."""
@@ -186,7 +192,7 @@ class LiveProcess:
         }
 
     def _saving(self) -> Message:
-        saving = self._driving.saving
+        saving = self.saving
         return {
             "saving": saving.state.value,
             "nodes": saving.nodes,
