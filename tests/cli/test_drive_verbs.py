@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import cv2
@@ -11,6 +12,7 @@ import pytest
 from tests.sequences.bag_maker import StereoBag, bag, rectified_infos
 
 from engram.calibration import read_calibration
+from engram.errors import NotAMapError
 from engram.geometry import StereoCamera
 from engram.maps import open_map
 from engram.sequences import open_sequence
@@ -151,3 +153,24 @@ def test_the_list_of_features_says_what_each_is_good_at(engram) -> None:
     ran = engram("features")
     assert "256 bits  night, snow, low sun, other seasons" in ran.out
     assert "--features KIND" in ran.out
+
+
+def test_nothing_stays_of_a_new_map_where_a_drive_cannot_be_read(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    broken, town = tmp_path / "broken", tmp_path / "maps" / "town.engram"
+    shutil.copytree(street, broken)
+    town.parent.mkdir()
+    first = min((broken / "left").glob("*.png"))
+    first.write_bytes(first.read_bytes()[:100])
+    ran = engram("map", town, broken)
+    assert ran.status == 2
+    assert first.name in ran.err
+    assert list(town.parent.iterdir()) == []
+    assert engram("map", town, broken, "--skip-bad").status == 0
+
+
+def test_no_map_is_made_to_see_one_of_its_revisions(tmp_path: Path) -> None:
+    with pytest.raises(NotAMapError):
+        open_map(tmp_path / "town.engram", at=1, create=True)
+    assert list(tmp_path.iterdir()) == []

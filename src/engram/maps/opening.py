@@ -14,12 +14,12 @@ def open_map(path: Path | str, at: int | str | None = None, create: bool = False
     Args:
         path: NAME.engram.
         at: number or tag of a revision, to see the map as it was then; None for the newest.
-        create: create an empty map if the file does not exist.
+        create: create an empty map if the file does not exist and no revision is named.
 
     Raises:
         MapError: the file is not a map, of a newer format, or damaged.
         RevisionError: there is no such revision.
     """
-    if create and not map_path(path).exists():
+    if create and at is None and not map_path(path).exists():
         Map.create(path).close()
     return Map.open(path, at=at)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from engram.doctor import Diagnosis
 from engram.errors import ConfigError
+from engram.files import check_parent
 from engram.frontend import DescriptorKind, Frontend, feature_kind
 from engram.graph.model import Session
 from engram.localiser import Localisation, Localiser
@@ -129,18 +130,29 @@ def map_drive(
     session = session_of_drive(sequence)
     report = MapReport(session)
     commit_spools(map_path)
-    with open_map(map_path, create=True) as opened, opened.writing():
-        if descriptor is not None:
-            mend = "map the drive into another map"
-            _check_descriptor(descriptor, opened.descriptor, str(map_path), mend)
-        if opened.session_state(session.id) is SessionState.COMMITTED:
-            report.known = True
-            return report
-        report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
-        settings = settings.for_descriptor(opened.descriptor)
-        _Mapping(opened, sequence, settings, options, begin, report).run(monitor)
+    check_parent(map_path)
+    # A new map is made once the drive's first frames are read: nothing stays if they cannot be.
+    with _written(map_path) if map_path.exists() else nullcontext() as opened:
+        if opened is not None:
+            if descriptor is not None:
+                mend = "map the drive into another map"
+                _check_descriptor(descriptor, opened.descriptor, str(map_path), mend)
+            if opened.session_state(session.id) is SessionState.COMMITTED:
+                report.known = True
+                return report
+            report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
+        settings = settings.for_descriptor(None if opened is None else opened.descriptor)
+        into = _written(map_path) if opened is None else nullcontext(opened)
+        _Mapping(into, sequence, settings, options, begin, report).run(monitor)
     report.skipped = sequence.skipped
     return report
+
+
+@contextmanager
+def _written(map_path: Path) -> Iterator[Map]:
+    """A map, made if there is none, locked for writing."""
+    with open_map(map_path, create=True) as opened, opened.writing():
+        yield opened
 
 
 def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend: str) -> None:
@@ -158,9 +170,9 @@ def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend:
 
 @dataclass(frozen=True)
 class _Mapping:
-    """One run of `map_drive`, on the open map."""
+    """One run of `map_drive`; `into` opens the map."""
 
-    opened: Map
+    into: AbstractContextManager[Map]
     sequence: DriveSequence
     settings: Settings
     options: RobotOptions
@@ -175,19 +187,20 @@ class _Mapping:
             with closing(LookedAhead(front, self.sequence, monitor)) as drive:
                 self.report.diagnosis = front.diagnosis
                 refuse_unfit(front.diagnosis, self.sequence.info.name, self.options)
-                self._save(drive, front, monitor)
+                with self.into as opened:
+                    self._save(opened, drive, front, monitor)
         except KeyboardInterrupt:
             self.report.interrupted = True
 
-    def _save(self, drive: LookedAhead, front: Front, monitor: Monitor) -> None:
+    def _save(self, opened: Map, drive: LookedAhead, front: Front, monitor: Monitor) -> None:
         """The same for a drive that is fit, or forced."""
-        writer = self._writer()  # first: what follows reads a resumed session's nodes
-        words = node_words(self.opened, self.settings, self.options.relocaliser)
-        localiser = self._localiser()
-        saved = SavedDrive(self.opened, writer, localiser, self.settings, words)
+        writer = self._writer(opened)  # first: what follows reads a resumed session's nodes
+        words = node_words(opened, self.settings, self.options.relocaliser)
+        localiser = self._localiser(opened)
+        saved = SavedDrive(opened, writer, localiser, self.settings, words)
         robot = Robot(front, localiser, saved.mapper, deadline_ms=self.options.deadline_ms)
         if self.begin is not None:
-            self.begin(Beginning(self.opened, robot, self.report.resumed))
+            self.begin(Beginning(opened, robot, self.report.resumed))
         try:
             with robot, closing(robot.drive(drive, monitor)) as found:
                 self.report.results.extend(one for one in found if not one.resumed)
@@ -196,7 +209,7 @@ class _Mapping:
             saved.close()
         self.report.revision = saved.commit().number
 
-    def _writer(self) -> RevisionWriter:
+    def _writer(self, opened: Map) -> RevisionWriter:
         """The writer of the drive's revision."""
         diagnosis = self.report.diagnosis
         assert diagnosis is not None
@@ -209,17 +222,17 @@ class _Mapping:
             "configuration": {**configuration, "doctor": diagnosis.to_dict()},
         }
         made_by = _made_by(self.sequence, self.settings)
-        return begin_or_resume(self.opened, session, self.sequence.camera, made_by, about)
+        return begin_or_resume(opened, session, self.sequence.camera, made_by, about)
 
-    def _localiser(self) -> Localiser:
+    def _localiser(self, opened: Map) -> Localiser:
         return localiser_in(
-            self.opened,
+            opened,
             self.sequence.camera,
             self.settings,
             policy=self.options.policy,
             budget=self.options.budget,
             relocaliser=relocaliser_with_fixes(
-                self.opened, self.sequence, self.settings, self.options.relocaliser
+                opened, self.sequence, self.settings, self.options.relocaliser
             ),
             live=self.report.session.id,
             saves=True,
