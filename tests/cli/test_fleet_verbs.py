@@ -20,6 +20,7 @@ def test_merge_hands_in_a_map_once(engram, robot, tmp_path):
     centre = tmp_path / "centre.engram"
     tried = engram("merge", centre, robot, "--dry-run", "--json").json["merges"][0]
     assert not centre.exists()
+    assert (tried["changed"], tried["revision"]) == (True, None)
     done = engram("merge", centre, robot, "--json").json["merges"][0]
     assert done["revision"] == 1
     assert done["taken"] > 0
@@ -27,6 +28,9 @@ def test_merge_hands_in_a_map_once(engram, robot, tmp_path):
     again = engram("merge", centre, robot)
     assert again.status == 0
     assert "nothing new" in again.out
+    engram("goal", "add", robot, "dock", "--x", 1, "--y", 0)
+    assert "revision 2" in engram("merge", centre, robot).out
+    assert "dock" in engram("goal", "list", centre).out
     assert engram("check", centre).status == 0
 
 
@@ -42,7 +46,7 @@ def failing(monkeypatch):
 
     def fail(error):
         def merge(centre, robots, options, monitor, **_):
-            monitor.hear(MergeReport(str(robots[0]), "", ["r1"], revision=2, taken=3))
+            monitor.hear(MergeReport(str(robots[0]), "", ["r1"], revision=2, changed=True, taken=3))
             raise error
 
         monkeypatch.setattr("engram.fleet.merge.merge", merge)

@@ -364,7 +364,9 @@ class TestReported:
             SegmentReport("5621beba-1", "r1", stamp, Seed.NONE, 1, 0, [run]) for stamp in range(50)
         ]
         segments.append(SegmentReport("5621beba-1", "r1", 60, Seed.NEIGHBOUR, omitted=4))
-        report = MergeReport("r1.engram", "", ["r1"], revision=2, taken=50, segments=segments)
+        report = MergeReport(
+            "r1.engram", "", ["r1"], revision=2, changed=True, taken=50, segments=segments
+        )
         (line,) = [line for line in report.text().splitlines() if "5621beba" in line]
         assert "50 added, 4 already covered, in 51 segments, 50 not found" in line
         assert "no known node nearby (50)" in line

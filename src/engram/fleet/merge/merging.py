@@ -86,7 +86,8 @@ def merge(
             gates.look_at(place, watched)
             for robot in robots:
                 reports.append(_merged(place, robot, settings, options, gates, watched))
-                reports[-1].dry_run = dry_run
+                if dry_run:
+                    reports[-1].dry_run, reports[-1].revision = True, None
                 if not (reports[-1].interrupted or dry_run or place == centre):
                     publish_map(place, centre)
                     place = centre

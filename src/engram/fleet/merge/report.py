@@ -205,6 +205,7 @@ class MergeReport:
         source_hash: its content hash.
         robots: names of the robots whose drives it holds.
         revision: number of the new revision; None if nothing changed, and in a dry run.
+        changed: whether the fleet map changed, or in a dry run would have.
         dry_run: whether the fleet map was left unchanged on purpose.
         interrupted: whether it was stopped; the fleet map is then unchanged by it.
         content_hash: of the fleet map afterwards; in a dry run, of the map that would result.
@@ -229,6 +230,7 @@ class MergeReport:
     source_hash: str
     robots: Sequence[str]
     revision: int | None = None
+    changed: bool = False
     dry_run: bool = False
     interrupted: bool = False
     content_hash: str = ""
@@ -257,23 +259,10 @@ class MergeReport:
         robots = sorted({session.robot for session in robot.sessions.values()})
         return MergeReport(robot.location, robot.content_hash(), robots)
 
-    @property
-    def changed(self) -> bool:
-        """Whether the fleet map changed."""
-        learnt = (
-            self.sessions,
-            self.taken,
-            self.omitted,
-            self.edges,
-            self.path_entries,
-            self.attempts,
-        )
-        return any(learnt)
-
     def to_dict(self) -> dict[str, Any]:
         """What ``merge --json`` prints for this map."""
         moved = None if self.moved is None else self.moved.to_dict()
-        return {**plain(self), "changed": self.changed, "moved": moved}
+        return {**plain(self), "moved": moved}
 
     def text(self) -> str:
         """The report as text."""

@@ -99,7 +99,8 @@ def merge_one(
     new = [node for node in nodes if not merge.knows(node.id)]
     report.known_omissions = sum(merge.has_omitted(node.id) for node in nodes)
     report.known = len(nodes) - len(new) - report.known_omissions
-    if new or merge.has_more():
+    report.changed = bool(new) or merge.has_more()
+    if report.changed:
         check_readable(robot, new)
         places, goals = centre.placements, list(centre.goals.values())
         with centre.begin_revision(**_about(merge, new, settings, options)) as merge.writer:
