@@ -229,7 +229,7 @@ def test_goals_far_from_the_map_are_warned_of_and_exported(engram, street, tmp_p
 def test_plot_refuses_what_it_cannot_write(engram, street: Path, tmp_path: Path) -> None:
     town = tmp_path / "town.engram"
     engram("map", town, street)
-    for picture in ("no/folder/a.png", "a.xyz"):
+    for picture in ("no/folder/a.png", "a.xyz", "town"):
         ran = engram("plot", town, picture)
         assert ran.status == 2
         assert picture in ran.err

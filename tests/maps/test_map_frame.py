@@ -65,6 +65,12 @@ def test_goals_and_places_are_each_others_inverse(road, pose):
     assert where.yaw_rad == pytest.approx(pose[2], abs=0.02)  # nodes are level to some minutes
 
 
+@pytest.mark.parametrize("pose", [(np.nan, 0.0, 0.0), (0.0, 1e300, 0.0), (0.0, 0.0, -1e10)])
+def test_a_goal_beyond_any_map_is_refused(road, pose):
+    with Map.open(road) as store, pytest.raises(InputError, match="at most 1e"):
+        store.frame.goal(*pose)
+
+
 def test_goals_survive_merges_and_say_how_far_they_moved(copy, tmp_path):
     add_goal(copy, "dock", 5.0, 1.0, 0.0, author="tests")
     centre = tmp_path / "centre.engram"
@@ -221,7 +227,9 @@ def test_exports_hold_every_node(copy, tmp_path):
         ("node,x,y\na,one,2\n", "not a number"),
         ("node,lat,lon\na,91,2\n", "not latitude, longitude"),
         ("time,x,y\nnoon,1,2\n", "line 2"),
+        ("node,x,y\na,1e300,2\n", "at most 1e"),
         ("node,x,y,sigma\na,1,2,0\n", "sigma"),
+        ("node,x,y,sigma\na,1,2,1e-300\n", "sigma"),
     ],
 )
 def test_what_is_wrong_with_a_file_of_anchors_is_said(tmp_path, text, said):

@@ -20,6 +20,8 @@ from engram.graph.placing import DEFAULT_CONFIG as PLACING
 # Metres per degree of latitude, and the least movement that is worth a word.
 _DEGREE_M = 111_320.0
 _WORTH_M = 0.05
+# No coordinate in the map frame is larger, whatever grid it is of.
+FARTHEST_M = 1e9
 # Directions in which a goal and the node that it is stored in may differ, before distance counts.
 _ALIKE_RAD = np.pi / 2
 _TURNED_AWAY_M = 5.0
@@ -118,12 +120,15 @@ class MapFrame:
             name: its name.
 
         Raises:
-            InputError: the map has no nodes, or a number is not finite.
+            InputError: the map has no nodes, or a number is not finite or above `FARTHEST_M`.
         """
         if not len(self._graph):
             raise InputError("the map has no nodes: there is nothing to store a goal in")
-        if not np.isfinite((x_m, y_m, yaw_rad)).all():
-            raise InputError(f"goal {name!r}: x {x_m}, y {y_m}, yaw {yaw_rad} must be finite")
+        if not (np.abs((x_m, y_m, yaw_rad)) <= FARTHEST_M).all():
+            raise InputError(
+                f"goal {name!r}: x {x_m:g}, y {y_m:g}, yaw {yaw_rad:g} must be finite, at most "
+                f"{FARTHEST_M:g}"
+            )
         offset = self.poses.translations[:, :2] - (x_m, y_m)
         turned = np.abs(np.angle(np.exp(1j * (self._yaws_rad - yaw_rad))))
         distance_m = np.hypot(*offset.T) + _TURNED_AWAY_M * (turned > _ALIKE_RAD)

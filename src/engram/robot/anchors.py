@@ -9,15 +9,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 import yaml
 
 from engram.errors import ConfigError, InputError
+from engram.maps.map_frame import FARTHEST_M
 from engram.sequences.options import parse_start
 from engram.untrusted import read_text
 
 # Farthest in time from a node that a line with a time may be.
 NEAR_NS = 500_000_000
+# Nothing is surveyed better.
+_LEAST_SIGMA_M = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +119,11 @@ def _given(row: Mapping[str, str], line: int, kind: tuple[str, str], source: Pat
             value = float(row[name])
         except ValueError:
             value = float("nan")
-        if not np.isfinite(value):
-            raise InputError(f"{source}, line {line}: {name} {row[name]!r} is not a number")
+        if not abs(value) <= FARTHEST_M:
+            raise InputError(
+                f"{source}, line {line}: {name} {row[name]!r} is not a number of at most "
+                f"{FARTHEST_M:g}"
+            )
         return value
 
     node, time = row.get("node") or None, row.get("time") or None
@@ -130,8 +135,10 @@ def _given(row: Mapping[str, str], line: int, kind: tuple[str, str], source: Pat
     if kind == ("lat", "lon") and not (abs(first) <= 90 and abs(second) <= 180):
         raise InputError(f"{source}, line {line}: {first}, {second} is not latitude, longitude")
     sigma_m = number("sigma")
-    if sigma_m is not None and sigma_m <= 0:
-        raise InputError(f"{source}, line {line}: sigma is {sigma_m}, must be > 0")
+    if sigma_m is not None and sigma_m < _LEAST_SIGMA_M:
+        raise InputError(
+            f"{source}, line {line}: sigma is {sigma_m}, must be at least {_LEAST_SIGMA_M:g} m"
+        )
     time_ns = None if time is None else _time_ns(time, line, source)
     return GivenAnchor(line, node, time_ns, (first, second), number("z"), sigma_m)
 

@@ -138,7 +138,7 @@ def check_picture(path: Path) -> None:
     ending = path.suffix.removeprefix(".").lower()
     if not path.parent.is_dir():
         raise InputError(f"the picture {path} cannot be written: {path.parent} is not a folder")
-    if ending and ending not in formats:
+    if ending not in formats:  # Matplotlib would write another file, NAME.png
         raise InputError(
             f"the picture {path} cannot be written: .{ending} is not one of {', '.join(formats)}"
         )
