@@ -628,6 +628,27 @@ class TestFirstHour:
         (path / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(PAIRS)))
         assert len(list(open_sequence(path))) == PAIRS
 
+    def test_9_comes_before_10(self, tmp_path: Path) -> None:
+        path = LAYOUTS["folder"].write(tmp_path)
+        padded = [pair.left.tobytes() for pair in open_sequence(path)]
+        for side in ("left", "right"):
+            for index, file in enumerate(sorted((path / side).iterdir())):
+                file.rename(file.with_name(f"frame{index + 8}.png"))
+        assert [pair.left.tobytes() for pair in open_sequence(path)] == padded
+
+    def test_pairs_lost_on_both_sides_leave_later_stamps_alone(self, tmp_path: Path) -> None:
+        path = LAYOUTS["folder"].write(tmp_path)
+        stamps_ns = [pair.stamp_ns for pair in open_sequence(path)]
+        for side in ("left", "right"):
+            files = sorted((path / side).iterdir())
+            for index, file in enumerate(files):
+                file.rename(file.with_name(f"{index}.png"))
+            (path / side / "1.png").unlink()
+        with pytest.raises(SequenceError, match="image 1 is missing"):
+            open_sequence(path)
+        found = [pair.stamp_ns for pair in open_sequence(path, skip_bad=True)]
+        assert found == stamps_ns[:1] + stamps_ns[2:]
+
     def test_both_spellings_are_known(self, tmp_path: Path) -> None:
         path = LAYOUTS["kitti"].write(tmp_path)
         with pytest.raises(SequenceError, match="colour rig"):

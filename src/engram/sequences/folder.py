@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from engram.calibration.toml import CalibrationFile
@@ -82,11 +83,30 @@ def _places(path: Path, options: OpenOptions) -> Listing:
     stamps_ns = read_stamps(times, seconds_as_ns)
     sides = [{file.stem: file for file in image_files(folder)} for folder in (left, right)]
     # A name that only one side has keeps its place, so that later stamps remain correct.
-    names = sorted({*sides[0], *sides[1]})
+    places = _numbered({*sides[0], *sides[1]}, len(stamps_ns))
     by_number = [
-        {number: side[name] for number, name in enumerate(names) if name in side} for side in sides
+        {number: side[name] for name, number in places.items() if name in side} for side in sides
     ]
     return pair_by_number(stamps_ns, by_number[0], by_number[1], times)
+
+
+def _numbered(names: set[str], stamps: int) -> dict[str, int]:
+    """The line of its stamp for each name; 9 comes before 10.
+
+    If there are more stamps than names, and the names are numbers of lines, images are lost on both
+    sides, and those after them keep their lines.
+    """
+    ordered = sorted(names, key=_by_number)
+    if len(names) < stamps and all(one.isascii() and one.isdecimal() for one in names):
+        lines = {name: int(name) for name in ordered}
+        if len(set(lines.values())) == len(names) and max(lines.values()) < stamps:
+            return lines
+    return {name: line for line, name in enumerate(ordered)}
+
+
+def _by_number(name: str) -> tuple[list[str | int], str]:
+    parts = re.split("([0-9]+)", name)  # every other one is a number
+    return [int(one) if at % 2 else one for at, one in enumerate(parts)], name
 
 
 def _named_by_stamp(folder: Path) -> list[StampedFile]:
