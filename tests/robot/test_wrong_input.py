@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from collections.abc import Iterator
@@ -74,6 +75,12 @@ def test_a_motion_or_deadline_of_the_wrong_kind_changes_nothing(robot: Robot, gi
     with pytest.raises(InputError, match=next(iter(given))):
         robot.step(LIVE[1].logged, **given)
     assert robot.step(LIVE[1].logged).localised
+
+
+@pytest.mark.parametrize("later_ns", [0, LATER_NS])
+def test_results_of_numpys_stamps_are_json(robot: Robot, later_ns: int) -> None:
+    found = robot.step(StereoPair(np.int64(later_ns), GREY, GREY, CAMERA))
+    assert json.loads(json.dumps(found.to_dict()))["stamp_ns"] == later_ns
 
 
 MOVED = SE3(np.eye(3), np.array([0.0, 0.0, 0.7]))

@@ -120,7 +120,7 @@ class Frontend:
         if descriptors is None:
             descriptors = kind.describe(pair.left, found.pixels, found.octaves)
         return Frame(
-            stamp_ns=pair.stamp_ns,
+            stamp_ns=int(pair.stamp_ns),  # perhaps NumPy's: JSON knows none
             camera=pair.camera,
             landmarks=quantised_landmarks(
                 found.pixels,

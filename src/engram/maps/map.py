@@ -149,8 +149,7 @@ class Map(MapReader):
         """A robot that localises in this map; see `Robot.step`.
 
         A robot that maps or remembers stores its drive as a session; closing the robot commits it
-        as a revision. The robot sees its own nodes at once; maps opened after the commit show them,
-        this one does not: open it again for each drive.
+        as a revision. It sees its own nodes at once; maps opened after the commit show them.
 
         Args:
             camera: its rectified stereo camera.

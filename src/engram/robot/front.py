@@ -270,7 +270,7 @@ def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]
 
 def stamp_of(arrived: Arrived) -> int:
     """Stamp of a pair or logged frame, ns."""
-    return arrived.stamp_ns if isinstance(arrived, StereoPair) else arrived.frame.stamp_ns
+    return int(arrived.stamp_ns if isinstance(arrived, StereoPair) else arrived.frame.stamp_ns)
 
 
 def arriving(sequence: Iterable[Arrived]) -> Generator[Arrived]:
