@@ -20,6 +20,8 @@ from engram.mapper import Mapper, Memory, NodeSaver, Saver
 from engram.maps import Map, RevisionWriter
 from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in
+from engram.robot.results import summarise
+from engram.viewing.trajectory import chain_trajectory
 
 ROAD = World(length_m=120.0, seed=11)
 ELSEWHERE = World(length_m=60.0, seed=12)
@@ -124,6 +126,10 @@ def test_a_fix_that_a_later_one_contradicts_is_withdrawn_and_forgotten(town: Pat
     assert len(rested) > 1
     assert {robot.pose_at(one.stamp_ns) for one in rested} == {None}
     assert robot.pose_at(again.stamp_ns) is again.position
+    stamp_ns, first_from_live = chain_trajectory(localiser.graph, found)[0]
+    assert stamp_ns == again.stamp_ns
+    assert first_from_live.distance_m == pytest.approx(again.node_from_live.distance_m)
+    assert summarise(found)["withdrawn"] == 1
     assert notes.entries
     assert false not in {entry.node for entry in notes.entries}
     assert [entry.sequence for entry in notes.entries] == list(range(len(notes.entries)))

@@ -81,6 +81,8 @@ def _frames(summary: Mapping[str, Any]) -> list[str]:
     """What became of every frame."""
     statuses = summary["statuses"]
     fates = [f"{statuses.get(status, 0)} {words}" for status, words in _FATES.items()]
+    if withdrawn := summary.get("withdrawn", 0):
+        fates[0] += f" ({withdrawn} of them withdrawn)"
     if unusable := summary.get("unusable_frames", 0):
         fates.append(f"{unusable} of them unusable")
     if skipped := summary["skipped_pairs"]:

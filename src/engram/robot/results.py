@@ -64,6 +64,7 @@ def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
         "frames": len(results),
         "share_localised": sum(result.localised for result in results) / count,
         "statuses": {status.value: statuses.count(status) for status in LocalisationStatus},
+        "withdrawn": sum(len(result.withdraws) for result in results),
         "unusable_frames": sum(not result.motion.usable for result in results),
         "attempts_per_frame": sum(r.attempts for r in results) / count,
         "driven_m": route_m([drive]),

@@ -30,16 +30,18 @@ def chain_trajectory(
     """Poses of the live camera in the frame of the first localised node.
 
     Frames before the first localised one are left out, and so are frames from a loss of odometry
-    to the next match.
+    to the next match. Fixes that the robot withdrew count as frames without a match.
 
     Returns:
         (stamp_ns, first_from_live) of each placed frame, in temporal order.
     """
     placed = _PlacedNodes(graph)
+    withdrawn = {stamp_ns for found in results for stamp_ns in found.withdraws}
     trajectory: list[tuple[int, SE3]] = []
     first_from_live: SE3 | None = None
     for found in results:
-        if found.node is not None and found.node_from_live is not None:
+        stands = found.stamp_ns not in withdrawn
+        if stands and found.node is not None and found.node_from_live is not None:
             first_from_node = placed.place(found.node, first_from_live, found.node_from_live)
             first_from_live = (
                 None if first_from_node is None else first_from_node @ found.node_from_live
