@@ -178,15 +178,19 @@ def test_ctrl_c_waits_for_the_end_of_a_step(
     assert localiser.driven_m == pytest.approx(0.7, abs=0.05)
 
 
-def test_no_pose_is_known_beside_a_frame_that_was_only_followed(localiser: Localiser) -> None:
+def test_a_pose_beside_a_frame_that_was_only_followed_lies_between(localiser: Localiser) -> None:
     robot = Robot(Front(Settings()), localiser)
     for seen in LIVE[:4]:
         robot.step(seen.logged)
     robot.follow(LIVE[4].logged)
-    after = robot.step(LIVE[5].logged)
-    assert robot.pose_at(after.stamp_ns) is after.position
-    # Its motion began at the followed frame, not at the one before.
-    assert robot.pose_at(LIVE[3].frame.stamp_ns + 1) is None
+    robot.step(LIVE[5].logged)
+    known, followed = (robot.pose_at(one.frame.stamp_ns) for one in LIVE[3:5])
+    between = robot.pose_at((LIVE[3].frame.stamp_ns + LIVE[4].frame.stamp_ns) // 2)
+    assert known is not None
+    for later, ahead_m in ((followed, 0.7), (between, 0.35)):
+        assert later is not None
+        way_m = later.node_from_live.translation - known.node_from_live.translation
+        np.testing.assert_allclose(way_m, [0.0, 0.0, ahead_m], atol=0.02)
 
 
 def test_a_robot_is_placed_and_lost_again(localiser: Localiser) -> None:

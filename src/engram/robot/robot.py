@@ -246,7 +246,8 @@ class Robot:
         if self._in_order(arrived):
             _, motion = self._front.take(arrived, motion)
             self._localiser.move(motion)
-            self._track = ()  # the next motion begins at this frame, not at one in it
+            followed = replace(self._left_out(arrived), motion=motion)
+            self._track = (*self._track[1 - _REMEMBERED :], (followed.stamp_ns, followed))
 
     def record(self, reason: str = "asked") -> Path:
         """Writes the last seconds as a flight record; see `Recorder.record`.
