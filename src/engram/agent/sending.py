@@ -10,6 +10,7 @@ from typing import Any
 
 from engram.agent.link import CentreRefusedError, Link
 from engram.agent.state import AgentState
+from engram.counts import counted
 from engram.errors import StorageFullError
 from engram.transfers import Manifest, PartHash, Split, split
 from engram.transfers.manifest import decode_manifest, encode_manifest
@@ -125,7 +126,9 @@ class Outbox:
             before = answer["wanted"]
             answer = link.send(f"/v1/handins/{key}/parts", partial(self._parts, row, wanted))
             if answer["wanted"] and set(answer["wanted"]) == set(before):
-                self._note(row, FAILED, None, f"{len(wanted)} parts are no longer on this robot")
+                self._note(
+                    row, FAILED, None, f"no longer on this robot: {counted(len(wanted), 'part')}"
+                )
                 return False
         link.ask("POST", f"/v1/handins/{key}/complete")
         self._state.share([*manifest.hashes(), *self._state.waiting_hashes(row["id"])])

@@ -23,6 +23,7 @@ from engram.centre.store.packs import given_by
 from engram.centre.store.schema import dreams, handins
 from engram.centre.store.waking import ring
 from engram.config import to_dict
+from engram.counts import counted
 from engram.fleet.dream import FEWEST_DRIVES
 from engram.maps.exchange import MapRows
 from engram.maps.schema import frames, nodes
@@ -49,8 +50,8 @@ class Dreams:
         gate = self._centre.policy(name).gate
         if len(gate) < FEWEST_DRIVES:
             raise ConflictError(
-                f"{name} has {len(gate)} held-out drives, which tell nothing about chance; give "
-                f"at least {FEWEST_DRIVES} with engram centre map --gate"
+                f"{name} has {counted(len(gate), 'held-out drive')}: that tells nothing about "
+                f"chance; give at least {FEWEST_DRIVES} with engram centre map --gate"
             )
         if not self.handed(name):
             raise ConflictError(f"nothing is merged into {name} yet: there is nothing to dream of")

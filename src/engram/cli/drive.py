@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from engram.cli import options
 from engram.cli.help import VerbInFull
+from engram.counts import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -165,11 +166,15 @@ def _toml(cameras: Cameras) -> str:
 def _bag_text(facts: BagFacts) -> str:
     width = max(len(topic.name) for topic in facts.topics)
     lines = [
-        f"{facts.path}: {_size(facts.size_bytes)} in {facts.files} "
-        f"{'file' if facts.files == 1 else 'files'}, {facts.duration_s:.1f} s"
+        f"{facts.path}: {_size(facts.size_bytes)} in "
+        f"{counted(facts.files, 'file')}, {facts.duration_s:.1f} s"
     ]
     for topic in facts.topics:
-        gaps = f"{topic.gaps} gaps, longest {topic.longest_gap_s:.2f} s" if topic.gaps else ""
+        gaps = (
+            f"{counted(topic.gaps, 'gap')}, longest {topic.longest_gap_s:.2f} s"
+            if topic.gaps
+            else ""
+        )
         rate = f"{topic.rate_hz:7.1f} Hz" if topic.rate_hz else " " * 10
         lines.append(
             f"  {topic.name:{width}}  {topic.messages:>7} × {topic.type:32} "
@@ -193,7 +198,7 @@ def _size(size_bytes: int) -> str:
     return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 1e5 else f"{size_bytes / 1e3:.1f} kB"
 
 
-def _drive_facts(path: Path, opening: options.Drive) -> dict[str, object]:
+def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
     sequence = opening.open(path)
     stamps_ns = getattr(sequence, "stamps_ns", None)
     seconds = 0.0 if stamps_ns is None else float(stamps_ns[-1] - stamps_ns[0]) / 1e9
@@ -208,9 +213,9 @@ def _drive_facts(path: Path, opening: options.Drive) -> dict[str, object]:
     }
 
 
-def _drive_text(facts: dict[str, object]) -> str:
+def _drive_text(facts: dict[str, Any]) -> str:
     return (
-        f"{facts['path']}: {facts['format']}, {facts['pairs']} pairs in "
+        f"{facts['path']}: {facts['format']}, {counted(facts['pairs'], 'pair')} in "
         f"{facts['duration_s']:.1f} s, clock {facts['clock']}\n"
         f"camera: {facts['width']}×{facts['height']} px, fx {facts['fx']:.1f} px, baseline "
         f"{facts['baseline_m']:.4f} m\n"

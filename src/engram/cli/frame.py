@@ -12,6 +12,7 @@ import typer
 from engram.cli import options
 from engram.cli.progress import Bars
 from engram.cli.wording import undo_text
+from engram.counts import counted
 
 # Further from the nodes, a goal hangs on the direction of one node.
 _FAR_M = 30.0
@@ -203,5 +204,5 @@ def export(
     if as_json:
         typer.echo(json.dumps({"nodes": wrote.nodes, "goals": wrote.goals, "file": str(out)}))
         return
-    goals = f", {wrote.goals} {'goal' if wrote.goals == 1 else 'goals'}" if wrote.goals else ""
-    typer.echo(f"{out}: {wrote.nodes} nodes{goals}")
+    goals = f", {counted(wrote.goals, 'goal')}" if wrote.goals else ""
+    typer.echo(f"{out}: {counted(wrote.nodes, 'node')}{goals}")

@@ -11,6 +11,7 @@ import typer
 
 from engram.cli import options
 from engram.cli.wording import undo_text
+from engram.counts import counted
 
 if TYPE_CHECKING:
     from engram.repair.repairing import GeometryReport
@@ -69,7 +70,8 @@ def info(
     for one in listed.get("session_list", []):
         hour = "hour unknown" if one["hour"] is None else f"hour {one['hour']:.2f}"
         typer.echo(
-            f"{one['session']}  {one['robot']:12s}  {one['start']}  {hour}  {one['nodes']} nodes"
+            f"{one['session']}  {one['robot']:12s}  {one['start']}  {hour}  "
+            f"{counted(one['nodes'], 'node')}"
         )
     for one in listed.get("node_list", []):
         typer.echo(f"{one['node']}  session {one['session'][:8]}  {one['driven_m']:8.1f} m")
@@ -101,7 +103,7 @@ def plot(
     from engram.viewing.map_from_above import plot_map
 
     drawn = plot_map(map_path, out, by.value, at)
-    typer.echo(f"{out}: {drawn} nodes by {by.value}")
+    typer.echo(f"{out}: {counted(drawn, 'node')} by {by.value}")
 
 
 def check(
@@ -159,7 +161,7 @@ def check(
         print(json.dumps({**report, "sealed": sealed} if seal else report))
     else:
         for one in sealed:
-            typer.echo(f"sealed session {one['session']}: {one['nodes']} nodes, "
+            typer.echo(f"sealed session {one['session']}: {counted(one['nodes'], 'node')}, "
                        f"revision {one['revision']}")  # fmt: skip
         if seal and not sealed:
             typer.echo("no session was interrupted")
@@ -196,8 +198,9 @@ def _print_check(report: dict[str, Any]) -> None:
             "what it saved with --seal"
         )
     typer.echo(
-        f"{len(report['problems'])} problems in {report['rows']} rows and {report['blobs']} blobs; "
-        f"{report['abandoned_rows']} abandoned rows, {report['removed_rows']} removed"
+        f"{counted(len(report['problems']), 'problem')} in {counted(report['rows'], 'row')} and "
+        f"{counted(report['blobs'], 'blob')}; {counted(report['abandoned_rows'], 'abandoned row')}"
+        f", {report['removed_rows']} removed"
     )
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 from shlex import quote
 from typing import Any
 
+from engram.counts import counted
+
 # A drive is known, or its area new, from these shares of localised frames on.
 _KNOWN, _NEW = 0.9, 0.1
 
@@ -30,7 +32,7 @@ def mapped_text(report: Mapping[str, Any], map_path: Path | str) -> str:
     area = "new area" if share <= _NEW else "partly new area"
     if share >= _KNOWN:
         area = "known area that looks different" if saved else "known area"
-    head = f"{area}: {_count(saved, 'node')} saved"
+    head = f"{area}: {counted(saved, 'node')} saved"
     if report["resumed"]:
         head = f"resumed; {head}"
     if report["revision"] is not None:
@@ -48,12 +50,12 @@ def localised_text(
 ) -> str:
     """What `engram localise` prints of the values that ``--json`` prints."""
     lines = [
-        f"{_count(summary['frames'], 'frame')} over {summary['driven_m']:.1f} m: "
+        f"{counted(summary['frames'], 'frame')} over {summary['driven_m']:.1f} m: "
         f"{summary['share_localised']:.1%} localised, "
         f"{summary['attempts_per_frame']:.2f} attempts per frame",
         *_frames(summary),
         f"  longest stretch without a match {summary['longest_gap_m']:.1f} m"
-        + (f"; {summary['late_frames']} frames late" if summary["late_frames"] else ""),
+        + (f"; {counted(summary['late_frames'], 'frame')} late" if summary["late_frames"] else ""),
         *_stages(summary["stages_ms"]),
     ]
     return _lines(*lines, f"next: {_after_localising(frames, map_path)}")
@@ -73,10 +75,6 @@ def _lines(*lines: str) -> str:
     return "\n".join(lines)
 
 
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
-
-
 def _frames(summary: Mapping[str, Any]) -> list[str]:
     """What became of every frame."""
     statuses = summary["statuses"]
@@ -86,8 +84,8 @@ def _frames(summary: Mapping[str, Any]) -> list[str]:
     if unusable := summary.get("unusable_frames", 0):
         fates.append(f"{unusable} of them unusable")
     if skipped := summary["skipped_pairs"]:
-        fates.append(f"{_count(skipped, 'bad pair')} skipped")
-    return [f"  {_count(summary['frames'], 'frame')}: {', '.join(fates)}"]
+        fates.append(f"{counted(skipped, 'bad pair')} skipped")
+    return [f"  {counted(summary['frames'], 'frame')}: {', '.join(fates)}"]
 
 
 def warnings(summary: Mapping[str, Any]) -> list[str]:
@@ -97,7 +95,7 @@ def warnings(summary: Mapping[str, Any]) -> list[str]:
     lines = []
     if damaged := summary["damaged_nodes"]:
         lines.append(
-            f"warning: {_count(len(damaged), 'damaged node')} of the map "
+            f"warning: {counted(len(damaged), 'damaged node')} of the map "
             f"{'was' if len(damaged) == 1 else 'were'} skipped, such as {damaged[0]}; "
             "engram check lists them"
         )

@@ -7,6 +7,7 @@ from enum import StrEnum
 from typing import Any
 
 from engram.config import plain
+from engram.counts import counted
 
 
 class Severity(StrEnum):
@@ -80,8 +81,12 @@ class Diagnosis:
         lines = [one.text() for one in self.findings]
         lines += [f"not checked: {code} needs {needs}" for code, needs in self.untold.items()]
         alarms = sum(one.severity is not Severity.NOTE for one in self.findings)
-        found = "nothing wrong" if not alarms else f"{len(self.fatal)} of {alarms} findings fatal"
-        return "\n".join([f"{self.frames} frames examined: {found}", *lines])
+        found = (
+            "nothing wrong"
+            if not alarms
+            else f"{len(self.fatal)} of {counted(alarms, 'finding')} fatal"
+        )
+        return "\n".join([f"{counted(self.frames, 'frame')} examined: {found}", *lines])
 
     def to_dict(self) -> dict[str, Any]:
         """What ``doctor --json`` prints."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.counts import counted
 from engram.errors import InputError
 from engram.graph.clock import hour_of_day
 from engram.graph.graph import ExperienceGraph
@@ -302,7 +303,7 @@ def _edges_text(kinds: dict[str, dict[str, int]]) -> str:
 
 def _session_text(one: dict[str, Any]) -> str:
     hour = "hour unknown" if one["hour"] is None else f"{one['hour']:.1f} h"
-    return f"{one['session']} of {one['robot']}, {hour}, {one['nodes']} nodes"
+    return f"{one['session']} of {one['robot']}, {hour}, {counted(one['nodes'], 'node')}"
 
 
 def _hours_text(hours: dict[str, dict[str, int]]) -> str:
@@ -318,6 +319,6 @@ def _region_text(one: dict[str, Any]) -> str:
     hours = ", ".join(f"{name}: {count}" for name, count in one["hours_added"].items())
     return (
         f"  component {one['component']}, {one['from_m']:.0f}-{one['to_m']:.0f} m of session "
-        f"{one['oldest_session'][:8]}: {one['nodes_before']} nodes, +{one['added']} "
+        f"{one['oldest_session'][:8]}: {counted(one['nodes_before'], 'node')}, +{one['added']} "
         f"-{one['removed']}" + (f" (by hour {hours})" if hours else "")
     )

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from engram.counts import counted
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock, Session
 from engram.maps.difference import STRETCH_M, MapDifference, difference, hours_of_nodes
@@ -19,19 +20,19 @@ from engram.maps.tags import Tag
 
 # Contents of a revision, in the order in which `log` prints them.
 _TOLD = {
-    "sessions": "sessions",
-    "nodes": "nodes",
-    "edges": "edges",
-    "path_entries": "path entries",
-    "attempts": "attempts",
-    "omissions": "nodes omitted",
-    "vocabularies": "vocabularies",
-    "amendments": "amendments",
-    "removals": "edges removed",
-    "placements": "nodes placed",
-    "anchors": "anchors",
-    "goals": "goals",
-    "hidden": "rows hidden or shown again",
+    "sessions": ("session", ""),
+    "nodes": ("node", ""),
+    "edges": ("edge", ""),
+    "path_entries": ("path entry", ""),
+    "attempts": ("attempt", ""),
+    "omissions": ("node", " omitted"),
+    "vocabularies": ("vocabulary", ""),
+    "amendments": ("amendment", ""),
+    "removals": ("edge", " removed"),
+    "placements": ("node", " placed"),
+    "anchors": ("anchor", ""),
+    "goals": ("goal", ""),
+    "hidden": ("row", " hidden or shown again"),
 }
 
 
@@ -254,8 +255,8 @@ def blame_text(found: Mapping[str, Any]) -> str:
         f"  at {found['when']}, {hour}",
         f"  added by revision {found['revision']} of {found['author']}, {found['committed']}"
         + (f": {found['message']}" if found["message"] else ""),
-        f"  edges: {edges}; on {found['paths']} paths; matched in {found['matches']} of "
-        f"{found['attempts']} attempts",
+        f"  edges: {edges}; on {counted(found['paths'], 'path')}; matched in "
+        f"{found['matches']} of {counted(found['attempts'], 'attempt')}",
     ]
     for said in found["told"]:
         done = "reverted" if said["hidden"] else "shown again"
@@ -297,7 +298,11 @@ def _revision(revision: Revision, names: Mapping[int, list[str]]) -> dict[str, A
 
 
 def _contents_text(contents: Mapping[str, float]) -> str:
-    told = [f"{contents[key]:.0f} {name}" for key, name in _TOLD.items() if contents.get(key)]
+    told = [
+        counted(int(contents[key]), thing) + done
+        for key, (thing, done) in _TOLD.items()
+        if contents.get(key)
+    ]
     if contents.get("mapped_m"):
         told.append(f"{contents['mapped_m']:.1f} m mapped")
     return ", ".join(told) or "nothing"

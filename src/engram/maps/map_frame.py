@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.counts import counted
 from engram.errors import InputError
 from engram.geometry import SE3
 from engram.graph.adjusting import Poses
@@ -216,7 +217,7 @@ class Moves:
         said = []
         if self.nodes:
             said.append(
-                f"{self.nodes} of {self.of_nodes} nodes moved in the map frame: median "
+                f"{self.nodes} of {counted(self.of_nodes, 'node')} moved in the map frame: median "
                 f"{self.median_m:.2f} m, largest {self.largest_m:.2f} m"
             )
         said += [f"goal {name} moved by {far_m:.2f} m" for name, far_m in self.goals.items()]

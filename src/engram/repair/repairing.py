@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from engram.config import to_dict
+from engram.counts import counted
 from engram.graph.marks import Removal
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig
@@ -64,12 +65,12 @@ class GeometryReport:
             lines.append(f"… and {len(found.wrong) - _SHOWN} more; --json lists all")
         lines += [f"doubtful: {one.text()}" for one in found.doubtful[:_SHOWN]]
         lines.append(
-            f"{len(found.wrong)} wrong and {len(found.doubtful)} doubtful of {found.of_edges} "
-            f"edges, {found.examined} looked at twice"
+            f"{len(found.wrong)} wrong and {len(found.doubtful)} doubtful of "
+            f"{counted(found.of_edges, 'edge')}, {found.examined} looked at twice"
         )
         if found.wrong and self.components[0] != self.components[1]:
-            lines.append(f"without the wrong ones the map has {self.components[0]} components, "
-                         f"not {self.components[1]}")  # fmt: skip
+            parts = counted(self.components[0], "component")
+            lines.append(f"without the wrong ones the map has {parts}, not {self.components[1]}")
         if self.revision is not None:
             lines.append(f"removed by revision {self.revision}")
         if self.moved:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.counts import counted
 from engram.errors import InputError
 from engram.graph.marks import Anchor
 from engram.graph.model import Clock, Node
@@ -66,11 +67,13 @@ class AnchorReport:
         """In words."""
         far_m = np.array(list(self.residuals_m.values()))
         lines = [
-            f"{self.anchors} anchors: residuals median {np.median(far_m):.2f} m, 90 % "
+            f"{counted(self.anchors, 'anchor')}: residuals median {np.median(far_m):.2f} m, 90 % "
             f"{np.percentile(far_m, 90):.2f} m, largest {far_m.max():.2f} m"
         ]
         if self.unplaced:
-            lines.append(f"{self.unplaced} lines left out: no node within 0.5 s of their time")
+            lines.append(
+                f"{counted(self.unplaced, 'line')} left out: no node within 0.5 s of their time"
+            )
         lines += [f"does not fit: node {node}" for node in self.outliers]
         if self.moved:
             lines.append(self.moved.text())
@@ -215,7 +218,7 @@ def _residuals(frame: MapFrame, anchors: list[Anchor]) -> dict[str, float]:
 
 def _about(source: Path, anchors: list[Anchor]) -> dict[str, Any]:
     about = {"anchor": {"source": source.name, "anchors": len(anchors)}}
-    return {"message": f"anchor {len(anchors)} nodes", "configuration": about}
+    return {"message": f"anchor {counted(len(anchors), 'node')}", "configuration": about}
 
 
 def _write(

@@ -17,6 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram.config import check_bounds
+from engram.counts import counted
 from engram.errors import MapCorruptError
 from engram.frontend.matching import match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
@@ -82,10 +83,12 @@ class IslandReport:
         if not self.compared:
             return ""
         if self.revision is None:
-            return f"unconnected parts: {self.compared} pairs of nodes compared, none joins them"
+            return (
+                f"unconnected parts: {counted(self.compared, 'pair')} of nodes compared, none joins"
+            )
         return (
-            f"{len(self.joined)} matches of {self.compared} join unconnected parts: revision "
-            f"{self.revision}"
+            f"unconnected parts: {counted(len(self.joined), 'match')} of {self.compared} joined, "
+            f"revision {self.revision}"
         )
 
 
@@ -110,7 +113,9 @@ def join_islands(
             return IslandReport(None, islands.compared, ids)
         about = {"islands": {"compared": islands.compared, "joined": len(edges)}}
         with store.begin_revision(
-            author=author, message=f"join parts by {len(edges)} matches", configuration=about
+            author=author,
+            message=f"join parts by {counted(len(edges), 'match')}",
+            configuration=about,
         ) as writer:
             for edge in edges:
                 writer.add_edge(edge)

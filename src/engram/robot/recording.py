@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from engram.config import config_hash
+from engram.counts import counted
 from engram.errors import SequenceError
 from engram.frontend import Frame, FrameStatus
 from engram.monitor import QUIET, Monitor, deferred_interrupt
@@ -56,9 +57,9 @@ class ExtractReport:
         """For people."""
         total = self.frames + self.already_recorded
         line = (
-            f"{total} frames in {self.log}, {self.bytes / max(total, 1) / 1e3:.1f} kB each; "
-            f"{self.unusable} unusable, {self.without_motion} without motion, "
-            f"{self.skipped} pairs skipped"
+            f"{counted(total, 'frame')} in {self.log}, {self.bytes / max(total, 1) / 1e3:.1f} kB "
+            f"each; {self.unusable} unusable, {self.without_motion} without motion, "
+            f"{counted(self.skipped, 'pair')} skipped"
         )
         if self.interrupted:
             line += "\ninterrupted: progress is saved; give the same command to continue"

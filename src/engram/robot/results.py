@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from engram.counts import counted
 from engram.localiser import Localisation, LocalisationStatus
 from engram.maps import Map
 from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_localised
@@ -80,8 +81,8 @@ def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
 def damage_warning(damaged: Sequence[str]) -> str:
     """The warning about unreadable nodes, of which there is at least one."""
     return (
-        f"warning: skipped {len(damaged)} damaged nodes of the map, such as {damaged[0]}; "
-        "run engram check for details"
+        f"warning: skipped {counted(len(damaged), 'damaged node')} of the map, such as "
+        f"{damaged[0]}; run engram check for details"
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.config import to_dict
+from engram.counts import counted
 from engram.errors import IncompatibleError, InputError, MapCorruptError
 from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus, Frontend
 from engram.graph.model import NodeId
@@ -66,8 +67,8 @@ class VocabularyReport:
         whose = "the default vocabulary" if self.default else f"vocabulary {self.hash[:12]}"
         stored = "" if self.revision is None else f", revision {self.revision}"
         return (
-            f"{whose}: {self.words} words of {self.descriptor} from {self.images} frames "
-            f"({self.trained_on}){stored}"
+            f"{whose}: {self.words} words of {self.descriptor} from "
+            f"{counted(self.images, 'frame')} ({self.trained_on}){stored}"
         )
 
 

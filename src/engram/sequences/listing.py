@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 
+from engram.counts import counted
 from engram.errors import SequenceError
 from engram.sequences.images import IMAGE_SUFFIXES
 from engram.untrusted import read_text
@@ -243,8 +244,8 @@ def usable_pairs(
     if not pairs:
         if places and not chosen:
             raise SequenceError(
-                f"{where}: none of its {len(places)} pairs is chosen, 0 to {len(places) - 1}; "
-                "change --frames, --from or --to"
+                f"{where}: none of its {counted(len(places), 'pair')} is chosen, 0 to "
+                f"{len(places) - 1}; change --frames, --from or --to"
             )
         why = f"; first fault: {reasons[0]}" if reasons else ""
         raise SequenceError(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.counts import counted
 from engram.maps import Map
 from engram.maps.difference import MapDifference
 from engram.viewing.from_above import Track, draw_from_above
@@ -33,7 +34,7 @@ def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> No
     old[[graph.index(node.id) for node in difference.old.nodes]] = True
     new[[graph.index(node.id) for node in difference.new.nodes]] = True
     tracks = [
-        Track(f"{label}: {int(mask.sum())} nodes", points[mask], colour)
+        Track(f"{label}: {counted(int(mask.sum()), 'node')}", points[mask], colour)
         for label, mask, colour in (
             ("in both", old & new, "0.6"),
             ("added", new & ~old, "tab:green"),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.counts import counted
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock, Node, Session
 from engram.maps import Map
@@ -76,14 +77,18 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
         counts = Counter(labels.tolist())
         largest = {label for label, _ in counts.most_common(_NAMED)}
         tracks = [
-            Track(f"{label} ({counts[label]} nodes)", points[labels == label])
+            Track(f"{label} ({counted(counts[label], 'node')})", points[labels == label])
             for label in sorted(largest)
         ]
         rest = [label for label in counts if label not in largest]
         if rest:
             points_of_rest = points[np.isin(labels, rest)]
             tracks.append(
-                Track(f"{len(rest)} more ({len(points_of_rest)} nodes)", points_of_rest, _FEW)
+                Track(
+                    f"{len(rest)} more ({counted(len(points_of_rest), 'node')})",
+                    points_of_rest,
+                    _FEW,
+                )
             )
         places = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
         marks = {name: (place.x_m, place.y_m) for name, place in sorted(places.items())}

@@ -21,6 +21,7 @@ from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
 from engram.centre.worker.admission import KilledError, admit
 from engram.centre.worker.watching import Watching
+from engram.counts import counted
 from engram.errors import (
     EngramError,
     MapLockedError,
@@ -50,7 +51,8 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
     """
     handins = HandIns(centre)
     if row["tries"] >= centre.settings.merge_tries:
-        fact = f"its worker died {row['tries']} times; an operator may have it merged anyway"
+        tries = counted(row["tries"], "time")
+        fact = f"its worker died {tries}; an operator may have it merged anyway"
         handins.end(row, HandInState.FAILED, error=fact)
         return
     handins.begun(row)

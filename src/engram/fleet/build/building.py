@@ -10,6 +10,7 @@ from typing import Any
 from uuid import UUID
 
 from engram.config import config_hash, plain, to_dict
+from engram.counts import counted
 from engram.errors import ConfigError
 from engram.files import check_parent
 from engram.fleet.build.best_order import find_best_order
@@ -127,9 +128,9 @@ class BuildReport:
         if not self.groups:
             return "\n".join([*lines, f"{self.centre}: nothing new; content {self.content_hash}"])
         for names, one in zip(self.groups, self.mapped, strict=True):
-            died = f", {one.retries} workers died" if one.retries else ""
-            made = f"{one.nodes} nodes, {one.seconds:.1f} s"
-            lines.append(f"group {one.number}: {len(names)} drives, {made}{died}")
+            died = f", {counted(one.retries, 'worker')} died" if one.retries else ""
+            made = f"{counted(one.nodes, 'node')}, {one.seconds:.1f} s"
+            lines.append(f"group {one.number}: {counted(len(names), 'drive')}, {made}{died}")
         lines += [one.text() for one in self.merges]
         if self.best is not None:
             lines += [self.best.text(), self._costs()]
@@ -137,8 +138,8 @@ class BuildReport:
         lines += [f"  note: {note}" for note in self.notes]
         lines.append(
             f"{self.centre}: content {self.content_hash}; mapping {mapped_s:.1f} s in "
-            f"{len(self.mapped)} groups, merging {self.merged_s:.1f} s; with a worker for each "
-            f"group {self.parallel_s:.1f} s"
+            f"{counted(len(self.mapped), 'group')}, merging {self.merged_s:.1f} s; with a "
+            f"worker for each group {self.parallel_s:.1f} s"
         )
         return "\n".join(lines)
 
@@ -334,7 +335,7 @@ def _map(
     frames = sum(drive.frames for task in missing for drive in grouped[task.number])
     with (
         interruptible(monitor) as asked,
-        asked.stage(f"map {len(missing)} groups", frames) as stage,
+        asked.stage(f"map {counted(len(missing), 'group')}", frames) as stage,
     ):
         if options.scheduler is not None:
             map_groups_on_cluster(missing, options.scheduler, stage, scratch.remember)

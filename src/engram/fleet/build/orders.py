@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from engram.config import config_hash, plain, to_dict
+from engram.counts import counted
 from engram.errors import ConfigError
 from engram.fleet.merge.gate import held_as
 from engram.graph.model import Session
@@ -247,10 +248,11 @@ class BestOrder:
         """The result as text."""
         told = " ".join(map(str, self.order))
         lines = [
-            f"best of {len(self.results)} orders: {told}, P(no match within "
+            f"best of {counted(len(self.results), 'order')}: {told}, P(no match within "
             f"{self.judge_at_m:g} m, {self.estimator}) {self.results[0].judged:.2%}; "
-            f"{self.spent.merges} merges in {self.spent.merge_s:.1f} s, {self.spent.copies} copies "
-            f"in {self.spent.copy_s:.1f} s, judging {self.spent.judge_s:.1f} s"
+            f"{counted(self.spent.merges, 'merge')} in {self.spent.merge_s:.1f} s, "
+            f"{counted(self.spent.copies, 'copy')} in {self.spent.copy_s:.1f} s, "
+            f"judging {self.spent.judge_s:.1f} s"
         ]
         lines += [
             f"  P(X >= {at} m, {self.estimator}): least {one['least']:.2%}, "

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from engram.counts import counted
 from engram.errors import ConfigError, MapError, MapLockedError, storage_full
 from engram.files import WriterLock, current_holder
 from engram.fleet.build.group_mapping import GroupResult
@@ -248,9 +249,9 @@ class Scratch:
         gone = sorted(set(plan.known) - sessions_of(self.centre))
         if gone:
             raise ConfigError(
-                f"{self.centre} no longer has {len(gone)} of the {len(plan.known)} sessions that "
-                f"it had when this build began ({gone[0]}); restore it, or delete {self.folder} "
-                "to build without them"
+                f"{self.centre} no longer has {len(gone)} of the "
+                f"{counted(len(plan.known), 'session')} that it had when this build began "
+                f"({gone[0]}); restore it, or delete {self.folder} to build without them"
             )
 
     def _check_empty(self) -> None:

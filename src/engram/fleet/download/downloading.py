@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.config import plain, to_dict
+from engram.counts import counted
 from engram.errors import InputError
 from engram.files import check_parent, draft_folder
 from engram.fleet.download.bridges import components
@@ -93,13 +94,13 @@ class DownloadReport:
     def text(self) -> str:
         """The report as text."""
         share = self.nodes / self.of_nodes if self.of_nodes else 1.0
-        parts = "1 component" if self.components == 1 else f"{self.components} components"
         lines = [
-            f"{self.policy}: {self.nodes} of {self.of_nodes} nodes ({share:.1%}), "
+            f"{self.policy}: {self.nodes} of {counted(self.of_nodes, 'node')} ({share:.1%}), "
             f"{self.size_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB, "
             f"of revision {self.revision}",
-            f"{self.sessions} sessions, {self.edges} edges ({self.bridges} bridges), "
-            f"{parts}, {self.partial_paths} partial paths",
+            f"{counted(self.sessions, 'session')}, {counted(self.edges, 'edge')} "
+            f"({counted(self.bridges, 'bridge')}), {counted(self.components, 'component')}, "
+            f"{counted(self.partial_paths, 'partial path')}",
             self.forecast.text(),
         ]
         if self.nodes < self.of_nodes:

@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.counts import counted
 from engram.errors import ConfigError, InputError
 from engram.fleet.download.by_time import best_paths, near_start
 from engram.fleet.download.coverage import Coverage, Demand, greedy_order
@@ -214,7 +215,7 @@ def facts_told(why: Mapping[str, Any]) -> list[str]:
     if epochs := why.get("epochs"):
         lines.append(f"epochs {epochs[0]} to {epochs[-1]}; paths chosen: {len(why['paths'])}")
     if unknown := why.get("nodes_without_hour"):
-        lines.append(f"{unknown} nodes left out: hour of day unknown")
+        lines.append(f"{counted(unknown, 'node')} left out: hour of day unknown")
     return lines
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.config import plain
+from engram.counts import counted
 from engram.errors import IncompatibleError, InputError
 from engram.files import draft_folder
 from engram.fleet.download.downloading import choose_part, revision_of
@@ -72,15 +73,16 @@ class UpdateReport:
 
     def text(self) -> str:
         """The report as text."""
-        head = f"{self.policy} of revision {self.source_revision}: {self.of_nodes} nodes"
+        head = f"{self.policy} of revision {self.source_revision}: {counted(self.of_nodes, 'node')}"
         if self.revision is None:
             lines = [f"{head}; {self.out.name} has them all: nothing changed"]
         else:
             lines = [
                 f"{head}, {self.nodes} of them new in {self.out.name} (revision {self.revision}), "
-                f"which keeps {self.own_nodes} nodes of its own",
-                f"copied {self.sessions} sessions, {self.edges} edges, {self.path_entries} path "
-                f"entries, {self.attempts} attempts; tied {self.ties} own nodes to equivalents",
+                f"which keeps {counted(self.own_nodes, 'node')} of its own",
+                f"copied {counted(self.sessions, 'session')}, {counted(self.edges, 'edge')}, "
+                f"{counted(self.path_entries, 'path entry')}, {counted(self.attempts, 'attempt')}; "
+                f"tied {counted(self.ties, 'own node')} to equivalents",
             ]
         return "\n".join(lines + facts_told(self.why))
 

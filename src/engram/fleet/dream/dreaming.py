@@ -18,6 +18,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from engram.config import check_bounds, config_hash, plain, to_dict
+from engram.counts import counted
 from engram.errors import ConfigError, InputError
 from engram.files import draft_folder
 from engram.fleet.build.best_order import results_in
@@ -116,7 +117,9 @@ class DreamReport:
     def text(self) -> str:
         """The report as text."""
         count = sum(map(len, self.tried.values()))
-        head = f"{count} maps tried" + ("" if self.complete else "; the same command tries more")
+        head = f"{counted(count, 'map')} tried" + (
+            "" if self.complete else "; the same command tries more"
+        )
         if not count:
             return head
         estimate, low, high = (100 * one for one in self.better_by)
@@ -129,7 +132,9 @@ class DreamReport:
         if self.added is None:
             lines.append("not better beyond its interval: the fleet map is unchanged")
         else:
-            lines.append(f"revision {self.added.revision}: {self.added.nodes} nodes added")
+            lines.append(
+                f"revision {self.added.revision}: {counted(self.added.nodes, 'node')} added"
+            )
         return "\n".join(lines)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from engram.counts import counted
 from engram.errors import IncompatibleError
 from engram.fleet.merge.state import Merge
 from engram.graph.model import Clock, Node, NodeId, Session, SessionId
@@ -122,8 +123,9 @@ def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
     if back:
         _, before, after = max(back, key=lambda one: one[0])
         yield (
-            f"the clock of session {session.id} ({session.robot}) runs backwards {len(back)} "
-            f"times: {(after.stamp_ns - before.stamp_ns) / _NS_PER_S:.1f} s after "
+            f"the clock of session {session.id} ({session.robot}) runs backwards "
+            f"{counted(len(back), 'time')}: "
+            f"{(after.stamp_ns - before.stamp_ns) / _NS_PER_S:.1f} s after "
             f"{before.driven_m:.0f} m driven it stamped {after.driven_m:.0f} m; nodes are replayed "
             "in the order of their stamps"
         )
@@ -141,7 +143,8 @@ def _overlaps(merge: Merge, new: Sequence[Session]) -> Iterator[str]:
                 "in time: two robots have the same name, or a clock was wrong"
             )
         if len(pairs) > _NAMED_OVERLAPS:
-            yield f"… and {len(pairs) - _NAMED_OVERLAPS} more pairs of drives of {name!r}"
+            more = counted(len(pairs) - _NAMED_OVERLAPS, "more pair")
+            yield f"… and {more} of drives of {name!r}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from engram.counts import counted
 from engram.errors import RefusedError
 from engram.graph.model import EdgeKind, NodeId
 from engram.maps import Map
@@ -44,7 +45,7 @@ class GeometryGate:
         new = [one for one in wrong if _key(one) not in self._known]
         if self._refuses and new:
             raise RefusedError(
-                f"{source} would add {len(new)} wrong edges, the most certain of them: "
+                f"{source} would add {counted(len(new), 'wrong edge')}, the most certain of them: "
                 f"{new[0].text()}; repair it with engram check {source} --geometry --repair"
             )
         self._known = {_key(one) for one in wrong}

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.counts import counted
 from engram.maps import Map, open_map
 from engram.viewing import Track, draw_panels
 
@@ -24,7 +25,7 @@ def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
     panels = []
     for at in (before, None):
         with open_map(centre, at) as opened:
-            words = f"{len(opened.graph)} nodes, revision {opened.revision}"
+            words = f"{counted(len(opened.graph), 'node')}, revision {opened.revision}"
             panels.append((f"{'before' if at is not None else 'after'}: {words}", _tracks(opened)))
     draw_panels(panels, path)
 

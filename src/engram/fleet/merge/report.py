@@ -10,6 +10,7 @@ from itertools import groupby
 from typing import Any
 
 from engram.config import plain
+from engram.counts import counted
 from engram.graph.model import Session
 from engram.maps import Map, Moves
 
@@ -269,21 +270,21 @@ class MergeReport:
         lines = [f"{self.source} ({', '.join(self.robots) or 'no drives'}): {self._outcome()}"]
         if self.changed and not self.interrupted:
             lines.append(
-                f"  {self.taken} nodes added, {self.omitted} already covered; from earlier merges "
-                f"{self.known} known, {self.known_omissions} covered; "
-                f"{self.sessions} new sessions, {self.path_entries} path entries, "
-                f"{self.attempts} attempts carried over"
+                f"  {counted(self.taken, 'node')} added, {self.omitted} already covered; from "
+                f"earlier merges {self.known} known, {self.known_omissions} covered; "
+                f"{counted(self.sessions, 'new session')}, "
+                f"{counted(self.path_entries, 'path entry')}, "
+                f"{counted(self.attempts, 'attempt')} carried over"
             )
             drives = self._drives()
             lines += [_drive_text(one) for one in drives[:_SHOWN_DRIVES]]
             if len(drives) > _SHOWN_DRIVES:
-                lines.append(f"  … and {len(drives) - _SHOWN_DRIVES} more drives")
+                lines.append(f"  … and {counted(len(drives) - _SHOWN_DRIVES, 'more drive')}")
         if self.held_out is not None:
             lines.append(f"  {self.held_out.text()}")
         if self.wrong_edges is not None:
-            lines.append(
-                f"  {len(self.wrong_edges)} wrong edges; engram check --geometry lists them"
-            )
+            wrong = counted(len(self.wrong_edges), "wrong edge")
+            lines.append(f"  {wrong}; engram check --geometry lists what is wrong")
         if self.moved:
             lines += [f"  {line}" for line in self.moved.text().splitlines()]
         lines += [f"  note: {note}" for note in self.notes]
@@ -302,5 +303,4 @@ class MergeReport:
         if not self.changed:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"
-        parts = "1 component" if self.components == 1 else f"{self.components} components"
-        return f"{made}, content {self.content_hash}, {parts}"
+        return f"{made}, content {self.content_hash}, {counted(self.components, 'component')}"

@@ -13,6 +13,7 @@ import numpy as np
 
 from engram import __version__
 from engram.config import to_dict
+from engram.counts import counted
 from engram.fleet.merge.checks import check_fits, check_readable, notes
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.geometry import GeometryGate
@@ -301,6 +302,6 @@ def _say_what_hangs_together(merge: Merge, before: int) -> None:
         )
     elif apart.any():
         report.notes.append(
-            f"{int(apart.sum())} added nodes are not connected to the existing map: no match "
-            "links them to it, or odometry failed in between"
+            f"not connected to the existing map: {counted(int(apart.sum()), 'added node')}; no "
+            "match links them to it, or odometry failed in between"
         )

@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from engram.counts import counted
 from engram.errors import SequenceError
 
 T = TypeVar("T")
@@ -58,14 +59,16 @@ class Pairing:
         """For people, in one line."""
         share = 100 * self.paired / self.left if self.left else 0.0
         facts = [
-            f"{self.paired} of {self.left} left images paired ({share:.1f} %), at most "
+            f"{self.paired} of {counted(self.left, 'left image')} paired ({share:.1f} %), at most "
             f"{self.largest_offset_ns / 1e6:.3f} ms apart (tolerance "
             f"{self.tolerance_ns / 1e6:.3f} ms)"
         ]
         if self.backwards:
-            facts.append(f"{self.backwards} images left out whose stamp does not increase")
+            facts.append(
+                f"{counted(self.backwards, 'image')} left out whose stamp does not increase"
+            )
         if self.unusable:
-            facts.append(f"{self.unusable} images could not be used")
+            facts.append(f"{counted(self.unusable, 'image')} could not be used")
         return "; ".join(facts)
 
 
