@@ -13,8 +13,8 @@ from typing import Any
 from sqlalchemy import select, update
 
 from engram.centre.errors import ConflictError, UnknownError
-from engram.centre.handins import HandIns
 from engram.centre.keeping import ASKED, CANCELLED, DONE, newest_merged
+from engram.centre.parts import Parts
 from engram.centre.resident import log_of
 from engram.centre.service import Centre
 from engram.centre.store.audit import note
@@ -211,7 +211,7 @@ class Dreams:
 
     def manifest(self, row: dict[str, Any]) -> Manifest:
         """The manifest of a merged hand-in."""
-        return HandIns(self._centre).manifest(row)
+        return Parts(self._centre).manifest(row)
 
 
 def _reverts(revision: Any) -> bool:

@@ -2,58 +2,17 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import Annotated
 
 import typer
 
-from engram.cli import options
-from engram.errors import ConfigError, InputError
-
-if TYPE_CHECKING:
-    from engram.centre.service import Centre
-
-centre_group = typer.Typer(
-    help="The fleet's shared map as a service.",
-    epilog="Start with: engram centre serve FOLDER",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-)
-
-Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The centre's folder.")]
-MapName: TypeAlias = Annotated[
-    str, typer.Option("--map", metavar="NAME", help="Which of the centre's maps.")
-]
-Database: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--database", metavar="URL", help="postgresql+psycopg://… [default: SQLite in FOLDER]."
-    ),
-]
-Objects: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--objects", metavar="URL", help="s3://bucket/prefix [default: files in FOLDER]."),
-]
-_BY = "shell"
-_NONE = "none"
+from engram.cli.centre_maps import dream, jobs, map_
+from engram.cli.centre_options import BY, NONE, Database, Folder, MapName, Objects, open_centre
+from engram.errors import ConfigError
 
 
-def _open(folder: Path, database: str | None = None, objects: str | None = None) -> Centre:
-    """A centre that is there.
-
-    Raises:
-        InputError: it is not there; `serve` and `map` make one, a mistyped name does not.
-    """
-    from engram.centre.service import Centre
-
-    if not (folder / ("maps" if database else "centre.sqlite")).exists():
-        raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
-    return Centre(folder, database, objects)
-
-
-@centre_group.command()
 def serve(
     folder: Folder,
     *,
@@ -95,11 +54,10 @@ def serve(
 
     listening = serving.Listening(host, port, certificate, key, insecure=insecure)
     with logging_to_stderr(), Centre(folder, database, objects) as centre:
-        centre.add_map(map_name, _BY)
+        centre.add_map(map_name, BY)
         serving.serve(centre, listening, worker=worker)
 
 
-@centre_group.command()
 def worker(
     folder: Folder,
     *,
@@ -120,11 +78,10 @@ def worker(
     """
     from engram.centre.serving import run_worker
 
-    _open(folder, database, objects).close()
+    open_centre(folder, database, objects).close()
     run_worker(folder, database, objects, scheduler)
 
 
-@centre_group.command()
 def code(
     folder: Folder,
     *,
@@ -146,11 +103,10 @@ def code(
     """
     from engram.centre.access.enrolment import new_code
 
-    with _open(folder, database) as centre:
-        print(new_code(centre, map_name, follows, _BY))
+    with open_centre(folder, database) as centre:
+        print(new_code(centre, map_name, follows, BY))
 
 
-@centre_group.command()
 def token(
     folder: Folder,
     *,
@@ -176,189 +132,15 @@ def token(
     from engram.centre.access.roles import Role
 
     roles = [str(one) for one in Role if one is not Role.ROBOT]
-    if role not in {*roles, _NONE}:
-        raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {_NONE}")
-    with _open(folder, database) as centre:
-        if role == _NONE:
-            typer.echo(f"{name} is taken away: {', '.join(take_away(centre, name, _BY))}")
+    if role not in {*roles, NONE}:
+        raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {NONE}")
+    with open_centre(folder, database) as centre:
+        if role == NONE:
+            typer.echo(f"{name} is taken away: {', '.join(take_away(centre, name, BY))}")
         else:
             print(add_person(centre, name, map_name, Role(role)))
 
 
-@centre_group.command("map")
-def map_(
-    folder: Folder,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A new or existing map.")],
-    *,
-    gate: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--gate",
-            metavar="DRIVE",
-            help="Held-out drive that must not localise worse; repeatable; none for no gate.",
-        ),
-    ] = None,
-    moves: Annotated[
-        str | None,
-        typer.Option(
-            "--moves",
-            metavar="REF",
-            help="Version that is moved to each merge that passed the gate; none for none.",
-        ),
-    ] = None,
-    quiet: Annotated[
-        str | None,
-        typer.Option(
-            "--quiet",
-            metavar="FROM-TO",
-            help="Hours UTC in which the centre dreams, as 22-5; or none.",
-        ),
-    ] = None,
-    settings: options.SettingsGiven,
-    database: Database = None,
-) -> None:
-    """Make a map, or change how its hand-ins are merged.
-
-    What is not given stays as it was; --set and --config give all settings of merging anew.
-
-    \b
-    Examples:
-      engram centre map town campus --gate held-out.framelog --moves stable
-      engram centre map town fleet --set merge.rounds=8
-    """
-    from engram.centre.service import Centre
-    from engram.cli.fleet import merging_of
-
-    changes: dict[str, Any] = {}
-    if settings.config is not None or settings.changes:
-        changes["merge"] = merging_of(settings.read())
-    if gate:
-        changes["gate"] = _gate(gate)
-    if moves is not None:
-        changes["moves"] = _movable(moves)
-    if quiet is not None:
-        changes["quiet"] = _hours(quiet)
-    with Centre(folder, database) as centre:
-        centre.add_map(name, _BY)
-        policy = replace(centre.policy(name), **changes)
-        centre.set_policy(name, policy, _BY)
-    typer.echo(
-        f"{name}: gate {', '.join(policy.gate) or _NONE}, moves {policy.moves or _NONE}, "
-        f"quiet {_NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}"
-    )
-
-
-def _gate(drives: list[Path]) -> tuple[str, ...]:
-    """Held-out drives, each of which opens: with one that does not, every hand-in would fail."""
-    from engram.robot import open_drive
-
-    if drives == [Path(_NONE)]:
-        return ()
-    for one in drives:
-        open_drive(one)
-    return tuple(str(one.absolute()) for one in drives)
-
-
-def _movable(ref: str) -> str | None:
-    from engram.centre.refs import check_movable
-
-    if ref == _NONE:
-        return None
-    check_movable(ref)
-    return ref
-
-
-def _hours(text: str) -> tuple[float, float] | None:
-    """The quiet hours, as FROM-TO."""
-    if text == _NONE:
-        return None
-    begin, _, end = text.partition("-")
-    try:
-        found = float(begin), float(end)
-    except ValueError:
-        found = (-1.0, -1.0)
-    if not all(0.0 <= one <= 24.0 for one in found):
-        raise ConfigError(f"--quiet {text!r:.40} is not FROM-TO in hours of the day, such as 22-5")
-    return found
-
-
-@centre_group.command()
-def dream(
-    folder: Folder,
-    *,
-    map_name: MapName = "fleet",
-    cancel: Annotated[
-        str | None, typer.Option("--cancel", metavar="DREAM", help="End this one.")
-    ] = None,
-    as_json: options.Json = False,
-    database: Database = None,
-) -> None:
-    """Ask for a dream, for whenever no robot waits.
-
-    It looks for a better map in what robots handed in, judged by the map's held-out drives. The
-    same command prints the outcome.
-
-    \b
-    Examples:
-      engram centre dream town
-    """
-    from engram.centre.dreams import Dreams
-
-    with _open(folder, database) as centre:
-        dreams = Dreams(centre)
-        if cancel is None:
-            row = dreams.ask(map_name, _BY)
-        else:
-            row = dreams.cancel(dreams.get(cancel), _BY)
-    typer.echo(json.dumps(row) if as_json else _told(row))
-
-
-@centre_group.command()
-def jobs(
-    folder: Folder,
-    *,
-    map_name: MapName = "fleet",
-    cancel: Annotated[
-        str | None,
-        typer.Option("--cancel", metavar="JOB", help="Cancel this hand-in: its id as listed."),
-    ] = None,
-    as_json: options.Json = False,
-    database: Database = None,
-) -> None:
-    """List hand-ins and dreams and their state, newest last.
-
-    \b
-    Examples:
-      engram centre jobs town
-      engram centre jobs town --map campus --json
-    """
-    from engram.centre.dreams import Dreams
-    from engram.centre.handins import HandIns
-
-    with _open(folder, database) as centre:
-        centre.map_row(map_name)
-        handins = HandIns(centre)
-        if cancel is not None:
-            handins.cancel(handins.get(cancel), _BY)
-        rows = handins.listed(map_name, None, None, 2**62, 1000)
-        dreamt = Dreams(centre).listed(map_name)
-    if as_json:
-        print(json.dumps({"jobs": rows, "dreams": dreamt}))
-        return
-    for row in reversed(rows):
-        typer.echo(_told(row))
-    for row in reversed(dreamt):
-        typer.echo(f"dream {_told(row)}")
-
-
-def _told(row: dict[str, Any]) -> str:
-    """A job on one line."""
-    fact = row["error"] or row["progress"] or ""
-    revision = "" if row["revision"] is None else f" revision {row['revision']}"
-    return f"{row['id']} {row['state']}{revision} {fact}".rstrip()
-
-
-@centre_group.command()
 def sweep(folder: Folder, *, database: Database = None, objects: Objects = None) -> None:
     """Remove parts that nothing needs any more.
 
@@ -371,12 +153,11 @@ def sweep(folder: Folder, *, database: Database = None, objects: Objects = None)
     """
     from engram.centre.worker.sweeping import sweep as run
 
-    with _open(folder, database, objects) as centre:
+    with open_centre(folder, database, objects) as centre:
         for name in centre.map_names():
             typer.echo(f"{name}: {run(centre, name)} bytes removed")
 
 
-@centre_group.command()
 def backup(
     folder: Folder,
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="A new folder.")],
@@ -395,6 +176,27 @@ def backup(
     """
     from engram.centre.backup import back_up
 
-    with _open(folder, database, objects) as centre:
+    with open_centre(folder, database, objects) as centre:
         for name, revision in back_up(centre, target).items():
             typer.echo(f"{name}: revision {revision} copied")
+
+
+centre_group = typer.Typer(
+    help="The fleet's shared map as a service.",
+    epilog="Start with: engram centre serve FOLDER",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+_VERBS: dict[str, Callable[..., None]] = {
+    "serve": serve,
+    "worker": worker,
+    "code": code,
+    "token": token,
+    "map": map_,
+    "dream": dream,
+    "jobs": jobs,
+    "sweep": sweep,
+    "backup": backup,
+}
+for _name, _verb in _VERBS.items():
+    centre_group.command(_name)(_verb)

@@ -20,6 +20,7 @@ from engram.centre.dreams import Dreams
 from engram.centre.errors import NotAllowedError, QuotaError, UnknownError
 from engram.centre.handins import HandIns
 from engram.centre.keeping import ASKED
+from engram.centre.parts import Parts
 from engram.centre.service import Centre
 from engram.centre.store.packs import PACK_BYTES
 from engram.errors import InputError
@@ -83,7 +84,7 @@ async def put_part(
             raise QuotaError(f"the part is larger than {MAX_PART_BYTES} bytes")
     if part_hash(bytes(body)).hex() != part:
         raise InputError("the body does not match its hash; send it again")
-    await run_in_threadpool(HandIns(centre).put_parts, row, [bytes(body)])
+    await run_in_threadpool(Parts(centre).put, row, [bytes(body)])
 
 
 @router.post("/handins/{handin}/parts", response_model=models.HandIn, openapi_extra=_BINARY)
@@ -92,23 +93,23 @@ async def put_parts(
 ) -> dict[str, Any]:
     """Sends parts in a bundle. Every megabyte that has arrived stays, even if the rest does not."""
     row = await run_in_threadpool(_handin, centre, who, handin)
-    store, opened = HandIns(centre), Unbundler()
+    parts, opened = Parts(centre), Unbundler()
     some: list[bytes] = []
     try:
         async for piece in request.stream():
             some += [body for _, body in opened.feed(piece)]
             if sum(map(len, some)) >= PACK_BYTES:
                 whole, some = some, []
-                await run_in_threadpool(store.put_parts, row, whole)
+                await run_in_threadpool(parts.put, row, whole)
     except BaseException:
         if some:
-            await run_in_threadpool(store.put_parts, row, some)
+            await run_in_threadpool(parts.put, row, some)
         raise
 
     def end() -> dict[str, Any]:
         if some:
-            store.put_parts(row, some)
-        return _shown(centre, store.get(handin))
+            parts.put(row, some)
+        return _shown(centre, HandIns(centre).get(handin))
 
     return await run_in_threadpool(end)
 
@@ -290,5 +291,5 @@ def _artifact(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _shown(centre: Centre, row: dict[str, Any]) -> dict[str, Any]:
-    wanted = HandIns(centre).wanted(row)[:_WANTED_AT_ONCE]
+    wanted = Parts(centre).wanted(row)[:_WANTED_AT_ONCE]
     return {**_plain(row), "wanted": [one.hex() for one in wanted]}

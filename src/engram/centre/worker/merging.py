@@ -17,6 +17,7 @@ from typing import Any
 from engram.centre.errors import MissingPartsError, StoreError
 from engram.centre.handins import HandIns
 from engram.centre.keeping import HandInState
+from engram.centre.parts import Parts
 from engram.centre.refs import Refs
 from engram.centre.service import Centre, MapPolicy
 from engram.centre.worker.admission import KilledError, admit
@@ -60,7 +61,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
     thin = centre.folder / "work" / f"{row['id']}.engram"
     try:
         with _scratch(thin):
-            _admit(centre, handins, row, thin)
+            _admit(centre, row, thin)
             outcome = _merged(centre, handins, row, thin)
     except MissingPartsError:  # the map changed since they were asked for, by a revert
         handins.end(row, HandInState.OPEN)
@@ -84,12 +85,12 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
         _log.info("%s: hand-in %s took %.1f s of work", row["map"], row["id"][:8], took_s)
 
 
-def _admit(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> None:
-    manifest = handins.manifest(row)
-    limits = centre.settings
+def _admit(centre: Centre, row: dict[str, Any], thin: Path) -> None:
+    parts, limits = Parts(centre), centre.settings
+    manifest = parts.manifest(row)
     admit(
         manifest,
-        handins.source(row, manifest),
+        parts.source(row, manifest),
         thin,
         limits.admission_bytes,
         limits.admission_s,
