@@ -24,7 +24,8 @@ def test_one_thing_stands_in_the_singular(number: int, thing: str, said: str) ->
 
 
 def test_reports_count_one_thing_as_one() -> None:
-    report = MergeReport("r1.engram", "", ["r1"], 1, taken=1, sessions=1, components=1, attempts=2)
+    report = MergeReport("r1.engram", "", ["r1"], 1, changed=True, taken=1, sessions=1)
+    report.components, report.attempts = 1, 2
     assert "1 node added" in report.text()
     assert "1 new session, 0 path entries, 2 attempts" in report.text()
     assert "1 component" in report.text()

@@ -69,7 +69,7 @@ def test_a_damaged_node_is_passed_over_and_told(
     asked = ("lab", "relocalise", town, street, "--relocaliser", relocaliser)
     ran = engram(*asked)
     assert ran.status == 0
-    assert "warning: skipped 1 damaged nodes of the map" in ran.err
+    assert "warning: skipped 1 damaged node of the map" in ran.err
     summary = engram(*asked, "--json").json["summary"]
     assert summary["found"] > 6
     (damaged,) = summary["damaged_nodes"]

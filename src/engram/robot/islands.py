@@ -83,9 +83,8 @@ class IslandReport:
         if not self.compared:
             return ""
         if self.revision is None:
-            return (
-                f"unconnected parts: {counted(self.compared, 'pair')} of nodes compared, none joins"
-            )
+            pairs = counted(self.compared, "pair")
+            return f"unconnected parts: {pairs} of nodes compared, none joins them"
         return (
             f"unconnected parts: {counted(len(self.joined), 'match')} of {self.compared} joined, "
             f"revision {self.revision}"
