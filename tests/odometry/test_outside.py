@@ -80,6 +80,17 @@ class TestLearning:
         model.add(wheels())
         assert model.guess() is None
 
+    def test_wheels_of_a_reversed_sign_are_left_aside(self) -> None:
+        model = driven(OutsideModel(), 3, scale=-1.0)
+        model.add(wheels(-STEP_M))
+        assert model.slip == 1.0
+        assert model.guess() is None
+
+    def test_nothing_outside_overrules_the_first_step_of_odometry(self) -> None:
+        model = OutsideModel()
+        assert model.is_sure(seen(inliers=20))
+        assert not model.is_sure(LOST)
+
     def test_the_bias_of_the_gyroscope_is_learnt_at_rest_only(self) -> None:
         bias = np.array([0.0, 0.02, 0.01])
         model = OutsideModel()

@@ -21,6 +21,8 @@ from engram.odometry.step import OdometryStatus, OdometryStep
 
 # Steps compared before their scale counts.
 _KNOWN_FROM = 5
+# Cosine of the largest angle between two ways that are one: 60°.
+_ALONG = 0.5
 # Least standard deviations of a motion from outside.
 _LEAST_M = 0.02
 _LEAST_RAD = float(np.deg2rad(0.2))
@@ -179,10 +181,14 @@ class OutsideModel:
         return Guess(pose, covariance, sigma_m, since.has_way)
 
     def is_sure(self, step: OdometryStep) -> bool:
-        """Whether a step of odometry has the usual number of inliers, or nearly."""
-        if step.status is not OdometryStatus.OK or not self._inliers:
+        """Whether a step of odometry has the usual number of inliers, or nearly.
+
+        The first one is: nothing has confirmed the source outside yet.
+        """
+        if step.status is not OdometryStatus.OK:
             return False
-        return step.inliers >= self.config.sure_share * float(np.median(self._inliers))
+        usual = float(np.median(self._inliers)) if self._inliers else 0.0
+        return step.inliers >= self.config.sure_share * usual
 
     def compare(self, step: OdometryStep) -> None:
         """Learns from the step of odometry that ends in this frame; the next motion begins here."""
@@ -212,7 +218,9 @@ class OutsideModel:
         spread = self._scale_error() + sigma_m / max(seen_m, 1e-3)
         expected = self.scale if len(self._ratios) >= _KNOWN_FROM else 1.0
         limit = self.config.gate * max(spread, self.config.scale_error)
-        agrees = abs(ratio / expected - 1.0) <= limit
+        along_m2 = float(since.prev_from_curr.translation @ measured.translation)
+        alike = along_m2 >= _ALONG * wheels_m * seen_m  # not so by wheels of a reversed sign
+        agrees = alike and abs(ratio / expected - 1.0) <= limit
         self._agrees.append(agrees)
         if agrees:
             self._ratios.append(ratio)
