@@ -86,6 +86,21 @@ class TestLearning:
         assert model.slip == 1.0
         assert model.guess() is None
 
+    @pytest.mark.parametrize("has_way", [True, False])
+    def test_a_gyroscope_in_degrees_is_left_aside(self, has_way: bool) -> None:
+        model, turn_rad = OutsideModel(), 0.02
+        rates = np.array([0.0, np.rad2deg(turn_rad) / STEP_S, 0.0])
+        way = STEP_M if has_way else 0.0
+        told = OutsideMotion(
+            wheels(way, np.rad2deg(turn_rad)).prev_from_curr, STEP_S, has_way, rates
+        )
+        for _ in range(3):
+            model.add(told)
+            model.compare(seen(turn_rad=turn_rad))
+        model.add(told)
+        assert model.slip == 1.0
+        assert model.guess() is None
+
     def test_nothing_outside_overrules_the_first_step_of_odometry(self) -> None:
         model = OutsideModel()
         assert model.is_sure(seen(inliers=20))

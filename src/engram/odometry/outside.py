@@ -23,6 +23,8 @@ from engram.odometry.step import OdometryStatus, OdometryStep
 _KNOWN_FROM = 5
 # Cosine of the largest angle between two ways that are one: 60°.
 _ALONG = 0.5
+# Turns that differ by less agree: a bias not yet learnt, clocks some milliseconds apart.
+_LEAST_UNLIKE_RAD = float(np.deg2rad(2.0))
 # Least standard deviations of a motion from outside.
 _LEAST_M = 0.02
 _LEAST_RAD = float(np.deg2rad(0.2))
@@ -168,11 +170,7 @@ class OutsideModel:
         config = self.config
         way = since.prev_from_curr.translation * (self.scale if since.has_way else 0.0)
         way_m = float(np.linalg.norm(way))
-        if since.rates_rad_s is not None:
-            sigma_rad = config.gyro_error_rad_s * since.seconds
-        else:
-            sigma_rad = config.turn_error * since.prev_from_curr.angle_rad + config.drift
-        sigma_rad = float(np.hypot(sigma_rad, _LEAST_RAD))
+        sigma_rad = self._turn_error(since)
         along = way_m * (self._scale_error() + self.slip)
         sideways = way_m * (sigma_rad / 2 + config.drift)
         sigma_m = float(np.sqrt(along**2 + sideways**2 + _LEAST_M**2))
@@ -204,11 +202,24 @@ class OutsideModel:
         if not self.is_sure(step):
             return
         self._learn_bias(since, measured)
+        off_rad = (since.prev_from_curr.inverse() @ measured).angle_rad
+        turns = off_rad <= max(self.config.gate * self._turn_error(since), _LEAST_UNLIKE_RAD)
         if since.has_way:
-            self._learn_scale(since, measured, covariance)
+            self._learn_scale(since, measured, covariance, turns=turns)
+        else:
+            self._agrees.append(turns)
+
+    def _turn_error(self, since: OutsideMotion) -> float:
+        """Standard deviation of a turn, rad."""
+        if since.rates_rad_s is not None:
+            sigma_rad = self.config.gyro_error_rad_s * since.seconds
+        else:
+            turned_rad = since.prev_from_curr.angle_rad
+            sigma_rad = self.config.turn_error * turned_rad + self.config.drift
+        return float(np.hypot(sigma_rad, _LEAST_RAD))
 
     def _learn_scale(
-        self, since: OutsideMotion, measured: SE3, covariance: NDArray[np.float64]
+        self, since: OutsideMotion, measured: SE3, covariance: NDArray[np.float64], *, turns: bool
     ) -> None:
         wheels_m, seen_m = since.prev_from_curr.distance_m, measured.distance_m
         sigma_m = float(np.sqrt(np.trace(covariance[:3, :3])))
@@ -220,7 +231,7 @@ class OutsideModel:
         limit = self.config.gate * max(spread, self.config.scale_error)
         along_m2 = float(since.prev_from_curr.translation @ measured.translation)
         alike = along_m2 >= _ALONG * wheels_m * seen_m  # not so by wheels of a reversed sign
-        agrees = alike and abs(ratio / expected - 1.0) <= limit
+        agrees = turns and alike and abs(ratio / expected - 1.0) <= limit
         self._agrees.append(agrees)
         if agrees:
             self._ratios.append(ratio)
