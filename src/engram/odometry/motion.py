@@ -23,6 +23,7 @@ from engram.config import check_bounds
 from engram.geometry import SE3
 from engram.odometry.outside import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.odometry.vague import VagueRun
 
 _NS_PER_S = 1e9
 # Variance of an unknown turn rate, (rad/s)².
@@ -172,6 +173,8 @@ class GapFiller:
       robot's own headlamps on the road make it seem to stop at once, with a small covariance. The
       longer ago the speed was measured, the larger the change allowed.
     - The covariance of measured steps grows with the share of missing steps among the newest.
+    - Errors of guesses and vague steps in a row have one cause, and add up: at night in rain all
+      are too short. Among them the robot may be as fast as when odometry was last sharp.
     - A robot that starts its drive moving, without a measured step, has no known speed. Its first
       measured step also accounts for the time before, at the same speed.
 
@@ -190,8 +193,9 @@ class GapFiller:
         self._turn_per_s = np.zeros(3)
         self._turn_variance = _ANY_TURN
         self._stamp_ns: int | None = None
-        # Distance of the gap so far.
-        self._gap_m = 0.0
+        self._run = VagueRun(config.steps_to_know_speed)
+        # Speed of the newest sharp step, or the greatest since.
+        self._fast_m_per_s = 0.0
         # Consecutive measurements less certain than a guess.
         self._vague = 0
         # Stamp of the newest motion that was measured and accepted.
@@ -239,15 +243,18 @@ class GapFiller:
         ):
             self._missing.append(True)
             if guess is not outside:
-                self._gap_m += guess.prev_from_curr.distance_m
+                self._run.go_on(self._wrong_m(guess.prev_from_curr, seconds))
             if guess is _ANY_MOTION:
                 self._unknown_s += max(seconds, 0.0)
             return Motion(odometry, guess.prev_from_curr, guess.covariance, guess.sigma_m)
         self._missing.append(False)
-        self._gap_m = 0.0
         self._believed_ns = stamp_ns
         if seconds > 0:
             self._learn(measured.distance_m, twist / seconds, covariance, sigma_m, seconds)
+        if sigma_m <= self._sharp_below_m(measured, seconds):
+            self._run.break_off()
+        else:
+            covariance = self._run.adds_up(covariance, sigma_m)
         if any(self._missing):
             covariance = covariance + self._doubt(measured, seconds)
         if self._unknown_s and seconds > 0:
@@ -269,6 +276,9 @@ class GapFiller:
         if sharp or not self._knows_speed or self._unlearnt > self._config.speed_steps:
             self._velocities.append(twist_per_s[:3].tolist())
             self._velocity = _median(self._velocities)
+            speed_m_per_s = math.sqrt(self._velocity @ self._velocity)
+            slower = self._fast_m_per_s if not sharp else 0.0
+            self._fast_m_per_s = max(speed_m_per_s, slower)
         # A Kalman filter; the turn rate changes per step by the error of a guess. The change does
         # not grow over a gap: the next guesses would then rest on the first uncertain step.
         change_rad = max(self._config.sigma_rad_per_m * step_m, self._config.least_sigma_rad)
@@ -298,10 +308,24 @@ class GapFiller:
 
         For a robot that seems to have stopped it follows from its previous speed.
         """
-        step_m = max(measured.distance_m, max(self._guessed_m_per_s, default=0.0) * seconds)
+        step_m = self._step_m(measured, seconds)
         share = sum(self._missing) / self._config.newest_steps
         variances = np.repeat([step_m**2, (self._config.sigma_rad_per_m * step_m) ** 2], 3)
         return np.diag(share * variances)
+
+    def _step_m(self, measured: SE3, seconds: float) -> float:
+        """Length of a step, metres, or what was expected lately if that is more."""
+        return max(measured.distance_m, max(self._guessed_m_per_s, default=0.0) * seconds)
+
+    def _sharp_below_m(self, measured: SE3, seconds: float) -> float:
+        """Largest standard deviation of a step that ends a run of vague ones, metres."""
+        share = self._config.sharp_share
+        return max(share * self._step_m(measured, seconds), self._config.least_sigma_m)
+
+    def _wrong_m(self, guess: SE3, seconds: float) -> float:
+        """How wrong a guess is by itself, metres: the robot may be as fast as it was."""
+        fast_m = self._fast_m_per_s * seconds
+        return self._config.sigma_per_m * max(guess.distance_m, fast_m)
 
     def _too_vague(self, sigma_m: float, guess: Guess) -> bool:
         vague = sigma_m > guess.sigma_m
@@ -346,13 +370,12 @@ class GapFiller:
         if not self._velocities or seconds <= 0:
             return _ANY_MOTION
         guess = SE3.exp(np.concatenate([self._velocity, self._turn_per_s]) * seconds)
-        # Errors of the steps of one gap are correlated: they add up, not their variances.
-        growth_m2 = (self._gap_m + guess.distance_m) ** 2 - self._gap_m**2
-        started_m = self._started_m(seconds, stamp_ns)
-        config, grown_m = self._config, np.sqrt(growth_m2)
-        least_m = max(config.least_sigma_m, started_m)
-        sigma_m = float(np.hypot(config.sigma_per_m * grown_m, least_m))
-        sigma_rad = float(np.hypot(config.sigma_rad_per_m * grown_m, config.least_sigma_rad))
+        config = self._config
+        grown_m = math.sqrt(self._run.variance_m2(self._wrong_m(guess, seconds)))
+        least_m = max(config.least_sigma_m, self._started_m(seconds, stamp_ns))
+        sigma_m = math.hypot(grown_m, least_m)
+        turned_rad = config.sigma_rad_per_m / config.sigma_per_m * grown_m
+        sigma_rad = math.hypot(turned_rad, config.least_sigma_rad)
         covariance = np.zeros((6, 6))
         variances = covariance.reshape(-1)[::7]
         variances[:3], variances[3:] = sigma_m**2, sigma_rad**2
