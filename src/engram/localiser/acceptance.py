@@ -45,6 +45,8 @@ class AcceptanceConfig:
         doubt_after: fixes that should have come since the last one, and did not, after which a
             robot looks for itself all over the map; so does one that was told its place, until its
             first fix. 0: neither does, before it is lost.
+        rival_share: a match is refused if another of the frame, with this share of its inliers,
+            lies more than `slack_m` from it and nearer to the prediction.
         min_inliers: fewest inliers of a match with a prediction.
         min_inliers_lost: fewest inliers of a match without a prediction; above every wrong match
             that passes the other tests.
@@ -70,6 +72,7 @@ class AcceptanceConfig:
     sure_confidence: float = 8.5
     settle_after_m: float = 10.0
     doubt_after: float = 3.0
+    rival_share: float = 0.6
     min_inliers: int = 20
     min_inliers_lost: int = 60
     min_inliers_plausible: int = 35

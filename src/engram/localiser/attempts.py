@@ -316,25 +316,6 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
     return guide.node_from_live, covariance
 
 
-def best_success(outcomes: Sequence[Outcome], rule: Rule) -> Outcome | None:
-    """The accepted outcome that is surest, then of the best rank (method §3.2).
-
-    By the published rule that is the one with the most inliers. In rain, of two matches of one
-    frame the one with a few more of them is sometimes a metre off.
-    """
-    successes = [outcome for outcome in outcomes if outcome.accepted]
-
-    def least(one: Outcome) -> tuple[float, int]:
-        return -(one.confidence if rule is Rule.CONFIDENCE else one.match.inliers), one.rank
-
-    return min(successes, key=least, default=None)
-
-
-def outcome_at(outcomes: Sequence[Outcome], node: NodeId | None) -> Outcome | None:
-    """The accepted outcome of a node, as that of a result; None if there is none."""
-    return next((one for one in outcomes if one.accepted and one.candidate.node == node), None)
-
-
 def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:
     """The outcomes in ranked order up to the first success: what one lane would have attempted."""
     first = next((at for at, one in enumerate(outcomes) if one.accepted), len(outcomes))

@@ -26,9 +26,9 @@ from engram.localiser.attempts import (
     Matcher,
     Outcome,
     alternate,
-    best_success,
     up_to_first_success,
 )
+from engram.localiser.choice import best_success, uncontested
 from engram.localiser.confidence import confidence_of
 from engram.localiser.given import LiveDrive, MapParts
 from engram.localiser.hypotheses import Hypotheses
@@ -491,13 +491,15 @@ class Localiser:
         return Candidate(index, node, prediction, guided, row, doubted, standing)
 
     def _judged(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
-        """Outcomes of readable nodes, with those accepted that an earlier match confirms."""
-        confirms = (
-            confidence_of(live.descriptor).witness
-            if self.config.acceptance.rule is Rule.CONFIDENCE
-            else 0.0
-        )
-        return self._hypotheses.judge(self._without_damaged(outcomes), confirms)
+        """Outcomes of readable nodes, with those accepted that an earlier match confirms.
+
+        What another match of the frame contests is not, but by the published rule.
+        """
+        acceptance, readable = self.config.acceptance, self._without_damaged(outcomes)
+        if acceptance.rule is Rule.INLIERS:
+            return self._hypotheses.judge(readable, 0.0)
+        confirms = confidence_of(live.descriptor).witness
+        return uncontested(self._hypotheses.judge(readable, confirms), acceptance)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes; the others are reported, and not attempted again."""

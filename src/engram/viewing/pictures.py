@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from engram.errors import InputError
 from engram.frontend import Frame, StereoPair
 from engram.localiser import Localisation
-from engram.localiser.attempts import Outcome, outcome_at
+from engram.localiser.attempts import Outcome
+from engram.localiser.choice import outcome_at
 from engram.maps.frame_reader import FrameReader
 from engram.robot.robot import Seen
 from engram.viewing import match_picture

@@ -14,7 +14,7 @@ from engram.frontend import StereoPair
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import SessionId
 from engram.localiser import Localisation, LocalisationStatus
-from engram.localiser.attempts import outcome_at
+from engram.localiser.choice import outcome_at
 from engram.maps import Map
 from engram.robot.robot import Robot, Seen
 from engram.robot.whereabouts import Whereabouts
