@@ -70,6 +70,14 @@ class GapConfig:
             "share of its length: wrong steps in rain and at night are mostly too short",
         ),
     ] = 0.25
+    vague_share: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="standard deviation of a vague step, as a share of its length: errors of "
+            "such steps in a row have one cause, and add up",
+        ),
+    ] = 0.4
     newest_steps: Annotated[
         int,
         Meta(
@@ -251,7 +259,7 @@ class GapFiller:
         self._believed_ns = stamp_ns
         if seconds > 0:
             self._learn(measured.distance_m, twist / seconds, covariance, sigma_m, seconds)
-        if sigma_m <= self._sharp_below_m(measured, seconds):
+        if sigma_m <= self._vague_from_m(measured, seconds):
             self._run.break_off()
         else:
             covariance = self._run.adds_up(covariance, sigma_m)
@@ -317,9 +325,9 @@ class GapFiller:
         """Length of a step, metres, or what was expected lately if that is more."""
         return max(measured.distance_m, max(self._guessed_m_per_s, default=0.0) * seconds)
 
-    def _sharp_below_m(self, measured: SE3, seconds: float) -> float:
-        """Largest standard deviation of a step that ends a run of vague ones, metres."""
-        share = self._config.sharp_share
+    def _vague_from_m(self, measured: SE3, seconds: float) -> float:
+        """Standard deviation from which a step is vague, metres."""
+        share = self._config.vague_share
         return max(share * self._step_m(measured, seconds), self._config.least_sigma_m)
 
     def _wrong_m(self, guess: SE3, seconds: float) -> float:

@@ -17,12 +17,12 @@ class VagueRun:
     """Guesses and vague steps in a row: their errors add up, not their variances.
 
     Args:
-        sharp_steps: so many sharp steps in a row end the run.
+        clear_steps: so many steps that are not vague, in a row, end the run.
     """
 
-    def __init__(self, sharp_steps: int) -> None:
-        self._sharp_steps = sharp_steps
-        self._sharp = 0
+    def __init__(self, clear_steps: int) -> None:
+        self._clear_steps = clear_steps
+        self._clear = 0
         # Sum of their standard deviations.
         self._sum_m = 0.0
 
@@ -33,7 +33,7 @@ class VagueRun:
     def go_on(self, sigma_m: float) -> None:
         """One more step, so wrong by itself."""
         self._sum_m += sigma_m
-        self._sharp = 0
+        self._clear = 0
 
     def adds_up(self, covariance: NDArray[np.float64], sigma_m: float) -> NDArray[np.float64]:
         """One more vague step: its (6, 6) covariance as part of the run, m and rad."""
@@ -43,7 +43,7 @@ class VagueRun:
         return covariance * np.outer(scale, scale)
 
     def break_off(self) -> None:
-        """A sharp step, which may be a false one."""
-        self._sharp += 1
-        if self._sharp >= self._sharp_steps:
+        """A step that is not vague; one by itself may be wrong."""
+        self._clear += 1
+        if self._clear >= self._clear_steps:
             self._sum_m = 0.0
