@@ -340,6 +340,8 @@ def test_a_wrong_focal_length_shows_against_motion_from_outside(
     drive.factor = factor
     with closing(LookedAhead(front, drive)):  # type: ignore[arg-type]
         assert codes(front.diagnosis) == found
+        cures = {one.cure for one in front.diagnosis.findings if one.code in found}
+        assert all("is in metres" in cure for cure in cures)
 
 
 def test_motion_from_outside_goes_on_behind_the_frames_that_were_taken_ahead(pairs) -> None:

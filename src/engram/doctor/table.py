@@ -128,9 +128,10 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "scale_off", _WARNING, motion.scale_off, "scale", "of the way",
-        "focal length or baseline is wrong: the distance by odometry differs from the one "
-        "measured outside",
-        "calibrate again; check the baseline with a ruler",
+        "the distance by odometry differs from the one measured outside: focal length or baseline "
+        "is wrong, or the unit of that motion",
+        "see that --motion is in metres and radians; calibrate again; check the baseline with a "
+        "ruler",
         needs="motion from outside, --motion TOPIC or FILE, and odometry that is sure of its steps",
     ),
     Check(
