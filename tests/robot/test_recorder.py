@@ -78,6 +78,26 @@ def test_what_is_too_old_or_too_much_is_dropped(pairs, tmp_path: Path) -> None:
     assert len(FrameLog(recorded(pairs, tmp_path / "b", most_bytes=1_000_000))) < len(pairs)
 
 
+def test_two_records_of_one_second_are_two_files(town: Path, tmp_path: Path) -> None:
+    with open_map(town) as opened, opened.robot(LIVE[0].frame.camera) as robot:
+        robot.recorder = Recorder(str(tmp_path), about={"map": town})  # type: ignore[arg-type]
+        robot.step(LIVE[0].logged)
+        robot.record({"no", "JSON"})  # type: ignore[arg-type]
+        asked = [robot.record(reason) for reason in ("a wall", "a hole")]
+    assert robot.recorder.written == asked
+    assert "not JSON serializable" in robot.recorder.failure
+    assert [read_report(path)["reason"] for path in asked] == ["a wall", "a hole"]
+    assert read_report(asked[0])["map"] == str(town)
+
+
+def test_why_nothing_was_recorded_is_said(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path)
+    path = recorder.record()
+    recorder.close()
+    assert not path.exists()
+    assert "has seen no frame yet" in recorder.failure
+
+
 def test_a_robot_without_a_recorder_says_what_to_do(town: Path) -> None:
     with (
         open_map(town) as opened,

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from queue import Full, Queue
 from threading import Thread
@@ -18,8 +19,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import __version__
-from engram.config import check_bounds, config_hash, to_dict
-from engram.errors import EngramError
+from engram.config import check_bounds, config_hash, plain, to_dict
+from engram.errors import EngramError, InputError
 from engram.frontend import Frame, StereoPair
 from engram.graph.model import Clock
 from engram.localiser import Localisation, LocalisationStatus
@@ -110,9 +111,14 @@ class Recorder:
     _ring: deque[_Entry] = field(default_factory=deque)
     _bytes: int = 0
     _unasked: int = 0
+    # Paths that were given away; their files may not be there yet.
+    _asked: set[Path] = field(default_factory=set)
     # Whether the robot knew where it was at the last frame, and the stamp of that.
     _knew: bool = False
     _stamp_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self.folder, self.about = Path(self.folder), plain(self.about)
 
     def note(
         self, arrived: Arrived, frame: Frame, found: Localisation, outcomes: list[Outcome]
@@ -147,11 +153,9 @@ class Recorder:
             reason: stored with it.
         """
         stamp = datetime.fromtimestamp(self._stamp_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S")
-        number = len(self.written) + 1
-        path = self.folder / f"{self.info.name}-{stamp}-{number}.flight"
-        while path.exists():
-            number += 1
-            path = self.folder / f"{self.info.name}-{stamp}-{number}.flight"
+        names = (self.folder / f"{self.info.name}-{stamp}-{n}.flight" for n in count(1))
+        path = next(one for one in names if one not in self._asked and not one.exists())
+        self._asked.add(path)
         self._start()
         self._queue.put(_Request(path, reason, {**self.about, "stamp_ns": self._stamp_ns}))
         return path
@@ -185,7 +189,8 @@ class Recorder:
             if isinstance(item, _Request):
                 try:
                     self._write(item)
-                except (EngramError, OSError) as error:
+                except (EngramError, OSError, TypeError, ValueError) as error:
+                    # Whatever it is: the robot would wait for ever for a thread that has ended.
                     self.failure = f"{item.path}: {error}"
                 continue
             self._keep(*item)
@@ -218,7 +223,7 @@ class Recorder:
     def _write(self, request: _Request) -> None:
         """Writes the ring as one file; another name until it is whole."""
         if not self._ring:
-            return
+            raise InputError("the robot has seen no frame yet")
         self.folder.mkdir(parents=True, exist_ok=True)
         draft = request.path.with_name(f".{request.path.stem}.part.flight")
         draft.unlink(missing_ok=True)
