@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import MapCorruptError
-from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, pack, unpack
+from engram.graph.attempts import Attempts
+from engram.maps.attempts import pack, unpack
 
 
-def table(count: int, seed: int = 0, iterations: int = 2000, nodes: int = 300) -> AttemptTable:
+def table(count: int, seed: int = 0, iterations: int = 2000, nodes: int = 300) -> Attempts:
     rng = np.random.default_rng(seed)
     columns = {
         "iteration": np.sort(rng.integers(0, iterations, count)),
@@ -28,26 +29,33 @@ def table(count: int, seed: int = 0, iterations: int = 2000, nodes: int = 300) -
         "inliers": rng.integers(0, 900, count),
         "rank": rng.integers(0, 255, count),
     }
-    kinds = dict(COLUMNS)
-    typed = {name: values.astype(kinds[name]) for name, values in columns.items()}
-    return AttemptTable(typed, rng.integers(0, 3, count).astype(np.int32), ("path", "x", "bandit"))
+    kinds = {"accepted": np.bool_, "inliers": np.int32, "rank": np.int32}
+    whole = dict.fromkeys(("iteration", "reference", "node"), np.int64)
+    return Attempts(
+        session=np.zeros(count, np.int32),
+        **{
+            name: one.astype((kinds | whole).get(name, np.float32)) for name, one in columns.items()
+        },
+        policy=rng.integers(0, 3, count).astype(np.int32),
+        policies=("path", "x", "bandit"),
+    )
 
 
-def unpack_all(bodies: list[tuple[int, bytes]]) -> AttemptTable:
-    return concatenate([unpack(body, count) for count, body in bodies])
+def unpack_all(bodies: list[tuple[int, bytes]]) -> Attempts:
+    return Attempts.joined([unpack(body, count) for count, body in bodies])
 
 
-def assert_close(read: AttemptTable, written: AttemptTable) -> None:
+def assert_close(read: Attempts, written: Attempts) -> None:
     for name in ("iteration", "reference", "node", "accepted", "inliers", "rank"):
-        np.testing.assert_array_equal(read.columns[name], written.columns[name], err_msg=name)
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name), err_msg=name)
     for name in ("along_m", "across_m", "yaw_rad"):  # half precision: 11 bits
         np.testing.assert_allclose(
-            read.columns[name], written.columns[name], rtol=2**-11, atol=1e-6
+            getattr(read, name), getattr(written, name), rtol=2**-11, atol=1e-6
         )
     for name in ("sigma_m", "sigma_yaw_rad"):  # steps of 2^(1/12): half of one is 2.93 %
-        inside = (written.columns[name] > 0.001) & (written.columns[name] < 1900)
+        inside = (getattr(written, name) > 0.001) & (getattr(written, name) < 1900)
         np.testing.assert_allclose(
-            read.columns[name][inside], written.columns[name][inside], rtol=0.0294
+            getattr(read, name)[inside], getattr(written, name)[inside], rtol=0.0294
         )
     names = [[one.policies[at] for at in one.policy] for one in (read, written)]
     assert names[0] == names[1]
@@ -83,7 +91,7 @@ def test_the_order_of_policies_is_of_no_account():
     )
     assert_close(other, written)
     assert pack(other) == pack(written)
-    assert concatenate([other]).policies == concatenate([written]).policies
+    assert Attempts.joined([other]).policies == Attempts.joined([written]).policies
 
 
 def test_long_sessions_are_split_where_indices_end():
@@ -95,15 +103,15 @@ def test_long_sessions_are_split_where_indices_end():
 
 def test_what_is_unknown_or_out_of_range_stays_so():
     written = table(4)
-    written.columns["along_m"][:] = [np.inf, -np.inf, 1e6, -0.0]
-    written.columns["sigma_m"][:] = [np.inf, 0.0, 1e5, 1e-9]
-    written.columns["rank"][:] = [255, 300, 70_000, 0]
-    written.columns["inliers"][:] = [65_535, 65_536, 0, -1]
-    read = unpack_all(pack(written)).columns
-    np.testing.assert_array_equal(read["along_m"], [np.inf, -np.inf, np.inf, 0])
-    np.testing.assert_array_equal(read["sigma_m"], [np.inf, 0, np.inf, 0])
-    np.testing.assert_array_equal(read["rank"], [255, 255, 255, 0])
-    np.testing.assert_array_equal(read["inliers"], [65_535, 65_535, 0, 0])
+    written.along_m[:] = [np.inf, -np.inf, 1e6, -0.0]
+    written.sigma_m[:] = [np.inf, 0.0, 1e5, 1e-9]
+    written.rank[:] = [255, 300, 70_000, 0]
+    written.inliers[:] = [65_535, 65_536, 0, -1]
+    read = unpack_all(pack(written))
+    np.testing.assert_array_equal(read.along_m, [np.inf, -np.inf, np.inf, 0])
+    np.testing.assert_array_equal(read.sigma_m, [np.inf, 0, np.inf, 0])
+    np.testing.assert_array_equal(read.rank, [255, 255, 255, 0])
+    np.testing.assert_array_equal(read.inliers, [65_535, 65_535, 0, 0])
 
 
 @given(data=st.data())

@@ -23,6 +23,7 @@ class Attempts:
         session: (A,) int32, index into a list of sessions.
         iteration: (A,) int64, iteration of the session's localiser.
         reference, node: (A,) int32, indices into a list of nodes; for a map, dense graph indices.
+            In the map's file (A,) int64, keys of their rows.
         along_m, across_m, yaw_rad, sigma_m, sigma_yaw_rad: (A,) float32, as in `Attempt`.
         accepted: (A,) bool, whether the match was accepted.
         inliers: (A,) int32, inliers of the match.
@@ -33,8 +34,8 @@ class Attempts:
 
     session: NDArray[np.int32]
     iteration: NDArray[np.int64]
-    reference: NDArray[np.int32]
-    node: NDArray[np.int32]
+    reference: NDArray[np.int32] | NDArray[np.int64]
+    node: NDArray[np.int32] | NDArray[np.int64]
     along_m: NDArray[np.float32]
     across_m: NDArray[np.float32]
     yaw_rad: NDArray[np.float32]
@@ -75,16 +76,27 @@ class Attempts:
         """No attempts."""
         return Attempts.of([])[0]
 
+    @staticmethod
+    def joined(parts: Sequence[Attempts]) -> Attempts:
+        """All attempts in order, with one sorted list of policies."""
+        parts = parts or [Attempts.none()]
+        policies = tuple(sorted({name for one in parts for name in one.policies}))
+        if len(parts) == 1 and parts[0].policies == policies:
+            return parts[0]
+        columns = {name: np.concatenate([getattr(one, name) for one in parts]) for name in _COLUMNS}
+        place = {name: at for at, name in enumerate(policies)}
+        known = [np.array([place[name] for name in one.policies], np.int32) for one in parts]
+        columns["policy"] = np.concatenate(
+            [named[one.policy] for named, one in zip(known, parts, strict=True)]
+        )
+        return Attempts(**columns, policies=policies)
+
     def __len__(self) -> int:
         return len(self.node)
 
-    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Attempts:
+    def rows(self, rows: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Attempts:
         """A selection of the attempts: (A,) bool mask, or (K,) row numbers in the wanted order."""
-        columns = {
-            field.name: getattr(self, field.name)[rows]
-            for field in fields(self)
-            if field.name != "policies"
-        }
+        columns = {name: getattr(self, name)[rows] for name in _COLUMNS}
         return Attempts(**columns, policies=self.policies)
 
     def moved_to(self, equivalent_from_node: Sequence[SE3 | None]) -> Attempts:
@@ -158,6 +170,9 @@ class Attempts:
             policy[self.policy],
         ]
         return np.stack(columns, axis=1, dtype=np.int64)
+
+
+_COLUMNS = tuple(one.name for one in fields(Attempts) if one.name != "policies")
 
 
 def _lacking_in_session(made: Attempts, remembered: Attempts) -> NDArray[np.intp]:

@@ -6,13 +6,11 @@ nodes, and the packed rows.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from engram.errors import MapCorruptError
+from engram.graph.attempts import Attempts
 
 _VERSION = 1
 _PACKED = np.dtype(
@@ -42,37 +40,20 @@ _SPAN = 65536
 _ROWS = 131072
 _POLICIES = 128
 
+# Of `Attempts`, in the order in which the content hash takes them.
 COLUMNS = (
-    ("iteration", np.int64),
-    ("reference", np.int64),
-    ("node", np.int64),
-    ("along_m", np.float32),
-    ("across_m", np.float32),
-    ("yaw_rad", np.float32),
-    ("sigma_m", np.float32),
-    ("sigma_yaw_rad", np.float32),
-    ("accepted", np.bool_),
-    ("inliers", np.int32),
-    ("rank", np.int32),
+    "iteration",
+    "reference",
+    "node",
+    "along_m",
+    "across_m",
+    "yaw_rad",
+    "sigma_m",
+    "sigma_yaw_rad",
+    "accepted",
+    "inliers",
+    "rank",
 )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AttemptTable:
-    """Attempts of one session as a struct of arrays, with the keys of nodes (see `Attempt`).
-
-    Attributes:
-        columns: (A,) rows with the names, types and units (in the names) of `COLUMNS`.
-        policy: (A,) int32, index into `policies`.
-        policies: names of the policies.
-    """
-
-    columns: dict[str, NDArray[np.generic]]
-    policy: NDArray[np.int32]
-    policies: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.policy)
 
 
 class _Body(msgspec.Struct, forbid_unknown_fields=True):
@@ -87,37 +68,22 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(_Body)
 
 
-def concatenate(tables: list[AttemptTable]) -> AttemptTable:
-    """All rows in order, with one sorted list of policies."""
-    if len(tables) == 1 and tables[0].policies == tuple(sorted(tables[0].policies)):
-        return tables[0]
-    policies = tuple(sorted({name for table in tables for name in table.policies}))
-    index = {name: at for at, name in enumerate(policies)}
-    columns = {
-        name: np.concatenate([np.empty(0, kind), *(table.columns[name] for table in tables)])
-        for name, kind in COLUMNS
-    }
-    policy = [
-        np.array([index[name] for name in table.policies], np.int32)[table.policy]
-        for table in tables
-        if len(table)
-    ]
-    return AttemptTable(columns, np.concatenate([np.empty(0, np.int32), *policy]), policies)
+def pack(table: Attempts) -> list[tuple[int, bytes]]:
+    """The bodies of one session's attempts, in order, each with its number of attempts.
 
-
-def pack(table: AttemptTable) -> list[tuple[int, bytes]]:
-    """The bodies of the table, in order, each with its number of attempts."""
+    Their `reference` and `node` are keys.
+    """
     bodies = []
     start = 0
     while start < len(table):
         stop = _body_end(table, start)
-        bodies.append((stop - start, _pack_body(table, slice(start, stop))))
+        bodies.append((stop - start, _pack_body(table.rows(slice(start, stop)))))
         start = stop
     return bodies
 
 
-def unpack(body: bytes, count: int) -> AttemptTable:
-    """The attempts of one body.
+def unpack(body: bytes, count: int) -> Attempts:
+    """The attempts of one body; `reference` and `node` are keys, `session` is 0.
 
     Raises:
         MapCorruptError: the body is malformed or does not hold `count` attempts.
@@ -145,33 +111,31 @@ def unpack(body: bytes, count: int) -> AttemptTable:
         raise MapCorruptError(
             f"attempts: {len(rows)} packed rows, {count} expected, or bad indices"
         )
-    return AttemptTable(_columns(rows, nodes, content.base), policy, tuple(content.policies))
+    return Attempts(
+        session=np.zeros(count, np.int32),
+        iteration=rows["iteration"].astype(np.int64) + content.base,
+        reference=nodes[rows["reference"]],
+        node=nodes[rows["node"]],
+        along_m=rows["along_m"].astype(np.float32),
+        across_m=rows["across_m"].astype(np.float32),
+        yaw_rad=rows["yaw_rad"].astype(np.float32),
+        sigma_m=_SIGMA_TABLE[rows["sigma_m"]],
+        sigma_yaw_rad=_SIGMA_TABLE[rows["sigma_yaw_rad"]],
+        accepted=rows["flags"] >= 128,
+        inliers=rows["inliers"].astype(np.int32),
+        rank=rows["rank"].astype(np.int32),
+        policy=policy,
+        policies=tuple(content.policies),
+    )
 
 
-def _columns(
-    rows: NDArray[np.void], nodes: NDArray[np.int64], base: int
-) -> dict[str, NDArray[np.generic]]:
-    special = {
-        "iteration": rows["iteration"].astype(np.int64) + base,
-        "reference": nodes[rows["reference"]],
-        "node": nodes[rows["node"]],
-        "sigma_m": _SIGMA_TABLE[rows["sigma_m"]],
-        "sigma_yaw_rad": _SIGMA_TABLE[rows["sigma_yaw_rad"]],
-        "accepted": rows["flags"] >= 128,
-    }
-    return {
-        name: special[name] if name in special else rows[name].astype(kind)
-        for name, kind in COLUMNS
-    }
-
-
-def _body_end(table: AttemptTable, start: int) -> int:
+def _body_end(table: Attempts, start: int) -> int:
     """The longest run from `start` that fits into one body."""
     stop = min(start + _ROWS, len(table))
     while stop - start > 1:
         rows = slice(start, stop)
-        iteration = table.columns["iteration"][rows].astype(np.int64)
-        nodes = np.concatenate([table.columns["reference"][rows], table.columns["node"][rows]])
+        iteration = table.iteration[rows]
+        nodes = np.concatenate([table.reference[rows], table.node[rows]])
         if (
             int(iteration.max() - iteration.min()) < _SPAN
             and len(np.unique(nodes)) <= _SPAN
@@ -182,26 +146,25 @@ def _body_end(table: AttemptTable, start: int) -> int:
     return stop
 
 
-def _pack_body(table: AttemptTable, rows: slice) -> bytes:
-    columns = {name: values[rows] for name, values in table.columns.items()}
-    nodes = np.unique(np.concatenate([columns["reference"], columns["node"]]))
-    used, policy = np.unique(table.policy[rows], return_inverse=True)
+def _pack_body(made: Attempts) -> bytes:
+    nodes = np.unique(np.concatenate([made.reference, made.node]))
+    used, policy = np.unique(made.policy, return_inverse=True)
     # Sorted by name, so that equal attempts give equal bodies.
-    policies = sorted(table.policies[at] for at in used)
-    policy = np.array([policies.index(table.policies[at]) for at in used])[policy]
-    base = int(columns["iteration"].astype(np.int64).min())
+    policies = sorted(made.policies[at] for at in used)
+    policy = np.array([policies.index(made.policies[at]) for at in used])[policy]
+    base = int(made.iteration.min())
     packed = np.empty(len(policy), _PACKED)
-    packed["iteration"] = columns["iteration"].astype(np.int64) - base
+    packed["iteration"] = made.iteration - base
     for name in ("reference", "node"):
-        packed[name] = np.searchsorted(nodes, columns[name])
+        packed[name] = np.searchsorted(nodes, getattr(made, name))
     with np.errstate(over="ignore"):  # beyond 65,504 m becomes infinity
         for name in ("along_m", "across_m", "yaw_rad"):
-            packed[name] = columns[name]
+            packed[name] = getattr(made, name)
     for name in ("sigma_m", "sigma_yaw_rad"):
-        packed[name] = np.searchsorted(_SIGMA_BORDERS, columns[name].astype(np.float64))
-    packed["inliers"] = np.clip(columns["inliers"].astype(np.int64), 0, 65535)
-    packed["rank"] = np.clip(columns["rank"].astype(np.int64), 0, 255)
-    packed["flags"] = policy.astype(np.uint8) | (columns["accepted"].astype(np.uint8) << 7)
+        packed[name] = np.searchsorted(_SIGMA_BORDERS, getattr(made, name).astype(np.float64))
+    packed["inliers"] = np.clip(made.inliers, 0, 65535)
+    packed["rank"] = np.clip(made.rank, 0, 255)
+    packed["flags"] = policy.astype(np.uint8) | (made.accepted.astype(np.uint8) << 7)
     body = _Body(
         version=_VERSION,
         base=base,

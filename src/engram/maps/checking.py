@@ -375,7 +375,7 @@ def _check_attempts(checking: _Checking, row: Row) -> None:
     if revision is None:
         return  # reported already
     for name in ("reference", "node"):
-        for key in np.unique(table.columns[name]).tolist():
+        for key in np.unique(getattr(table, name)).tolist():
             fact = checking.reference_problem(revision, nodes, key)
             if fact:
                 raise MapCorruptError(f"a {name} {fact}")

@@ -8,10 +8,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, select
 
 from engram.errors import MapCorruptError
-from engram.maps.attempts import COLUMNS, AttemptTable, concatenate, unpack
+from engram.graph.attempts import Attempts
+from engram.maps.attempts import COLUMNS, unpack
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.rows import Row, verified, verified_values
 from engram.maps.schema import (
@@ -173,22 +175,22 @@ def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, by
         packed.setdefault((row["revision"], row["session"]), []).append(row)
     found: dict[int, bytes] = {}
     for (revision, session), bodies in packed.items():
-        table = concatenate([unpack(row["body"], row["count"]) for row in bodies])
+        table = Attempts.joined([unpack(row["body"], row["count"]) for row in bodies])
         content = _encode(
             [
                 _identity(identities, "revisions", revision),
                 _identity(identities, "sessions", session),
                 list(table.policies),
                 table.policy.astype("<i4").tobytes(),
-                *(_column_bytes(table, name, identities) for name, _ in COLUMNS),
+                *(_column_bytes(table, name, identities) for name in COLUMNS),
             ]
         )
         found.update((row["key"], content) for row in bodies)
     return found
 
 
-def _column_bytes(table: AttemptTable, name: str, identities: Identities) -> bytes:
-    values = table.columns[name]
+def _column_bytes(table: Attempts, name: str, identities: Identities) -> bytes:
+    values: NDArray[np.generic] = getattr(table, name)
     if name in {"reference", "node"}:
         keys, index = np.unique(values, return_inverse=True)
         uuids = [_identity(identities, "nodes", int(key)) for key in keys]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from engram.graph.model import (
     Session,
     SessionId,
 )
-from engram.maps.attempts import AttemptTable, concatenate, unpack
+from engram.maps.attempts import unpack
 from engram.maps.columns import Columns, read_columns
 from engram.maps.marks import counting, edge_key, is_removed, removed_measurements
 from engram.maps.records import MapContents, MapInfo, Revision
@@ -332,12 +333,12 @@ def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:
     )
 
 
-def attempt_tables(connection: Connection, view: View) -> dict[int, AttemptTable]:
+def attempt_tables(connection: Connection, view: View) -> dict[int, Attempts]:
     """Remembered attempts by key of their session."""
-    found: dict[int, list[AttemptTable]] = {}
+    found: dict[int, list[Attempts]] = {}
     for row in view.rows(connection, attempts):
         found.setdefault(row["session"], []).append(unpack(row["body"], row["count"]))
-    return {session: concatenate(tables) for session, tables in found.items()}
+    return {session: Attempts.joined(tables) for session, tables in found.items()}
 
 
 def _nodes(
@@ -455,25 +456,17 @@ def _attempts(
     """All attempts between visible nodes, with keys converted to dense indices."""
     by_session = attempt_tables(connection, view)
     order = [key for key in session_keys if key in by_session]
-    table = concatenate([by_session[key] for key in order])
+    found = Attempts.joined([by_session[key] for key in order])
     place = {key: at for at, key in enumerate(session_keys)}
     session = np.repeat(
         np.array([place[key] for key in order], np.int32),
         np.array([len(by_session[key]) for key in order], np.int64),
     )
-    reference, reference_seen = _dense(table.columns["reference"], node_keys)
-    node, node_seen = _dense(table.columns["node"], node_keys)
+    reference, reference_seen = _dense(found.reference, node_keys)
+    node, node_seen = _dense(found.node, node_keys)
+    found = replace(found, session=session, reference=reference, node=node)
     seen = reference_seen & node_seen
-    columns: dict[str, Any] = {
-        **table.columns,
-        "reference": reference,
-        "node": node,
-        "session": session,
-        "policy": table.policy,
-    }
-    if not seen.all():
-        columns = {name: values[seen] for name, values in columns.items()}
-    return Attempts(policies=table.policies, **columns)
+    return found if seen.all() else found.rows(seen)
 
 
 def _dense(

@@ -84,7 +84,7 @@ class References:
             raise InputError(f"{what}: node {node} is not in the map; add it first")
         return key
 
-    def nodes(self, indices: NDArray[np.int32], node_ids: Sequence[NodeId]) -> NDArray[np.int64]:
+    def nodes(self, indices: NDArray[np.integer], node_ids: Sequence[NodeId]) -> NDArray[np.int64]:
         """(R,) keys of the nodes of attempts, given as indices (R,) to `node_ids`.
 
         Raises:

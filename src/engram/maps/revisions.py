@@ -261,7 +261,7 @@ def stored_session(connection: Connection, view: View, session: Row) -> StoredSe
         nodes=tuple(saved),
         last_entry=last_entry,
         next_sequence=0 if last_entry is None else last_entry.sequence + 1,
-        next_iteration=0 if made is None else int(made.columns["iteration"].max()) + 1,
+        next_iteration=0 if made is None else int(made.iteration.max()) + 1,
     )
 
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, delete, insert, select
 
+from engram.graph.attempts import Attempts
 from engram.graph.model import Edge
-from engram.maps.attempts import AttemptTable, concatenate, pack, unpack
+from engram.maps.attempts import pack, unpack
 from engram.maps.database import upsert
 from engram.maps.keys import KeyBook
 from engram.maps.rows import Row, edge_row, sealed, verified
@@ -85,7 +86,7 @@ class RowBuffer:
         self.rows: dict[Table, list[Row]] = {table: [] for table in _TABLES}
         self._edges: dict[tuple[int, int, str], Row] = {}
         self._words: dict[int, Row] = {}
-        self._attempts: dict[int, list[AttemptTable]] = defaultdict(list)
+        self._attempts: dict[int, list[Attempts]] = defaultdict(list)
         self.size_bytes = 0
 
     def new(self, table: Table, size_bytes: int = 0, **values: Any) -> int:
@@ -117,7 +118,7 @@ class RowBuffer:
         self._words[node] = words_row(node, vocabulary, found)
         self.size_bytes += _ROW_BYTES
 
-    def put_attempts(self, session: int, made: AttemptTable) -> None:
+    def put_attempts(self, session: int, made: Attempts) -> None:
         """Adds attempts of the session of this key."""
         self._attempts[session].append(made)
         self.size_bytes += _ATTEMPT_BYTES * len(made)
@@ -138,18 +139,16 @@ class RowBuffer:
         """Packs attempts of all checkpoints together, so that the file does not depend on them."""
         written = attempts.c.revision == self._revision_key
         found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
-        tables: dict[int, list[AttemptTable]] = defaultdict(list)
+        tables: dict[int, list[Attempts]] = defaultdict(list)
         for row in verified(attempts, found):
             tables[row["session"]].append(unpack(row["body"], row["count"]))
         connection.execute(delete(attempts).where(written))
         for session, made in tables.items():
             self._write_attempts(connection, session, made)
 
-    def _write_attempts(
-        self, connection: Connection, session: int, tables: list[AttemptTable]
-    ) -> None:
+    def _write_attempts(self, connection: Connection, session: int, tables: list[Attempts]) -> None:
         rows = []
-        for count, body in pack(concatenate(tables)):
+        for count, body in pack(Attempts.joined(tables)):
             row = {"key": self._keys.next(attempts), "revision": self._revision_key}
             rows.append(sealed(attempts, {**row, "session": session, "count": count, "body": body}))
         connection.execute(insert(attempts), rows)

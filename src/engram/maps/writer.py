@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -33,7 +33,6 @@ from engram.graph.model import (
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
-from engram.maps.attempts import COLUMNS, AttemptTable
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.maps.keys import KeyBook
@@ -354,17 +353,9 @@ class RevisionWriter:
             raise InputError(f"attempts of session {session}, which is not in the map")
         if not len(made):
             return
-        columns: dict[str, NDArray[np.generic]] = {
-            name: np.asarray(
-                self._known.nodes(getattr(made, name), node_ids)
-                if name in {"reference", "node"}
-                else getattr(made, name),
-                kind,
-            )
-            for name, kind in COLUMNS
-        }
+        reference, node = (self._known.nodes(one, node_ids) for one in (made.reference, made.node))
         key, *_ = self._known.sessions[session.bytes]
-        self._rows.put_attempts(key, AttemptTable(columns, made.policy, made.policies))
+        self._rows.put_attempts(key, replace(made, reference=reference, node=node))
         self._checkpoint_if_due()
 
     def add_omission(self, omission: Omission) -> None:

@@ -63,14 +63,10 @@ class RunAttempts:
         return len(self.nodes)
 
     def newest(self, count: int) -> RunAttempts:
-        """The last `count` informative ones at most.
-
-        A failure without a prediction is not informative: a lost robot has dozens per frame.
-        """
-        telling = np.flatnonzero(self.accepted | ~np.isnan(self.distance_m))
-        if len(telling) == len(self) <= count:
+        """The last `count` at most."""
+        if len(self) <= count:
             return self
-        last = telling[-count:]
+        last = slice(len(self) - count, None)
         return RunAttempts(
             self.driven_m,
             self.at_m[last],
