@@ -17,11 +17,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import pytest
+from tests.live.in_process import InProcess
 
 from engram.errors import InputError
 from engram.frontend import StereoPair
 from engram.geometry import SE3
-from engram.live import InProcess, LiveOptions, LiveProcess, Played, Served, process
+from engram.live import LiveOptions, LiveProcess, Played, Served, process
 from engram.live.link import Link, Ring
 from engram.live.outside import Outside
 from engram.maps import open_map

@@ -7,12 +7,11 @@ A robot's middleware talks to it through `engram.live.link`, which needs nothing
 from engram.live.driving import LiveOptions
 from engram.live.process import LiveProcess
 from engram.live.served import Served
-from engram.live.transport import Command, FrameEvent, InProcess, Played, Transport
+from engram.live.transport import Command, FrameEvent, Played, Transport
 
 __all__ = [
     "Command",
     "FrameEvent",
-    "InProcess",
     "LiveOptions",
     "LiveProcess",
     "Played",

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from engram.counts import counted
 from engram.localiser import Localisation, LocalisationStatus
 from engram.maps import Map
 from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_localised
@@ -76,14 +75,6 @@ def summarise(results: Sequence[Localisation]) -> dict[str, Any]:
         "damaged_nodes": sorted({str(n) for r in results for n in r.damaged}),
         "stages_ms": stage_statistics([result.stage_ms for result in results]),
     }
-
-
-def damage_warning(damaged: Sequence[str]) -> str:
-    """The warning about unreadable nodes, of which there is at least one."""
-    return (
-        f"warning: skipped {counted(len(damaged), 'damaged node')} of the map, such as "
-        f"{damaged[0]}; run engram check for details"
-    )
 
 
 def stage_statistics(stage_ms: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:

@@ -3,7 +3,6 @@
 from engram.viewing.from_above import (
     Track,
     check_picture,
-    draw_attempts,
     draw_from_above,
     draw_panels,
 )
@@ -12,7 +11,6 @@ from engram.viewing.matches import match_picture
 __all__ = [
     "Track",
     "check_picture",
-    "draw_attempts",
     "draw_from_above",
     "draw_panels",
     "match_picture",

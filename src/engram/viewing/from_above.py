@@ -104,29 +104,6 @@ def _name(track: Track) -> str:
     return track.label.split(" (")[0]
 
 
-def draw_attempts(attempts: Mapping[str, NDArray[np.int64]], path: Path, title: str) -> None:
-    """Draws the attempts that each frame took, one line per policy.
-
-    Args:
-        attempts: policy → (F,) int64, attempts of each frame.
-        path: image file.
-        title: title of the picture.
-
-    Raises:
-        InputError: the file cannot be written.
-        MissingExtraError: Matplotlib is not installed.
-    """
-    figure, (axes,) = _axes(wide=True)
-    for policy, counts in attempts.items():
-        axes.step(np.arange(len(counts)), counts, where="mid", label=policy, linewidth=1.2)
-    axes.set_xlabel("live frame")
-    axes.set_ylabel("match attempts")
-    axes.set_ylim(0, None)
-    axes.set_title(title)
-    axes.legend(fontsize=8)
-    _save(figure, path)
-
-
 def check_picture(path: Path) -> None:
     """Checks before the work whether a picture can be written to a path.
 
@@ -157,11 +134,11 @@ def _matplotlib() -> ModuleType:
     return matplotlib
 
 
-def _axes(wide: bool = False, columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
+def _axes(columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
     _matplotlib().use("Agg")
     from matplotlib import pyplot
 
-    size = (9, 3.2) if wide else (7 * columns, 6)
+    size = (7 * columns, 6)
     figure, axes = pyplot.subplots(1, columns, figsize=size, layout="constrained", squeeze=False)
     return figure, axes[0]
 

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from engram.cli import options
+from engram.counts import counted
 
 
 def relocalise(
@@ -44,7 +45,6 @@ def relocalise(
     from engram.cli.progress import Bars
     from engram.cli.settings import read_settings
     from engram.localiser import Budget
-    from engram.robot.results import damage_warning
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
     sequence = drive.open(path)
@@ -61,8 +61,9 @@ def relocalise(
     if as_json:
         print(json.dumps({"summary": summary, "frames": [one.to_dict() for one in starts]}))
         return
-    if summary["damaged_nodes"]:
-        typer.echo(damage_warning(summary["damaged_nodes"]), err=True)
+    if damaged := summary["damaged_nodes"]:
+        nodes = counted(len(damaged), "damaged node")
+        typer.echo(f"warning: skipped {nodes} of the map, such as {damaged[0]}", err=True)
     typer.echo(
         f"{summary['found']} of {summary['frames']} frames found, {summary['unknown']} not found, "
         f"{summary['unusable_frame']} unusable; {summary['attempts']} attempts"

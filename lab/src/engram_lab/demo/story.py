@@ -23,7 +23,8 @@ from engram.robot import (
     robot_on,
     summarise,
 )
-from engram.viewing import Track, draw_attempts, draw_from_above
+from engram.viewing import Track, draw_from_above
+from engram.viewing.canvas import save, subplots
 from engram.viewing.pictures import PictureWriter
 from engram_lab.town import SimulatedDrive, campaign_named
 from engram_lab.town.simulating import simulate
@@ -134,10 +135,7 @@ def _draw(
     results: dict[str, list[Localisation]],
     drives: list[SimulatedDrive],
 ) -> None:
-    attempts = {
-        policy: np.array([one.attempts for one in found]) for policy, found in results.items()
-    }
-    draw_attempts(attempts, report.out / "attempts.png", "Attempts per frame, last drive")
+    _draw_attempts(results, report.out / "attempts.png")
     draw_from_above(
         _experience_tracks(map_path, drives, report.conditions),
         report.out / "map_from_above.png",
@@ -145,6 +143,20 @@ def _draw(
     )
     shown = _one_place(drives, report.conditions)
     cv2.imwrite(str(report.out / "one_place.png"), shown)
+
+
+def _draw_attempts(results: dict[str, list[Localisation]], path: Path) -> None:
+    """The attempts that each frame took, one line per policy."""
+    figure, (axes,) = subplots(1, width=9, height=3.2)
+    for policy, found in results.items():
+        counts = [one.attempts for one in found]
+        axes.step(np.arange(len(counts)), counts, where="mid", label=policy, linewidth=1.2)
+    axes.set_xlabel("live frame")
+    axes.set_ylabel("match attempts")
+    axes.set_ylim(0, None)
+    axes.set_title("Attempts per frame, last drive")
+    axes.legend(fontsize=8)
+    save(figure, path)
 
 
 def _experience_tracks(

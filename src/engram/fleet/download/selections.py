@@ -200,7 +200,7 @@ def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
     Raises:
         InputError: no session or several match the prefix, or its path has no node.
     """
-    found = stock.named_session(session)
+    found = stock.store.named_session(session)
     seeds = stock.on_path.get(path_id(found.id))
     if seeds is None:
         raise InputError(f"session {found.id} of {found.robot} has no node on its path")

@@ -157,19 +157,6 @@ class Stock:
             raise InputError(f"node {origin.node} was reverted in revision {origin.told[-1][0]}")
         return self.index[origin.node]
 
-    def named_session(self, prefix: str) -> Session:
-        """The one session whose UUID begins with `prefix`.
-
-        Raises:
-            InputError: no session or several match.
-        """
-        wanted = prefix.strip().lower()
-        found = [one for one in self.sessions if str(one.id).startswith(wanted)]
-        if not wanted or len(found) != 1:
-            listed = ", ".join(f"{str(one.id)[:8]} ({one.robot})" for one in found or self.sessions)
-            raise InputError(f"{len(found)} sessions begin with {prefix!r}; choose from: {listed}")
-        return found[0]
-
     def place_of(self, session: SessionId) -> int:
         """Place of a session in `sessions`."""
         return next(at for at, one in enumerate(self.sessions) if one.id == session)
