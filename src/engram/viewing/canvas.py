@@ -3,11 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from engram.errors import MissingExtraError
+from engram.errors import InputError, MissingExtraError
+
+
+def matplotlib_for_files() -> ModuleType:
+    """Matplotlib without a window.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import matplotlib
+        import matplotlib.figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "pictures need Matplotlib: pip install 'engram-localisation[plots]'"
+        ) from error
+    matplotlib.use("Agg")
+    return matplotlib
 
 
 def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple[Any, list[Any]]:
@@ -18,13 +36,7 @@ def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple
     Raises:
         MissingExtraError: Matplotlib is not installed.
     """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need Matplotlib: pip install 'engram-localisation[plots]'"
-        ) from error
-    matplotlib.use("Agg")
+    matplotlib_for_files()
     from matplotlib import pyplot
 
     columns = -(-count // rows)
@@ -38,8 +50,16 @@ def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple
 
 
 def save(figure: Any, path: Path) -> None:
-    """Writes the figure and releases its memory."""
+    """Writes the figure and releases its memory.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
     from matplotlib import pyplot
 
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # no such folder; an unknown file extension
+        raise InputError(f"the picture {path} cannot be written: {error}") from error
+    finally:
+        pyplot.close(figure)

@@ -6,18 +6,14 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import InputError, MissingExtraError
+from engram.errors import InputError
 from engram.untrusted import printable
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from engram.viewing.canvas import matplotlib_for_files, save, subplots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +70,7 @@ def draw_panels(
     """
     names = dict.fromkeys(_name(track) for _, tracks in panels for track in tracks)
     colours = {name: f"C{number % 10}" for number, name in enumerate(names)}
-    figure, all_axes = _axes(columns=len(panels))
+    figure, all_axes = subplots(len(panels), width=7 * len(panels), height=6)
     for axes, (title, tracks) in zip(all_axes, panels, strict=True):
         for track in tracks:
             x, y = track.points_m[:, 0], track.points_m[:, 1]
@@ -91,7 +87,7 @@ def draw_panels(
         axes.set_title(_shown(title))
         if tracks:
             axes.legend(fontsize=8, loc="best")
-    _save(figure, path)
+    save(figure, path)
 
 
 def _shown(text: str) -> str:
@@ -111,7 +107,7 @@ def check_picture(path: Path) -> None:
         InputError: the folder does not exist or is not writable, or the file extension is unknown.
         MissingExtraError: Matplotlib is not installed.
     """
-    formats = _matplotlib().figure.Figure().canvas.get_supported_filetypes()
+    formats = matplotlib_for_files().figure.Figure().canvas.get_supported_filetypes()
     ending = path.suffix.removeprefix(".").lower()
     if not path.parent.is_dir():
         raise InputError(f"the picture {path} cannot be written: {path.parent} is not a folder")
@@ -121,34 +117,3 @@ def check_picture(path: Path) -> None:
         )
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise InputError(f"the picture {path} cannot be written: permission denied, or a folder")
-
-
-def _matplotlib() -> ModuleType:
-    try:
-        import matplotlib
-        import matplotlib.figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures of maps need Matplotlib: pip install 'engram-localisation[plots]'"
-        ) from error
-    return matplotlib
-
-
-def _axes(columns: int = 1) -> tuple[Figure, Sequence[Axes]]:
-    _matplotlib().use("Agg")
-    from matplotlib import pyplot
-
-    size = (7 * columns, 6)
-    figure, axes = pyplot.subplots(1, columns, figsize=size, layout="constrained", squeeze=False)
-    return figure, axes[0]
-
-
-def _save(figure: Figure, path: Path) -> None:
-    from matplotlib import pyplot
-
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:  # no such folder; an unknown file extension
-        raise InputError(f"the picture {path} cannot be written: {error}") from error
-    finally:
-        pyplot.close(figure)
