@@ -118,10 +118,11 @@ def diff(
       engram diff town.engram 3 7
       engram diff town.engram winter head --picture changes.png
     """
-    from engram.maps.history import diff_revisions
+    from engram.maps import open_map
     from engram.viewing.difference import draw_difference
 
-    found = diff_revisions(map_path, before, after, stretch_m=stretch)
+    with open_map(map_path) as town:
+        found = town.diff(before, after, stretch)
     if picture is not None:
         draw_difference(map_path, found, picture)
     typer.echo(json.dumps(found.to_dict()) if as_json else found.text())
@@ -149,7 +150,8 @@ def tag(
       engram tag town.engram
       engram tag town.engram winter --delete
     """
-    from engram.maps.history import delete_tag, map_tags, tag_dict, tag_revision
+    from engram.maps import open_map
+    from engram.maps.history import map_tags, tag_dict
 
     if name is None:
         _check_only_listing({"--delete": delete, "--move": move, "--message": bool(message)})
@@ -161,11 +163,11 @@ def tag(
             typer.echo(f"{one['name']:20s} revision {one['revision']}  {one['message']}")
         return
     who = user()
-    if delete:
-        done = tag_dict(delete_tag(map_path, name, author=who))
-    else:
+    with open_map(map_path) as town:
         done = tag_dict(
-            tag_revision(map_path, name, revision, author=who, message=message, move=move)
+            town.untag(name, author=who)
+            if delete
+            else town.tag(name, revision, author=who, message=message, move=move)
         )
     if as_json:
         print(json.dumps(done))

@@ -4,17 +4,15 @@ from engram.mapper.edges import edge_through_live, match_edges
 from engram.mapper.loops import LoopConfig, LoopSearch
 from engram.mapper.mapper import Mapper, MapperConfig
 from engram.mapper.memory import Memory, Walk
-from engram.mapper.saver import FrameHolder, NodeSaver, Records, RecordWriter, Saver
+from engram.mapper.saver import NodeSaver, Records, Saver
 
 __all__ = [
-    "FrameHolder",
     "LoopConfig",
     "LoopSearch",
     "Mapper",
     "MapperConfig",
     "Memory",
     "NodeSaver",
-    "RecordWriter",
     "Records",
     "Saver",
     "Walk",

@@ -8,28 +8,19 @@ from queue import Full, Queue
 from threading import Thread
 from typing import Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from engram.errors import MapError
 from engram.frontend import Frame
-from engram.graph.model import Attempt, Edge, Node, NodeId, PathEntry
+from engram.graph.model import Attempt, Edge, Node, PathEntry
+from engram.maps import RevisionWriter
+from engram.maps.frame_reader import FrameReader
 from engram.places.words import NodeWords
 
 # Most frames that wait to be written, about 40 MB; beyond it a slow disk slows the drive.
 _QUEUE_LENGTH = 1000
 
 
-class FrameHolder(Protocol):
-    """Keeps frames readable while they wait to be written."""
-
-    def hold(self, node: NodeId, frame: Frame) -> None:
-        """Keeps a frame readable until its node has been written."""
-        ...
-
-
 class PathWriter(Protocol):
-    """Where a session's path and attempts go."""
+    """Where a session's path and attempts go: a map, or a spool."""
 
     def add_path_entry(self, entry: PathEntry) -> None:
         """Adds a step of the session's path."""
@@ -41,28 +32,6 @@ class PathWriter(Protocol):
 
     def checkpoint(self) -> None:
         """Makes everything added so far durable."""
-        ...
-
-
-class RecordWriter(PathWriter, Protocol):
-    """Where all of a session's records go; `engram.maps.RevisionWriter` is one."""
-
-    def add_node(self, node: Node, frame: Frame) -> None:
-        """Adds a node with its frame."""
-        ...
-
-    def add_words(self, node: NodeId, vocabulary: bytes, found: NDArray[np.int32]) -> None:
-        """Adds the visual words of a node.
-
-        Args:
-            node: the node.
-            vocabulary: hash of the vocabulary.
-            found: (W,) int32, numbers of its words.
-        """
-        ...
-
-    def add_edge(self, edge: Edge) -> None:
-        """Adds an edge, or supersedes one."""
         ...
 
 
@@ -95,8 +64,8 @@ class NodeSaver:
         words: finds the words stored with saved nodes; None stores none.
     """
 
-    writer: RecordWriter
-    frames: FrameHolder
+    writer: RevisionWriter
+    frames: FrameReader
     words: NodeWords | None = None
 
     def hold(self, records: Records) -> None:

@@ -5,13 +5,10 @@ from engram.maps.hiding import Reverted
 from engram.maps.history import (
     RevertReport,
     blame_node,
-    delete_tag,
-    diff_revisions,
     map_log,
     map_tags,
     revert_revision,
     show_revision,
-    tag_revision,
 )
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, compact_map, copy_map, publish_map
@@ -58,8 +55,6 @@ __all__ = [
     "check_file",
     "compact_map",
     "copy_map",
-    "delete_tag",
-    "diff_revisions",
     "map_log",
     "map_tags",
     "moves",
@@ -67,5 +62,4 @@ __all__ = [
     "publish_map",
     "revert_revision",
     "show_revision",
-    "tag_revision",
 ]

@@ -12,7 +12,7 @@ from typing import Any
 from engram.counts import counted
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock, Session
-from engram.maps.difference import STRETCH_M, MapDifference, difference, hours_of_nodes
+from engram.maps.difference import MapDifference, difference, hours_of_nodes
 from engram.maps.hiding import Reverted
 from engram.maps.opening import open_map
 from engram.maps.records import MapContents, Revision
@@ -85,44 +85,6 @@ def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDiff
         return shown, difference(max(number - 1, 0), store.load(), number, new)
 
 
-def diff_revisions(
-    path: Path, before: int | str, after: int | str, *, stretch_m: float = STRETCH_M
-) -> MapDifference:
-    """Compares two revisions of a map.
-
-    Args:
-        path: NAME.engram.
-        before, after: numbers or names of the revisions.
-        stretch_m: length of the stretches by which changes are listed, metres.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
-        InputError: the length is not positive.
-    """
-    with open_map(path) as town:
-        return town.diff(before, after, stretch_m)
-
-
-def tag_revision(
-    path: Path,
-    name: str,
-    named: int | str | None,
-    *,
-    author: str,
-    message: str = "",
-    move: bool = False,
-) -> Tag:
-    """Tags a revision; `Map.tag` lists the errors."""
-    with open_map(path) as store:
-        return store.tag(name, named, author=author, message=message, move=move)
-
-
-def delete_tag(path: Path, name: str, *, author: str) -> Tag:
-    """Removes a tag; `Map.untag` lists the errors."""
-    with open_map(path) as store:
-        return store.untag(name, author=author)
-
-
 def map_tags(path: Path) -> list[dict[str, Any]]:
     """The tags of a map, by name.
 
@@ -188,7 +150,13 @@ class RevertReport:
 
 def _rows_text(counts: Mapping[str, int]) -> str:
     """Number of rows by table, without tables that have none."""
-    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items() if count)
+    return ", ".join(counted(count, _one_of(name)) for name, count in counts.items() if count)
+
+
+def _one_of(table: str) -> str:
+    """A row of a table, as it is called: `path_entries` has path entries."""
+    name = table.replace("_", " ")
+    return f"{name[:-3]}y" if name.endswith("ies") else name.removesuffix("s")
 
 
 def revert_revision(

@@ -159,7 +159,7 @@ def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
 
 
 def seal_map(path: Path) -> list[dict[str, Any]]:
-    """Commits the saved part of interrupted sessions, for ``engram seal``.
+    """Commits the saved part of interrupted sessions, for ``engram check --seal``.
 
     Raises:
         MapError: the map cannot be written.
