@@ -12,9 +12,10 @@ from tests.mapping_rig import session_for
 from tests.synthetic_world import Seen, World, drive
 
 from engram.doctor import DoctorConfig
-from engram.errors import ConfigError, StorageFullError
+from engram.errors import ConfigError, MapError, MapLockedError, StorageFullError
 from engram.fleet.merge import merge
 from engram.maps import Map, RevisionWriter, check_file, open_map
+from engram.maps.sqlite import SqliteDatabase
 from engram.robot import Robot, Settings
 from engram.robot.saved import SavingState
 
@@ -229,6 +230,29 @@ def test_where_nothing_can_be_sealed_the_robot_localises_and_saves_nothing(
     monkeypatch.undo()
     with open_map(path) as opened, opened.robot(CAMERA, name="r1", maps=True) as robot:
         assert robot.saving.recovered == (1,)
+
+
+@pytest.mark.parametrize(
+    ("error", "is_raised"), [(MapError("is read-only"), False), (MapLockedError("locked"), True)]
+)
+def test_on_a_read_only_disk_a_mapping_robot_localises(
+    path: Path, monkeypatch: pytest.MonkeyPatch, error: MapError, is_raised: bool
+) -> None:
+    mapped(path)
+
+    def fails(_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(SqliteDatabase, "lock_for_writing", fails)
+    with open_map(path) as opened:
+        if is_raised:
+            with pytest.raises(MapLockedError):
+                opened.robot(CAMERA, name="r1", maps=True)
+            return
+        with opened.robot(CAMERA, name="r1", maps=True) as robot:
+            assert "localised" in run(robot, AGAIN[:5])
+    assert robot.saving.state is SavingState.FAILED
+    assert "is read-only" in robot.saving.text()
 
 
 def test_a_drive_that_the_map_holds_is_not_saved_again(path: Path) -> None:

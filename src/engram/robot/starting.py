@@ -97,10 +97,17 @@ def robot_in(
         localiser, deadline_ms = owner.localiser_in(opened), owner.options.deadline_ms
         front = front or Front(owner.settings, owner.camera)
         return Robot(front, localiser, deadline_ms=deadline_ms)
-    if not maps:
+    if not maps or saving is None:
         return _keeping(owner, IntoMemory(owner, opened), front, saving)
-    commit_spools(Path(opened.location))
-    return _keeping(owner, IntoMap(owner, open_map(opened.location)), front, saving)
+    try:
+        commit_spools(Path(opened.location))
+        into: Into = IntoMap(owner, open_map(opened.location))
+    except MapLockedError:
+        raise
+    except MapError as error:  # on a read-only disk it localises, as on a full one
+        saving.state, saving.reason = SavingState.FAILED, str(error)
+        into = IntoMemory(owner, opened)
+    return _keeping(owner, into, front, saving)
 
 
 def _saving_in(opened: Map, owner: Owner, *, maps: bool) -> Saving:
