@@ -76,6 +76,7 @@ def test_a_drive_that_saves_nothing_is_resumed_where_it_stopped(
     assert not second.interrupted
     assert second.revision == 2
     assert len(first.results) + len(second.results) >= 16
+    assert len(repr(second)) < 2_000  # as an interactive session prints it
     assert check_map(parts)["sound"]
     sequences = [sequence for sequence, _, _ in path_of(parts)]
     assert sequences == list(range(len(sequences)))

@@ -51,7 +51,7 @@ class MapReport:
     interrupted: bool = False
     skipped: int = 0
     diagnosis: Diagnosis | None = None
-    results: list[Localisation] = field(default_factory=list)
+    results: list[Localisation] = field(default_factory=list, repr=False)
 
     @property
     def saved(self) -> int:
