@@ -273,9 +273,7 @@ def test_a_first_step_that_is_far_off_is_forgotten_once_better_ones_came() -> No
     vague = OdometryStep(OdometryStatus.OK, good, np.eye(6) * 0.2**2, 20)
     for k in range(2, 10):
         motion = gaps.motion(vague, k * 100 * MS)
-    # Nothing is missing, so it is not doubted; but eight vague steps may be wrong together.
-    np.testing.assert_allclose(motion.covariance[3:, 3:], vague.covariance[3:, 3:])
-    assert motion.covariance[2, 2] == pytest.approx(0.2**2 * (8**2 - 7**2))
+    assert motion.covariance is vague.covariance  # nothing is missing: it is not doubted
     assert gaps.motion(BLIND, 1000 * MS).prev_from_curr.distance_m == pytest.approx(0.5)
 
 

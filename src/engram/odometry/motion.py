@@ -67,10 +67,17 @@ class GapConfig:
         Meta(
             gt=0,
             description="largest standard deviation of a step that counts for the speed, as a "
-            "share of its length; a vaguer one may be wrong as those before it: at night in rain "
-            "most are too short",
+            "share of its length: wrong steps in rain and at night are mostly too short",
         ),
     ] = 0.25
+    vague_share: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="standard deviation of a vague step, as a share of its length: errors of "
+            "such steps in a row have one cause, and add up",
+        ),
+    ] = 0.4
     newest_steps: Annotated[
         int,
         Meta(
@@ -320,7 +327,7 @@ class GapFiller:
 
     def _vague_from_m(self, measured: SE3, seconds: float) -> float:
         """Standard deviation from which a step is vague, metres."""
-        share = self._config.sharp_share
+        share = self._config.vague_share
         return max(share * self._step_m(measured, seconds), self._config.least_sigma_m)
 
     def _wrong_m(self, guess: SE3, seconds: float) -> float:
