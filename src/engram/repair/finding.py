@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from engram.frontend.matching import MatcherConfig
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, LandmarkSource
 from engram.graph.paths import PathMemory
@@ -112,7 +111,6 @@ def find_wrong_edges(
     paths: PathMemory,
     frames: LandmarkSource,
     config: RepairConfig | None = None,
-    matcher: MatcherConfig | None = None,
     monitor: Monitor = QUIET,
 ) -> Findings:
     """Finds the edges of a map that join what does not belong together.
@@ -127,14 +125,13 @@ def find_wrong_edges(
         paths: its path memory.
         frames: the landmarks of its nodes.
         config: settings.
-        matcher: settings of the matcher; None for the defaults.
         monitor: receives progress, and may stop the search.
     """
-    config, matcher = config or RepairConfig(), matcher or MatcherConfig()
+    config = config or RepairConfig()
     crossings = Crossings.of(graph, paths)
     gone: dict[int, Finding] = {}
     while True:
-        search = _Search(graph, crossings, frames, config, matcher, gone)
+        search = _Search(graph, crossings, frames, config, gone)
         found = search.findings(monitor)
         alone = [one for one in found if one.surety >= 1 and one.why == "alone"]
         if not alone:
@@ -153,11 +150,10 @@ class _Search:
         crossings: Crossings,
         frames: LandmarkSource,
         config: RepairConfig,
-        matcher: MatcherConfig,
         gone: Mapping[int, Finding],
     ) -> None:
         self._graph, self._crossings, self._frames = graph, crossings, frames
-        self._config, self._matcher, self._gone = config, matcher, gone
+        self._config, self._gone = config, gone
         self._suspicion = suspect(graph, config, gone)
         trusted = self._suspicion.measured & ~self._suspicion.contradicted
         trusted[list(gone)] = False
@@ -172,7 +168,7 @@ class _Search:
         )
         alone = suspicion.measured & ~suspicion.confirmed & ~suspicion.contradicted & ~odometry
         rows = np.flatnonzero(suspicion.contradicted | alone).tolist()
-        looks = SecondLooks(self._graph, self._frames, self._trusted, self._matcher, self._config)
+        looks = SecondLooks(self._graph, self._frames, self._trusted, self._config)
         found = []
         with monitor.stage("second looks", len(rows)) as stage:
             for row in rows:

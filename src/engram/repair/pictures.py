@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, MapCorruptError
-from engram.frontend.matching import MatcherConfig, match_frames, pair_seed
+from engram.frontend import feature_kind
+from engram.frontend.matching import match_frames, pair_seed
 from engram.graph.model import NodeId
 from engram.maps.frame_reader import FrameReader
 from engram.repair.finding import Finding, Findings
@@ -67,7 +68,8 @@ def _inliers(
         reference, live = frames.frame(a), frames.frame(b)
     except MapCorruptError:
         return nothing, nothing
-    match = match_frames(reference, live, MatcherConfig(), pair_seed(b, a))
+    matcher = feature_kind(live.descriptor).matcher
+    match = match_frames(reference, live, matcher, pair_seed(b, a))
     return tuple(  # type: ignore[return-value]
         (frame.landmarks.pixels[rows] / (frame.camera.width, frame.camera.height)).astype(
             np.float32

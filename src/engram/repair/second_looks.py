@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from engram.errors import MapCorruptError
-from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
+from engram.frontend import feature_kind
+from engram.frontend.matching import Match, match_frames, pair_seed
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, LandmarkSource
@@ -44,7 +45,6 @@ class SecondLooks:
         graph: the graph.
         frames: the landmarks of its nodes.
         surroundings: the ways that lead to the nodes around.
-        matcher: settings of the matcher.
         config: which pairs are looked at.
     """
 
@@ -53,13 +53,11 @@ class SecondLooks:
         graph: ExperienceGraph,
         frames: LandmarkSource,
         surroundings: Surroundings,
-        matcher: MatcherConfig,
         config: RepairConfig,
     ) -> None:
         self._graph = graph
         self._frames = frames
         self._surroundings = surroundings
-        self._matcher = matcher
         self._config = config
 
     def at(self, row: int) -> list[Look]:
@@ -106,7 +104,8 @@ class SecondLooks:
         ids = [self._graph.node(near.node).id for near in (one, other)]
         try:
             reference, live = (self._frames.frame(node) for node in ids)
-            match = match_frames(reference, live, self._matcher, pair_seed(ids[1], ids[0]))
+            matcher = feature_kind(live.descriptor).matcher
+            match = match_frames(reference, live, matcher, pair_seed(ids[1], ids[0]))
         except MapCorruptError:
             match = Match(None, None, 0, *(np.empty(0, np.int32),) * 2)
         way_m = max(one.way_m, other.way_m)
