@@ -295,7 +295,7 @@ def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Pat
     path = begun.runs_path(plan.folds[0].held_out[0], "memo")
     runs = read_runs(path)
     assert runs is not None
-    unfinished = Configuration("distance", 4)
+    unfinished = Configuration("distance", 8)
     write_runs(path, only(runs, set(runs.configurations) - {unfinished}))
     found = collect(begun)
     assert unfinished not in found.memo
@@ -304,7 +304,7 @@ def test_what_was_not_run_in_every_session_is_left_out(plan: Plan, tmp_path: Pat
     assert found.left_out == {unfinished: SESSIONS - 1}
     write_report(tmp_path / "out", [begun])
     told = (tmp_path / "out" / "report.md").read_text()
-    assert f"not run on the same {SESSIONS} sessions: distance (Np = 4) on {SESSIONS - 1}." in told
+    assert f"not run on the same {SESSIONS} sessions: distance (Np = 8) on {SESSIONS - 1}." in told
     # Only the folds that have it: there it is shown.
     other = replace(begun, options=replace(begun.options, only_folds=(1,)))
     assert unfinished in collect(other).memo
