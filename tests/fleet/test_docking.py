@@ -303,7 +303,7 @@ class TestReported:
         merge(mixed, [fleet["other"][0], fleet["longer"][0]], apart)
         (report,) = merged(centre, mixed)
         (note,) = [note for note in report.notes if "not connected to the existing map" in note]
-        assert note.startswith(f"{nodes_in(fleet['other'][0])} added nodes")
+        assert f": {nodes_in(fleet['other'][0])} added nodes;" in note
 
     def test_two_robots_of_one_name(self, tmp_path, fleet):
         maps = []
