@@ -173,7 +173,10 @@ def _is_outdated(target: Path) -> bool:
     """Whether a whole log is there, which a session that is rendered anew replaces."""
     if not target.exists():
         return False
-    log = FrameLog(target)
+    try:
+        log = FrameLog(target)
+    except SequenceError:  # its worker died before the first frame
+        return False
     log.close()
     return log.complete
 
