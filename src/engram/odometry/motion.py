@@ -285,8 +285,8 @@ class GapFiller:
             self._velocities.append(twist_per_s[:3].tolist())
             self._velocity = _median(self._velocities)
             speed_m_per_s = math.sqrt(self._velocity @ self._velocity)
-            slower = self._fast_m_per_s if not sharp else 0.0
-            self._fast_m_per_s = max(speed_m_per_s, slower)
+            since_m_per_s = 0.0 if sharp else self._fast_m_per_s
+            self._fast_m_per_s = max(speed_m_per_s, since_m_per_s)
         # A Kalman filter; the turn rate changes per step by the error of a guess. The change does
         # not grow over a gap: the next guesses would then rest on the first uncertain step.
         change_rad = max(self._config.sigma_rad_per_m * step_m, self._config.least_sigma_rad)

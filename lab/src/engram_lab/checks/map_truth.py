@@ -4,6 +4,7 @@
     python -m engram_lab.checks.map_truth village --out village.engram
     python -m engram_lab.checks.map_truth village --out few.engram --sessions 0,5,9
     python -m engram_lab.checks.map_truth begbroke24h --out merged4-3.engram --judge
+    python -m engram_lab.checks.map_truth trial --seed 303 --out town.engram      # a small town
 
 Tells of each drive what was localised and saved; then, of each kind of edge, how many are wrong by
 more than a metre, and how many join two places: more than 5 m off, and more than three of their own
@@ -32,6 +33,7 @@ from engram_lab.studies.drives import EvaluatedDrive, drives_of
 from engram_lab.studies.starting import TrueNodes
 from engram_lab.town import Size, campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
+from engram_lab.trial_towns import trial_town
 
 WRONG_M, OTHER_PLACE_M = 1.0, 5.0
 STANDS, VIEW_GATE_RAD, CERTAIN = 150, float(np.deg2rad(60.0)), np.eye(6) * 0.1**2
@@ -41,7 +43,9 @@ def map_all(drives: list[EvaluatedDrive], path: Path) -> None:
     """Adds each drive to the map."""
     for drive in drives:
         report = map_drive(path, open_drive(drive.path), Settings(), RobotOptions())
-        print(f"{drive.name:45} {report.saved} nodes saved", flush=True)
+        found = sum(one.localised for one in report.results)
+        frames = f"{found} of {len(report.results)} frames localised"
+        print(f"{drive.name:45} {report.saved} nodes saved, {frames}", flush=True)
 
 
 def judge(drives: list[EvaluatedDrive], path: Path) -> int:
@@ -103,7 +107,11 @@ def main() -> None:
     parser.add_argument("--campaigns", type=Path, default=campaigns_folder())
     parser.add_argument("--sessions", type=numbers, help="numbers, joined by commas; all without")
     asked = parser.parse_args()
-    campaign = campaign_named(asked.campaign, asked.seed, Size.STANDARD)
+    campaign = (
+        trial_town(asked.seed)
+        if asked.campaign == "trial"
+        else campaign_named(asked.campaign, asked.seed, Size.STANDARD)
+    )
     chosen = asked.sessions or range(len(campaign.sessions))
     folder = campaign_folder(asked.campaigns, campaign)
     logs = [folder / f"{campaign.session(number).name}.framelog" for number in chosen]

@@ -2,10 +2,12 @@
 
     python -m engram_lab.checks.right_fixes                    # held-out towns
     python -m engram_lab.checks.right_fixes --towns 401,402 --json right.json
+    python -m engram_lab.checks.right_fixes --set localiser.acceptance.rival_share=1000
 
 Every drive of a small town is localised in each map that it is no part of, once by each rule, from
 a true start. Fixes within 1 m and 5° are right. Lost is what the rule of inliers found rightly and
-`confidence` did not, less what only `confidence` found, in points of the frames.
+`confidence` did not, less what only `confidence` found, in points of the frames. `--set` changes a
+setting of the robots that are localised; maps are those of the defaults.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from engram.cli.settings import read_settings
 from engram.frontend import BRIEF, DescriptorKind
 from engram.localiser import Rule
 from engram.monitor import QUIET
@@ -65,9 +68,10 @@ def fixes(street: Street, rule: Rule) -> tuple[frozenset[int], int]:
     return frozenset(right), false
 
 
-def compared(towns: Sequence[int], settings: Settings) -> Iterator[Compared]:
-    """All drives of some towns."""
+def compared(towns: Sequence[int], settings: Settings, live: Settings) -> Iterator[Compared]:
+    """All drives of some towns, localised with settings of their own in maps of `settings`."""
     for plan, name, street in all_streets(towns, settings, 8, QUIET):
+        street.settings = live
         found = {rule: fixes(street, rule) for rule in Rule}
         street.close()
         yield Compared(
@@ -102,9 +106,11 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(HELD_OUT_TOWNS))
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
     asked = parser.parse_args()
-    rows = []
-    for row in compared(asked.towns, Settings().for_descriptor(asked.kind)):
+    settings, rows = Settings().for_descriptor(asked.kind), []
+    live = read_settings(None, asked.set).for_descriptor(asked.kind)
+    for row in compared(asked.towns, settings, live):
         rows.append(row)
         counts = ", ".join(f"{rule.value} {len(row.right[rule])}" for rule in Rule)
         print(f"{row.street} {row.weather} {row.robot}: {counts} of {row.frames}", flush=True)
