@@ -209,11 +209,19 @@ def test_plot_draws_a_map(engram, street: Path, tmp_path: Path, by: str) -> None
     assert picture.stat().st_size > 5000
 
 
-def test_goals_far_from_the_map_are_warned_of_and_exported(engram, street, tmp_path) -> None:
+def test_goals_that_move_or_are_far_from_the_map_are_named_and_exported(
+    engram, street, tmp_path
+) -> None:
     town, table = tmp_path / "town.engram", tmp_path / "town.csv"
     engram("map", town, street)
     assert not engram("goal", "add", town, "dock", "--x", 2, "--y", 1).err
     assert "from the nearest node" in engram("goal", "add", town, "far", "--x", 400, "--y", 1).err
+    moved = engram("goal", "add", town, "dock", "--x", 3, "--y", 1).out.splitlines()
+    assert "x      3.00" in moved[0]
+    assert moved[1].startswith("moved from       x      2.00")
+    assert engram(*moved[2].removeprefix("to undo: engram ").split()).status == 0
+    listed = engram("goal", "list", town, "--json").json["goals"]
+    assert {one["name"]: round(one["x_m"]) for one in listed} == {"dock": 2, "far": 400}
     nodes = engram("info", town, "--json").json["nodes"]
     assert f"{nodes} nodes, 2 goals" in engram("export", town, table).out
     assert "needs a name" in engram("goal", "remove", town).err

@@ -122,7 +122,7 @@ def goal(
     """Store poses in a map, list or remove them.
 
     A goal is stored relative to the nearest node, so it survives merges, downloads and new anchors.
-    Adding a goal under an existing name replaces it. Each change is a revision that engram revert
+    Adding a goal under an existing name moves it. Each change is a revision that engram revert
     can undo. A goal that was removed from a fleet map does not come back with a robot's hand-in.
 
     \b
@@ -161,8 +161,13 @@ def goal(
             "plot shows?",
             err=True,
         )
-    typer.echo(json.dumps(added) if as_json else
-               f"{_goal_text(added)}; revision {added['revision']}")  # fmt: skip
+    if as_json:
+        print(json.dumps(added))
+        return
+    typer.echo(f"{_goal_text(added)}; revision {added['revision']}")
+    if (before := added["replaced"]) is not None:
+        typer.echo(_goal_text({**before, "name": "moved from"}))
+        typer.echo(undo_text(map_path, added["revision"]))
 
 
 def _goal_text(one: dict[str, object]) -> str:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from engram.errors import InputError
 from engram.graph.marks import Goal
 from engram.maps import Map
@@ -21,6 +19,10 @@ def add_goal(
 ) -> dict[str, Any]:
     """Stores a pose of the map frame as a goal, in a revision of its own.
 
+    Returns:
+        The goal as `list_goals` describes it; `replaced`, the earlier goal of its name or None; and
+        the number of the `revision`.
+
     Raises:
         InputError: the name is empty, a number is not finite, or the map has no nodes.
         MapError: the map cannot be written.
@@ -28,19 +30,15 @@ def add_goal(
     if not name.strip():
         raise InputError("a goal needs a name")
     with Map.open(path, writes=True) as store:
-        goal = store.frame.goal(x_m, y_m, yaw_rad, name)
+        before, goal = store.goals.get(name), store.frame.goal(x_m, y_m, yaw_rad, name)
         about = {"goal": {"name": name, "x_m": x_m, "y_m": y_m, "yaw_rad": yaw_rad}}
         with store.begin_revision(
             author=author, message=f"goal {name}", configuration=about
         ) as writer:
             writer.add_mark(goal)
             revision = writer.commit().number
-        away_m = float(np.linalg.norm(goal.node_from_goal.translation))
-        where = store.frame.locate(goal).to_dict()
-    return {
-        "name": name, "node": str(goal.node), "from_node_m": round(away_m, 3), **where,
-        "revision": revision,
-    }  # fmt: skip
+        replaced = None if before is None else _described(before, store)
+        return {**_described(goal, store), "replaced": replaced, "revision": revision}
 
 
 def remove_goal(path: Path, name: str, *, author: str) -> dict[str, Any]:
@@ -82,13 +80,14 @@ def list_goals(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
         MapError: the map cannot be read, or has no such revision.
     """
     with Map.open(path, at=at) as store:
-        frame = store.frame
-        return [
-            {
-                "name": name,
-                "node": str(goal.node),
-                "from_node_m": round(goal.node_from_goal.distance_m, 3),
-                **frame.locate(goal).to_dict(),
-            }
-            for name, goal in sorted(store.goals.items())
-        ]
+        return [_described(goal, store) for _, goal in sorted(store.goals.items())]
+
+
+def _described(goal: Goal, store: MapReader) -> dict[str, Any]:
+    """Name, node and place of a goal."""
+    return {
+        "name": goal.name,
+        "node": str(goal.node),
+        "from_node_m": round(goal.node_from_goal.distance_m, 3),
+        **store.frame.locate(goal).to_dict(),
+    }
