@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from uuid import uuid4
 
 import numpy as np
@@ -20,7 +21,7 @@ from engram.geometry import SE3
 from engram.localiser import Position
 from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
-from engram.robot import Robot
+from engram.robot import Robot, map_drive
 
 ROAD = np.arange(0.0, 20.0, 0.7)
 LIVE = drive(World(30.0), ROAD, seed=1, start_ns=10**15)
@@ -167,3 +168,10 @@ def test_another_thread_may_ask_for_poses_during_a_step(robot: Robot) -> None:
         sys.setswitchinterval(interval_s)
     assert not faults
     assert robot.pose_at(stamps_ns[-1]) is not None
+
+
+@pytest.mark.parametrize("given", ["sequences/06", Path("sequences/06"), [], None])
+def test_what_is_not_a_drive_is_not_mapped_and_the_error_says_what_to_call(tmp_path, given) -> None:
+    with pytest.raises(InputError, match=rf"{type(given).__name__} is not .*open_drive\(PATH\)"):
+        map_drive(tmp_path / "town.engram", given)
+    assert not list(tmp_path.iterdir())

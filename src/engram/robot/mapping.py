@@ -105,7 +105,7 @@ def map_drive(
 
     Args:
         map_path: NAME.engram.
-        sequence: the drive.
+        sequence: the drive, as `open_drive` gives it.
         settings: the resolved configuration, kept with the revision; None for the defaults.
         options: how to map it; None for the defaults.
         monitor: receives the status of each frame, and may stop the drive.
@@ -116,6 +116,7 @@ def map_drive(
     Raises:
         ConfigError: the frame log or the map has another kind of descriptor than required, or the
             threads are too few.
+        InputError: the sequence is a path or a list, not a drive.
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; the earlier frames are saved.
         UnfitDriveError: the doctor found something fatal, and `options.force` is not set; nothing

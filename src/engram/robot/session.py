@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from engram.errors import SequenceError
+from engram.errors import InputError, SequenceError
 from engram.graph.model import Session
 from engram.sequences import (
     Drive,
@@ -19,7 +19,7 @@ from engram.sequences import (
 DriveSequence: TypeAlias = StereoSequence | FrameLog
 
 
-def open_drive(path: Path, **options: Any) -> Drive:
+def open_drive(path: Path | str, **options: Any) -> Drive:
     """Opens a drive.
 
     Args:
@@ -38,8 +38,14 @@ def session_of_drive(sequence: DriveSequence) -> Session:
     """The session of a drive: the same drive read twice is the same session (method §2.7).
 
     Raises:
+        InputError: it is no drive, but its path or a list of pairs.
         SequenceError: the drive has no usable frame.
     """
+    if not isinstance(sequence, StereoSequence | FrameLog):
+        raise InputError(
+            f"a value of {type(sequence).__name__} is not a drive: open a path with "
+            "engram.open_drive(PATH); give pairs of your own to `step` of Map.robot(maps=True)"
+        )
     info = sequence.info
     if isinstance(sequence, FrameLog):
         return session_of(

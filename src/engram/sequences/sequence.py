@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -39,6 +39,7 @@ class SequenceInfo:
     zone: str | None = None
 
 
+@runtime_checkable
 class StereoSequence(Protocol):
     """A drive as rectified stereo pairs, in the order of time."""
 
