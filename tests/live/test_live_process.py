@@ -19,12 +19,14 @@ import numpy as np
 import pytest
 from tests.live.in_process import InProcess
 
-from engram.errors import InputError
+from engram.errors import InputError, MapError
 from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.live import LiveOptions, LiveProcess, Played, Served, process
+from engram.live.driving import Driving
 from engram.live.link import Link, Ring
 from engram.live.outside import Outside
+from engram.localiser import Localiser
 from engram.maps import open_map
 from engram.robot import RobotOptions, map_drive, open_drive
 
@@ -190,6 +192,22 @@ def test_odometry_goes_on_without_a_map(
     after = seen(client, pairs[1])
     assert after["status"] == "localised"
     assert after["odom_from_live"] != before["odom_from_live"]
+
+
+def test_a_frame_at_which_the_map_failed_keeps_its_motion(
+    pairs: list[StereoPair], town: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise MapError("the disk failed")
+
+    driving = Driving(LiveOptions(town, robot=OPTIONS))
+    driving.step(pairs[0])
+    with monkeypatch.context() as patched:
+        patched.setattr(Localiser, "localise", fails)
+        failed = driving.step(pairs[1])
+    assert failed.trouble == "the disk failed"
+    assert failed.motion.prev_from_curr.distance_m == pytest.approx(0.8, abs=0.1)
+    driving.pause()
 
 
 def test_a_clock_that_goes_back_begins_the_drive_anew(

@@ -16,6 +16,7 @@ from tests.synthetic_world import World, drive
 
 import engram
 from engram import _core
+from engram.errors import MapError
 from engram.localiser import (
     Budget,
     Hint,
@@ -191,6 +192,28 @@ def test_a_pose_beside_a_frame_that_was_only_followed_lies_between(localiser: Lo
         assert later is not None
         way_m = later.node_from_live.translation - known.node_from_live.translation
         np.testing.assert_allclose(way_m, [0.0, 0.0, ahead_m], atol=0.02)
+
+
+def test_a_frame_at_which_the_map_failed_is_driven_all_the_same(
+    localiser: Localiser,
+) -> None:
+    at_ns = LIVE[4].frame.stamp_ns
+
+    class Failing(Keeper):
+        def hint(self, live, motion) -> Hint | None:
+            if live.stamp_ns == at_ns:
+                raise MapError("the disk failed")
+            return None
+
+    robot = Robot(Front(Settings()), localiser, Failing())
+    known = [robot.step(seen.logged) for seen in LIVE[:4]][-1].position
+    with pytest.raises(MapError, match="disk"):
+        robot.step(LIVE[4].logged)
+    robot.step(LIVE[5].logged)
+    for stamp_ns, ahead_m in ((at_ns, 0.7), ((at_ns + LIVE[5].frame.stamp_ns) // 2, 1.05)):
+        where = robot.pose_at(stamp_ns)
+        way_m = where.node_from_live.translation - known.node_from_live.translation
+        np.testing.assert_allclose(way_m, [0.0, 0.0, ahead_m], atol=0.03)
 
 
 def test_a_robot_is_placed_and_lost_again(localiser: Localiser) -> None:

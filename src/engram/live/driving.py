@@ -163,7 +163,8 @@ class Driving:
         except EngramError as error:
             self.pause()
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
-            return Step(trouble=self.trouble)
+            taken = (one.motion for one in robot.track[-1:] if one.stamp_ns == frame.stamp_ns)
+            return Step(next(taken, None), trouble=self.trouble)
         self._belief = found.position
         map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
         if found.status is LocalisationStatus.LOCALISED or found.position is None or found.saved:

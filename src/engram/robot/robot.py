@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Self
 
 from engram.doctor import Diagnosis
-from engram.errors import ConfigError, InputError
+from engram.errors import ConfigError, InputError, MapError
 from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
@@ -88,8 +88,9 @@ class Robot:
         self._stamp_ns: int | None = None
         # Rising stamps of the newest frames that came too late.
         self._early_ns: list[int] = []
-        # Replaced, never changed: another thread may ask `pose_at`.
-        self._track: tuple[tuple[int, Localisation], ...] = ()
+        # The newest frames, also those where an error came. Replaced, never changed: another
+        # thread may ask `pose_at`.
+        self.track: tuple[Localisation, ...] = ()
         self._closed = False
         self.recorder: Recorder | None = None
         # Called after each step with the frame and its result, such as by a viewer.
@@ -184,12 +185,17 @@ class Robot:
             frame, motion = self._taken(arrived, motion, clock)
             deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
             self._localiser.move(motion)
-            found = self._known(frame, motion)
-            if found is None:
-                found = self._localiser.localise(frame, deadline, self._keeper, clock)
-            for stamp_ns in found.withdraws:
-                self._withdraw_at(stamp_ns)
-            found = self._keeper.keep(frame, found)
+            try:
+                found = self._known(frame, motion)
+                if found is None:
+                    found = self._localiser.localise(frame, deadline, self._keeper, clock)
+                for earlier in self.track if found.withdraws else ():
+                    if earlier.stamp_ns in found.withdraws:
+                        self.withdraw(earlier)
+                found = self._keeper.keep(frame, found)
+            except MapError:
+                self._followed(arrived, motion)
+                raise
             if deadline is not None and time.perf_counter() > deadline:
                 found = replace(found, late=True)
             self.last = Seen(arrived, frame, self._localiser.outcomes)
@@ -197,7 +203,7 @@ class Robot:
                 self.watch(self.last, found)
             if self.recorder is not None:
                 self.recorder.note(arrived, frame, found, self._localiser.outcomes)
-            self._track = (*self._track[1 - _REMEMBERED :], (frame.stamp_ns, found))
+            self.track = (*self.track[1 - _REMEMBERED :], found)
         raise_if_asked()
         return found
 
@@ -246,8 +252,12 @@ class Robot:
         if self._in_order(arrived):
             _, motion = self._front.take(arrived, motion)
             self._localiser.move(motion)
-            followed = replace(self._left_out(arrived), motion=motion)
-            self._track = (*self._track[1 - _REMEMBERED :], (followed.stamp_ns, followed))
+            self._followed(arrived, motion)
+
+    def _followed(self, arrived: Arrived, motion: Motion) -> None:
+        """Notes a frame of which only the motion is known."""
+        followed = replace(self._left_out(arrived), motion=motion)
+        self.track = (*self.track[1 - _REMEMBERED :], followed)
 
     def record(self, reason: str = "asked") -> Path:
         """Writes the last seconds as a flight record; see `Recorder.record`.
@@ -284,21 +294,14 @@ class Robot:
         The loop calls it for `Localisation.withdraws`, and so may a caller that knows better.
         """
         track, rests = [], False
-        for at_ns, one in self._track:
-            rests = at_ns == found.stamp_ns or (rests and not one.localised)
-            track.append((at_ns, replace(one, position=None) if rests else one))
+        for one in self.track:
+            rests = one.stamp_ns == found.stamp_ns or (rests and not one.localised)
+            track.append(replace(one, position=None) if rests else one)
             rests = rests and one.saved is None  # from there on it is seen from that node
-        self._track = tuple(track)
+        self.track = tuple(track)
         self._keeper.withdrawn(found)
         if self.recorder is not None:
             self.recorder.withdrew()
-
-    def _withdraw_at(self, stamp_ns: int) -> None:
-        """Withdraws the result of an earlier frame."""
-        for at_ns, found in self._track:
-            if at_ns == stamp_ns:
-                self.withdraw(found)
-                return
 
     def pose_at(self, stamp_ns: int) -> Position | None:
         """The position at a time between the robot's last frames, such as that of an image.
@@ -312,18 +315,18 @@ class Robot:
             The position of the previous frame, carried on along the motion to the next one; None
             if unknown or outside these frames.
         """
-        usable = [(at, found) for at, found in self._track if found.motion.usable]
-        after = bisect_left([at for at, _ in usable], stamp_ns)
+        usable = [one for one in self.track if one.motion.usable]
+        after = bisect_left(usable, stamp_ns, key=lambda one: one.stamp_ns)
         if after == len(usable):
             return None
-        at_ns, found = usable[after]
-        if at_ns == stamp_ns:
+        found = usable[after]
+        if found.stamp_ns == stamp_ns:
             return found.position
         motion = found.motion
         if after == 0 or motion.prev_from_curr is None or motion.covariance is None:
             return None
-        before_ns, before = usable[after - 1]
-        share = (stamp_ns - before_ns) / (at_ns - before_ns)
+        before = usable[after - 1]
+        share = (stamp_ns - before.stamp_ns) / (found.stamp_ns - before.stamp_ns)
         twist = motion.prev_from_curr.log()
         if before.position is not None:
             return before.position.carried_on(SE3.exp(share * twist), share * motion.covariance)
@@ -374,7 +377,7 @@ class Robot:
             return False
         self._front.restart()
         self._localiser.lose()
-        self._track = ()
+        self.track = ()
         return True
 
     def _left_out(self, arrived: Arrived) -> Localisation:
