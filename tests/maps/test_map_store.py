@@ -101,7 +101,7 @@ class TestSessions:
         assert store.session_state(session().id) is SessionState.OPEN
         writer.commit()
         assert store.session_state(session().id) is SessionState.COMMITTED
-        with pytest.raises(RevisionError, match="already"):
+        with pytest.raises(RevisionError, match="holds this drive already: session"):
             begin(store, session())
         assert_holds(store, drive)
         assert store.revision == 1
@@ -148,7 +148,7 @@ class TestInterruption:
             assert (found.nodes, found.last_stamp_ns) == (5, drive.nodes[-1].stamp_ns)
         with Map.open(location, writes=True) as again:
             assert again.session_state(session().id) is SessionState.INTERRUPTED
-            with pytest.raises(RevisionError, match="resume"):
+            with pytest.raises(RevisionError, match="holds this drive, interrupted"):
                 begin(again, session())
             resumed = again.resume_session(session().id)
             assert resumed.stored.nodes == tuple(drive.nodes)

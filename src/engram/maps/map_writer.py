@@ -274,10 +274,11 @@ class MapWriter(MapReader):
     def _check_new(self, session: Session) -> None:
         state = self.session_state(session.id)
         if state is SessionState.COMMITTED:
-            raise RevisionError(f"{self._database.name} has session {session.id} already")
+            raise RevisionError(f"{self.location} holds this drive already: session {session.id}")
         if state is not SessionState.ABSENT:
             raise RevisionError(
-                f"session {session.id} was interrupted; resume it or seal what is there"
+                f"{self.location} holds this drive, interrupted: session {session.id}; engram map "
+                "resumes it, engram check --seal commits what was saved"
             )
 
     def _check_descriptor(self, connection: Connection, descriptor: DescriptorKind) -> None:

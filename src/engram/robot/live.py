@@ -24,12 +24,12 @@ from engram.localiser import (
     Relocaliser,
 )
 from engram.mapper import Memory, Saver
-from engram.maps import Map, SessionState
+from engram.maps import Map
 from engram.odometry import Motion
 from engram.robot.front import Arrived
 from engram.robot.localisers import localiser_in
 from engram.robot.saved import Saving, SavingState
-from engram.robot.saving import SavedDrive, begin_or_resume, configuration_of, node_words
+from engram.robot.saving import SavedDrive, configuration_of, node_words
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import Spool, commit_spools
 from engram.sequences import SequenceInfo, first_pair_hash, session_of
@@ -166,20 +166,15 @@ class IntoMap:
     def begin(self, session: Session, made_by: tuple[DescriptorKind, str]) -> Keeper:
         """See `Into`."""
         opened, owner = self._opened, self._owner
-        state = opened.session_state(session.id)
-        if state is SessionState.COMMITTED:
-            raise MapError(f"{opened.location} holds this drive already: session {session.id}")
-        if state is not SessionState.ABSENT:
-            raise MapError(
-                f"{opened.location} holds this drive, interrupted: session {session.id}; engram "
-                "map resumes it, engram check --seal commits what was saved"
-            )
-        about = {
-            "author": session.robot,
-            "message": f"map {session.robot}",
-            "configuration": {**configuration_of(owner.settings, owner.options), "live": True},
-        }
-        writer = begin_or_resume(opened, session, owner.camera, made_by, about)
+        writer = opened.begin_session(
+            session,
+            owner.camera,
+            descriptor=made_by[0],
+            frontend=made_by[1],
+            author=session.robot,
+            message=f"map {session.robot}",
+            configuration={**configuration_of(owner.settings, owner.options), "live": True},
+        )
         self._drive = SavedDrive(
             opened, writer, self.localiser, owner.settings, self._words, waits=False
         )

@@ -22,7 +22,7 @@ from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
 from engram.robot.results import summarise
 from engram.robot.robot import Robot
-from engram.robot.saving import SavedDrive, begin_or_resume, configuration_of, node_words
+from engram.robot.saving import SavedDrive, configuration_of, node_words
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import commit_spools
@@ -211,19 +211,24 @@ class _Mapping:
         self.report.revision = saved.commit().number
 
     def _writer(self, opened: Map) -> RevisionWriter:
-        """The writer of the drive's revision."""
+        """The writer of the drive's revision: a new one, or that of an interrupted run."""
+        session, name = self.report.session, self.sequence.info.name
+        if opened.session_state(session.id) is SessionState.INTERRUPTED:
+            return opened.resume_session(session.id)
         diagnosis = self.report.diagnosis
         assert diagnosis is not None
         forced = ", ".join(one.code for one in diagnosis.fatal)
-        session, name = self.report.session, self.sequence.info.name
         configuration = configuration_of(self.settings, self.options)
-        about = {
-            "author": self.options.author or session.robot,
-            "message": f"map {name}" + (f" (forced: {forced})" if forced else ""),
-            "configuration": {**configuration, "doctor": diagnosis.to_dict()},
-        }
-        made_by = _made_by(self.sequence, self.settings)
-        return begin_or_resume(opened, session, self.sequence.camera, made_by, about)
+        descriptor, frontend = _made_by(self.sequence, self.settings)
+        return opened.begin_session(
+            session,
+            self.sequence.camera,
+            descriptor=descriptor,
+            frontend=frontend,
+            author=self.options.author or session.robot,
+            message=f"map {name}" + (f" (forced: {forced})" if forced else ""),
+            configuration={**configuration, "doctor": diagnosis.to_dict()},
+        )
 
     def _localiser(self, opened: Map) -> Localiser:
         return localiser_in(

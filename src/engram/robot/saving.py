@@ -8,14 +8,11 @@ from typing import Any
 
 from engram import __version__
 from engram.config import to_dict
-from engram.frontend import DescriptorKind
-from engram.geometry import StereoCamera
-from engram.graph.model import Session
 from engram.localiser import ByAppearance, FrameMatcher, Localiser
 from engram.localiser.attempts import Attempter
 from engram.localiser.relocalisation import Suggested
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeSaver, Saver
-from engram.maps import Map, Revision, RevisionWriter, SessionState, StoredSession
+from engram.maps import Map, Revision, RevisionWriter, StoredSession
 from engram.places import RECOGNISERS
 from engram.places.words import NodeWords, words_of
 from engram.robot.localisers import drives_of
@@ -85,32 +82,6 @@ class SavedDrive:
     def leave(self) -> None:
         """Leaves the session uncommitted, for ``engram check --seal`` alone."""
         self._writer.leave()
-
-
-def begin_or_resume(
-    opened: Map,
-    session: Session,
-    camera: StereoCamera,
-    made_by: tuple[DescriptorKind, str],
-    about: dict[str, Any],
-) -> RevisionWriter:
-    """The writer of a drive: for a new session, or an interrupted one.
-
-    Args:
-        opened: the map, open for writing.
-        session: the drive.
-        camera: its camera.
-        made_by: kind of its descriptors, and hash of the front-end.
-        about: author, message and configuration (`configuration_of`) of a new revision.
-
-    Raises:
-        MapError: the map already holds the drive, or cannot be written.
-    """
-    if opened.session_state(session.id) is SessionState.INTERRUPTED:
-        return opened.resume_session(session.id)
-    return opened.begin_session(
-        session, camera, descriptor=made_by[0], frontend=made_by[1], **about
-    )
 
 
 def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ...]:
