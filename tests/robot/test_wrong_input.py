@@ -20,7 +20,7 @@ from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.localiser import Position
 from engram.maps import Map, open_map
-from engram.odometry import Motion, OutsideMotion
+from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot import Robot, map_drive
 
 ROAD = np.arange(0.0, 20.0, 0.7)
@@ -104,6 +104,16 @@ def test_a_motion_that_no_robot_makes_changes_nothing(robot: Robot, motion) -> N
     with pytest.raises(InputError):
         robot.step(LIVE[1].logged, motion=motion)
     assert robot.step(LIVE[1].logged).localised
+
+
+def test_a_motion_that_nothing_tells_is_taken(robot: Robot) -> None:
+    """As `GapFiller` has it where a drive begins with frames without odometry."""
+    failed = OdometryStep(OdometryStatus.NO_CONSENSUS)
+    gaps = GapFiller()
+    gaps.motion(OdometryStep(OdometryStatus.FIRST), LIVE[0].frame.stamp_ns)
+    unknown = gaps.motion(failed, LIVE[1].frame.stamp_ns)
+    assert unknown.guessed_m == np.inf
+    assert robot.step(LIVE[1].logged, motion=unknown).motion is unknown
 
 
 def test_a_robot_is_placed_only_where_the_map_has_a_node(robot: Robot, town: Map) -> None:

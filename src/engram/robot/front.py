@@ -41,6 +41,8 @@ _MOVING_M = 0.02
 _MOVING_RAD = float(np.deg2rad(0.2))
 # No robot moves further between two frames.
 _FARTHEST_M = 1e5
+# A year between two frames.
+_LONGEST_S = 3.2e7
 
 
 class Front:
@@ -206,13 +208,14 @@ def check_motion(motion: Motion | OutsideMotion) -> None:
     """Refuses a motion that no robot makes: its position would rest on it from then on.
 
     Raises:
-        InputError: it is no rigid motion, too long, or a number beside it is not finite.
+        InputError: it is no rigid motion, too long, or a number beside it is not finite, but for
+            `Motion.guessed_m`: of a motion that nothing tells it is infinite.
     """
     shape: tuple[int, ...]
     if isinstance(motion, OutsideMotion):
-        number, array, shape = motion.seconds, motion.rates_rad_s, (3,)
+        number, array, shape, most = motion.seconds, motion.rates_rad_s, (3,), _LONGEST_S
     else:
-        number, array, shape = motion.guessed_m, motion.covariance, (6, 6)
+        number, array, shape, most = motion.guessed_m, motion.covariance, (6, 6), inf
     pose = motion.prev_from_curr
     if pose is not None or isinstance(motion, OutsideMotion):
         if not isinstance(pose, SE3):
@@ -221,9 +224,9 @@ def check_motion(motion: Motion | OutsideMotion) -> None:
         if way_m > _FARTHEST_M:
             raise InputError(f"motion is {way_m:g} m long, at most {_FARTHEST_M:g}; give metres")
     given = np.zeros(shape) if array is None else np.asarray(array)
-    if not 0 <= number < inf or given.shape != shape or not np.isfinite(given).all():
+    if not 0 <= number <= most or given.shape != shape or not np.isfinite(given).all():
         raise InputError(
-            f"motion: seconds or guessed_m is {number}, must be at least 0; rates are (3,), "
+            f"motion: seconds or guessed_m is {number}, must be 0 to {most:g}; rates are (3,), "
             "covariances (6, 6) finite numbers"
         )
 
