@@ -358,8 +358,9 @@ def _edit(path: Path, old: str, new: str) -> None:
 class TestBadCalibrations:
     def test_missing(self, drive: Drive) -> None:
         drive.calibration.unlink()
-        with pytest.raises(InputError, match=drive.calibration.name):
-            open_sequence(drive.path, format=drive.layout.format)
+        with pytest.raises(InputError, match=drive.calibration.name) as caught:
+            drive.open()
+        assert str(caught.value).count(drive.calibration.name) == 1
 
     @pytest.mark.parametrize("text", ["", "hello", "[[[[", "\0\0\0", "P0: x\nP1: y", "- 1\n- 2"])
     def test_something_else(self, drive: Drive, text: str) -> None:
@@ -446,6 +447,12 @@ class TestRecognition:
     def test_euroc_may_be_named_by_its_inner_folder(self, tmp_path: Path, folder: str) -> None:
         drive = open_sequence(LAYOUTS["euroc"].write(tmp_path) / folder)
         assert (drive.info.name, drive.info.format, len(drive)) == ("V9_01", "euroc", PAIRS)
+
+    def test_euroc_without_its_left_camera_is_known_and_the_file_named(self, tmp_path) -> None:
+        path = LAYOUTS["euroc"].write(tmp_path)
+        shutil.rmtree(path / "mav0" / "cam0")
+        with pytest.raises(CalibrationError, match="cam0/sensor.yaml: the file is missing"):
+            open_sequence(path)
 
     def test_places_and_robots_come_from_the_caller_or_the_files(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)

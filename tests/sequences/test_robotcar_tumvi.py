@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from engram.errors import CalibrationError
+from engram.errors import CalibrationError, SequenceError
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock
 from engram.sequences import ImageSequence, open_sequence, session_of
@@ -69,6 +70,12 @@ class TestRobotCar:
         path = write_robotcar(tmp_path)
         (path / "stereo" / "right" / f"{START_US}.png").unlink()
         assert len(open_sequence(path)) == PAIRS - 1
+
+    def test_a_missing_side_is_named(self, tmp_path) -> None:
+        path = write_robotcar(tmp_path)
+        shutil.rmtree(path / "stereo" / "right")
+        with pytest.raises(SequenceError, match="right: the image folder is missing"):
+            open_sequence(path)
 
     def test_missing_models_say_where_to_get_them(self, tmp_path) -> None:
         path = write_robotcar(tmp_path)

@@ -35,13 +35,16 @@ YEAR_2000_NS = 946_684_800 * 1_000_000_000
 
 def is_euroc(path: Path) -> bool:
     """A folder with `mav0/cam0`, or `mav0` itself; `tum-vi` keeps its calibration elsewhere."""
-    folder = _mav_folder(path)
-    return (folder / "cam0").is_dir() and not tumvi_calibration(path).is_file()
+    return _has_cameras(path) and not tumvi_calibration(path).is_file()
 
 
 def is_tumvi(path: Path) -> bool:
     """The same layout with `dso/camchain.yaml` beside `mav0`."""
-    return (_mav_folder(path) / "cam0").is_dir() and tumvi_calibration(path).is_file()
+    return _has_cameras(path) and tumvi_calibration(path).is_file()
+
+
+def _has_cameras(path: Path) -> bool:
+    return any((_mav_folder(path) / camera).is_dir() for camera in ("cam0", "cam1"))
 
 
 def tumvi_calibration(path: Path) -> Path:

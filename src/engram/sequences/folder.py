@@ -51,10 +51,10 @@ def find_folder(path: Path, options: OpenOptions) -> ImageDrive:
         CalibrationError: `calibration.toml` is missing or malformed, or not of a stereo pair.
     """
     file = path / "calibration.toml"
-    calibration = CalibrationFile()
+    needed = options.calibration is None or file.exists()
+    text = read_text(file, CalibrationError) if needed else ""
     try:
-        if options.calibration is None or file.exists():
-            calibration = load_toml(read_text(file, CalibrationError), CalibrationFile)
+        calibration = load_toml(text, CalibrationFile)
         check_longitude(calibration.longitude_deg)
         check_zone(calibration.zone)
         clock = parse_choice(Clock, calibration.clock)

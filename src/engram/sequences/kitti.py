@@ -37,10 +37,8 @@ _SAME_INTRINSICS_PX = 1e-3
 
 
 def is_kitti_odometry(path: Path) -> bool:
-    """A folder `sequences/NN` with `calib.txt` and `image_0` or `image_2`."""
-    return (path / "calib.txt").is_file() and any(
-        (path / f"image_{camera}").is_dir() for camera in range(4)
-    )
+    """A folder `sequences/NN` with `image_0` or another camera's."""
+    return any((path / f"image_{camera}").is_dir() for camera in range(4))
 
 
 def is_kitti_raw(path: Path) -> bool:
@@ -57,7 +55,6 @@ def find_kitti_odometry(path: Path, options: OpenOptions) -> ImageDrive:
     """
     left, right = _CAMERAS[options.rig]
     folders = _rig_folders(path, {camera: f"image_{camera}" for camera in range(4)}, options.rig)
-    calibration = _Calibration(path / "calib.txt")
     times = path / "times.txt"
     stamps_ns = read_stamps(times, seconds_as_ns)
     left_files, right_files = numbered_files(folders[0]), numbered_files(folders[1])
@@ -65,7 +62,9 @@ def find_kitti_odometry(path: Path, options: OpenOptions) -> ImageDrive:
     cameras = cameras_of(
         options,
         lambda: Cameras(
-            calibration.stereo_camera(f"P{left}", f"P{right}", _first_size(places, path))
+            _Calibration(path / "calib.txt").stereo_camera(
+                f"P{left}", f"P{right}", _first_size(places, path)
+            )
         ),
         folders[0],
         rectified=True,

@@ -43,8 +43,8 @@ _MAX_TABLE_BYTES = 200_000_000
 
 
 def is_robotcar(path: Path) -> bool:
-    """A folder with `stereo/left` and `stereo/right`."""
-    return all((path / "stereo" / side).is_dir() for side in ("left", "right"))
+    """A folder with `stereo/left` or `stereo/right`."""
+    return any((path / "stereo" / side).is_dir() for side in ("left", "right"))
 
 
 def find_robotcar(path: Path, options: OpenOptions) -> ImageDrive:
