@@ -451,7 +451,7 @@ class TestRecognition:
     def test_euroc_without_its_left_camera_is_known_and_the_file_named(self, tmp_path) -> None:
         path = LAYOUTS["euroc"].write(tmp_path)
         shutil.rmtree(path / "mav0" / "cam0")
-        with pytest.raises(CalibrationError, match="cam0/sensor.yaml: the file is missing"):
+        with pytest.raises(CalibrationError, match=r"cam0.*missing"):
             open_sequence(path)
 
     def test_places_and_robots_come_from_the_caller_or_the_files(self, tmp_path: Path) -> None:
