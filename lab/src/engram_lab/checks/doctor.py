@@ -30,7 +30,7 @@ from engram.geometry import SE3
 from engram.graph.model import Clock
 from engram.robot import Front, Settings
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.studies.faults.clips import JUDGING, read_clip
+from engram_lab.studies.faults.clips import JUDGING
 from engram_lab.studies.faults.injected import (
     Frozen,
     LateSide,
@@ -227,7 +227,7 @@ def windows() -> Iterator[Window]:
     for plan in JUDGING:
         if not plan.path().exists():
             continue
-        clip = read_clip(plan)
+        clip = plan.read()
         for first in range(0, len(clip) - _WINDOW + 1, _WINDOW + 4):
             part = slice(first, first + _WINDOW)
             yield Window(

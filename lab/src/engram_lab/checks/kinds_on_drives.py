@@ -14,42 +14,18 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from engram.frontend import DescriptorKind, StereoPair
-from engram.geometry import StereoCamera
-from engram.graph.model import Clock
+from engram.frontend import DescriptorKind
 from engram.maps import Map
 from engram.measures import route_not_localised
 from engram.robot import RobotOptions, Settings, map_drive, measure
-from engram.sequences import SequenceInfo
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.studies.faults.clips import JUDGING, SETTING, Clip, missing, read_clip
+from engram_lab.studies.faults.clips import JUDGING, SETTING, ClipDrive, missing
 
 _MAPPED = 3
 BUDGETS = {
     "two attempts": RobotOptions(lanes=2, rounds=1),
     "everything tried": RobotOptions(lanes=8, rounds=8),
 }
-
-
-class ClipDrive:
-    """A clip as a `StereoSequence`."""
-
-    skipped = 0
-
-    def __init__(self, clip: Clip) -> None:
-        self._pairs = clip.pairs
-        self.info = SequenceInfo(clip.plan.name, "clip", Clock.RELATIVE, clip.plan.rig)
-
-    @property
-    def camera(self) -> StereoCamera:
-        """Of all pairs."""
-        return self._pairs[0].camera
-
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __iter__(self) -> Iterator[StereoPair]:
-        return iter(self._pairs)
 
 
 def towns() -> dict[str, list[ClipDrive]]:
@@ -59,7 +35,7 @@ def towns() -> dict[str, list[ClipDrive]]:
     for plan in [*SETTING, *JUDGING]:
         town = f"{plan.rig} {plan.town}"
         if town not in absent and plan.rig != "kitti":  # clips of a third of the length
-            plans.setdefault(town, []).append(ClipDrive(read_clip(plan)))
+            plans.setdefault(town, []).append(ClipDrive(plan, plan.read().pairs))
     return plans
 
 

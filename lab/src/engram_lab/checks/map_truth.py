@@ -25,17 +25,17 @@ from engram.geometry import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import EdgeKind
 from engram.graph.neighbourhood import Search
-from engram.localiser import Position
 from engram.maps import Map
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram_lab.programs import command_line, numbers
 from engram_lab.studies.drives import EvaluatedDrive, drives_of
+from engram_lab.studies.edge_truth import EdgeError, edge_errors
 from engram_lab.studies.starting import TrueNodes
 from engram_lab.town import Size, campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
 from engram_lab.trial_towns import trial_town
 
-WRONG_M, OTHER_PLACE_M = 1.0, 5.0
+WRONG_M = 1.0
 STANDS, VIEW_GATE_RAD, CERTAIN = 150, float(np.deg2rad(60.0)), np.eye(6) * 0.1**2
 
 
@@ -51,24 +51,19 @@ def map_all(drives: list[EvaluatedDrive], path: Path) -> None:
 def judge(drives: list[EvaluatedDrive], path: Path) -> int:
     """Prints the wrong edges by kind; returns how many join two places."""
     truths = {drive.session.id: drive.truth() for drive in drives}
-    errors: dict[EdgeKind, list[float]] = {}
-    joined: Counter[EdgeKind] = Counter()
+    by_kind: dict[EdgeKind, list[EdgeError]] = {}
     with Map.open(path) as opened:
         true = TrueNodes(opened, truths)
-        for edge in opened.graph.edges:
-            a, b = true.pose(edge.a), true.pose(edge.b)
-            if a is None or b is None:
-                continue
-            error = (edge.a_from_b.inverse() @ (a.inverse() @ b)).distance_m
-            errors.setdefault(edge.kind, []).append(error)
-            sigma_m = Position(edge.a, edge.a_from_b, edge.covariance).sigma_m
-            joined[edge.kind] += error > max(OTHER_PLACE_M, 3 * sigma_m)
+        for one in edge_errors(opened.graph.edges, true.pose):
+            by_kind.setdefault(one.kind, []).append(one)
         neighbours = what_is_near(opened, true)
-    for kind, found in sorted(errors.items()):
-        wrong = np.array(found) > WRONG_M
+    joined: Counter[EdgeKind] = Counter()
+    for kind, found in sorted(by_kind.items()):
+        errors_m = np.array([one.error_m for one in found])
+        joined[kind] = sum(one.joins_places for one in found)
         print(
-            f"{kind:10} {len(found):6} edges, {int(wrong.sum()):3} wrong by > {WRONG_M:.0f} m, "
-            f"{joined[kind]} join two places, worst {max(found):.1f} m"
+            f"{kind:10} {len(found):6} edges, {int((errors_m > WRONG_M).sum()):3} wrong by > "
+            f"{WRONG_M:.0f} m, {joined[kind]} join two places, worst {errors_m.max():.1f} m"
         )
     print(neighbours)
     return joined.total() - joined[EdgeKind.ODOMETRY]

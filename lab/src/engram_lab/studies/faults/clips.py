@@ -9,16 +9,20 @@ python -m engram_lab.studies.faults.clips             # renders what is missing
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import StereoPair
 from engram.geometry import SE3, StereoCamera
+from engram.graph.model import Clock
 from engram.monitor import write_whole
+from engram.sequences import SequenceInfo
 from engram_lab.town import WORLD_VERSION
 from engram_lab.town.campaigns import SessionPlan, campaign_named
 from engram_lab.town.robots import ROBOTS, Robot
@@ -50,7 +54,7 @@ class ClipPlan:
         town: seed of the town.
         session: number of the village's drive whose day, hour and weather it has.
         start, count: the frames of the drive.
-        reverse: driven the other way round.
+        reverse: driven the other way round, from where those frames end to where they begin.
     """
 
     rig: str
@@ -69,10 +73,55 @@ class ClipPlan:
         """Where it is kept."""
         return (folder or campaigns_folder()) / f"clips-v{WORLD_VERSION}" / f"{self.name}.npz"
 
+    @property
+    def mapped(self) -> bool:
+        """Whether the map of the town is made of it."""
+        return self.session == MAPPED
+
+    def read(self, folder: Path | None = None) -> Clip:
+        """The clip from the cache, rendered first if it is not there."""
+        path = self.path(folder)
+        if not path.exists():
+            _render(self, path)
+        with np.load(path) as kept:
+            left, right, stamps, poses = (kept[key] for key in ("left", "right", "stamps", "poses"))
+        camera = RIGS[self.rig].camera
+        pairs = [
+            StereoPair(int(stamp), left[k], right[k], camera)
+            for k, stamp in enumerate(stamps.tolist())
+        ]
+        return Clip(self, pairs, [SE3.from_matrix(pose) for pose in poses])
+
+
+class Plan(Protocol):
+    """What a clip shows, rendered or real.
+
+    Attributes:
+        name: of the clip.
+        rig: name of the cameras.
+        town: seed of the town, or name of the place.
+        mapped: whether the map of the town is made of it.
+        reverse: driven against the direction of that map.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def rig(self) -> str: ...  # noqa: D102
+    @property
+    def town(self) -> int | str: ...  # noqa: D102
+    @property
+    def mapped(self) -> bool: ...  # noqa: D102
+    @property
+    def reverse(self) -> bool: ...  # noqa: D102
+    def read(self) -> Clip:
+        """The clip."""
+        ...
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clip:
-    """A rendered clip.
+    """A clip with its truth.
 
     Attributes:
         plan: what it shows.
@@ -80,12 +129,44 @@ class Clip:
         world_from_cam: the truth, one pose a frame.
     """
 
-    plan: ClipPlan
+    plan: Plan
     pairs: list[StereoPair]
     world_from_cam: list[SE3]
 
     def __len__(self) -> int:
         return len(self.pairs)
+
+
+class ClipDrive:
+    """Frames of a clip as a `StereoSequence`.
+
+    As a reader under ``--skip-bad`` it leaves out frames that are not later than the one before.
+
+    Args:
+        plan: of the clip.
+        pairs: the frames, in the order in which a robot meets them; at least one.
+
+    Attributes:
+        info: the name of the clip and of its rig.
+        skipped: frames that are left out.
+    """
+
+    def __init__(self, plan: Plan, pairs: Sequence[StereoPair]) -> None:
+        newest = accumulate((pair.stamp_ns for pair in pairs), max, initial=-1)
+        self._pairs = [one for one, last in zip(pairs, newest, strict=False) if one.stamp_ns > last]
+        self.skipped = len(pairs) - len(self._pairs)
+        self.info = SequenceInfo(plan.name, "clip", Clock.RELATIVE, plan.rig)
+
+    @property
+    def camera(self) -> StereoCamera:
+        """Of all pairs."""
+        return self._pairs[0].camera
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return iter(self._pairs)
 
 
 def clips_of(towns: tuple[tuple[int, str], ...], count: int) -> list[ClipPlan]:
@@ -110,28 +191,19 @@ JUDGING = clips_of(
     ),
     80,
 )  # fmt: skip
-
-
-def read_clip(plan: ClipPlan, folder: Path | None = None) -> Clip:
-    """A clip of the cache, rendered first if it is not there."""
-    path = plan.path(folder)
-    if not path.exists():
-        _render(plan, path)
-    with np.load(path) as kept:
-        left, right, stamps, poses = (kept[name] for name in ("left", "right", "stamps", "poses"))
-    camera = RIGS[plan.rig].camera
-    pairs = [
-        StereoPair(int(stamp), left[k], right[k], camera) for k, stamp in enumerate(stamps.tolist())
-    ]
-    return Clip(plan, pairs, [SE3.from_matrix(pose) for pose in poses])
+# One clip of each judged town against the direction of its map, each of another live day.
+REVERSED = [
+    replace(JUDGING[first + 1 + town % _LIVE], reverse=True)
+    for town, first in enumerate(range(0, len(JUDGING), 1 + _LIVE))
+]
 
 
 def _render(plan: ClipPlan, path: Path) -> None:
     drive = drive_of(plan)
-    pairs = list(drive.frames(plan.start, plan.start + plan.count))
-    poses: list[NDArray[np.float64]] = [
-        one.matrix() for one in drive.world_from_cams()[plan.start : plan.start + plan.count]
-    ]
+    start = _reversed_start(plan, drive) if plan.reverse else plan.start
+    stop = start + plan.count
+    pairs = list(drive.frames(start, stop))
+    poses: list[NDArray[np.float64]] = [one.matrix() for one in drive.world_from_cams()[start:stop]]
     path.parent.mkdir(parents=True, exist_ok=True)
     with write_whole(path) as draft, draft.open("wb") as file:
         np.savez(
@@ -141,6 +213,15 @@ def _render(plan: ClipPlan, path: Path) -> None:
             stamps=np.array([one.stamp_ns for one in pairs], np.int64),
             poses=np.array(poses),
         )
+
+
+def _reversed_start(plan: ClipPlan, drive: SimulatedDrive) -> int:
+    """The frame of a drive the other way round that is nearest to where the stretch ends."""
+    forwards = drive_of(replace(plan, reverse=False)).world_from_cams()
+    end = forwards[plan.start + plan.count - 1].translation
+    return int(
+        np.argmin([np.linalg.norm(one.translation - end) for one in drive.world_from_cams()])
+    )
 
 
 def drive_of(plan: ClipPlan) -> SimulatedDrive:
@@ -162,7 +243,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.parse_args()
-    for plan in missing([*SETTING, *JUDGING]):
+    for plan in missing([*SETTING, *JUDGING, *REVERSED]):
         _render(plan, plan.path())
         print(plan.path(), flush=True)
 

@@ -21,7 +21,7 @@ from engram.graph.model import NodeId
 from engram.localiser import Localisation, Position
 from engram.maps import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram_lab.studies.faults.clips import JUDGING, MAPPED, Clip, ClipPlan, read_clip
+from engram_lab.studies.faults.clips import JUDGING, MAPPED, Clip, ClipPlan
 from engram_lab.studies.faults.injected import FAULTS, Shown
 
 # A fix further from the truth is false.
@@ -238,14 +238,12 @@ class _Places:
         own = [plan for plan in maps if plan.town == town]
         others = [plan for plan in maps if plan.town != town]
         self._clips: dict[str, Clip] = {}
-        self.own = Place(read_clip(own[0]), folder / f"{town}.engram") if own else None
-        self.other = (
-            Place(read_clip(others[0]), folder / f"{town}-other.engram") if others else None
-        )
+        self.own = Place(own[0].read(), folder / f"{town}.engram") if own else None
+        self.other = Place(others[0].read(), folder / f"{town}-other.engram") if others else None
 
     def clip(self, plan: ClipPlan) -> Clip:
         if plan.name not in self._clips:
-            self._clips = {plan.name: read_clip(plan)}
+            self._clips = {plan.name: plan.read()}
         return self._clips[plan.name]
 
     def close(self) -> None:
