@@ -3,28 +3,40 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from itertools import pairwise
 from pathlib import Path
 from uuid import UUID
 
 import numpy as np
 import pytest
 
+from engram.errors import ConfigError, MapCorruptError
 from engram.frontend import StereoPair
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import NodeId
-from engram_lab.studies.faults.clips import JUDGING, MAPPED, SETTING, Clip
-from engram_lab.studies.faults.injected import FAULTS, Blackout, Frozen, Kidnapped, Stall
-from engram_lab.studies.faults.page import headline, matrix
-from engram_lab.studies.faults.study import (
-    CARRIED,
-    KINDS,
-    Place,
-    Trial,
-    drawn,
-    read_trials,
-    run_trial,
+from engram.maps import Map
+from engram_lab.bench.data import synthetic_drive
+from engram_lab.studies.faults.clips import JUDGING, MAPPED, REVERSED, SETTING, Clip, ClipDrive
+from engram_lab.studies.faults.injected import (
+    FAULTS,
+    Blackout,
+    Frozen,
+    Kidnapped,
+    Stall,
+    brightened,
+    on_both,
+    undisturbed,
 )
+from engram_lab.studies.faults.mapping import map_on
+from engram_lab.studies.faults.page import page
+from engram_lab.studies.faults.places import Place, damaged, mapped_by
+from engram_lab.studies.faults.real import RealPlan, real_plans
+from engram_lab.studies.faults.staging import KINDS, REVERSE, TURNED, Scene, drawn, turned_round
+from engram_lab.studies.faults.study import run_trial
+from engram_lab.studies.faults.trials import MADE_BY, Trial, TrialFile, read_trials
 
 CAMERA = StereoCamera(60.0, 60.0, 47.5, 31.5, 0.2, 96, 64)
 
@@ -73,34 +85,163 @@ def test_a_kidnapped_robot_is_elsewhere_and_its_stamps_go_on(pairs) -> None:
 
 
 def test_trials_are_drawn_from_their_number_and_no_clip_of_the_limits_is_judged() -> None:
-    first, again = (drawn(7, JUDGING) for _ in range(2))
+    plans = [*JUDGING, *REVERSED]
+    first, again = (drawn(7, plans) for _ in range(2))
+    assert first is not None
+    assert again is not None
     assert first[:2] == again[:2]
-    assert first[1].session != MAPPED
-    assert {drawn(number, JUDGING)[0] for number in range(len(KINDS))} == set(KINDS)
-    assert not {plan.town for plan in SETTING} & {plan.town for plan in JUDGING}
+    found = [drawn(number, plans) for number in range(len(KINDS))]
+    assert {one[0] for one in found if one} == set(KINDS)
+    assert not any(one[1].mapped for one in found if one)
+    assert {one[0] for one in found if one and one[1].reverse} == {REVERSE, TURNED}
+    assert drawn(KINDS.index(TURNED), JUDGING) is None
+    assert not {plan.town for plan in SETTING} & {plan.town for plan in [*JUDGING, *REVERSED]}
+
+
+def test_each_judged_town_is_driven_once_against_its_map() -> None:
+    assert [plan.town for plan in REVERSED] == list(dict.fromkeys(plan.town for plan in JUDGING))
+    assert {plan.session for plan in REVERSED}.isdisjoint({MAPPED})
 
 
 def test_results_are_read_as_far_as_they_are_whole_and_counted(tmp_path: Path) -> None:
     trials = [
         Trial(0, "stall", "a", 15, 0.5, frames=50, fixes=40, again=0, driven_m=60.0),
         Trial(1, "stall", "a", 15, 3.0, frames=50, fixes=30, false=4, events=1, worst_m=7.5),
-        Trial(2, "none", "a", 15, 0.0, frames=50, fixes=50, again=1),
-    ]
+        Trial(
+            2, "none", "kitti-06-there", 15, 0.0, frames=50, fixes=50, again=1,
+            nodes=3, edges=9, joined=2, map_refused=["dark"],
+        ),
+    ]  # fmt: skip
     file = tmp_path / "trials.jsonl"
     file.write_text("\n".join(json.dumps(asdict(one)) for one in trials) + '\n{"number": 3, "f')
     assert read_trials(file) == trials
-    assert "1 false events, largest error claimed 7.50 m" in headline(trials)
-    rows = matrix(trials).splitlines()
-    assert len(rows) == 2 + 1 + 2 + 1
-    assert rows[-1].startswith("| all |  | 3 | 150 | 120 | 4 | 1 | 7.50 |")
+    rows = page(trials).splitlines()
+    assert rows[0].endswith("1 false events, largest error claimed 7.50 m")
+    assert "| all on real clips |  | 1 | 50 | 50 | 0 | 0 | 0.00 | 1, 1 | 0 | 0 |" in rows
+    assert "| all |  | 3 | 150 | 120 | 4 | 1 | 7.50 | 0, 1 | 1 | 0 |" in rows
+    assert rows[-1] == "| all |  | 1 | 1 | 3 | 9 | 2 | 0 | 0 | 0.00 |"
 
 
-def test_a_map_without_a_far_place_tells_no_robot_a_wrong_one(pairs) -> None:
+def test_a_file_of_trials_goes_on_after_a_line_that_a_killed_run_left(tmp_path: Path) -> None:
+    path, rows = tmp_path / "faults/trials.jsonl", [Trial(k, "stall", "a", 15, 0.5) for k in (0, 1)]
+    for row in rows:
+        row.made_by = MADE_BY
+    TrialFile(path).add(rows[0])
+    with path.open("a") as out:
+        out.write('{"number": 1, "fau')
+    made = TrialFile(path)
+    assert made.numbers == {0}
+    made.add(rows[1])
+    assert read_trials(path) == rows
+
+
+def test_trials_of_other_versions_are_read_but_not_added_to(tmp_path: Path) -> None:
+    path = tmp_path / "trials.jsonl"
+    old = {"number": 0, "fault": "stall", "clip": "a", "start": 15, "strength": 0.5}
+    path.write_text(json.dumps(old) + "\n")
+    assert page(read_trials(path)).startswith("1 trials of earlier versions")
+    with pytest.raises(ConfigError, match="name another file with --work"):
+        TrialFile(path)
+
+
+def test_a_map_without_a_far_place_tells_no_robot_a_wrong_one() -> None:
     """Clips of a wide camera are short: all nodes may lie within 15 m of the robot."""
+    here, rng = SE3.identity(), np.random.default_rng(1)
     place = Place.__new__(Place)
-    here = SE3.identity()
-    place.world_from_node = {NodeId(UUID(int=k)): here for k in range(1, 4)}
-    clip = Clip(JUDGING[1], pairs, [here] * len(pairs))
-    assert run_trial(2, CARRIED, clip, place, np.random.default_rng(1)) is None
-    place.world_from_node[NodeId(UUID(int=9))] = SE3.exp([0, 0, 15.5, 0, 0, 0])
-    assert place.nodes_off(here) == [NodeId(UUID(int=9))]
+    nodes = {NodeId(UUID(int=k)): here for k in range(1, 4)}
+    object.__setattr__(place, "world_from_node", nodes)
+    assert place.wrong_hint(here, 1.0, rng) is None
+    nodes[NodeId(UUID(int=9))] = SE3.exp([0, 0, 15.5, 0, 0, 0])
+    hint = place.wrong_hint(here, 1.0, rng)
+    assert hint is not None
+    assert hint.node == NodeId(UUID(int=9))
+    assert hint.sigma_m == pytest.approx(1.0)
+
+
+def moved(pairs: list[StereoPair], steps_m: list[float]) -> Clip:
+    return Clip(JUDGING[1], pairs, [SE3.exp([0, 0, step, 0, 0, 0]) for step in steps_m])
+
+
+def test_a_robot_that_is_turned_round_drives_back_from_where_it_was(pairs) -> None:
+    there = moved(pairs, [float(k) for k in range(40)])
+    back = moved(pairs, [45.0 - k for k in range(40)])
+    turned = turned_round(there, back, 20)
+    assert [pose.translation[2] for pose in turned.world_from_cam[18:23]] == [18, 19, 19, 18, 17]
+    assert [pair.stamp_ns for pair in turned.pairs] == [k * 100_000_000 for k in range(34)]
+    assert turned.pairs[20].left is back.pairs[26].left
+
+
+def test_a_drive_leaves_out_what_a_reader_would(pairs) -> None:
+    drive = ClipDrive(JUDGING[1], [pairs[0], pairs[2], pairs[1], pairs[2], pairs[3]])
+    assert [one.stamp_ns for one in drive] == [0, 200_000_000, 300_000_000]
+    assert (len(drive), drive.skipped) == (3, 2)
+
+
+@pytest.fixture(scope="module")
+def street_clip() -> Clip:
+    pairs = list(synthetic_drive(frames=8, step_m=0.8))
+    return moved(pairs, [0.8 * k for k in range(8)])
+
+
+@contextmanager
+def mapped(clip: Clip, frames: int, path: Path) -> Iterator[Place]:
+    """The first frames of a clip, mapped."""
+    place = mapped_by(Clip(clip.plan, clip.pairs[:frames], clip.world_from_cam[:frames]), path)
+    yield place
+    place.opened.close()
+
+
+def test_damaged_landmarks_are_met_and_no_place_is_claimed_by_them(
+    street_clip: Clip, tmp_path: Path
+) -> None:
+    with mapped(street_clip, 4, tmp_path / "own.engram") as own:
+        spoilt = damaged(own, tmp_path / "damaged.engram", 0.5, np.random.default_rng(0))
+    unreadable = 0
+    for node in own.world_from_node:
+        try:
+            spoilt.opened.frames.frame(node)
+        except MapCorruptError:
+            unreadable += 1
+    assert (unreadable, len(own.world_from_node)) == (1, 2)
+    scene = Scene(street_clip, spoilt, 0, 0.5, undisturbed(street_clip.pairs[:4]))
+    trial = run_trial(0, "damaged landmarks", scene)
+    spoilt.opened.close()
+    assert trial.fixes > 0
+    assert trial.false == 0
+
+
+def test_a_drive_is_mapped_on_into_a_copy_and_wrong_edges_are_counted(
+    street_clip: Clip, tmp_path: Path
+) -> None:
+    bright = [on_both(pair, lambda image: brightened(image, 3.0)) for pair in street_clip.pairs]
+    later = [replace(pair, stamp_ns=pair.stamp_ns + 10**12) for pair in bright]
+    clip = Clip(street_clip.plan, later, street_clip.world_from_cam)
+    trial, out = Trial(0, "none", "a", 0, 0.0), tmp_path / "mapped.engram"
+    with mapped(street_clip, 2, tmp_path / "own.engram") as own:
+        map_on(trial, Scene(clip, own, 0, 0.0, undisturbed(later)), out)
+        assert (trial.nodes, trial.edges, trial.joined, trial.map_refused) == (1, 1, 0, [])
+        away = SE3.exp([9, 0, 0, 0, 0, 0])
+        nodes = {node: away @ pose for node, pose in own.world_from_node.items()}
+        scene = Scene(clip, replace(own, world_from_node=nodes), 0, 0.0, undisturbed(later))
+        map_on(trial, scene, out)
+        assert trial.joined == 1
+        assert trial.worst_edge_m == pytest.approx(9, abs=0.1)
+    with Map.open(own.path) as unchanged:
+        assert len(unchanged.graph) == len(own.world_from_node)
+
+
+def test_without_real_data_there_are_no_real_clips(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("ENGRAM_DATA", str(tmp_path))
+    assert real_plans() == []
+    monkeypatch.delenv("ENGRAM_DATA")
+    assert real_plans() == []
+
+
+@pytest.mark.data
+def test_a_real_room_is_mapped_by_one_part_and_driven_in_another(data_dir: Path) -> None:
+    first, live = (RealPlan("v1-01", part, data_dir).read() for part in ("mapped", "there"))
+    seen = {pair.left.tobytes() for pair in first.pairs}
+    assert len(live) == 63
+    assert not seen & {pair.left.tobytes() for pair in live.pairs}
+    assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(live.pairs))
+    assert np.array_equal(live.pairs[0].left, live.pairs[-1].left)

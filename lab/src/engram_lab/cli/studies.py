@@ -358,14 +358,15 @@ def faults(
         ),
     ] = None,
     out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The table, in Markdown.")
+        Path, typer.Option("--out", metavar="FILE", help="The tables, in Markdown.")
     ] = Path("results/faults.md"),
     as_json: options.Json = False,
 ) -> None:
     """Inject faults into drives; count false fixes.
 
-    Localises rendered clips (python -m engram_lab.studies.faults.clips) in maps of other
-    days. The same command resumes a run that was stopped.
+    Localises clips (python -m engram_lab.studies.faults.clips renders them; ENGRAM_DATA names
+    real ones) in maps of other days, and maps them on. The same command resumes a run that
+    was stopped; each version of the method has a file of its own.
 
     \b
     Examples:
@@ -377,10 +378,11 @@ def faults(
     from platformdirs import user_cache_path
 
     from engram.cli.progress import Bars
-    from engram_lab.studies.faults.page import headline, matrix
-    from engram_lab.studies.faults.study import read_trials, run
+    from engram_lab.studies.faults.page import headline, page
+    from engram_lab.studies.faults.study import run
+    from engram_lab.studies.faults.trials import default_file, read_trials
 
-    file = work or user_cache_path("engram") / "faults" / "trials.jsonl"
+    file = work or default_file(user_cache_path("engram") / "faults")
     if not report_only:
         left = trials - len(read_trials(file))
         with Bars().stage("faults", max(left, 0)) as monitor:
@@ -388,7 +390,7 @@ def faults(
                 pass
     made = read_trials(file)
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(f"{headline(made)}\n\n{matrix(made)}\n", encoding="utf-8")
+    out.write_text(page(made), encoding="utf-8")
     if as_json:
         print(json.dumps([asdict(one) for one in made]))
     else:
