@@ -5,11 +5,13 @@ from __future__ import annotations
 import queue
 import socket
 import threading
+import tracemalloc
 from dataclasses import replace
 
 import httpx
 import pytest
 import uvicorn
+from sqlalchemy import delete, insert
 
 from engram.agent import enrol
 from engram.agent.link import CentreRefusedError
@@ -20,7 +22,7 @@ from engram.centre.dreams import Dreams
 from engram.centre.errors import UnknownError
 from engram.centre.fleet import Fleet
 from engram.centre.serving import Listening, serve
-from engram.centre.store.audit import first_broken
+from engram.centre.store.audit import _hash, first_broken
 from engram.centre.store.schema import audit
 from engram.errors import ConfigError, InputError
 
@@ -242,6 +244,23 @@ def test_the_audit_log_shows_what_was_changed_in_it(site):
         assert first_broken(connection) is None
         connection.execute(audit.update().where(audit.c.number == 2).values(subject="me"))
         assert first_broken(connection) == 2
+
+
+def test_a_long_audit_log_is_checked_in_little_memory(site):
+    with site.centre.database.writing() as connection:
+        connection.execute(delete(audit))
+        rows, before = [], ""
+        for number in range(1, 5_001):
+            row = {"number": number, "at_ns": 1, "subject": "s", "action": "a", "map": ""}
+            row["detail"] = "{}"
+            before = _hash(before, row)
+            rows.append({**row, "hash": before})
+        connection.execute(insert(audit), rows)
+        del rows
+        tracemalloc.start()
+        assert first_broken(connection) is None
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000  # all rows at once are 2.8
+        tracemalloc.stop()
 
 
 def test_an_address_that_is_taken_and_a_certificate_that_is_gone_are_named(site, tmp_path):

@@ -72,7 +72,8 @@ def _events(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:
 def first_broken(connection: Connection) -> int | None:
     """Number of the first row that was changed, removed or added later; None for a whole log."""
     before = ""
-    for number, row in enumerate(rows_of(connection, select(audit).order_by(audit.c.number)), 1):
+    query = select(audit).order_by(audit.c.number).execution_options(yield_per=1000)
+    for number, row in enumerate(map(dict, connection.execute(query).mappings()), 1):
         told = row.pop("hash")
         if row["number"] != number or told != _hash(before, row):
             return number
