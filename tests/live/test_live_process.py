@@ -27,8 +27,9 @@ from engram.live.driving import Driving
 from engram.live.link import Link, Ring
 from engram.live.outside import Outside
 from engram.localiser import Localiser
-from engram.maps import open_map
-from engram.robot import RobotOptions, map_drive, open_drive
+from engram.maps import Map, open_map
+from engram.robot import Robot, RobotOptions, map_drive, open_drive
+from engram.robot.goals import add_goal
 
 OPTIONS = RobotOptions(lanes=1, rounds=4)
 
@@ -192,6 +193,26 @@ def test_odometry_goes_on_without_a_map(
     after = seen(client, pairs[1])
     assert after["status"] == "localised"
     assert after["odom_from_live"] != before["odom_from_live"]
+
+
+def test_switching_to_the_same_map_shows_its_newest_revision(
+    pairs: list[StereoPair], town: Path, tmp_path: Path
+) -> None:
+    path, revisions = tmp_path / "town.engram", []
+
+    class Noting:
+        def watch(self, _: Robot, opened: Map) -> None:
+            revisions.append(opened.revision)
+
+    path.write_bytes(town.read_bytes())
+    driving = Driving(LiveOptions(path, robot=OPTIONS), watcher=Noting())
+    driving.step(pairs[0])
+    add_goal(path, "dock", 1.0, 0.0, 0.0, author="tests")
+    driving.step(pairs[1])
+    driving.switch(path)
+    assert driving.step(pairs[2]).motion.prev_from_curr.distance_m == pytest.approx(0.8, abs=0.1)
+    driving.pause()
+    assert revisions == [1, 2]
 
 
 def test_a_frame_at_which_the_map_failed_keeps_its_motion(

@@ -186,7 +186,7 @@ class Driving:
         return said or f"mapping is {'on' if on else 'off'}"
 
     def switch(self, path: Path) -> str:
-        """Continues in another map, without losing odometry.
+        """Continues in another map, or in the newest revision of the same, with its odometry.
 
         Raises:
             EngramError: it cannot be opened; the robot stays in the old one.

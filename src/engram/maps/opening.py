@@ -11,6 +11,9 @@ from engram.maps.sqlite import map_path
 def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
     """Opens a map for localising, writing or reading.
 
+    Until it is written to, the map stays as it is now, whatever others commit: open it anew to see
+    later revisions. A robot stays with the map that it began in.
+
     Args:
         path: NAME.engram.
         at: number or tag of a revision, to see the map as it was then; None for the newest.
