@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -21,6 +23,7 @@ import typer
 import yaml
 
 import engram
+from engram import errors
 from engram.cli.app import app, main
 from engram_lab.bench.data import synthetic_drive
 
@@ -337,6 +340,13 @@ def test_the_documents_stay_within_their_length() -> None:
     # Words hold a letter or a digit: the bars and dashes that draw tables are none.
     words = [word for page in read for word in page.read_text().split() if re.search(r"\w", word)]
     assert len(words) <= 15_000
+
+
+def test_the_error_tree_is_that_of_the_code() -> None:
+    drawn = inspect.cleandoc(errors.__doc__ or "").split("::\n\n")[1].split("\n\n")[0]
+    assert f"```text\n{textwrap.dedent(drawn)}\n```" in (DOCS / "python.md").read_text()
+    found = {name for name in vars(errors) if name.endswith("Error")}
+    assert found == set(re.findall(r"\w+Error", drawn))
 
 
 def test_no_text_names_somebody_elses_package() -> None:

@@ -5,19 +5,19 @@
     EngramError
     ├── InputError               an input cannot be used: correct it and call again
     │   ├── SequenceError        images, stamps or layout of a drive
-    │   │   └── UnfitDriveError  a fatal finding of the doctor: repair the drive, or force it
-    │   ├── CalibrationError     a calibration that is missing, malformed or does not fit
+    │   │   └── UnfitDriveError  the doctor's fatal finding: repair the drive, or force it
+    │   ├── CalibrationError     a calibration: missing, malformed, does not fit
     │   └── ConfigError          a setting: unknown key, wrong type, out of range
     ├── MapError                 a stored file: a map or a frame log
     │   ├── NotAMapError         the file is something else
     │   ├── FormatVersionError   written by a newer Engram: upgrade
     │   ├── MapLockedError       another process writes to it: wait
     │   ├── MapCorruptError      bytes do not match their hash: restore a copy
-    │   ├── RevisionError        no such revision, or in a state that forbids the step
+    │   ├── RevisionError        no such revision, or its state forbids the step
     │   └── StorageFullError     no space left: free some; nothing committed is lost
     ├── IncompatibleError        two valid things do not fit together
     ├── RefusedError             a result did not pass the requested gate
-    ├── WorkerError              workers died, or cannot be reached: look at memory and disk
+    ├── WorkerError              workers died, or cannot be reached: see memory and disk
     └── MissingExtraError        an optional dependency: the message names the pip command
 
 Not localising is never an error: it is a status of the result.
