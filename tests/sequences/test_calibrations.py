@@ -272,16 +272,15 @@ class TestFisheye:
 
 
 class TestDrives:
-    @pytest.mark.parametrize("name", ["euroc", "folder", "kitti"])
+    @pytest.mark.parametrize("name", ["euroc", "folder", "kitti", "kitti-raw"])
     def test_a_given_calibration_replaces_the_own(self, tmp_path, name) -> None:
         path = LAYOUTS[name].write(tmp_path)
         given = tmp_path / "given.toml"
         text = calibration_toml(Cameras(camera())).replace("baseline_m = 0.1", "baseline_m = 0.7")
         given.write_text(text)
         assert open_sequence(path, calibration=given).camera.baseline_m == 0.7
-        if name != "kitti":  # whose stamps and sizes need no calibration of its own
-            LAYOUTS[name].calibration(path).unlink()
-            assert open_sequence(path, calibration=given).camera.baseline_m == 0.7
+        LAYOUTS[name].calibration(path).unlink()
+        assert open_sequence(path, calibration=given).camera.baseline_m == 0.7
 
     def test_a_view_is_for_raw_images(self, tmp_path) -> None:
         with pytest.raises(CalibrationError, match="rectified already"):

@@ -83,20 +83,19 @@ def find_kitti_raw(path: Path, options: OpenOptions) -> ImageDrive:
     left, right = _CAMERAS[options.rig]
     names = {camera: f"image_{camera:02d}/data" for camera in range(4)}
     folders = _rig_folders(path, names, options.rig)
-    calibration = _Calibration(_raw_calibration_file(path))
     stamps_file = folders[0].parent / "timestamps.txt"
     stamps_ns = read_stamps(stamps_file, date_as_ns)
     left_files, right_files = numbered_files(folders[0]), numbered_files(folders[1])
     places = pair_by_number(stamps_ns, left_files, right_files, stamps_file)
-    width, height = calibration.numbers(f"S_rect_{left:02d}", 2)
-    size = (_whole(width), _whole(height))
-    names_of_pair = (f"P_rect_{left:02d}", f"P_rect_{right:02d}")
-    cameras = cameras_of(
-        options,
-        lambda: Cameras(calibration.stereo_camera(*names_of_pair, size)),
-        folders[0],
-        rectified=True,
-    )
+
+    def own() -> Cameras:
+        calibration = _Calibration(_raw_calibration_file(path))
+        width, height = calibration.numbers(f"S_rect_{left:02d}", 2)
+        size = (_whole(width), _whole(height))
+        projections = f"P_rect_{left:02d}", f"P_rect_{right:02d}"
+        return Cameras(calibration.stereo_camera(*projections, size))
+
+    cameras = cameras_of(options, own, folders[0], rectified=True)
     info = SequenceInfo(
         path.resolve().name, "kitti-raw", Clock.UTC, longitude_deg=_oxts_longitude_deg(path)
     )
