@@ -12,7 +12,7 @@ from engram_lab.studies.faults.staging import KINDS, STRENGTHS
 from engram_lab.studies.faults.trials import Trial
 
 _FIXES = (
-    "trials", "frames", "fixes", "false", "events", "worst, m",
+    "trials", "frames", "fixes", "right fixes lost", "false", "events", "worst, m",
     "found again after (median, worst)", "never", "the doctor objects",
 )  # fmt: skip
 _MAPS = (
@@ -76,8 +76,10 @@ def _parts(fault: str, rows: Sequence[Trial]) -> Iterator[tuple[str, Sequence[Tr
 
 def _fixes(rows: Sequence[Trial]) -> Sequence[object]:
     again = [one.again for one in rows if one.again is not None]
+    expected = sum(one.expected for one in rows)
     return (
         len(rows), sum(one.frames for one in rows), sum(one.fixes for one in rows),
+        f"{sum(one.lost for one in rows)} of {expected}" if expected else "–",
         sum(one.false for one in rows), sum(one.events for one in rows),
         f"{max((one.worst_m for one in rows), default=0.0):.2f}",
         f"{np.median(again):.0f}, {max(again)}" if again else "–",

@@ -19,6 +19,8 @@ REVERSE = "driving in the other direction"
 TURNED = "turned round unseen"
 DAMAGED = "damaged landmarks"
 KINDS = (NONE, OTHER_TOWN, CARRIED, REVERSE, TURNED, DAMAGED, *FAULTS)
+# Of these, no frame of the clip has a right fix where nothing is wrong.
+ELSEWHERE = frozenset({OTHER_TOWN, REVERSE, TURNED})
 # Changes with what a number means, so that results of two meanings are not mixed.
 DRAW = 2
 # Frames before a fault, in which the robot finds itself, and after its start.

@@ -29,6 +29,8 @@ class Trial:
         events: runs of false fixes.
         worst_m: largest error of a fix, m; in another town 10 km.
         again: frames from the start of the fault until the first right fix; None if never.
+        expected: frames that were shown and have a right fix where nothing is wrong.
+        lost: those of them without a right fix.
         driven_m: true length of the drive.
         refused: findings of the doctor that are fatal.
         nodes, edges: what the drive added to the map, mapped with ``--force``; None where it was
@@ -51,6 +53,8 @@ class Trial:
     events: int = 0
     worst_m: float = 0.0
     again: int | None = None
+    expected: int = 0
+    lost: int = 0
     driven_m: float = 0.0
     refused: list[str] = field(default_factory=list)
     nodes: int | None = None
