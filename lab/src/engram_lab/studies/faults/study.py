@@ -103,7 +103,10 @@ def _events(fixes: Sequence[Fix], clip: Clip) -> int:
 
 
 def available() -> list[Plan]:
-    """The clips of the study: rendered ones that are in the cache, and real ones."""
+    """The clips of the study: rendered ones that are in the cache, and real ones.
+
+    With other clips at hand a number draws another clip; trials that are made stay.
+    """
     return [*(one for one in (*JUDGING, *REVERSED) if one.path().exists()), *real_plans()]
 
 
