@@ -173,7 +173,7 @@ def test_unusable_frames_are_neither_saved_nor_matched(path: Path) -> None:
     assert len(set(graph_of(path).experiences.tolist())) == 1
 
 
-@pytest.mark.parametrize(("lost", "components"), [(1, 1), (3, 1), (12, 2)])
+@pytest.mark.parametrize(("lost", "components"), [(2, 1), (3, 1), (12, 2)])
 def test_a_chain_bears_short_gaps_of_odometry_and_breaks_at_long_ones(
     path: Path, lost: int, components: int
 ) -> None:
@@ -189,6 +189,15 @@ def test_a_chain_bears_short_gaps_of_odometry_and_breaks_at_long_ones(
     for edge in vague:  # the robot went on straight, as was guessed
         assert edge.a_from_b.distance_m < 3.0
         assert abs(edge.a_from_b.translation[0]) < 0.5
+
+
+def test_a_chain_breaks_where_the_images_go_on_elsewhere(path: Path) -> None:
+    """One step fails between frames of which each alone is good: they are not neighbours."""
+    seen = drive(WORLD, ROAD)
+    seen[25] = dataclasses.replace(seen[25], odometry=OdometryStep(OdometryStatus.NO_CONSENSUS))
+    map_simulated(path, seen)
+    graph = graph_of(path)
+    assert len(set(graph.components().tolist())) == 2
 
 
 def test_a_short_gap_after_a_long_one_is_borne_again(path: Path) -> None:

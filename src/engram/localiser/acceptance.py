@@ -33,8 +33,8 @@ class AcceptanceConfig:
         rule: `confidence` weighs all evidence (`engram.localiser.confidence`); `inliers` is the
             published rule, `min_inliers` near the prediction, and the stricter one below for a
             lost robot.
-        min_confidence: least log-odds that a match is right which the position predicts; 4.6 is one
-            wrong in a hundred at the threshold, far fewer over all.
+        min_confidence: least log-odds that a match is right which the position predicts: one in
+            seventy is wrong at the threshold, far fewer over all.
         min_confidence_told: the same where no fix has confirmed the position yet: it may have been
             told wrong, and streets look alike.
         min_confidence_lost: the same of a match that nothing predicts: many such are tried.
@@ -67,9 +67,9 @@ class AcceptanceConfig:
 
     rule: Rule = Rule.CONFIDENCE
     min_confidence: float = 4.25
-    min_confidence_told: float = 5.0
-    min_confidence_lost: float = 6.0
-    sure_confidence: float = 8.5
+    min_confidence_told: float = 4.74
+    min_confidence_lost: float = 5.39
+    sure_confidence: float = 7.01
     settle_after_m: float = 10.0
     doubt_after: float = 3.0
     rival_share: float = 0.6
@@ -143,7 +143,12 @@ def agrees(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig
 
 
 def apart(node_from_live: SE3, prediction: Prediction, config: AcceptanceConfig) -> float:
-    """Distance of a pose from its prediction over the standard deviation and a share of slack."""
+    """Distance of a pose from its prediction over the standard deviation and a share of slack.
+
+    Infinite if the two contradict each other.
+    """
+    if not agrees(node_from_live, prediction, config):
+        return math.inf
     apart_m = node_from_live.translation - prediction.node_from_live.translation
     return math.sqrt(apart_m @ apart_m) / math.hypot(prediction.sigma_m, config.slack_m / 3)
 

@@ -29,7 +29,6 @@ from engram.localiser.acceptance import (
     Rule,
     accept,
     accept_lost,
-    agrees,
     apart,
     determined,
     plausible,
@@ -263,9 +262,7 @@ class Attempter:
             math.sqrt(x_m2 + y_m2 + z_m2),
             candidate.standing,
             math.inf if prediction is None else prediction.sigma_m,
-            apart(pose, prediction, acceptance)
-            if prediction is not None and agrees(pose, prediction, acceptance)
-            else math.inf,
+            math.inf if prediction is None else apart(pose, prediction, acceptance),
             spread() if spreads else None,
         )
 

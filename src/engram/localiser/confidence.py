@@ -8,8 +8,9 @@ that nothing has confirmed yet supports none.
 
 The model is additive. A match has several readings: as what the position predicts, if fixes have
 confirmed it; the same if the match is weak or later fixes failed to come; as what somebody said;
-and as that of a robot that may be anywhere. `CONFIDENCES` holds the weights for each kind of
-features, made and judged by ``python -m engram_lab.fits.confidence``.
+and as that of a robot that may be anywhere. A calibration makes log-odds of their sums that hold.
+`CONFIDENCES` holds both for each kind of features, made and judged by ``python -m
+engram_lab.fits.confidence``.
 """
 
 from __future__ import annotations
@@ -201,6 +202,29 @@ ANYWHERE_TERMS = (*_MATCH_TERMS, *_SPREAD_TERMS)
 
 
 @dataclass(frozen=True, slots=True)
+class Calibration:
+    """Log-odds that hold, from a sum of terms.
+
+    What is wrong among the surest matches is seldom another place: it is the right one in rain, and
+    a pose a metre off. No term foretells that, so where matches are believed claims grow more
+    slowly.
+
+    Attributes:
+        knee, slope: from this sum on, log-odds grow by so much of what it grows.
+    """
+
+    knee: float
+    slope: float
+
+    def log_odds(self, total: float) -> float:
+        """Of a sum; -inf stays."""
+        return total - (1.0 - self.slope) * max(total - self.knee, 0.0)
+
+
+AS_SUMMED = Calibration(knee=0.0, slope=1.0)
+
+
+@dataclass(frozen=True, slots=True)
 class ConfidenceModel:
     """Weights of the terms, one kind of features and one matcher.
 
@@ -212,6 +236,7 @@ class ConfidenceModel:
         witness: what a second match adds that agrees from some way on.
         weak_inliers: matches of fewer must spread even near a confirmed position: a robot that is
             carried elsewhere unseen meets look-alikes there, low in the image.
+        calibration: of the sums.
     """
 
     predicted: tuple[float, ...]
@@ -220,6 +245,7 @@ class ConfidenceModel:
     anywhere: tuple[float, ...]
     witness: float
     weak_inliers: int
+    calibration: Calibration
 
     def as_predicted(self, evidence: Evidence) -> float:
         """Log-odds of a match that agrees with its prediction; -inf if it does not.
@@ -229,30 +255,34 @@ class ConfidenceModel:
         if not math.isfinite(evidence.apart):
             return -math.inf
         if not evidence.standing.agreed:
-            return -math.inf if evidence.spread is None else _sum(self.told, evidence.told_terms())
+            if evidence.spread is None:
+                return -math.inf
+            return self._log_odds(self.told, evidence.told_terms())
         if evidence.spread is None:
-            return _sum(self.predicted, evidence.predicted_terms())
-        return _sum(self.doubted, evidence.doubted_terms())
+            return self._log_odds(self.predicted, evidence.predicted_terms())
+        return self._log_odds(self.doubted, evidence.doubted_terms())
 
     def alone(self, evidence: Evidence) -> float:
         """Log-odds of a match as if no fix had come before it."""
         standing = evidence.standing
         unproved = replace(evidence, standing=Standing(0, standing.missed, standing.usual_inliers))
         if evidence.spread is None and math.isfinite(evidence.apart):
-            return _sum(self.predicted, unproved.predicted_terms())
+            return self._log_odds(self.predicted, unproved.predicted_terms())
         return max(self.as_predicted(unproved), self.as_anywhere(evidence))
 
     def as_anywhere(self, evidence: Evidence) -> float:
         """Log-odds of a match whatever was predicted; -inf if the spread is not known."""
         if evidence.spread is None:
             return -math.inf
-        return _sum(self.anywhere, evidence.anywhere_terms())
+        return self._log_odds(self.anywhere, evidence.anywhere_terms())
+
+    def _log_odds(self, weights: tuple[float, ...], terms: tuple[float, ...]) -> float:
+        return self.calibration.log_odds(sum(map(float.__mul__, weights, terms)))
 
 
-def _sum(weights: tuple[float, ...], terms: tuple[float, ...]) -> float:
-    return sum(map(float.__mul__, weights, terms))
-
-
+# Source: python -m engram_lab.fits.confidence --shipped --towns 301,302,303,304, method version 16:
+# 0.65, of `net` 0.58; one for both, so that limits mean the same.
+_CALIBRATION = Calibration(knee=4.25, slope=0.65)
 # Source: python -m engram_lab.fits.confidence, with the covariances of method version 10; the
 # constant of `anywhere` is 0.2 more, so that under those of 11 the likest look-alike stays where it
 # was.
@@ -267,8 +297,9 @@ _BRIEF = ConfidenceModel(
     told=(10.864, 0.257, 1.212, -0.124, -0.347, -0.003, -0.174, -2.589, 1.544, 0.77),
     # constant, inliers, share, distance, match sigma, spread, height
     anywhere=(13.904, 0.0, 3.055, -0.113, -0.512, 1.509, 0.777),
-    witness=2.0,
+    witness=1.4,
     weak_inliers=45,
+    calibration=_CALIBRATION,
 )
 # Source: the same with --kind net and the covariances of method version 11. The constants of
 # `predicted` and `doubted` are 0.25, that of `told` 0.9 and that of `anywhere` 0.4 less than
@@ -282,8 +313,9 @@ _NET = ConfidenceModel(
     ),
     told=(4.568, 0.0, 0.792, -0.021, -2.498, 0.0, -0.194, -2.745, 0.839, 0.938),
     anywhere=(9.239, 0.0, 2.758, 0.0, -2.048, 0.933, 1.051),
-    witness=2.0,
+    witness=1.4,
     weak_inliers=45,
+    calibration=_CALIBRATION,
 )
 CONFIDENCES: dict[DescriptorKind, ConfidenceModel] = {BRIEF: _BRIEF, NET: _NET}
 

@@ -310,7 +310,7 @@ class Localiser:
 
         A frame that odometry could not use changes nothing: the next usable one carries the motion
         since the last. The robot is lost once the uncertainty of guessed motion exceeds
-        `LocaliserConfig.greatest_gap_m`.
+        `LocaliserConfig.greatest_gap_m`, and if the images went on elsewhere.
         """
         self._motion = motion
         if motion.prev_from_curr is None or motion.covariance is None:
@@ -320,9 +320,12 @@ class Localiser:
             self._guessed_m2 += motion.guessed_m**2
         else:
             self._driven_m += motion.moved_m
+        if motion.jumped:
+            self._guessed_m2 = math.inf
+            self._hypotheses.forget()
         self._hypotheses.carry_on(motion.prev_from_curr, motion.covariance)
         if self._relocaliser is not None:
-            followed = motion.guessed_m <= self.config.followed_gap_m
+            followed = not motion.jumped and motion.guessed_m <= self.config.followed_gap_m
             self._relocaliser.carry_on(motion.prev_from_curr if followed else None)
         if self.position is not None:
             self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)

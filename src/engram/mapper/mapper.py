@@ -231,13 +231,13 @@ class Mapper(Memory):
         return followed
 
     def _move_on(self, motion: Motion) -> None:
-        """Carries the pose in the last saved node on; drops it after too long a gap."""
+        """Carries the pose in the last saved node on; drops it after too long a gap, or a jump."""
         if motion.prev_from_curr is None or motion.covariance is None:
             return
         self._gap_m2 = self._gap_m2 + motion.guessed_m**2 if motion.guessed_m else 0.0
         if self._since_saved is None:
             return
-        if self._gap_m2 > self._localiser.config.greatest_gap_m**2:
+        if motion.jumped or self._gap_m2 > self._localiser.config.greatest_gap_m**2:
             self._since_saved = None
         else:
             self._since_saved = self._since_saved.carried_on(
@@ -253,9 +253,11 @@ class Mapper(Memory):
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
         """Whether a frame is usable and far enough from the last saved one (method §5).
 
-        During a long gap of odometry none is: a node without an edge has no use.
+        During a long gap of odometry none is: a node without an edge has no use. Nor is one at
+        which it just failed: the next frame tells whether the images jumped.
         """
-        if live.status is not FrameStatus.OK:
+        just_failed = motion.guessed_m and self._gap_m2 <= motion.guessed_m**2
+        if live.status is not FrameStatus.OK or just_failed:
             return False
         if self._since_saved is None:
             return not motion.guessed_m

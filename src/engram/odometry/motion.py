@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.config import check_bounds
 from engram.geometry import SE3
+from engram.odometry.jumps import Jumps
 from engram.odometry.outside import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.vague import VagueRun
@@ -102,6 +103,18 @@ class GapConfig:
             "away with 1",
         ),
     ] = 0.5
+    jump_share: Annotated[
+        float,
+        Meta(
+            ge=0,
+            lt=1,
+            description="a step with less than this share of the inliers before and after it was "
+            "no motion: the images go on elsewhere. 0: never. Source: lab/reports/faults.md",
+        ),
+    ] = 0.1
+    jump_inliers: Annotated[
+        int, Meta(ge=1, description="fewest inliers before and after such a step")
+    ] = 60
     steady_s: Annotated[
         float, Meta(ge=0, description="s within which no robot sets off unnoticed")
     ] = 0.5
@@ -124,6 +137,8 @@ class Motion:
         ahead: at an unusable frame, the guess of the motion since the last usable one, with its
             (6, 6) float64 covariance; it is not part of the motion that the next usable frame
             brings.
+        jumped: whether the images went on elsewhere at the frame before, which this one tells:
+            where the robot is now does not follow from where it was.
     """
 
     odometry: OdometryStep
@@ -131,6 +146,7 @@ class Motion:
     covariance: NDArray[np.float64] | None = None
     guessed_m: float = 0.0
     ahead: tuple[SE3, NDArray[np.float64]] | None = None
+    jumped: bool = False
 
     @property
     def moved_m(self) -> float:
@@ -202,6 +218,7 @@ class GapFiller:
         self._turn_variance = _ANY_TURN
         self._stamp_ns: int | None = None
         self._run = VagueRun(config.steps_to_know_speed)
+        self._jumps = Jumps(config.jump_share, config.jump_inliers)
         # Speed of the newest sharp step, or the greatest since.
         self._fast_m_per_s = 0.0
         # Consecutive measurements less certain than a guess.
@@ -237,6 +254,17 @@ class GapFiller:
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         if odometry.status is OdometryStatus.FIRST:
             return Motion(odometry)
+        moved = self._moved(odometry, before, outside, doubted=doubted)
+        # Wheels or a gyroscope know of a motion that the images do not show.
+        jumped = self._jumps.jumped(odometry.inliers) and outside is None
+        return replace(moved, jumped=True) if jumped else moved
+
+    def _moved(
+        self, odometry: OdometryStep, before: int | None, outside: Guess | None, *, doubted: bool
+    ) -> Motion:
+        """The motion since a stamp: measured, or a guess."""
+        stamp_ns = self._stamp_ns
+        assert stamp_ns is not None
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         guess = self._guess(seconds, stamp_ns, outside)
