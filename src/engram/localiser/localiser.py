@@ -171,6 +171,7 @@ class Localiser:
         open_loop_m: float | None = 0.0,
         guessed_m: float = 0.0,
         agreed: int = 0,
+        said: bool = False,
     ) -> None:
         """Sets the position, as an operator or another localiser would.
 
@@ -180,9 +181,10 @@ class Localiser:
                 the count.
             guessed_m: standard deviation of the motion guessed since then, metres.
             agreed: number of fixes that confirm it; 0 for a position that is only said to be.
+            said: whether somebody says so, who may be wrong where the robot knew its place.
         """
+        self._prover.forget(agreed, told_otherwise=said and self.certain)
         self.position = position
-        self._prover.forget(agreed)
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
         self._guessed_m2 = guessed_m**2
@@ -524,6 +526,11 @@ class Localiser:
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
+
+    @property
+    def told_otherwise(self) -> bool:
+        """Whether the position was said to be another than the robot knew: no edge rests on it."""
+        return self._prover.told_otherwise
 
     @property
     def on_trial(self) -> bool:

@@ -26,6 +26,8 @@ class Prover:
 
     Attributes:
         standing: of the position, when the frame began.
+        told_otherwise: whether somebody said another place than the robot knew, and no fix has
+            confirmed it yet.
         withdraws: stamps of the fixes that the frame's fix contradicts, ns.
     """
 
@@ -36,6 +38,7 @@ class Prover:
         self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
         self.standing = Standing()
         self._told = False
+        self.told_otherwise = False
         self.withdraws: tuple[int, ...] = ()
 
     @property
@@ -64,8 +67,9 @@ class Prover:
         """
         self._chain.carry_on(prev_from_curr, covariance)
 
-    def forget(self, agreed: int = 0) -> None:
+    def forget(self, agreed: int = 0, *, told_otherwise: bool = False) -> None:
         """The position is another, confirmed by so many fixes; those before it stay."""
+        self.told_otherwise = told_otherwise and (self.told_otherwise or not self._told)
         self._told = not agreed
         self._record.forget(agreed)
         self._chain.settle()
@@ -108,7 +112,7 @@ class Prover:
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, found, alone)
-        self._told = False
+        self._told = self.told_otherwise = False
         self._record.fixed(success.match.inliers, agrees=fits is True)
 
     def _agrees(self, found: Position, before: Position | None) -> bool | None:

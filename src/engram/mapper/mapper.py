@@ -271,7 +271,8 @@ class Mapper(Memory):
         """Saves the frame as a node, chained to the experience or tied to where it began."""
         node = self._node_of(live)
         edges = []
-        if self._since_saved is None:
+        unknown = self._localiser.told_otherwise
+        if self._since_saved is None or unknown:
             self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
@@ -279,14 +280,14 @@ class Mapper(Memory):
             tie = _edge(position, node.id, EdgeKind.TIE)
             if self._localiser.on_trial:
                 self._wait_with([tie])
-            else:
+            elif not unknown:
                 edges.append(tie)
             edges += self._edge_to_last_saved(position, node.id, EdgeKind.TIE)
         self._graph.add_edges(edges)
         edges += self._beside(node.id)
         self._experience.append(node.id)
         self._since_saved = Position.at(node.id)
-        if not self._waiting:
+        if not self._waiting and not unknown:
             self._localiser.settle_in(node.id)
         return node, edges
 

@@ -282,7 +282,7 @@ class Robot:
             InputError: no such position; see `check_position`.
         """
         check_position(hint, self.graph)
-        self._localiser.place_at(hint)
+        self._localiser.place_at(hint, said=True)
 
     def lose(self) -> None:
         """Discards the position: the robot was carried elsewhere."""
