@@ -18,7 +18,7 @@ FAILED = OdometryStep(OdometryStatus.NO_CONSENSUS)
 
 def _jumped_at(inliers: list[int]) -> list[int]:
     jumps = Jumps(share=0.1, least=60)
-    return [at for at, one in enumerate(inliers) if jumps.jumped(one)]
+    return [at for at, one in enumerate(inliers) if jumps.jumped(one, 0.1)]
 
 
 @pytest.mark.parametrize(
@@ -47,6 +47,12 @@ def test_wipers_are_no_jumps() -> None:
 def test_where_landmarks_are_few_steps_fail_by_themselves() -> None:
     assert _jumped_at([50] * 20 + [0] + [50] * 5) == []
     assert _jumped_at([200] * 20 + [0] + [50] * 5) == []
+
+
+def test_where_frames_are_missing_the_time_bounds_the_guess() -> None:
+    jumps = Jumps(share=0.1, least=60)
+    steps = [(200, 0.1)] * 20 + [(0, 0.5), (200, 0.1)]
+    assert not any(jumps.jumped(*step) for step in steps)
 
 
 def test_wheels_know_of_a_motion_that_the_images_do_not_show() -> None:

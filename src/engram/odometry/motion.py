@@ -254,18 +254,22 @@ class GapFiller:
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         if odometry.status is OdometryStatus.FIRST:
             return Motion(odometry)
-        moved = self._moved(odometry, before, outside, doubted=doubted)
+        seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
+        moved = self._moved(odometry, stamp_ns, seconds, outside, doubted=doubted)
         # Wheels or a gyroscope know of a motion that the images do not show.
-        jumped = self._jumps.jumped(odometry.inliers) and outside is None
+        jumped = self._jumps.jumped(odometry.inliers, seconds) and outside is None
         return replace(moved, jumped=True) if jumped else moved
 
     def _moved(
-        self, odometry: OdometryStep, before: int | None, outside: Guess | None, *, doubted: bool
+        self,
+        odometry: OdometryStep,
+        stamp_ns: int,
+        seconds: float,
+        outside: Guess | None,
+        *,
+        doubted: bool,
     ) -> Motion:
-        """The motion since a stamp: measured, or a guess."""
-        stamp_ns = self._stamp_ns
-        assert stamp_ns is not None
-        seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
+        """The motion within so many seconds: measured, or a guess."""
         measured, covariance = odometry.prev_from_curr, odometry.covariance
         guess = self._guess(seconds, stamp_ns, outside)
         if seconds > 0 and self._knows_speed:
