@@ -253,11 +253,9 @@ class Mapper(Memory):
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
         """Whether a frame is usable and far enough from the last saved one (method §5).
 
-        During a long gap of odometry none is: a node without an edge has no use. Nor is one at
-        which it just failed: the next frame tells whether the images jumped.
+        During a long gap of odometry none is: a node without an edge has no use.
         """
-        just_failed = motion.guessed_m and self._gap_m2 <= motion.guessed_m**2
-        if live.status is not FrameStatus.OK or just_failed:
+        if live.status is not FrameStatus.OK or motion.suspected:
             return False
         if self._since_saved is None:
             return not motion.guessed_m

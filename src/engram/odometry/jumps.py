@@ -25,30 +25,40 @@ class Jumps:
     Args:
         share: a step with less than this share of the inliers on either side of it is a jump.
         least: fewest inliers on either side: where landmarks are few steps fail by themselves.
+
+    Attributes:
+        suspected: whether the last step may be one, which the next step tells.
     """
 
     def __init__(self, share: float, least: int) -> None:
         self._share, self._least = share, least
         # Inliers of the last steps and the time that they took, the newest last.
-        self._steps: deque[tuple[int, float]] = deque(maxlen=_FRAMES_BEFORE + 1)
+        self._steps: deque[tuple[int, float]] = deque(maxlen=_FRAMES_BEFORE)
+        self.suspected = False
 
     def jumped(self, inliers: int, seconds: float) -> bool:
-        """Whether the step before this one was a jump.
+        """Takes a step; whether the one before it was a jump.
 
         Args:
             inliers: of this step; 0 if it failed.
             seconds: that it took.
         """
-        steps = list(self._steps)
+        jumped = (
+            self.suspected and inliers >= self._least and self._steps[-1][0] < self._share * inliers
+        )
+        self.suspected = self._is_suspect(inliers, seconds)
         self._steps.append((inliers, seconds))
-        if len(steps) < 2:
+        return jumped
+
+    def _is_suspect(self, inliers: int, seconds: float) -> bool:
+        """Whether a step fails after many that did not, and in the usual time."""
+        if not self._steps:
             return False
-        before = [count for count, _ in steps[:-1]]
-        last, took_s = steps[-1]
-        if took_s > _GAP_RATIO * statistics.median(at_s for _, at_s in steps[:-1]):
-            return False
-        usual = statistics.median(before)
-        beside = min(usual, inliers)
-        if beside < self._least or last >= self._share * beside:
-            return False
-        return min(before) >= _STEADY_SHARE * usual
+        before = [count for count, _ in self._steps]
+        usual, usual_s = statistics.median(before), statistics.median(s for _, s in self._steps)
+        return (
+            usual >= self._least
+            and inliers < self._share * usual
+            and min(before) >= _STEADY_SHARE * usual
+            and seconds <= _GAP_RATIO * usual_s
+        )

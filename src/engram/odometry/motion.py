@@ -139,6 +139,7 @@ class Motion:
             brings.
         jumped: whether the images went on elsewhere at the frame before, which this one tells:
             where the robot is now does not follow from where it was.
+        suspected: whether they may have gone on elsewhere at this frame, which the next one tells.
     """
 
     odometry: OdometryStep
@@ -147,6 +148,7 @@ class Motion:
     guessed_m: float = 0.0
     ahead: tuple[SE3, NDArray[np.float64]] | None = None
     jumped: bool = False
+    suspected: bool = False
 
     @property
     def moved_m(self) -> float:
@@ -257,8 +259,10 @@ class GapFiller:
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
         moved = self._moved(odometry, stamp_ns, seconds, outside, doubted=doubted)
         # Wheels or a gyroscope know of a motion that the images do not show.
-        jumped = self._jumps.jumped(odometry.inliers, seconds) and outside is None
-        return replace(moved, jumped=True) if jumped else moved
+        jumped, suspected = self._jumps.jumped(odometry.inliers, seconds), self._jumps.suspected
+        if outside is not None or not (jumped or suspected):
+            return moved
+        return replace(moved, jumped=jumped, suspected=suspected)
 
     def _moved(
         self,
