@@ -275,6 +275,7 @@ def _decision(found: Localisation, outcomes: list[Outcome]) -> dict[str, Any]:
         "looked_up": found.looked_up,
         "moved_m": found.motion.moved_m,
         "guessed_m": _finite(found.motion.guessed_m),
+        "jumped": found.motion.jumped,
         "belief": None
         if position is None
         else {
